@@ -1,0 +1,33 @@
+# `make demo` and `make test` need only Python 3.11 or later and make.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+OUT    ?= demo
+
+.PHONY: demo test lint clean
+
+# One stamp per set of extras: pip runs again only when pyproject.toml changes.
+$(VENV)/.report: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[report]'
+	touch $@
+
+$(VENV)/.dev: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	touch $@ $(VENV)/.report
+
+demo: $(VENV)/.report
+	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 -o $(OUT)/calibration.h5 --report $(OUT)/report.html
+	$(BIN)/jaxeit evaluate $(OUT)/calibration.h5 data/sessions/testbed_presses.h5
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) $(OUT) build *.egg-info
