@@ -1,0 +1,125 @@
+"""jaxeit: from what an EIT-pneumatic robot skin records to force maps in newtons.
+
+Nouns are frozen pytrees, verbs are pure jitted functions, choices are objects, and physics that is
+not in the scene is not in the program.
+"""
+
+from .basis import BasisMap, Elements, Pixels
+from .discretise import Model, discretise, make_mesh
+from .domain import Disc, Polygon, Rectangle
+from .effects import (
+    EFFECTS,
+    AbstractEffect,
+    AbstractPadEffect,
+    AbstractReadoutEffect,
+    BaselineDrift,
+    CoatingNonUniformity,
+    ContactGain,
+    ContactPiezoresistance,
+    LoadSpreading,
+    Noise,
+    PadEdgeDip,
+    Quantisation,
+    Stream,
+    fold,
+)
+from .electrodes import AreaPatch, BoundaryPatch, ElectrodeError, PointElectrode, disc_resistance
+from .fidelity import Fidelity, FidelityError
+from .forward import conductivity, forward, load_spread
+from .fusion import ForceMap, FusionError, PadMasks, fuse, pad_masks
+from .inverse import InverseError, OneStep, Reconstructor, prepare
+from .jacobian import jacobian
+from .mesh import Mesh, MeshError, Pattern, structured, triangulate
+from .metrics import (
+    ESTIMATORS,
+    LevelCentroid,
+    Peak,
+    PositiveCentroid,
+    coefficient_of_variation,
+    image_sum,
+    inward_bias,
+    localisation_error,
+)
+from .pneumatics import pad_response
+from .priors import Noser, Tikhonov
+from .protocol import Protocol, adjacent, reciprocal_rows
+from .scene import Scene, read_effects
+from .skin import Pad, PressureSensor, Skin, load_skin, parse_skin, shipped_skins
+from .toml import TomlError, TomlTable, parse_toml, read_text
+
+__all__ = [
+    "EFFECTS",
+    "ESTIMATORS",
+    "AbstractEffect",
+    "AbstractPadEffect",
+    "AbstractReadoutEffect",
+    "AreaPatch",
+    "BaselineDrift",
+    "BasisMap",
+    "BoundaryPatch",
+    "CoatingNonUniformity",
+    "ContactGain",
+    "ContactPiezoresistance",
+    "Disc",
+    "ElectrodeError",
+    "Elements",
+    "Fidelity",
+    "FidelityError",
+    "ForceMap",
+    "FusionError",
+    "InverseError",
+    "LevelCentroid",
+    "LoadSpreading",
+    "Mesh",
+    "MeshError",
+    "Model",
+    "Noise",
+    "Noser",
+    "OneStep",
+    "Pad",
+    "PadEdgeDip",
+    "PadMasks",
+    "Pattern",
+    "Peak",
+    "Pixels",
+    "PointElectrode",
+    "Polygon",
+    "PositiveCentroid",
+    "PressureSensor",
+    "Protocol",
+    "Quantisation",
+    "Reconstructor",
+    "Rectangle",
+    "Scene",
+    "Skin",
+    "Stream",
+    "Tikhonov",
+    "TomlError",
+    "TomlTable",
+    "adjacent",
+    "coefficient_of_variation",
+    "conductivity",
+    "disc_resistance",
+    "discretise",
+    "fold",
+    "forward",
+    "fuse",
+    "image_sum",
+    "inward_bias",
+    "jacobian",
+    "load_skin",
+    "load_spread",
+    "localisation_error",
+    "make_mesh",
+    "pad_masks",
+    "pad_response",
+    "parse_skin",
+    "parse_toml",
+    "prepare",
+    "read_effects",
+    "read_text",
+    "reciprocal_rows",
+    "shipped_skins",
+    "structured",
+    "triangulate",
+]

@@ -1,0 +1,183 @@
+"""Image bases: what the coefficients of an image stand for."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .discretise import Model
+
+
+class BasisError(ValueError):
+    """A basis that cannot be laid over the model."""
+
+
+class BasisMap(eqx.Module):
+    """A basis laid over one model: conductivity change = sparse matrix times coefficients.
+
+    | meaning                                               | shape       | unit |
+    |-------------------------------------------------------|-------------|------|
+    | element, coefficient, weight: the matrix's entries    | (entries,)  |      |
+    | centres in the sheet's flat coordinates               | (basis, 2)  | m    |
+    | areas on the sheet; zero for a pixel that misses it   | (basis,)    | m^2  |
+    | shape: (rows, columns) of a picture, row 0 at low y   |             |      |
+    | extent: x0, x1, y0, y1 of that picture                |             | m    |
+    """
+
+    element: Int[Array, " entries"]
+    coefficient: Int[Array, " entries"]
+    weight: Float[Array, " entries"]
+    centres: Float[Array, "basis 2"]
+    areas: Float[Array, " basis"]
+    elements: int = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+    extent: tuple[float, float, float, float] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.areas.shape[0]
+
+    def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
+        """Values on the elements, from those of the coefficients."""
+        spread = self.weight * image[self.coefficient]
+        return jnp.zeros(self.elements, spread.dtype).at[self.element].add(spread)
+
+
+class AbstractBasis(ABC):
+    """A choice of image; `on` lays it over a model, on the host."""
+
+    @abstractmethod
+    def on(self, model: Model) -> BasisMap:
+        """The basis for this model.
+
+        Raises:
+            BasisError: under jit, where the model's geometry is not known.
+        """
+
+
+@dataclass(frozen=True)
+class Elements(AbstractBasis):
+    """One coefficient per element: the finest image the mesh can carry, and not a picture."""
+
+    def on(self, model: Model) -> BasisMap:
+        areas = _host(model.areas)
+        every = np.arange(len(areas))
+        chart = _host(model.chart)
+        weight = np.ones(len(areas))
+        return _basis_map(
+            model, (every, every, weight), _host(model.centroids), areas, (len(areas),), chart
+        )
+
+
+@dataclass(frozen=True)
+class Pixels(AbstractBasis):
+    """A regular grid over the sheet's bounding box, projected by exact areas of overlap.
+
+    The conductivity change of an element is the mean of the pixels over it, weighted by the areas
+    they share.
+
+    | meaning                                                      | default |
+    |--------------------------------------------------------------|---------|
+    | columns along x                                              | 40      |
+    | rows along y; None: square pixels                            | None    |
+    """
+
+    columns: int = 40
+    rows: int | None = None
+
+    def __post_init__(self):
+        for name, count in (("columns", self.columns), ("rows", self.rows)):
+            if count is not None and not 1 <= count <= 2000:
+                raise BasisError(f"{name} is {count}; give 1 to 2000 pixels")
+
+    def on(self, model: Model) -> BasisMap:
+        chart = _host(model.chart)
+        low, high = chart.min(0), chart.max(0)
+        rows = self.rows or max(1, round(self.columns * (high[1] - low[1]) / (high[0] - low[0])))
+        counts = np.array([self.columns, rows])
+        pixel = (high - low) / counts
+        corners = (chart[_host(model.triangles)] - low) / pixel  # in units of pixels
+        element, place = _candidates(corners, counts)
+        shared = overlap_areas(corners[element], place, place + 1)
+        kept = shared > 1e-12
+        element, place, shared = element[kept], place[kept], shared[kept]
+        whole = np.bincount(element, shared, minlength=len(corners))
+        weight = shared / whole[element]
+        number = place[:, 1] * self.columns + place[:, 0]
+        areas = np.bincount(number, weight * _host(model.areas)[element], minlength=counts.prod())
+        x, y = np.meshgrid(np.arange(self.columns) + 0.5, np.arange(rows) + 0.5)
+        centres = low + np.stack([x.ravel(), y.ravel()], 1) * pixel
+        shape = (rows, self.columns)
+        return _basis_map(model, (element, number, weight), centres, areas, shape, chart)
+
+
+def _basis_map(model, entries, centres, areas, shape, chart) -> BasisMap:
+    (x0, y0), (x1, y1) = chart.min(0).tolist(), chart.max(0).tolist()
+    element, coefficient, weight = entries
+    return BasisMap(
+        element=jnp.asarray(element, jnp.int32),
+        coefficient=jnp.asarray(coefficient, jnp.int32),
+        weight=jnp.asarray(weight, model.dtype),
+        centres=jnp.asarray(centres, model.dtype),
+        areas=jnp.asarray(areas, model.dtype),
+        elements=model.areas.shape[0],
+        shape=shape,
+        extent=(x0, x1, y0, y1),
+    )
+
+
+def _host(array: Array) -> np.ndarray:
+    if eqx.is_array(array) and not isinstance(array, np.ndarray):
+        try:
+            array = np.asarray(array)
+        except Exception as error:
+            raise BasisError(
+                "a basis needs a model's geometry, which jit hides; make basis.on(model) outside "
+                "and pass the result in"
+            ) from error
+    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
+
+
+def _candidates(corners: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a triangle and a pixel whose bounding boxes meet: (pairs,), (pairs, 2)."""
+    first = np.clip(np.floor(corners.min(1)).astype(int), 0, counts - 1)
+    last = np.clip(np.ceil(corners.max(1)).astype(int) - 1, first, counts - 1)
+    spans = last - first + 1
+    element = np.repeat(np.arange(len(corners)), spans.prod(1))
+    start = np.cumsum(spans.prod(1)) - spans.prod(1)
+    within = np.arange(len(element)) - start[element]
+    width = spans[element, 0]
+    return element, first[element] + np.stack([within % width, within // width], 1)
+
+
+def overlap_areas(polygons: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Areas that polygons share with axis-parallel boxes, exactly.
+
+    Each edge is split where it crosses the box's lines and what lies outside is pushed onto them;
+    the pushed parts enclose nothing, so the shoelace formula gives the area inside.
+
+    Args:
+        polygons: (pairs, corners, 2), counter-clockwise, convex or not.
+        low, high: corners of the boxes, (pairs, 2).
+    """
+    for axis in (0, 1):
+        polygons = _push(polygons, axis, low[:, axis], high[:, axis])
+    x, y = np.moveaxis(polygons, -1, 0)
+    return 0.5 * np.sum(x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1), 1)
+
+
+def _push(polygons: np.ndarray, axis: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    start = polygons
+    step = np.roll(polygons, -1, 1) - start
+    lines = np.stack([low, high], -1)[:, None, :]
+    along = np.where(step[..., axis] == 0, 1.0, step[..., axis])[..., None]
+    crossing = np.clip((lines - start[..., axis][..., None]) / along, 0.0, 1.0)
+    t = np.concatenate([np.zeros_like(crossing[..., :1]), np.sort(crossing, -1)], -1)
+    points = start[:, :, None] + t[..., None] * step[:, :, None]
+    points = points.reshape(len(points), -1, 2)
+    points[..., axis] = np.clip(points[..., axis], low[:, None], high[:, None])
+    return points

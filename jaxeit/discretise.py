@@ -1,0 +1,334 @@
+"""From a scene and a fidelity to arrays: the one door between host and device, and the one place
+that says no.
+
+The unknowns are the potentials ``u`` of the sheet and ``U`` of the complete electrodes.  Solving
+for them as they stand fails at both ends: at small contact resistance u and U differ by less than
+rounding, at large resistance the reverse substitution subtracts.  So under each electrode
+
+    u = w + s U chi,        s = G_c / (G_c + G_s)
+
+is solved for ``w`` and ``U`` instead, chi being one on the nodes under the electrode, G_c its contact
+conductance and G_s = chi^T K chi that of the sheet around it.  The diagonal entry of U becomes the
+conductance of the two in series, no entry is formed by subtraction, and after diagonal scaling the
+matrix is well conditioned from a perfect contact to none.  (Derived here; a congruence, so the
+matrix stays symmetric positive definite.)
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .effects import AbstractEffect
+from .electrodes import AbstractElectrode, ElectrodeError
+from .elements import Space, function_space
+from .fidelity import Fidelity, require_dtype
+from .mesh import Mesh, triangulate
+from .scene import Scene
+from .solvers import AbstractLinearSolver, AbstractPlan, Pattern, default_solver
+
+
+class System(eqx.Module):
+    """The assembled problem with its numbers left out: which coefficient goes where.
+
+    One unknown is grounded; index ``unknowns`` stands for it wherever an index can meet it.  An
+    electrode of index ``electrodes`` stands for none.
+
+    | meaning                                                                 | shape           |
+    |-------------------------------------------------------------------------|-----------------|
+    | dofs: unknowns of each element                                          | (elements, k)   |
+    | stiffness of each element at unit conductivity                          | (elements, k, k)|
+    | contact_dofs, contact_mass (m^2 or m): pieces under complete electrodes | (p, k), (p, k, k)|
+    | contact_electrode: whose piece it is                                    | (p,)            |
+    | rim_element, rim_electrode, rim_chi: elements around an electrode and   | (r,), (r,),     |
+    |   the values of chi at their nodes                                      | (r, k)          |
+    | measure: area (m^2) or length (m) of each electrode, 0 if tied          | (electrodes,)   |
+    | under: the complete electrode over each unknown, and over the ground    | (unknowns + 1,) |
+    | electrode_dof: the unknown that is each electrode's potential           | (electrodes,)   |
+    | slots: place in the matrix of every contribution (`forward.assemble`)   | (contributions,)|
+    """
+
+    dofs: Int[Array, "elements k"]
+    stiffness: Float[Array, "elements k k"]
+    contact_dofs: Int[Array, "p k"]
+    contact_mass: Float[Array, "p k k"]
+    contact_electrode: Int[Array, " p"]
+    rim_element: Int[Array, " r"]
+    rim_electrode: Int[Array, " r"]
+    rim_chi: Float[Array, "r k"]
+    measure: Float[Array, " electrodes"]
+    under: Int[Array, " unknowns_and_ground"]
+    electrode_dof: Int[Array, " electrodes"]
+    slots: Int[Array, " contributions"]
+    plan: AbstractPlan
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns solved for."""
+        return self.under.shape[0] - 1
+
+
+class Model(eqx.Module):
+    """A scene at a fidelity: arrays only, so that it can be an argument of any jitted function.
+
+    | meaning                                             | shape           | unit              |
+    |-----------------------------------------------------|-----------------|-------------------|
+    | nodes of the mesh                                   | (nodes, 2 or 3) | m                 |
+    | chart: nodes in the sheet's flat coordinates        | (nodes, 2)      | m                 |
+    | triangles                                           | (elements, 3)   |                   |
+    | centroids in the sheet's flat coordinates           | (elements, 2)   | m                 |
+    | areas                                               | (elements,)     | m^2               |
+    | background: sheet conductivity, before effects      | (elements,)     | S                 |
+    | contact: contact conductance of each electrode      | (electrodes,)   | S/m^2 or S/m      |
+    | pattern: drive+, drive-, sense+, sense-             | (readings, 4)   |                   |
+    | current                                             | ()              | A                 |
+    | effects of the scene                                |                 |                   |
+    """
+
+    nodes: Float[Array, "nodes d"]
+    chart: Float[Array, "nodes 2"]
+    triangles: Int[Array, "elements 3"]
+    centroids: Float[Array, "elements 2"]
+    areas: Float[Array, " elements"]
+    background: Float[Array, " elements"]
+    contact: Float[Array, " electrodes"]
+    pattern: Int[Array, "readings 4"]
+    current: Float[Array, ""]
+    effects: tuple[AbstractEffect, ...]
+    system: System
+    solver: AbstractLinearSolver
+
+    @property
+    def electrodes(self) -> int:
+        """Number of electrodes."""
+        return self.contact.shape[0]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of every floating-point array of the model."""
+        return self.background.dtype
+
+
+def discretise(
+    scene: Scene,
+    fidelity: Fidelity | None = None,
+    *,
+    mesh: Mesh | None = None,
+    ground: int | None = None,
+) -> Model:
+    """Build the model of ``scene`` at ``fidelity`` (default: `Fidelity.standard`).
+
+    Args:
+        mesh: use this mesh instead of making one; it must follow the electrodes.
+        ground: the mesh node held at zero volts; readings do not depend on it.
+
+    Raises:
+        FidelityError: float64 asked for while JAX is in 32-bit mode.
+        ElectrodeError, MeshError: the electrodes do not fit the sheet, each other or the mesh.
+    """
+    fidelity = Fidelity.standard() if fidelity is None else fidelity
+    require_dtype(fidelity.dtype)
+    skin = scene.skin
+    mesh = make_mesh(scene, fidelity) if mesh is None else mesh.check()
+    space = function_space(mesh, fidelity.order)
+    layout = _lay_out(space, scene, ground)
+    system, solver = _system(space, layout, fidelity)
+    contact = [1 / e.contact if e.contact > 0 else 0.0 for e in skin.electrodes]
+    model = Model(
+        nodes=mesh.nodes,
+        chart=mesh.chart,
+        triangles=mesh.triangles,
+        centroids=mesh.chart_centroids,
+        areas=mesh.areas,
+        background=np.full(len(mesh.triangles), 1 / skin.sheet_resistance),
+        contact=np.array(contact),
+        pattern=skin.protocol.pattern,
+        current=np.array(skin.protocol.current),
+        effects=scene.effects,
+        system=system,
+        solver=solver,
+    )
+    return _to_device(model, fidelity.dtype)
+
+
+def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
+    """The mesh that `discretise` makes: graded around the electrodes, checked."""
+    skin = scene.skin
+    footprints = [e.footprint(fidelity.electrode_segments) for e in skin.electrodes]
+    length = fidelity.edge_length * np.sqrt(skin.domain.area)
+    return triangulate(skin.domain, footprints, length, growth=fidelity.growth).check()
+
+
+def _to_device(model: Model, dtype: np.dtype) -> Model:
+    def convert(leaf):
+        leaf = np.asarray(leaf)
+        floating = np.issubdtype(leaf.dtype, np.floating)
+        return jnp.asarray(leaf, dtype if floating else leaf.dtype)
+
+    return jax.tree.map(convert, model)
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Numbering of the unknowns; indices of the space's dofs go through ``index``."""
+
+    index: np.ndarray  # (space dofs + electrodes,) -> unknown; the grounded one -> unknowns
+    unknowns: int
+    coords: np.ndarray  # (unknowns, 2), NaN for electrodes
+    electrode_dof: np.ndarray
+    complete: list[tuple[int, np.ndarray, np.ndarray]]  # electrode, dofs and mass of its pieces
+
+
+def _lay_out(space: Space, scene: Scene, ground: int | None) -> _Layout:
+    electrodes, domain = scene.skin.electrodes, scene.skin.domain
+    count = len(space.points)
+    alias = np.arange(count + len(electrodes))
+    owner = np.full(count, -1)
+    complete = []
+    for number, electrode in enumerate(electrodes):
+        pieces = electrode.pieces(space, domain)
+        patch = np.unique(pieces.dofs)
+        _claim(owner, patch, number)
+        if electrode.contact > 0:
+            complete.append((number, pieces.dofs, pieces.mass))
+        else:  # a perfect contact: one potential under the whole electrode
+            alias[patch] = alias[count + number] = patch[0]
+    grounded = _ground(space, alias, owner, electrodes, ground)
+    names = np.setdiff1d(alias, alias[grounded])
+    index = np.searchsorted(names, alias)
+    index[alias == alias[grounded]] = len(names)
+    places = np.concatenate([space.chart, np.full((len(electrodes), 2), np.nan)])
+    return _Layout(index, len(names), places[names], index[count:], complete)
+
+
+def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
+    taken = owner[patch] >= 0
+    if taken.any():
+        other = int(owner[patch][taken][0])
+        raise ElectrodeError(
+            f"electrodes {other} and {number} touch the same mesh node; move them apart or make "
+            "the mesh finer"
+        )
+    owner[patch] = number
+
+
+def _ground(
+    space: Space,
+    alias: np.ndarray,
+    owner: np.ndarray,
+    electrodes: tuple[AbstractElectrode, ...],
+    ground: int | None,
+) -> int:
+    """A node amid the sheet that no complete electrode covers, as one at the rim would see more
+    resistance and cost a digit."""
+    complete = np.array([e.contact > 0 for e in electrodes])
+    free = (owner < 0) | ~complete[owner]
+    if ground is None:
+        away = np.linalg.norm(space.chart - space.chart.mean(0), axis=1)
+        return int(np.argmin(np.where(free, away, np.inf)))
+    if not (0 <= ground < len(owner) and free[ground]):
+        raise ElectrodeError(f"node {ground} cannot be the ground: it is under an electrode")
+    return ground
+
+
+def _system(
+    space: Space, layout: _Layout, fidelity: Fidelity
+) -> tuple[System, AbstractLinearSolver]:
+    electrodes = len(layout.electrode_dof)
+    width = space.dofs.shape[1]
+    dofs = layout.index[space.dofs]
+    contact_dofs, contact_mass, contact_electrode = _contacts(layout, width)
+    measure = np.bincount(contact_electrode, contact_mass.sum((1, 2)), minlength=electrodes)
+    under = np.full(layout.unknowns + 1, electrodes)
+    under[contact_dofs[contact_mass.any(2)]] = np.repeat(
+        contact_electrode, contact_mass.any(2).sum(1)
+    )
+    rim_element, rim_electrode, rim_chi = _rims(dofs, under, electrodes)
+    rows, cols = _entries(
+        dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, layout.electrode_dof
+    )
+    slots, pattern_rows, pattern_cols = _slots(rows, cols, layout.unknowns)
+    roots = np.unique(layout.electrode_dof)
+    pattern = Pattern(
+        layout.unknowns,
+        pattern_rows,
+        pattern_cols,
+        layout.coords,
+        roots[roots < layout.unknowns],
+    )
+    solver = fidelity.solver or default_solver(layout.unknowns)
+    system = System(
+        dofs=dofs,
+        stiffness=space.stiffness,
+        contact_dofs=contact_dofs,
+        contact_mass=contact_mass,
+        contact_electrode=contact_electrode,
+        rim_element=rim_element,
+        rim_electrode=rim_electrode,
+        rim_chi=rim_chi,
+        measure=measure,
+        under=under,
+        electrode_dof=layout.electrode_dof,
+        slots=slots,
+        plan=solver.analyse(pattern),
+    )
+    return system, solver
+
+
+def _contacts(layout: _Layout, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All pieces in one array; edges have fewer nodes than triangles and are padded with zeros."""
+    dofs, masses, owners = [np.zeros((0, width), int)], [np.zeros((0, width, width))], []
+    for number, piece_dofs, mass in layout.complete:
+        short = width - piece_dofs.shape[1]
+        dofs.append(np.pad(layout.index[piece_dofs], ((0, 0), (0, short)), mode="edge"))
+        masses.append(np.pad(mass, ((0, 0), (0, short), (0, short))))
+        owners.append(np.full(len(piece_dofs), number))
+    owner = np.concatenate([np.zeros(0, int), *owners])
+    return np.concatenate(dofs), np.concatenate(masses), owner
+
+
+def _rims(
+    dofs: np.ndarray, under: np.ndarray, electrodes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Elements with some nodes under an electrode: K chi vanishes where all are."""
+    above = under[dofs]
+    element, corner = np.nonzero(above < electrodes)
+    pairs = np.unique(np.stack([element, above[element, corner]], 1), axis=0)
+    chi = above[pairs[:, 0]] == pairs[:, 1:]
+    partly = ~chi.all(1)
+    return pairs[partly, 0], pairs[partly, 1], chi[partly].astype(float)
+
+
+def _entries(
+    dofs: np.ndarray,
+    contact_dofs: np.ndarray,
+    contact_electrode: np.ndarray,
+    rim_element: np.ndarray,
+    rim_electrode: np.ndarray,
+    electrode_dof: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of every contribution, in the order in which `forward.assemble` makes them."""
+    width = dofs.shape[1]
+    blocks = np.concatenate([dofs, contact_dofs])
+    nodes = np.concatenate([dofs[rim_element], contact_dofs])
+    potential = electrode_dof[np.concatenate([rim_electrode, contact_electrode])]
+    rows = [np.repeat(blocks, width, 1).ravel(), nodes.ravel(), electrode_dof]
+    cols = [np.tile(blocks, (1, width)).ravel(), np.repeat(potential, width), electrode_dof]
+    # A node and the electrode over it make one entry, which the lower triangle holds once; a block
+    # makes each of its entries twice, and the upper one is dropped.
+    rows[1], cols[1] = np.maximum(rows[1], cols[1]), np.minimum(rows[1], cols[1])
+    return np.concatenate(rows), np.concatenate(cols)
+
+
+def _slots(
+    rows: np.ndarray, cols: np.ndarray, unknowns: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Number the distinct places of the lower triangle; what is dropped goes past the last."""
+    kept = (rows >= cols) & (rows < unknowns)
+    keys, inverse = np.unique(rows[kept] * np.int64(unknowns) + cols[kept], return_inverse=True)
+    slots = np.full(len(rows), len(keys))
+    slots[kept] = inverse
+    return slots, keys // unknowns, keys % unknowns

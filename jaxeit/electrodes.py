@@ -1,0 +1,182 @@
+"""Electrode models: how a terminal of the instrument meets the sheet.
+
+Every model says two things: what the mesh must follow (`footprint`), and which pieces of the mesh
+it touches (`pieces`).  A complete electrode has a contact conductance ``g`` per unit of its measure
+(area for a bolt, length for an edge electrode) and obeys, with u the sheet potential and U its own,
+
+    -div(sigma grad u) + sum_l chi_l g_l (u - U_l) = 0,      integral over E_l of g_l (U_l - u) = I_l
+
+(area patch: current enters through the film from above; boundary patch: through its edge, which is
+the complete electrode model of Somersalo, Cheney and Isaacson 1992).
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ive
+
+from .domain import Domain
+from .elements import Space
+from .mesh import ArcFootprint, DiscFootprint, Footprint, PointFootprint
+
+
+class ElectrodeError(ValueError):
+    """An electrode that cannot be built on this sheet or mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Where one electrode touches a function space.
+
+    | meaning                                         | shape  | unit   |
+    |-------------------------------------------------|--------|--------|
+    | dofs of each triangle or boundary edge touched  | (p, k) |        |
+    | mass: integrals of phi_i phi_j over each        | (p, k, k) | m^2 or m |
+    """
+
+    dofs: np.ndarray
+    mass: np.ndarray
+
+
+class AbstractElectrode(ABC):
+    """One terminal.  ``contact`` is its specific contact resistance; 0 means a perfect contact."""
+
+    contact: float
+
+    @abstractmethod
+    def footprint(self, segments: int) -> Footprint:
+        """What the mesh must follow, discs as polygons of ``segments`` sides."""
+
+    @abstractmethod
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        """The parts of the space that it touches."""
+
+    @abstractmethod
+    def centre(self, domain: Domain) -> np.ndarray:
+        """Its middle in the sheet's flat coordinates, (2,) m."""
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ElectrodeError(f"an electrode's {name} is {value}; give a positive number")
+
+
+def _contact(value: float, unit: str) -> None:
+    if not (np.isfinite(value) and value >= 0):
+        raise ElectrodeError(
+            f"an electrode's contact is {value} {unit}; give zero (perfect) or a positive number"
+        )
+
+
+@dataclass(frozen=True)
+class PointElectrode(AbstractElectrode):
+    """The ideal limit: a node of the mesh.  Its own drive resistance is infinite in the limit of
+    fine meshes (the potential is logarithmic there); four-terminal readings are not affected.
+
+    | meaning  | shape | unit |
+    |----------|-------|------|
+    | position | (2,)  | m    |
+    """
+
+    position: tuple[float, float]
+    contact = 0.0
+
+    def footprint(self, segments: int) -> PointFootprint:
+        return PointFootprint(self.position)
+
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        distance = np.linalg.norm(space.chart - np.asarray(self.position), axis=1)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] > 1e-6 * np.ptp(space.chart):
+            raise ElectrodeError(f"no mesh node at the point electrode {self.position}")
+        return Pieces(np.array([[nearest]]), np.ones((1, 1, 1)))
+
+    def centre(self, domain: Domain) -> np.ndarray:
+        return np.asarray(self.position, float)
+
+
+@dataclass(frozen=True)
+class AreaPatch(AbstractElectrode):
+    """A bolt head or disc pressed on the film: current spreads into the sheet under its whole area.
+
+    | meaning                                 | shape | unit    |
+    |-----------------------------------------|-------|---------|
+    | position of the centre                  | (2,)  | m       |
+    | radius                                  | ()    | m       |
+    | contact: specific contact resistance    | ()    | ohm m^2 |
+
+    The current passes within the transfer length ``sqrt(contact / sheet resistance)`` of the rim,
+    0.08 mm for the default: a mesh that does not resolve it gives the perfect-contact limit, which
+    leaves four-terminal readings unchanged; `disc_resistance` is what a two-terminal reading lacks.
+    """
+
+    position: tuple[float, float]
+    radius: float
+    contact: float = 1e-6
+
+    def __post_init__(self):
+        _positive(radius=self.radius)
+        _contact(self.contact, "ohm m^2")
+
+    def footprint(self, segments: int) -> DiscFootprint:
+        return DiscFootprint(self.position, self.radius, segments)
+
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        offset = space.mesh.chart_centroids - np.asarray(self.position)
+        inside = np.flatnonzero(np.linalg.norm(offset, axis=1) < self.radius)
+        if not len(inside):
+            raise ElectrodeError(f"the mesh has no triangle under the bolt at {self.position}")
+        return Pieces(space.dofs[inside], space.element_mass(inside))
+
+    def centre(self, domain: Domain) -> np.ndarray:
+        return np.asarray(self.position, float)
+
+
+@dataclass(frozen=True)
+class BoundaryPatch(AbstractElectrode):
+    """An electrode along the edge of the sheet: the complete electrode model.
+
+    | meaning                                              | shape | unit  |
+    |------------------------------------------------------|-------|-------|
+    | start, stop: arc length along the domain's boundary  | ()    | m     |
+    | contact: contact impedance z in  u + z sigma du/dn = U | ()  | ohm m |
+    """
+
+    start: float
+    stop: float
+    contact: float = 1e-3
+
+    def __post_init__(self):
+        _positive(length=self.stop - self.start)
+        _contact(self.contact, "ohm m")
+
+    def footprint(self, segments: int) -> ArcFootprint:
+        return ArcFootprint(self.start, self.stop)
+
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        middles = space.mesh.chart[space.mesh.boundary_edges].mean(1)
+        along = (domain.boundary_coordinate(middles) - self.start) % domain.perimeter
+        touched = np.flatnonzero(along < self.stop - self.start)
+        if not len(touched):
+            raise ElectrodeError(
+                f"the mesh has no edge under the electrode from {self.start} to {self.stop} m"
+            )
+        return Pieces(space.boundary_dofs[touched], space.edge_mass(touched))
+
+    def centre(self, domain: Domain) -> np.ndarray:
+        return np.asarray(domain.boundary_point(0.5 * (self.start + self.stop)))
+
+
+def disc_resistance(radius: float, contact: float, sheet_resistance: float) -> float:
+    """Resistance in ohm from a disc electrode into the sheet around it, in closed form.
+
+    ``R_s L_T / (2 pi a) * I0(a / L_T) / I1(a / L_T)`` with the transfer length
+    ``L_T = sqrt(contact / R_s)``: the modified Bessel solution of ``laplace(u) = (u - U) / L_T^2``
+    under the disc.  Radius in m, contact in ohm m^2, sheet resistance in ohm per square.
+    """
+    _positive(radius=radius, contact=contact, sheet_resistance=sheet_resistance)
+    transfer = np.sqrt(contact / sheet_resistance)
+    ratio = radius / transfer
+    return float(sheet_resistance * transfer / (2 * np.pi * radius) * ive(0, ratio) / ive(1, ratio))

@@ -1,0 +1,203 @@
+"""The forward model: from sheet conductivity to voltages.
+
+All readings are differences of the entries of one small symmetric matrix, the transfer matrix
+``Z[a, b]``: the potential of electrode a per ampere driven into electrode b (and out at the ground,
+which cancels).  With x_a the field of a unit current into electrode a, and
+``A(theta; x, y) = integral of sigma grad x . grad y + sum_l g_l integral over E_l of (x - X_l)(y - Y_l)``,
+
+    Z[a, b] = A(theta; x_a, x_b),          dZ[a, b] = -A(dtheta; x_a, x_b),
+
+since A is linear in theta = (sigma, g) and the fields are stationary.  The derivative needs no
+further solve (the adjoint identity; Geselowitz 1971, Lehr 1972).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .discretise import Model, System
+from .effects import AbstractLoadEffect, AbstractSheetEffect, Sheet, Touch, fold
+from .solvers import solve_spd
+
+
+class Coefficients(NamedTuple):
+    """What the physics is linear in: conductivity of the elements, S; contact conductances."""
+
+    sigma: Float[Array, " elements"]
+    contact: Float[Array, " electrodes"]
+
+
+class Fields(NamedTuple):
+    """Potentials per ampere driven into each electrode, in ohm.
+
+    | meaning                                        | shape                       |
+    |------------------------------------------------|-----------------------------|
+    | potential of the sheet at its unknowns         | (unknowns + 1, electrodes)  |
+    | drop from sheet to electrode, where under one  | (unknowns + 1, electrodes)  |
+    | terminal: potential of each electrode          | (electrodes, electrodes)    |
+    """
+
+    potential: Float[Array, "unknowns_and_ground electrodes"]
+    drop: Float[Array, "unknowns_and_ground electrodes"]
+    terminal: Float[Array, "electrodes electrodes"]
+
+
+def forward(
+    model: Model, sigma: Float[Array, " elements"] | None = None
+) -> Float[Array, " readings"]:
+    """Voltages of one frame.
+
+    Args:
+        model: from `discretise`.
+        sigma: sheet conductivity of each element, S; default: that of the untouched sheet.
+
+    Returns:
+        (readings,) V, in the order of the protocol.  Not finite if ``sigma`` is not positive.
+
+    Raises:
+        ValueError: if ``sigma`` has another shape or precision than the model.
+    """
+    return readings(model, transfer(model, coefficients(model, sigma)))
+
+
+# `forward` and `jacobian` are made of jitted parts, so that they share one compiled solver.
+
+@eqx.filter_jit
+def conductivity(
+    model: Model, pressure: Float[Array, " elements"] | None = None
+) -> Float[Array, " elements"]:
+    """Sheet conductivity, (elements,) S, under the scene's material effects.
+
+    Args:
+        pressure: on the sheet, (elements,) Pa; default: none.
+    """
+    pressure = jnp.zeros_like(model.background) if pressure is None else pressure
+    sheet = Sheet(model.background, pressure, model.centroids)
+    return fold(model.effects, AbstractSheetEffect, sheet).sigma
+
+
+@eqx.filter_jit
+def load_spread(
+    model: Model, centre: Float[Array, "2"], diameter: Float[Array, ""]
+) -> Float[Array, " elements"]:
+    """Pressure on the sheet per unit load of a flat round tip, (elements,) 1/m^2.
+
+    The ideal tip presses evenly on its own area; effects of the scene may spread that.
+
+    Args:
+        centre: of the tip, (2,) m in the sheet's flat coordinates.
+        diameter: of the tip, m.
+    """
+    touch = Touch(jnp.asarray(centre, model.dtype), jnp.asarray(diameter, model.dtype))
+    offset = jnp.linalg.norm(model.centroids - touch.centre, axis=-1)
+    even = jnp.where(offset < touch.diameter / 2, 4 / (jnp.pi * touch.diameter**2), 0.0)
+    return fold(model.effects, AbstractLoadEffect, even, touch, model.centroids)
+
+
+def coefficients(model: Model, sigma: Float[Array, " elements"] | None) -> Coefficients:
+    """The conductivity given, or the scene's own, with the contact conductances."""
+    if sigma is None:
+        sigma = conductivity(model)
+    sigma = jnp.asarray(sigma)
+    if sigma.shape != model.background.shape or sigma.dtype != model.dtype:
+        raise ValueError(
+            f"sigma is {sigma.dtype}{list(sigma.shape)}; this model needs "
+            f"{model.dtype}{list(model.background.shape)}, one value per element"
+        )
+    return Coefficients(sigma, model.contact)
+
+
+@eqx.filter_jit
+def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
+    """Voltages of the protocol from the transfer matrix in ohm."""
+    source, sink, plus, minus = model.pattern.T
+    return model.current * (z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
+
+
+def transfer(model: Model, theta: Coefficients) -> Float[Array, "electrodes electrodes"]:
+    """The transfer matrix Z in ohm; its derivatives of first order cost no further solve."""
+    return _transfer(theta, model)
+
+
+@eqx.filter_custom_jvp
+def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes electrodes"]:
+    return fields(model, theta).terminal
+
+
+@_transfer.def_jvp
+def _transfer_jvp(primals, tangents):
+    theta, model = primals
+    direction, _ = tangents
+    x = fields(model, theta)
+    slope = jnp.zeros_like(x.terminal)
+    if direction is not None:
+        slope = -energy(model.system, _filled(direction, theta), x)
+    return x.terminal, slope
+
+
+def _filled(direction: Coefficients, theta: Coefficients) -> Coefficients:
+    pairs = zip(direction, theta, strict=True)
+    return Coefficients(*(jnp.zeros_like(t) if d is None else d for d, t in pairs))
+
+
+@eqx.filter_jit
+def fields(model: Model, theta: Coefficients) -> Fields:
+    """Fields of a unit current into each electrode; one factorisation, differentiable."""
+    system = model.system
+    values, share, rest = assemble(system, theta)
+    unit = jnp.zeros((system.unknowns, model.electrodes), values.dtype)
+    unit = unit.at[system.electrode_dof, jnp.arange(model.electrodes)].set(1, mode="drop")
+    x = solve_spd(model.solver, system.plan, values, unit)
+    x = jnp.concatenate([x, jnp.zeros_like(x[:1])])  # the ground
+    terminal = x[system.electrode_dof]
+    return Fields(
+        potential=x + _over(system, share[:, None] * terminal),
+        drop=x - _over(system, rest[:, None] * terminal),
+        terminal=terminal,
+    )
+
+
+def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, "n k"]:
+    """Each electrode's values at the unknowns under it, zero elsewhere."""
+    return jnp.concatenate([values, jnp.zeros_like(values[:1])])[system.under]
+
+
+def assemble(
+    system: System, theta: Coefficients
+) -> tuple[Float[Array, " nnz"], Float[Array, " electrodes"], Float[Array, " electrodes"]]:
+    """Lower triangle of the matrix for (w, U), and the shares s and 1 - s of `discretise`.
+
+    The shares only choose the unknowns: the potentials do not depend on them, nor derivatives.
+    """
+    sigma, contact = theta
+    chi, element, electrode = system.rim_chi, system.rim_element, system.rim_electrode
+    around = sigma[element, None] * jnp.einsum("rij,rj->ri", system.stiffness[element], chi)
+    sheet = jnp.zeros_like(contact).at[electrode].add(jnp.sum(chi * around, 1))
+    touch = contact * system.measure
+    total = jnp.where(touch > 0, touch + sheet, 1.0)
+    share, rest = jax.lax.stop_gradient((touch / total, sheet / total))
+
+    pieces = contact[system.contact_electrode]
+    load = pieces[:, None] * system.contact_mass.sum(2)
+    contributions = [
+        sigma[:, None, None] * system.stiffness,
+        pieces[:, None, None] * system.contact_mass,
+        share[electrode, None] * around,
+        -rest[system.contact_electrode, None] * load,
+        share**2 * sheet + rest**2 * touch,
+    ]
+    flat = jnp.concatenate([c.ravel() for c in contributions])
+    values = jnp.zeros(system.plan.rows.shape, flat.dtype).at[system.slots].add(flat, mode="drop")
+    return values, share, rest
+
+
+def energy(system: System, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
+    """``A(theta; x_a, x_b)`` for all pairs of fields, in ohm."""
+    u, d = x.potential[system.dofs], x.drop[system.contact_dofs]
+    sigma_k = theta.sigma[:, None, None] * system.stiffness
+    contact_m = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
+    sheet = jnp.einsum("eia,eib->ab", u, jnp.einsum("eij,ejb->eib", sigma_k, u))
+    return sheet + jnp.einsum("pia,pib->ab", d, jnp.einsum("pij,pjb->pib", contact_m, d))

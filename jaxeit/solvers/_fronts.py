@@ -1,0 +1,203 @@
+"""Symbolic multifrontal factorisation, on the host: where every number goes.
+
+Each node of the dissection tree has a *front*, a small dense matrix over its own unknowns (pivots)
+and those of its ancestors that its elimination will fill (boundary).  Eliminating the pivots leaves
+an update of the boundary, which is added into the parent's front (Duff and Reid 1983).
+
+All fronts of one tree level are padded to one shape: p pivots and b boundary places, of which the
+last is always padding.  Padded pivots carry a one on the diagonal, and padded boundary rows zeros.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._base import Pattern
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of m fronts; c children each, of the level below.
+
+    | meaning                                                              | shape       |
+    |----------------------------------------------------------------------|-------------|
+    | pivots: unknown at each pivot place, n where padded                  | (m, p)      |
+    | up: place of each boundary unknown in the parent's front             | (m, b)      |
+    | down: place of each unknown in each child's boundary                 | (m, c, p+b) |
+    """
+
+    pivots: np.ndarray
+    up: np.ndarray
+    down: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Fronts:
+    """The levels from the root down, and where the matrix entries go.
+
+    | meaning                                                                  | shape  |
+    |--------------------------------------------------------------------------|--------|
+    | slots: place of each entry in the panels (m, p+b, p), root first, flat   | (nnz,) |
+    | ones: places on the diagonal of padded pivots                            | (pad,) |
+    """
+
+    levels: tuple[Level, ...]
+    slots: np.ndarray
+    ones: np.ndarray
+
+
+class _Tree:
+    """The dissection tree after merging: level and index of the front that owns each unknown."""
+
+    def __init__(self, owner: np.ndarray, starts: tuple[int, ...]) -> None:
+        bits = np.frexp(owner.astype(float))[1] - 1
+        self.starts = np.asarray(starts)
+        self.level = np.searchsorted(self.starts, bits, side="right") - 1
+        self.index = (owner >> (bits - self.starts[self.level])) - (1 << self.starts[self.level])
+        self.rank, self.pivots = self._ranked(owner)
+
+    def _ranked(self, owner: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Place of each unknown among its front's pivots, and the reverse for each level."""
+        rank, tables = np.zeros(owner.size, np.int64), []
+        for level, start in enumerate(self.starts):
+            mine = np.flatnonzero(self.level == level)
+            mine = mine[np.lexsort((mine, -owner[mine], self.index[mine]))]
+            rank[mine], size = _ranks(self.index[mine], 1 << start)
+            table = np.full((1 << start, size), owner.size)
+            table[self.index[mine], rank[mine]] = mine
+            tables.append(table)
+        return rank, tables
+
+    def ancestor(self, unknowns: np.ndarray, level: int) -> np.ndarray:
+        """Index of the front on that level at or above each unknown's own."""
+        return self.index[unknowns] >> (self.starts[self.level[unknowns]] - self.starts[level])
+
+
+def _ranks(groups: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """Position of each element within its (sorted) group, and the size of the largest group."""
+    sizes = np.bincount(groups, minlength=count)
+    first = np.cumsum(sizes) - sizes
+    return np.arange(groups.size) - first[groups], int(sizes.max(initial=0))
+
+
+class _Boundaries:
+    """Boundary lists of one level as sorted keys, front * n + unknown; answers where one stands."""
+
+    def __init__(self, fronts: np.ndarray, unknowns: np.ndarray, count: int, n: int) -> None:
+        self.n, self.keys = n, np.unique(fronts * n + unknowns)
+        self.fronts, self.unknowns = np.divmod(self.keys, n)
+        self.rank, largest = _ranks(self.fronts, count)
+        self.size = largest + 1
+
+    def find(self, fronts: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
+        return self.rank[np.searchsorted(self.keys, fronts * self.n + unknowns)]
+
+
+def lay_out(pattern: Pattern, owner: np.ndarray, starts: tuple[int, ...]) -> Fronts:
+    """Fronts of the tree with heap numbers `owner`, its depths merged into levels at `starts`.
+
+    Merging puts a separator and those right below it into one front: more arithmetic, but fewer
+    levels, hence fewer kernels to compile and to launch.
+    """
+    tree = _Tree(owner, starts)
+    bounds = _boundaries(pattern, tree)
+    levels = _levels(tree, bounds)
+    return Fronts(levels, *_slots(pattern, tree, bounds))
+
+
+def _boundaries(pattern: Pattern, tree: _Tree) -> list[_Boundaries]:
+    """Bottom up: what the entries couple a front to, and what its children hand on."""
+    n, below = pattern.n, np.concatenate([pattern.rows, pattern.cols])
+    above = np.concatenate([pattern.cols, pattern.rows])
+    upward = tree.level[above] < tree.level[below]
+    below, above = below[upward], above[upward]
+    handed = np.zeros((2, 0), np.int64)
+    found: list[_Boundaries] = []
+    for level in reversed(range(len(tree.starts))):
+        mine = tree.level[below] == level
+        direct = np.stack([tree.index[below[mine]], above[mine]])
+        fronts, unknowns = np.concatenate([direct, handed], 1)
+        found.append(_Boundaries(fronts, unknowns, 1 << tree.starts[level], n))
+        handed = _handed(tree, found[-1], level)
+    return found[::-1]
+
+
+def _handed(tree: _Tree, bound: _Boundaries, level: int) -> np.ndarray:
+    """Boundary unknowns that the parents do not eliminate, with the parents' indices."""
+    keep = tree.level[bound.unknowns] < level - 1
+    unknowns = bound.unknowns[keep]
+    if not unknowns.size:
+        return np.zeros((2, 0), np.int64)
+    shift = tree.starts[level] - tree.starts[level - 1]
+    return np.stack([bound.fronts[keep] >> shift, unknowns])
+
+
+def _levels(tree: _Tree, bounds: list[_Boundaries]) -> tuple[Level, ...]:
+    ups = [_up(tree, bounds, level) for level in range(len(bounds))]
+    return tuple(
+        Level(tree.pivots[level], ups[level], _down(tree, bounds, ups, level))
+        for level in range(len(bounds))
+    )
+
+
+def _front_size(tree: _Tree, bounds: list[_Boundaries], level: int) -> int:
+    return tree.pivots[level].shape[1] + bounds[level].size
+
+
+def _up(tree: _Tree, bounds: list[_Boundaries], level: int) -> np.ndarray:
+    bound = bounds[level]
+    if level == 0:
+        return np.zeros((1, bound.size), np.int64)
+    last = _front_size(tree, bounds, level - 1) - 1
+    table = np.full((1 << tree.starts[level], bound.size), last)
+    parents = bound.fronts >> (tree.starts[level] - tree.starts[level - 1])
+    table[bound.fronts, bound.rank] = _place(tree, bounds, level - 1, parents, bound.unknowns)
+    return table
+
+
+def _place(
+    tree: _Tree, bounds: list[_Boundaries], level: int, fronts: np.ndarray, unknowns: np.ndarray
+) -> np.ndarray:
+    """Place of unknowns in fronts of a level: among the pivots, or behind them in the boundary."""
+    place = tree.rank[unknowns]
+    outside = tree.level[unknowns] < level
+    found = bounds[level].find(fronts[outside], unknowns[outside])
+    place[outside] = tree.pivots[level].shape[1] + found
+    return place
+
+
+def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: int) -> np.ndarray:
+    """The reverse of the children's `up`; what a child lacks points to its padding."""
+    fronts, size = 1 << tree.starts[level], _front_size(tree, bounds, level)
+    if level + 1 == len(bounds):
+        return np.zeros((fronts, 0, size), np.int64)
+    child = bounds[level + 1]
+    table = np.full((1 << tree.starts[level + 1], size), child.size - 1)
+    table[child.fronts, ups[level + 1][child.fronts, child.rank]] = child.rank
+    return table.reshape(fronts, -1, size)
+
+
+def _slots(
+    pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each entry stands in the column of whichever of its unknowns is eliminated first."""
+    first, second = _elimination_order(pattern, tree)
+    slots, ones, offset = np.zeros(first.size, np.int64), [], 0
+    for level, pivots in enumerate(tree.pivots):
+        m, p = pivots.shape
+        q = p + bounds[level].size
+        mine = np.flatnonzero(tree.level[first] == level)
+        front, column = tree.index[first[mine]], tree.rank[first[mine]]
+        row = _place(tree, bounds, level, front, second[mine])
+        slots[mine] = offset + (front * q + row) * p + column
+        padded, place = np.nonzero(pivots == pattern.n)
+        ones.append(offset + (padded * q + place) * p + place)
+        offset += m * q * p
+    return slots, np.concatenate(ones)
+
+
+def _elimination_order(pattern: Pattern, tree: _Tree) -> tuple[np.ndarray, np.ndarray]:
+    rows, cols = pattern.rows, pattern.cols
+    level, rank = tree.level, tree.rank
+    swap = (level[rows] > level[cols]) | ((level[rows] == level[cols]) & (rank[rows] < rank[cols]))
+    return np.where(swap, rows, cols), np.where(swap, cols, rows)

@@ -1,0 +1,121 @@
+"""TOML files read key by key: what is missing, wrong or unknown is named, with its reason."""
+
+import difflib
+import math
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+
+class TomlError(ValueError):
+    """A file that cannot be used; the message names the file, the key and the reason."""
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, or a `TomlError` that names it."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TomlError(f"{path}: cannot be read as text ({error})") from None
+
+
+def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T]) -> T:
+    """What ``build`` makes of the text; every ValueError on the way comes back naming ``source``."""
+    try:
+        return build(TomlTable(tomllib.loads(text), source))
+    except tomllib.TOMLDecodeError as error:
+        raise TomlError(f"{source}: not valid TOML: {error}") from None
+    except TomlError:
+        raise
+    except ValueError as error:  # an object refused the values it was given
+        raise TomlError(f"{source}: {error}") from None
+
+
+class TomlTable:
+    """A TOML table read key by key; `done` refuses what was not asked for."""
+
+    def __init__(self, values: dict[str, Any], where: str):
+        self._values, self._where, self._asked = values, where, set[str]()
+
+    def error(self, key: str, reason: str) -> TomlError:
+        return TomlError(f"{self._where}: {key}: {reason}")
+
+    def has(self, key: str) -> bool:
+        self._asked.add(key)
+        return key in self._values
+
+    def get(self, key: str, kind: Callable[[Any], bool], meaning: str, default: Any = ...) -> Any:
+        if not self.has(key):
+            if default is ...:
+                raise self.error(key, f"missing; give {meaning}")
+            return default
+        value = self._values[key]
+        if not kind(value):
+            raise self.error(key, f"is {value!r}; give {meaning}")
+        return value
+
+    def number(self, key: str, meaning: str, default: Any = ..., least: float = 0.0) -> float:
+        def good(value: Any) -> bool:
+            return _is_number(value) and value >= least
+
+        return float(self.get(key, good, meaning, default))
+
+    def positive(self, key: str, meaning: str) -> float:
+        return float(self.get(key, lambda v: _is_number(v) and v > 0, f"{meaning}, above zero"))
+
+    def count(self, key: str) -> int:
+        return self.get(key, lambda v: type(v) is int and v > 0, "a whole number, one or more")
+
+    def choice(self, key: str, *names: str, default: Any = ...) -> str:
+        meaning = "one of " + ", ".join(f'"{name}"' for name in names)
+        return self.get(key, lambda v: v in names, meaning, default)
+
+    def array(self, key: str, columns: int | None, meaning: str) -> np.ndarray:
+        def good(value: Any) -> bool:
+            rows = value if columns is not None else [value]
+            return (
+                isinstance(value, list)
+                and len(rows) > 0
+                and all(isinstance(row, list) and all(map(_is_number, row)) for row in rows)
+                and (columns is None or all(len(row) == columns for row in rows))
+            )
+
+        return np.array(self.get(key, good, meaning))
+
+    def vector(self, key: str, length: int, meaning: str) -> tuple[float, ...]:
+        value = self.array(key, None, meaning)
+        if len(value) != length:
+            raise self.error(key, f"has {len(value)} numbers; give {meaning}")
+        return tuple(map(float, value))
+
+    def table(self, key: str) -> "TomlTable":
+        value = self.get(key, lambda v: isinstance(v, dict), f"a table [{key}]")
+        return TomlTable(value, f"{self._where}: [{key}]")
+
+    def tables(self, key: str) -> list["TomlTable"]:
+        def good(value: Any) -> bool:
+            return isinstance(value, list) and all(isinstance(v, dict) for v in value)
+
+        values = self.get(key, good, f"tables [[{key}]]", [])
+        return [
+            TomlTable(v, f"{self._where}: [[{key}]] number {i + 1}") for i, v in enumerate(values)
+        ]
+
+    def done(self) -> None:
+        for key in self._values:
+            if key not in self._asked:
+                near = difflib.get_close_matches(key, self._asked, 1)
+                hint = f"did you mean {near[0]!r}?" if near else "known: " + self._known()
+                raise self.error(key, f"unknown key; {hint}")
+
+    def _known(self) -> str:
+        return ", ".join(sorted(self._asked))
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)

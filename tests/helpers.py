@@ -1,0 +1,31 @@
+"""Small skins whose answers are known."""
+
+import numpy as np
+
+import jaxeit as je
+from jaxeit.solvers import Dense
+
+
+def skin_of(domain, electrodes, pattern, *, sheet_resistance=1.0, current=1.0, pads=()):
+    """A bare skin; unit sheet resistance and current unless said otherwise."""
+    protocol = je.Protocol(np.asarray(pattern), current)
+    return je.Skin("test", domain, sheet_resistance, tuple(electrodes), protocol, pads)
+
+
+def square_model(points, pattern, cells, *, order=1, dtype="float64", ground=None, solver=Dense()):
+    """The 0.2 m square with point electrodes on a structured mesh of ``cells`` a side."""
+    square = je.Rectangle(0.2, 0.2)
+    skin = skin_of(square, [je.PointElectrode(p) for p in points], pattern)
+    mesh = je.structured(square, cells, cells)
+    fidelity = je.Fidelity(order=order, dtype=dtype, solver=solver)
+    return je.discretise(je.Scene(skin), fidelity, mesh=mesh, ground=ground)
+
+
+def disc_model(z, edge_length, *, electrodes=16, cover=0.5, order=1, pattern=None):
+    """The unit disc with ``electrodes`` boundary patches that cover half the rim."""
+    width = 2 * np.pi * cover / electrodes
+    starts = 2 * np.pi * np.arange(electrodes) / electrodes - width / 2
+    patches = [je.BoundaryPatch(float(s), float(s + width), z) for s in starts % (2 * np.pi)]
+    pattern = [[0, 1, 0, 1]] if pattern is None else pattern
+    skin = skin_of(je.Disc(1.0), patches, pattern)
+    return je.discretise(je.Scene(skin), je.Fidelity(edge_length=edge_length, order=order, solver=Dense()))

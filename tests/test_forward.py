@@ -1,0 +1,200 @@
+"""The forward model against exact solutions and identities."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit.forward import coefficients, transfer
+from jaxeit.solvers import Dense
+
+from .helpers import disc_model, skin_of, square_model
+from .oracles.disc import disc_potentials
+from .oracles.rectangle import four_point
+
+POINTS = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.13)]
+ROUND = [[0, 1, i, (i + 1) % 16] for i in range(16)]
+
+
+def test_rectangle_oracle_has_the_published_value():
+    exact = four_point(0.2, 0.2, (0.06, 0.06), (0.14, 0.10), (0.10, 0.142), (0.062, 0.13))
+    assert exact == pytest.approx(-0.1409373898, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("z", "sigma1", "rho", "golden"),
+    [
+        (10, 1, 0, (51.6185019, -0.2197156, -0.0061858)),
+        (1, 1, 0, (5.7807020, -0.2192019, -0.0061849)),
+        (0.1, 1, 0, (1.1881339, -0.2156918, -0.0061783)),
+        (0.1, 2, 0.5, (1.1817891, -0.1996226, -0.0038618)),
+        (0.1, 1e6, 0.5, (1.1707565, -0.1720916, -0.0004739)),
+        (0.1, 1e-6, 0.5, (1.2123886, -0.2785202, -0.0174209)),
+    ],
+)
+def test_disc_oracle_has_the_published_values(z, sigma1, rho, golden):
+    potentials = disc_potentials(z, sigma1=sigma1, rho=rho)
+    np.testing.assert_allclose(potentials[[0, 2, 8]], golden, atol=3e-7)
+
+
+@pytest.mark.parametrize(("order", "bound"), [(1, 2e-4), (2, 6e-5)])
+def test_point_electrodes_on_the_square(order, bound):
+    model = square_model(POINTS, [[0, 1, 2, 3]], 20, order=order)
+    exact = four_point(0.2, 0.2, *POINTS)
+    assert float(je.forward(model)[0]) == pytest.approx(exact, rel=bound)
+
+
+def test_van_der_pauw():
+    """Contacts at the corners of a square: R = R_s ln 2 / pi, here with R_s = 1 and 1 A."""
+    corners = [(0.0, 0.0), (0.2, 0.0), (0.2, 0.2), (0.0, 0.2)]
+    errors = []
+    for cells in (10, 20):
+        model = square_model(corners, [[0, 1, 3, 2]], cells, order=2, solver=Dense())
+        errors.append(float(je.forward(model)[0]) / (np.log(2) / np.pi) - 1)
+    assert abs(errors[1]) < 4e-4
+    assert abs(errors[1]) < abs(errors[0]) / 3
+
+
+@pytest.mark.parametrize(("z", "bound"), [(10, 1e-4), (0.1, 3e-3), (0.01, 1e-2)])
+def test_complete_electrodes_on_the_disc(z, bound):
+    potentials = disc_potentials(z)
+    exact = potentials - np.roll(potentials, -1)
+    model = disc_model(z, 0.08, order=2, pattern=ROUND)
+    found = np.asarray(je.forward(model))
+    assert np.abs(found - exact).max() < bound * np.abs(exact).max()
+
+
+def _strip(contact, length=0.1, width=0.05):
+    """A strip with an electrode across each short end, both driven and sensed."""
+    ends = [(length, length + width), (2 * length + width, 2 * (length + width))]
+    patches = [je.BoundaryPatch(a, b, contact) for a, b in ends]
+    strip = je.Rectangle(length, width)
+    skin = skin_of(strip, patches, [[0, 1, 0, 1]])
+    mesh = je.structured(strip, 20, 10)
+    return je.discretise(je.Scene(skin), je.Fidelity(solver=Dense()), mesh=mesh)
+
+
+@pytest.mark.parametrize("contact", [0.0, 1e-12, 1e-6, 1e-3, 1.0, 1e3, 1e8])
+def test_strip_between_its_ends_is_exact_for_every_contact(contact):
+    """R = R_s L / W + 2 z / W: linear elements hold the exact field, whatever the contact."""
+    found = float(je.forward(_strip(contact))[0])
+    assert found == pytest.approx(0.1 / 0.05 + 2 * contact / 0.05, rel=1e-12)
+
+
+def _patched(contact):
+    """Bolts at four places of the square, sensed apart from the drive."""
+    bolts = [je.AreaPatch(p, 0.006, contact) for p in POINTS]
+    skin = skin_of(je.Rectangle(0.2, 0.2), bolts, [[0, 1, 2, 3], [0, 1, 0, 1]])
+    return je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.06, solver=Dense()))
+
+
+def test_four_terminal_readings_do_not_feel_the_contact():
+    """They tend to the perfect contact at one end and to a limit of even injection at the other."""
+    perfect, tiny = (np.asarray(je.forward(_patched(c))) for c in (0.0, 1e-12))
+    np.testing.assert_allclose(tiny, perfect, rtol=1e-6)
+    large, larger = (np.asarray(je.forward(_patched(c)))[0] for c in (1e2, 1e6))
+    assert large == pytest.approx(larger, rel=1e-6)
+
+
+def test_scaling_of_conductivity_and_contact():
+    """U(c sigma, z / c) = U / c."""
+    model = _patched(1e-4)
+    theta = coefficients(model, model.background)
+    scaled = theta._replace(sigma=3 * theta.sigma, contact=3 * theta.contact)
+    np.testing.assert_allclose(3 * transfer(model, scaled), transfer(model, theta), rtol=1e-11)
+
+
+def test_reciprocity(model, skin):
+    voltages = np.asarray(je.forward(model))
+    partner = je.reciprocal_rows(skin.protocol.pattern)
+    assert (partner >= 0).all()
+    np.testing.assert_allclose(voltages, voltages[partner], atol=1e-14)
+
+
+def test_readings_do_not_depend_on_the_ground():
+    first, second = (square_model(POINTS, [[0, 1, 2, 3]], 20, ground=g) for g in (0, 137))
+    assert float(je.forward(first)[0]) == pytest.approx(float(je.forward(second)[0]), rel=1e-12)
+
+
+def test_more_conductivity_means_less_drive_resistance():
+    model = square_model(POINTS, [[0, 1, 0, 1]], 20, solver=Dense())
+    key = jax.random.key(0)
+    more = model.background * (1 + jax.random.uniform(key, model.background.shape))
+    assert float(je.forward(model, more)[0]) < float(je.forward(model)[0])
+
+
+def test_symmetry_of_the_grid_of_electrodes():
+    """Mirroring the 5 x 5 grid in the diagonal permutes the readings."""
+    square = je.Rectangle(0.2, 0.2)
+    grid = [(0.02 + 0.04 * i, 0.02 + 0.04 * j) for j in range(5) for i in range(5)]
+    mirrored = [5 * (k % 5) + k // 5 for k in range(25)]
+    pattern = [[0, 1, 7, 13], [2, 18, 6, 24]]
+    swapped = [[mirrored[e] for e in row] for row in pattern]
+    skin = skin_of(square, [je.PointElectrode(p) for p in grid], pattern + swapped)
+    mesh = je.structured(square, 20, 20, pattern=je.Pattern.CROSSED)
+    voltages = np.asarray(je.forward(je.discretise(je.Scene(skin), je.Fidelity(solver=Dense()), mesh=mesh)))
+    np.testing.assert_allclose(voltages[:2], voltages[2:], rtol=1e-11)
+
+
+def test_a_bent_sheet_reads_as_the_flat_one():
+    """Bending without stretching changes no voltage: exact for a fold along mesh lines."""
+    square = je.Rectangle(0.2, 0.2)
+    skin = skin_of(square, [je.PointElectrode(p) for p in POINTS], [[0, 1, 2, 3]])
+    mesh = je.structured(square, 20, 20)
+    radius = 0.1
+
+    def cylinder(chart):
+        x, y = chart.T
+        return np.stack([radius * np.sin(x / radius), y, radius * np.cos(x / radius)], 1)
+
+    flat, bent = (
+        float(je.forward(je.discretise(je.Scene(skin), je.Fidelity(solver=Dense()), mesh=m))[0])
+        for m in (mesh, mesh.lift(cylinder))
+    )
+    assert bent == pytest.approx(flat, rel=1e-3)  # chords are (h / r)^2 / 24 shorter than arcs
+
+
+def test_jit_vmap_and_grad_of_forward():
+    model = square_model(POINTS, [[0, 1, 2, 3], [0, 2, 1, 3]], 20)
+    sigma = model.background
+    batch = jnp.stack([sigma, 2 * sigma])
+    together = jax.vmap(lambda s: je.forward(model, s))(batch)
+    alone = jnp.stack([je.forward(model, s) for s in batch])
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    np.testing.assert_allclose(eqx.filter_jit(je.forward)(model, sigma), alone[0], rtol=1e-12)
+    # voltages are homogeneous of degree -1 in the conductivity (Euler)
+    slope = jax.grad(lambda s: je.forward(model, s)[0])(sigma)
+    assert float(slope @ sigma) == pytest.approx(-float(alone[0, 0]), rel=1e-10)
+
+
+def test_float32_follows_float64():
+    single, double = (
+        np.asarray(je.forward(square_model(POINTS, [[0, 1, 2, 3]], 20, dtype=d)))
+        for d in ("float32", "float64")
+    )
+    assert single.dtype == np.float32
+    assert single[0] == pytest.approx(double[0], rel=1e-4)
+
+
+def test_wrong_sigma_is_refused(model):
+    with pytest.raises(ValueError, match="one value per element"):
+        je.forward(model, jnp.ones(3))
+    with pytest.raises(ValueError, match="float32"):
+        je.forward(model, model.background.astype(jnp.float32))
+
+
+def test_float64_without_x64_is_refused(skin):
+    with jax.enable_x64(False), pytest.raises(je.FidelityError, match="jax_enable_x64"):
+        je.discretise(je.Scene(skin), je.Fidelity.draft())
+
+
+def test_electrodes_on_one_node_are_refused():
+    points = [(0.06, 0.06), (0.06, 0.06), (0.1, 0.1), (0.14, 0.1)]
+    with pytest.raises(je.ElectrodeError, match="electrodes 0 and 1"):
+        square_model(points, [[0, 1, 2, 3]], 20)
+
+
+def test_disc_resistance_of_the_physics_note():
+    assert je.disc_resistance(3e-3, 1e-6, 100.0) == pytest.approx(0.54, abs=0.005)
