@@ -4,6 +4,8 @@ Nouns are frozen pytrees, verbs are pure jitted functions, choices are objects, 
 not in the scene is not in the program.
 """
 
+from importlib import metadata
+
 from .basis import BasisMap, Elements, Pixels
 from .discretise import Model, discretise, make_mesh
 from .domain import Disc, Polygon, Rectangle
@@ -46,6 +48,8 @@ from .protocol import Protocol, adjacent, reciprocal_rows
 from .scene import Scene, read_effects
 from .skin import Pad, PressureSensor, Skin, load_skin, parse_skin, shipped_skins
 from .toml import TomlError, TomlTable, parse_toml, read_text
+
+__version__ = metadata.version("jaxeit")
 
 __all__ = [
     "EFFECTS",

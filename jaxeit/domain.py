@@ -44,7 +44,7 @@ class Domain(ABC):
 
     @abstractmethod
     def boundary_coordinate(self, points: ArrayLike) -> np.ndarray:
-        """Arc length in [0, perimeter) of the rim's point nearest to each of points (n, 2); (n,)."""
+        """Arc length in [0, perimeter) of the rim point nearest to each of points (n, 2); (n,)."""
 
     @abstractmethod
     def clearance(self, s: ArrayLike) -> np.ndarray:
@@ -124,7 +124,7 @@ class _Polygonal(Domain):
         return np.sqrt(np.where(across, squared, np.inf).min(1))
 
     def _on_sides(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest place on every side, as a fraction of it, and its squared distance; (n, sides)."""
+        """Nearest place on each side, as a fraction of it, and squared distances; (n, sides)."""
         vectors, lengths, _ = self._sides
         offset = points[:, None] - self.corner_points
         along = np.clip((offset * vectors).sum(-1) / lengths**2, 0.0, 1.0)
@@ -231,7 +231,7 @@ class Disc(Domain):
 
 @dataclass(frozen=True)
 class Polygon(_Polygonal):
-    """A simple polygon; s = 0 is its first vertex.  Clockwise vertices are reversed, the first kept.
+    """A simple polygon; s = 0 is its first vertex.  Clockwise vertices are turned round.
 
     | meaning  | shape       | unit |
     |----------|-------------|------|

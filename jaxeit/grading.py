@@ -81,13 +81,29 @@ def divide_rim(domain: Domain, fixed: np.ndarray, size: SizeField) -> np.ndarray
     """Arc lengths (n,) of rim nodes: those ``fixed`` (k,), ascending, and graded ones between."""
     ends = fixed if len(fixed) else np.zeros(1)
     stops = np.append(ends[1:], ends[0] + domain.perimeter)
-    pieces = [_divide(domain, a, b, size) for a, b in zip(ends, stops, strict=True)]
+    samples = _size_samples(domain, size)
+    pieces = [_divide(domain, a, b, size, samples) for a, b in zip(ends, stops, strict=True)]
     return np.concatenate(pieces)
 
 
-def _divide(domain: Domain, start: float, stop: float, size: SizeField) -> np.ndarray:
+def _size_samples(domain: Domain, size: SizeField) -> np.ndarray:
+    """Ascending arc lengths over two turns that resolve the size field, which varies fastest where
+    the rim passes a source: samples crowd there geometrically."""
+    nearest = domain.boundary_coordinate(size.centres)[:, None]
+    away = size.sizes[:, None] * np.geomspace(0.1, 1e4, 80)
+    close = np.concatenate([nearest - away, nearest, nearest + away], axis=1).ravel()
+    even = np.linspace(0, domain.perimeter, 2000)
+    once = np.unique(np.mod(np.concatenate([close, even]), domain.perimeter))
+    return np.concatenate([once, once + domain.perimeter])
+
+
+def _divide(
+    domain: Domain, start: float, stop: float, size: SizeField, samples: np.ndarray
+) -> np.ndarray:
     """``start`` and nodes up to, not including, ``stop``, evenly spread in the integral of 1/h."""
-    s = np.linspace(start, stop, 2001)
+    inside = samples[(samples > start) & (samples < stop)]
+    s = np.concatenate([[start], inside, np.linspace(start, stop, 33)[1:-1], [stop]])
+    s.sort()
     per_length = 1.0 / size(domain.boundary_point(s))
     steps = 0.5 * (per_length[1:] + per_length[:-1]) * np.diff(s)
     edges_to = np.concatenate([[0.0], np.cumsum(steps)])
@@ -99,8 +115,8 @@ def _divide(domain: Domain, start: float, stop: float, size: SizeField) -> np.nd
 def fill(domain: Domain, size: SizeField) -> np.ndarray:
     """Candidate nodes (n, 2) over the domain's bounding box, finest lattices first.
 
-    Lattices are laid from the middle of the box, and the order depends on nothing but the positions,
-    so that equal input gives equal meshes.
+    Lattices are laid from the middle of the box, and the order depends on nothing but positions, so
+    that equal input gives equal meshes.
     """
     low, high = np.asarray(domain.bounds)
     middle = 0.5 * (low + high)

@@ -1,351 +1,50 @@
-"""Triangle meshes of the sheet, flat or lifted onto a surface, graded around its electrodes.
+"""Meshes of the sheet: graded around its electrodes, or regular.
 
 A mesh keeps two positions per node: where it is in space, and where it is on the flat sheet (its
-*chart*), in which electrodes and pixels are laid out.  `triangulate` makes graded meshes that follow
-every electrode's footprint; `structured` makes regular ones that others can rebuild node by node.
+*chart*), in which electrodes and pixels are laid out.  `triangulate` makes graded meshes that
+follow every electrode's footprint; `structured` makes regular ones that others can rebuild node by
+node.  The work is shared out: `triangles` holds and checks a mesh, `footprints` says what it must
+follow, `grading` how fine it is where, and `smoothing` makes its triangles good.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property, partial
-from itertools import combinations
+from functools import partial
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .domain import Domain, Rectangle
+from .footprints import (
+    ArcFootprint,
+    DiscFootprint,
+    Footprint,
+    PointFootprint,
+    polygon_radius,
+    reach,
+    require_placed,
+)
 from .grading import SizeField, divide_rim, fill, narrow_places, thin
-from .smoothing import Problem, corner_angles, directed_edges, doubled_areas, edge_keys, relax
+from .smoothing import Problem, relax
+from .triangles import Mesh, MeshError, Surface
 
-Surface = Callable[[np.ndarray], np.ndarray]
+__all__ = [
+    "ArcFootprint",
+    "DiscFootprint",
+    "Footprint",
+    "Mesh",
+    "MeshError",
+    "Pattern",
+    "PointFootprint",
+    "Surface",
+    "polygon_radius",
+    "structured",
+    "triangulate",
+]
 
 MOST_NODES = 2_000_000
-
-
-class MeshError(ValueError):
-    """A mesh that cannot be built, or that would give wrong answers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """Triangles in the plane or on a surface in space.  Arrays are copied and made read-only.
-
-    | meaning                                            | shape       | unit |
-    |----------------------------------------------------|-------------|------|
-    | nodes: positions in space, float64                 | (n, 2 or 3) | m    |
-    | triangles: node numbers, int32, counter-clockwise in the chart | (m, 3) |  |
-    | chart: positions on the flat sheet; nodes if not given and nodes are plane | (n, 2) | m |
-
-    Raises MeshError for wrong shapes; `check` looks at the values.
-    """
-
-    nodes: np.ndarray
-    triangles: np.ndarray
-    chart: np.ndarray = None  # type: ignore[assignment]  # filled in below, never None afterwards
-
-    def __post_init__(self):
-        chart = self.nodes if self.chart is None else self.chart
-        _set(self, "nodes", _array("nodes", self.nodes, np.float64, (2, 3)))
-        _set(self, "triangles", _array("triangles", self.triangles, np.int32, (3,)))
-        _set(self, "chart", _array("chart", chart, np.float64, (2,)))
-        if len(self.chart) != len(self.nodes):
-            raise MeshError(
-                f"mesh: {len(self.nodes)} nodes but {len(self.chart)} chart positions; give each "
-                "node one"
-            )
-
-    @cached_property
-    def areas(self) -> np.ndarray:
-        """Areas of the triangles on the surface, (m,) m^2."""
-        corners = self.nodes[self.triangles]
-        u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        gram = (u * u).sum(1) * (v * v).sum(1) - (u * v).sum(1) ** 2
-        return 0.5 * np.sqrt(np.maximum(gram, 0.0))
-
-    @property
-    def centroids(self) -> np.ndarray:
-        """Centroids of the triangles in space, (m, 2 or 3) m."""
-        return self.nodes[self.triangles].mean(1)
-
-    @property
-    def chart_centroids(self) -> np.ndarray:
-        """Centroids of the triangles on the flat sheet, (m, 2) m."""
-        return self.chart[self.triangles].mean(1)
-
-    @cached_property
-    def edges(self) -> np.ndarray:
-        """Every edge once, lower node first, in ascending order; (e, 2) int32."""
-        return np.unique(np.sort(directed_edges(self.triangles), axis=1), axis=0).astype(np.int32)
-
-    @cached_property
-    def boundary_edges(self) -> np.ndarray:
-        """Edges of exactly one triangle, with the sheet on their left; (b, 2) int32."""
-        directed = directed_edges(self.triangles)
-        alone = ~np.isin(edge_keys(directed), edge_keys(directed[:, ::-1]))
-        return directed[alone].astype(np.int32)
-
-    @property
-    def min_angles(self) -> np.ndarray:
-        """Smallest angle of each triangle on the surface, (m,) degrees."""
-        return corner_angles(self.nodes[self.triangles]).min(1)
-
-    def check(self, min_angle: float = 20.0) -> "Mesh":
-        """This mesh, or MeshError naming its worst fault, where it is, and what to do.
-
-        Looks for values that are not finite, indices out of range, nodes that coincide or belong to
-        no triangle, flipped triangles, edges of more than two triangles, separate pieces, and angles
-        below ``min_angle`` degrees.
-        """
-        _require_finite(self)
-        _require_indices(self)
-        _require_distinct_nodes(self)
-        _require_orientation(self)
-        _require_manifold(self)
-        _require_connected(self)
-        _require_angles(self, min_angle)
-        return self
-
-    def lift(self, surface: Surface) -> "Mesh":
-        """The same triangles on a curved sheet: ``surface`` maps chart (n, 2) m to space (n, 3) m."""
-        return Mesh(_on_surface(surface, self.chart), self.triangles, self.chart)
-
-    def refine(self, surface: Surface | None = None) -> "Mesh":
-        """Every triangle cut into four at the middles of its edges; old nodes keep their numbers.
-
-        New nodes are at the middle of their edge, in space and on the chart; with ``surface``, as in
-        `lift`, they are put on the curved sheet instead.
-        """
-        chart = self.chart[self.edges].mean(1)
-        nodes = _on_surface(surface, chart) if surface else self.nodes[self.edges].mean(1)
-        return Mesh(
-            np.concatenate([self.nodes, nodes]),
-            _quartered(self),
-            np.concatenate([self.chart, chart]),
-        )
-
-
-def _set(mesh: Mesh, name: str, value: np.ndarray) -> None:
-    value.setflags(write=False)
-    object.__setattr__(mesh, name, value)
-
-
-def _array(name: str, value, dtype: type, columns: tuple[int, ...]) -> np.ndarray:
-    array = np.array(value)
-    if array.ndim != 2 or array.shape[1] not in columns or not len(array):
-        wanted = " or ".join(f"(n, {c})" for c in columns)
-        raise MeshError(f"mesh: {name} has shape {array.shape}; give an array of shape {wanted}")
-    if dtype is np.int32 and not np.issubdtype(array.dtype, np.integer):
-        raise MeshError(f"mesh: {name} are {array.dtype}; give whole node numbers")
-    return array.astype(dtype)
-
-
-def _on_surface(surface: Surface, chart: np.ndarray) -> np.ndarray:
-    nodes = np.asarray(surface(chart), float)
-    if nodes.shape != (len(chart), 3):
-        raise MeshError(
-            f"mesh: the surface returned shape {nodes.shape} for {len(chart)} points; "
-            f"it must map (n, 2) to (n, 3)"
-        )
-    return nodes
-
-
-def _quartered(mesh: Mesh) -> np.ndarray:
-    """Triangles (4 m, 3) of the refined mesh; edge k carries node n + k."""
-    keys = edge_keys(mesh.edges)
-    sides = np.sort(directed_edges(mesh.triangles), axis=1)
-    middle = len(mesh.nodes) + np.searchsorted(keys, edge_keys(sides)).reshape(-1, 3)
-    (a, b, c), (ab, bc, ca) = mesh.triangles.T, middle.T
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([np.stack(part, axis=1) for part in parts])
-
-
-# What `check` looks for, in the order in which one fault would hide the next.
-
-
-def _place(position: np.ndarray) -> str:
-    return "(" + ", ".join(f"{1e3 * x:.2f}" for x in position) + ") mm"
-
-
-def _require_finite(mesh: Mesh) -> None:
-    bad = ~(np.isfinite(mesh.nodes).all(1) & np.isfinite(mesh.chart).all(1))
-    if bad.any():
-        node = int(np.flatnonzero(bad)[0])
-        raise MeshError(
-            f"mesh: node {node} is at {mesh.nodes[node]} m; {int(bad.sum())} of {len(bad)} nodes "
-            "are not finite: correct the coordinates or the surface they are lifted onto"
-        )
-
-
-def _require_indices(mesh: Mesh) -> None:
-    count = len(mesh.nodes)
-    bad = ((mesh.triangles < 0) | (mesh.triangles >= count)).any(1)
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise MeshError(
-            f"mesh: triangle {row} has nodes {mesh.triangles[row].tolist()}, but they run from 0 "
-            f"to {count - 1}; correct the indices (files that count from 1 need 1 subtracted)"
-        )
-    unused = np.bincount(mesh.triangles.ravel(), minlength=count) == 0
-    if unused.any():
-        node = int(np.flatnonzero(unused)[0])
-        raise MeshError(
-            f"mesh: node {node} at {_place(mesh.nodes[node])} belongs to no triangle "
-            f"({int(unused.sum())} such nodes); remove them, or the system is singular"
-        )
-
-
-def _require_distinct_nodes(mesh: Mesh) -> None:
-    nearest = 1e-9 * float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
-    pairs = cKDTree(mesh.nodes).query_pairs(nearest, output_type="ndarray")
-    if len(pairs):
-        a, b = (int(i) for i in pairs[np.lexsort(pairs.T[::-1])[0]])
-        raise MeshError(
-            f"mesh: nodes {a} and {b} are both at {_place(mesh.nodes[a])} ({len(pairs)} such "
-            "pairs); merge them, or the sheet is torn there"
-        )
-
-
-def _require_orientation(mesh: Mesh) -> None:
-    doubled = doubled_areas(mesh.chart[mesh.triangles])
-    worst = int(np.argmin(doubled))
-    if doubled[worst] <= 0:
-        raise MeshError(
-            f"mesh: triangle {worst} at {_place(mesh.centroids[worst])} has area "
-            f"{0.5e6 * doubled[worst]:.3g} mm^2 in the chart ({int((doubled <= 0).sum())} such "
-            "triangles); list its nodes counter-clockwise, remove it if it is flat"
-        )
-
-
-def _require_manifold(mesh: Mesh) -> None:
-    directed = directed_edges(mesh.triangles)
-    keys, first, count = np.unique(edge_keys(directed), return_index=True, return_counts=True)
-    if np.any(count > 1):
-        edge = directed[first[np.argmax(count > 1)]]
-        raise MeshError(
-            f"mesh: the edge between nodes {edge[0]} and {edge[1]} at "
-            f"{_place(mesh.nodes[edge].mean(0))} belongs to two triangles on the same side; remove "
-            "overlapping triangles"
-        )
-    starts = np.bincount(mesh.boundary_edges[:, 0], minlength=len(mesh.nodes))
-    if starts.max() > 1:
-        node = int(np.argmax(starts))
-        raise MeshError(
-            f"mesh: parts of the sheet meet only in node {node} at {_place(mesh.nodes[node])}; "
-            "join them along an edge or mesh them apart"
-        )
-
-
-def _require_connected(mesh: Mesh) -> None:
-    start, stop = mesh.edges.T
-    graph = coo_array((np.ones(len(start)), (start, stop)), shape=(len(mesh.nodes),) * 2)
-    pieces, label = connected_components(graph, directed=False)
-    if pieces > 1:
-        node = int(np.argmin(np.bincount(label)[label]))
-        raise MeshError(
-            f"mesh: {pieces} separate pieces; the smallest holds node {node} at "
-            f"{_place(mesh.nodes[node])}; keep the piece with the electrodes or join them"
-        )
-
-
-def _require_angles(mesh: Mesh, min_angle: float) -> None:
-    angles = mesh.min_angles
-    worst = int(np.argmin(angles))
-    if not angles[worst] >= min_angle:
-        raise MeshError(
-            f"mesh: triangle {worst} at {_place(mesh.centroids[worst])} has an angle of "
-            f"{angles[worst]:.1f} degrees ({int((angles < min_angle).sum())} triangles are below "
-            f"{min_angle:g}); use a shorter edge_length or more segments there, or move what is "
-            "crowded apart"
-        )
-
-
-# Footprints: what a mesh must follow.
-
-
-@dataclass(frozen=True)
-class PointFootprint:
-    """A node exactly at ``position``, (2,) m."""
-
-    position: tuple[float, float]
-
-    def __post_init__(self):
-        _require_position("PointFootprint", self.position)
-
-
-@dataclass(frozen=True)
-class DiscFootprint:
-    """A regular polygon of the disc's exact area, filled with triangles, and a node at its centre.
-
-    | meaning                                             | shape | unit |
-    |-----------------------------------------------------|-------|------|
-    | position of the centre                              | (2,)  | m    |
-    | radius of the disc, not of the polygon              | ()    | m    |
-    | segments: least number of sides; 6 to 12 times a power of two | () | |
-
-    Raises ValueError for other values.
-    """
-
-    position: tuple[float, float]
-    radius: float
-    segments: int = 16
-
-    def __post_init__(self):
-        _require_position("DiscFootprint", self.position)
-        if not (np.isfinite(self.radius) and self.radius > 0):
-            raise ValueError(
-                f"DiscFootprint: radius is {self.radius}; give a positive length in metres"
-            )
-        if not _halves_to_a_hub(self.segments):
-            raise ValueError(
-                f"DiscFootprint: segments is {self.segments}; give 6 to 12 times a power of two, "
-                "such as 12, 16, 24 or 32, so that the rings inside can halve their nodes"
-            )
-
-
-@dataclass(frozen=True)
-class ArcFootprint:
-    """Nodes exactly at both ends of the rim from arc length ``start`` to ``stop`` > start, m.
-
-    ``stop`` may exceed the perimeter: the arc then runs on past the origin.
-    """
-
-    start: float
-    stop: float
-
-    def __post_init__(self):
-        if not (np.isfinite(self.start) and np.isfinite(self.stop) and self.start < self.stop):
-            raise ValueError(
-                f"ArcFootprint: runs from {self.start} to {self.stop} m; give finite arc lengths, "
-                "start before stop (an arc across the origin stops past the perimeter)"
-            )
-
-
-Footprint = PointFootprint | DiscFootprint | ArcFootprint
-
-
-def _require_position(what: str, position: tuple[float, float]) -> None:
-    if np.shape(position) != (2,) or not np.all(np.isfinite(position)):
-        raise ValueError(f"{what}: position is {position}; give two finite numbers in metres")
-
-
-def _halves_to_a_hub(segments: int) -> bool:
-    if segments != int(segments) or segments < 6:
-        return False
-    while segments > 12 and segments % 2 == 0:
-        segments //= 2
-    return segments <= 12
-
-
-def polygon_radius(radius: float, segments: int) -> float:
-    """Circumradius in m of the regular polygon with the area of the disc of ``radius`` m."""
-    sector = 2 * np.pi / segments
-    return float(radius * np.sqrt(sector / np.sin(sector)))
-
-
-# Graded meshes.
+"""A mesh that would be larger is taken for a mistake in units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,13 +78,12 @@ def triangulate(
     straight, and by chords where it is round.  Nodes: the rim counter-clockwise, then the
     footprints' in their order, then the rest.
 
-    Raises ValueError for footprints that overlap or leave the domain, naming the electrodes by their
-    place in ``footprints``, and MeshError if no mesh passes `Mesh.check` with angles of 20 degrees.
+    Raises ValueError for footprints that overlap or leave the domain, naming the electrodes by
+    their place in ``footprints``, and MeshError if the mesh reached does not pass `Mesh.check`.
     """
     fine = _lengths(domain, edge_length, growth, electrode_edge)
     footprints = list(footprints)
-    _require_inside(domain, footprints)
-    _require_apart(domain, footprints)
+    require_placed(domain, footprints)
     footprints = _subdivided(domain, footprints, edge_length)
     rim = _rim_positions(domain, footprints)
     size = _size_field(domain, footprints, rim, edge_length, growth - 1, fine)
@@ -413,102 +111,28 @@ def _lengths(domain: Domain, edge_length: float, growth: float, edge: float | No
     return min(fine, edge_length)
 
 
-def _name(index: int, footprint: Footprint) -> str:
-    if isinstance(footprint, ArcFootprint):
-        return f"electrode {index} (arc {1e3 * footprint.start:.2f} to {1e3 * footprint.stop:.2f} mm)"
-    kind = "disc" if isinstance(footprint, DiscFootprint) else "point"
-    return f"electrode {index} ({kind} at {_place(np.asarray(footprint.position))})"
-
-
-def _reach(footprint: PointFootprint | DiscFootprint) -> float:
-    """Radius of what is meshed around the position, m."""
-    if isinstance(footprint, PointFootprint):
-        return 0.0
-    return polygon_radius(footprint.radius, footprint.segments)
-
-
-def _require_inside(domain: Domain, footprints: list[Footprint]) -> None:
-    for index, footprint in enumerate(footprints):
-        if isinstance(footprint, ArcFootprint):
-            _require_on_rim(domain, index, footprint)
-            continue
-        position = np.asarray([footprint.position], float)
-        room = float(domain.boundary_distance(position)[0])
-        if not domain.contains(position)[0]:
-            raise ValueError(
-                f"{_name(index, footprint)} is {1e3 * room:.2f} mm outside the domain; move it "
-                "inside (coordinates are metres)"
-            )
-        if isinstance(footprint, DiscFootprint) and room <= 1.02 * _reach(footprint):
-            raise ValueError(
-                f"{_name(index, footprint)} of radius {1e3 * footprint.radius:.2f} mm is only "
-                f"{1e3 * room:.2f} mm from the rim; move it inward or make it smaller so that it is "
-                "wholly inside the domain"
-            )
-
-
-def _require_on_rim(domain: Domain, index: int, arc: ArcFootprint) -> None:
-    if arc.stop - arc.start > domain.perimeter * (1 - 1e-6):
-        raise ValueError(
-            f"{_name(index, arc)} is longer than the rim, {1e3 * domain.perimeter:.2f} mm; leave a "
-            "gap (arc lengths are metres)"
-        )
-
-
-def _require_apart(domain: Domain, footprints: list[Footprint]) -> None:
-    for (i, a), (j, b) in combinations(enumerate(footprints), 2):
-        if _overlap(domain, a, b):
-            raise ValueError(
-                f"{_name(i, a)} and {_name(j, b)} overlap or touch; move them apart"
-            )
-
-
-def _overlap(domain: Domain, a: Footprint, b: Footprint) -> bool:
-    if isinstance(a, ArcFootprint) and isinstance(b, ArcFootprint):
-        return _in_arc(domain, a, b.start) or _in_arc(domain, b, a.start)
-    if isinstance(a, ArcFootprint):
-        return _overlap(domain, b, a)
-    if isinstance(b, ArcFootprint):
-        position = np.asarray([a.position], float)
-        on_rim = domain.boundary_distance(position)[0] <= domain.tolerance
-        return bool(on_rim) and _in_arc(domain, b, float(domain.boundary_coordinate(position)[0]))
-    apart = np.linalg.norm(np.subtract(a.position, b.position))
-    return bool(apart <= 1.02 * (_reach(a) + _reach(b)) + domain.tolerance)
-
-
-def _in_arc(domain: Domain, arc: ArcFootprint, s: float) -> bool:
-    """Whether s is on the arc, ends included; neighbours that touch would share a node."""
-    slack = 2 * domain.tolerance
-    return (s - arc.start + slack) % domain.perimeter <= arc.stop - arc.start + 2 * slack
-
-
-def _subdivided(
-    domain: Domain, footprints: list[Footprint], edge_length: float
-) -> list[Footprint]:
+def _subdivided(domain: Domain, footprints: list[Footprint], edge_length: float) -> list[Footprint]:
     """The footprints, with discs given more segments where neighbours or edge_length ask for it."""
     return [
-        _subdivide(domain, footprints, index, edge_length)
-        if isinstance(footprint, DiscFootprint)
-        else footprint
-        for index, footprint in enumerate(footprints)
+        _subdivide(domain, f, footprints[:index] + footprints[index + 1 :], edge_length)
+        if isinstance(f, DiscFootprint)
+        else f
+        for index, f in enumerate(footprints)
     ]
 
 
 def _subdivide(
-    domain: Domain, footprints: list[Footprint], index: int, edge_length: float
+    domain: Domain, disc: DiscFootprint, others: list[Footprint], edge_length: float
 ) -> DiscFootprint:
-    disc = footprints[index]
-    assert isinstance(disc, DiscFootprint)
     position = np.asarray(disc.position, float)
-    others = [f for k, f in enumerate(footprints) if k != index]
-    gaps = [
-        np.linalg.norm(position - f.position) - _reach(f)
+    room = [float(domain.boundary_distance(position[None])[0])]
+    room += [
+        float(np.linalg.norm(position - f.position)) - reach(f)
         for f in others
         if not isinstance(f, ArcFootprint)
     ]
-    room = min(float(domain.boundary_distance(position[None])[0]), *gaps, np.inf) - _reach(disc)
-    segments = disc.segments
-    while 2 * np.pi * disc.radius / segments > 1.3 * min(edge_length, room):
+    gap, segments = min(room) - reach(disc), disc.segments
+    while 2 * np.pi * disc.radius / segments > 1.3 * min(edge_length, gap):
         segments *= 2
     return DiscFootprint(disc.position, disc.radius, segments)
 
@@ -543,8 +167,10 @@ def _size_field(
     slope: float,
     fine: float,
 ) -> SizeField:
-    cap = _cap(domain, edge_length)
+    # No edge is longer than a sixteenth of the rim: the coarsest mesh still has a shape.
+    cap = min(edge_length, domain.perimeter / 16)
     features = _fitted(_features(domain, footprints, rim, cap, fine), domain)
+    features = [f for f in features if f.size < cap]
     places, widths = narrow_places(domain, cap, slope)
     centres = np.array([f.centre for f in features]).reshape(-1, 2)
     return SizeField(
@@ -556,29 +182,23 @@ def _size_field(
     )
 
 
-def _cap(domain: Domain, edge_length: float) -> float:
-    """No edge is longer than a sixteenth of the rim: the coarsest mesh still has a shape."""
-    return min(edge_length, domain.perimeter / 16)
-
-
 def _features(
     domain: Domain, footprints: list[Footprint], rim: np.ndarray, cap: float, fine: float
 ) -> list[_Feature]:
-    """One per disc, interior point and fixed node of the rim."""
-    features = []
+    """One per disc, point, arc end and fixed node of the rim, with the edge length asked there."""
+    features = [_Feature(p, 0.0, cap) for p in domain.boundary_point(rim)]
     for f in footprints:
         if isinstance(f, DiscFootprint):
             edge = 2 * np.pi * f.radius / f.segments
-            features.append(_Feature(np.asarray(f.position, float), _reach(f), min(edge, cap)))
+            features.append(_Feature(np.asarray(f.position, float), reach(f), min(edge, cap)))
         elif isinstance(f, PointFootprint):
             features.append(_Feature(np.asarray(f.position, float), 0.0, fine))
-    arcs = [f for f in footprints if isinstance(f, ArcFootprint)]
-    # Two edges or more under an arc: the current crowds at its ends.
-    for arc in arcs:
-        size = min(fine, 0.5 * (arc.stop - arc.start))
-        ends = domain.boundary_point([arc.start, arc.stop])
-        features += [_Feature(end, 0.0, size) for end in ends]
-    return features + [_Feature(p, 0.0, cap) for p in domain.boundary_point(rim)]
+        else:
+            # Two edges or more under an arc: the current crowds at its ends.
+            size = min(fine, 0.5 * (f.stop - f.start))
+            ends = domain.boundary_point([f.start, f.stop])
+            features += [_Feature(end, 0.0, size) for end in ends]
+    return features
 
 
 def _fitted(features: list[_Feature], domain: Domain) -> list[_Feature]:
@@ -602,24 +222,19 @@ def _problem(
     domain: Domain, footprints: list[Footprint], rim: np.ndarray, size: SizeField
 ) -> Problem:
     """Fixed nodes and the edges between them: the rim, then each footprint's own."""
-    nodes = [domain.boundary_point(divide_rim(domain, rim, size))]
-    rings = [np.zeros((0, 2), int)]
-    rim_edges = _cycle(0, len(nodes[0]))
-    count = len(nodes[0])
-    for f in footprints:
-        own = _own_nodes(domain, f)
-        if isinstance(f, DiscFootprint):
-            rings.append(_cycle(count, f.segments))
-        nodes.append(own)
-        count += len(own)
-    discs = [f for f in footprints if isinstance(f, DiscFootprint)]
+    around = domain.boundary_point(divide_rim(domain, rim, size))
+    own = [_own_nodes(domain, f) for f in footprints]
+    first = len(around) + np.cumsum([0, *map(len, own)])
+    discs = [
+        (k, f) for k, f in zip(first, footprints, strict=False) if isinstance(f, DiscFootprint)
+    ]
     return Problem(
-        domain,
-        size,
-        np.concatenate(nodes),
-        rim_edges,
-        np.concatenate(rings),
-        partial(_open_to, domain, discs, size),
+        domain=domain,
+        size=size,
+        fixed=np.concatenate([around, *own]),
+        rim=_cycle(0, len(around)),
+        rings=np.concatenate([np.zeros((0, 2), int), *(_cycle(k, f.segments) for k, f in discs)]),
+        open_to=partial(_open_to, domain, [f for _, f in discs], size),
     )
 
 
@@ -641,7 +256,7 @@ def _own_nodes(domain: Domain, footprint: Footprint) -> np.ndarray:
 
 def _disc_nodes(disc: DiscFootprint) -> np.ndarray:
     """Rings from the polygon inward, each with half the nodes of the one around it, and a hub."""
-    count, radius, rings = disc.segments, _reach(disc), []
+    count, radius, rings = disc.segments, reach(disc), []
     while True:
         angle = 2 * np.pi * np.arange(count) / count
         rings.append(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -659,7 +274,7 @@ def _open_to(
     wanted = size(points)
     allowed = domain.contains(points) & (domain.boundary_distance(points) > 0.45 * wanted)
     for disc in discs:
-        away = np.linalg.norm(points - disc.position, axis=1) - _reach(disc)
+        away = np.linalg.norm(points - disc.position, axis=1) - reach(disc)
         allowed &= away > 0.4 * wanted
     return allowed
 
@@ -671,7 +286,7 @@ class Pattern(Enum):
     """How the cells of a structured mesh are cut.
 
     RISING: by the diagonal from lower left to upper right.
-    ALTERNATING: by either diagonal in turn (union jack); mirror-symmetric for even numbers of cells.
+    ALTERNATING: by either diagonal in turn (union jack); mirror-symmetric for even nx and ny.
     CROSSED: by both, with a node at the middle of each cell; has all symmetries of the rectangle.
     """
 
@@ -708,7 +323,9 @@ def structured(
 def _require_counts(nx: int, ny: int) -> None:
     for name, value in {"nx": nx, "ny": ny}.items():
         if value != int(value) or value < 1:
-            raise ValueError(f"structured: {name} is {value}; give a whole number of cells, 1 or more")
+            raise ValueError(
+                f"structured: {name} is {value}; give a whole number of cells, 1 or more"
+            )
 
 
 def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:

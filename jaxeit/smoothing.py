@@ -1,8 +1,8 @@
 """From a cloud of nodes to a good triangulation: Delaunay, relaxation, repair.
 
 Free nodes move to the weighted mean of their triangles' circumcentres (optimal Delaunay
-triangulation, Chen and Holst 2011), nodes that crowd are removed and gaps are filled, and last the
-nodes of the poorest triangles are moved, one star at a time, to where the smallest angle is largest.
+triangulation, Chen and Holst 2011), nodes that crowd are removed and gaps are filled, and last
+the nodes of the poorest triangles are moved, each to where the smallest angle around it is largest.
 Triangles are (m, 3) indices, counter-clockwise; points are (n, 2) m with the fixed ones first.
 """
 

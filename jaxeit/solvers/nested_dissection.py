@@ -11,8 +11,10 @@ a level keeps the panel M = [L^-1; -W L^-1], so that a sweep of a solve is one p
     forward  [y; update] = M r1,    backward  x1 = M^T [y; x2].
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from math import prod
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -40,11 +42,11 @@ class LevelPlan(eqx.Module):
 class NestedDissectionPlan(AbstractPlan):
     """The pattern, the levels from the root down, and the permutations in and out of them.
 
-    | meaning                                                             | shape    |
-    |---------------------------------------------------------------------|----------|
+    | meaning                                                             | shape      |
+    |---------------------------------------------------------------------|------------|
     | slots: where entries, then padding ones, stand in the panels, flat  | (nnz+pad,) |
-    | gather: unknown at each pivot place of all levels, n where padded   | (places,) |
-    | scatter: pivot place of each unknown                                | (n,)     |
+    | gather: unknown at each pivot place of all levels, n where padded   | (places,)  |
+    | scatter: pivot place of each unknown                                | (n,)       |
     """
 
     rows: Int[Array, " nnz"]
@@ -55,6 +57,10 @@ class NestedDissectionPlan(AbstractPlan):
     scatter: Int[Array, " n"]
     levels: tuple[LevelPlan, ...]
     n: int = eqx.field(static=True)
+
+    @property
+    def panel_shapes(self) -> list[tuple[int, int, int]]:
+        return [level.panel_shape for level in self.levels]
 
 
 class NestedDissectionFactor(eqx.Module):
@@ -95,9 +101,14 @@ class NestedDissection(AbstractLinearSolver):
         self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]
     ) -> NestedDissectionFactor:
         scale, scaled = jacobi_scale(plan, values)
-        panels, updates = [], None
-        for level, panel in zip(plan.levels[::-1], _assemble(plan, scaled)[::-1], strict=True):
-            panel, updates = _eliminate(panel, _extend(level, updates))
+        panels: list[Float[Array, "m q p"]] = []
+        update = None
+        for level, panel in _upwards(plan.levels, _assemble(plan, scaled)):
+            kept: Array | float = 0.0
+            if update is not None:
+                panel, kept = _extend_add(level, panel, update)
+            panel, lost = _eliminate(panel)
+            update = kept - lost
             panels.append(panel)
         return NestedDissectionFactor(tuple(panels[::-1]), scale, plan)
 
@@ -106,7 +117,7 @@ class NestedDissection(AbstractLinearSolver):
     ) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
         padded = jnp.concatenate([scale * rhs, jnp.zeros_like(rhs, shape=(1, rhs.shape[1]))])
-        loads = _split(padded[plan.gather], [level.panel_shape for level in plan.levels])
+        loads = _split(padded[plan.gather], [(m, p) for m, _, p in plan.panel_shapes])
         x = _backward(factor, _forward(factor, loads))
         return scale * x[plan.scatter]
 
@@ -128,89 +139,102 @@ def _assemble(
     plan: NestedDissectionPlan, values: Float[Array, " nnz"]
 ) -> list[Float[Array, "m q p"]]:
     """The columns of the pivots in every front, from the matrix alone."""
-    shapes = [level.panel_shape for level in plan.levels]
-    sizes = [int(np.prod(shape)) for shape in shapes]
+    shapes = plan.panel_shapes
     ones = jnp.ones(plan.slots.size - values.size, values.dtype)
-    flat = jnp.zeros(sum(sizes), values.dtype)
-    flat = flat.at[plan.slots].set(jnp.concatenate([values, ones]), unique_indices=True)
-    ends = np.cumsum([0, *sizes])
+    flat = jnp.zeros(sum(map(prod, shapes)), values.dtype)
+    flat = flat.at[plan.slots].set(
+        jnp.concatenate([values, ones]), unique_indices=True, mode="promise_in_bounds"
+    )
+    return _split(flat, shapes)
+
+
+def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Cut the leading axis into pieces, and fold each into its shape."""
+    ends = np.cumsum([0, *map(prod, shapes)])
+    pieces = [rows[begin:end] for begin, end in pairwise(ends)]
     return [
-        flat[begin:end].reshape(shape)
-        for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
+        piece.reshape(*shape, *rows.shape[1:]) for piece, shape in zip(pieces, shapes, strict=True)
     ]
 
 
-def _extend(level: LevelPlan, updates: Float[Array, "mc b b"] | None) -> Float[Array, "m q q"]:
-    """Sum of the children's updates, each put at its places in the parent's front."""
-    fronts, children, size = level.down.shape
-    if updates is None:
-        return jnp.zeros(())
-    by_child = updates.reshape(fronts, children, *updates.shape[1:])
-    spread = [_spread(by_child[:, c], level.down[:, c]) for c in range(children)]
-    return sum(spread[1:], spread[0])
+def _extend_add(
+    level: LevelPlan, panel: Float[Array, "m q p"], updates: Float[Array, "mc bc bc"]
+) -> tuple[Float[Array, "m q p"], Float[Array, "m b b"]]:
+    """Add the children's updates at their places in the front; its panel and its F22."""
+    by_child = _by_child(level, updates)
+    extended = sum(_spread(by_child[:, c], level.down[:, c]) for c in range(by_child.shape[1]))
+    return panel + extended[:, :, : level.pivots], extended[:, level.pivots :, level.pivots :]
+
+
+def _by_child(level: LevelPlan, children: Array) -> Array:
+    return children.reshape(*level.down.shape[:2], *children.shape[1:])
 
 
 def _spread(update: Float[Array, "m b b"], places: Int[Array, "m q"]) -> Float[Array, "m q q"]:
     front = jnp.arange(update.shape[0])[:, None, None]
-    return update[front, places[:, :, None], places[:, None, :]]
+    spread = update.at[front, places[:, :, None], places[:, None, :]]
+    return spread.get(mode="promise_in_bounds")
 
 
 def _eliminate(
-    panel: Float[Array, "m q p"], extended: Float[Array, "m q q"]
+    panel: Float[Array, "m q p"],
 ) -> tuple[Float[Array, "m q p"], Float[Array, "m b b"]]:
+    """M of every front, and W W^T, which its F22 loses."""
     p = panel.shape[2]
-    if extended.ndim:
-        panel = panel + extended[:, :, :p]
     lower = lax.linalg.cholesky(panel[:, :p], symmetrize_input=False)
     eye = jnp.broadcast_to(jnp.eye(p, dtype=panel.dtype), lower.shape)
     inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
     w = jnp.einsum("mbp,mkp->mbk", panel[:, p:], inverse)
-    update = -jnp.einsum("mip,mjp->mij", w, w)
-    if extended.ndim:
-        update = update + extended[:, p:, p:]
-    return jnp.concatenate([inverse, -jnp.einsum("mbk,mkp->mbp", w, inverse)], 1), update
+    below = -jnp.einsum("mbk,mkp->mbp", w, inverse)
+    return jnp.concatenate([inverse, below], 1), jnp.einsum("mip,mjp->mij", w, w)
 
 
-def _split(
-    rows: Float[Array, "places k"], shapes: Sequence[tuple[int, int, int]]
+def _forward(
+    factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]
 ) -> list[Float[Array, "m p k"]]:
-    ends = np.cumsum([0, *(m * p for m, _, p in shapes)])
-    return [
-        rows[begin:end].reshape(m, p, rows.shape[1])
-        for (begin, end), (m, _, p) in zip(pairwise(ends), shapes, strict=True)
-    ]
-
-
-def _forward(factor, loads):
-    carried, ys = None, []
-    for level, panel, load in zip(
-        factor.plan.levels[::-1], factor.panels[::-1], loads[::-1], strict=True
-    ):
-        p = level.pivots
-        if carried is None:
-            out = jnp.einsum("mqp,mpk->mqk", panel, load)
-            y, carried = out[:, :p], out[:, p:]
-        else:
-            m, c, q = level.down.shape
-            by_child = carried.reshape(m, c, *carried.shape[1:])
-            summed = jnp.take_along_axis(by_child, level.down[..., None], axis=2).sum(1)
-            out = jnp.einsum("mqp,mpk->mqk", panel, load + summed[:, :p])
-            y, carried = out[:, :p], out[:, p:] + summed[:, p:]
+    """y = L^-1 r from the leaves up; every front hands what its boundary gained to its parent."""
+    ys: list[Float[Array, "m p k"]] = []
+    handed = None
+    for level, panel, load in _upwards(factor.plan.levels, factor.panels, loads):
+        gained = 0.0 if handed is None else _gained(level, handed)
+        pivots, boundary = _cut(gained, level.pivots)
+        out = jnp.einsum("mqp,mpk->mqk", panel, load + pivots)
+        y, handed = _cut(out, level.pivots)
+        handed = handed + boundary
         ys.append(y)
     return ys[::-1]
 
 
-def _backward(factor, ys):
-    front, xs = None, []
+def _gained(level: LevelPlan, handed: Float[Array, "mc bc k"]) -> Float[Array, "m q k"]:
+    by_child = _by_child(level, handed)
+    places = level.down[..., None]
+    return jnp.take_along_axis(by_child, places, 2, mode="promise_in_bounds").sum(1)
+
+
+def _backward(
+    factor: NestedDissectionFactor, ys: list[Float[Array, "m p k"]]
+) -> Float[Array, "places k"]:
+    """x = L^-T y from the root down; every front finds its boundary's x in its parent's front."""
+    front = jnp.zeros_like(ys[0], shape=(1, 1, ys[0].shape[2]))
+    xs = []
     for level, panel, y in zip(factor.plan.levels, factor.panels, ys, strict=True):
-        m, b = level.up.shape
-        if front is None:
-            x2 = jnp.zeros((m, b, y.shape[2]), y.dtype)
-        else:
-            c = m // front.shape[0]
-            x2 = jnp.take_along_axis(front, level.up.reshape(-1, c * b, 1), axis=1)
-            x2 = x2.reshape(m, b, -1)
-        x1 = jnp.einsum("mqp,mqk->mpk", panel, jnp.concatenate([y, x2], 1))
-        front = jnp.concatenate([x1, x2], 1)
-        xs.append(x1.reshape(-1, x1.shape[2]))
+        outer = _inherited(level, front)
+        x = jnp.einsum("mqp,mqk->mpk", panel, jnp.concatenate([y, outer], 1))
+        front = jnp.concatenate([x, outer], 1)
+        xs.append(x.reshape(-1, x.shape[2]))
     return jnp.concatenate(xs)
+
+
+def _inherited(level: LevelPlan, front: Float[Array, "mp qp k"]) -> Float[Array, "m b k"]:
+    by_parent = level.up.reshape(front.shape[0], -1, 1)
+    outer = jnp.take_along_axis(front, by_parent, 1, mode="promise_in_bounds")
+    return outer.reshape(*level.up.shape, -1)
+
+
+def _upwards(*columns: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
+    """The levels from the leaves up."""
+    return zip(*(column[::-1] for column in columns), strict=True)
+
+
+def _cut(rows: Array | float, p: int) -> tuple[Array | float, Array | float]:
+    return (rows, rows) if isinstance(rows, float) else (rows[:, :p], rows[:, p:])

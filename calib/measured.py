@@ -1,0 +1,235 @@
+"""What a session says about each press, in the terms that a calibration needs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import jaxeit as je
+
+from .corrections import AbstractBaseline, AbstractCorrection, LowPass, TwoSided, sample_rate
+from .presses import (
+    Cutting,
+    PressSamples,
+    Windows,
+    check_overlap,
+    find_presses,
+    locate,
+    press_means,
+    press_samples,
+    press_windows,
+    reject,
+)
+from .session import PressTable, Session, SessionError, Stream
+
+_LOW_PASS = 50.0  # Hz, the paper's
+
+
+@dataclass(frozen=True)
+class Processing:
+    """How a session is cut and corrected before anything is fitted.
+
+    | meaning                                                                           | default    |
+    |-----------------------------------------------------------------------------------|------------|
+    | corrections: applied to every stream; None: the paper's 50 Hz low-pass on those    | None       |
+    |   streams that are sampled fast enough for it, the others noted                    |            |
+    | baseline: what is taken off a press                                                | `TwoSided` |
+    | cutting: lengths of the windows                                                    | `Cutting`  |
+    """
+
+    corrections: tuple[AbstractCorrection, ...] | None = None
+    baseline: AbstractBaseline = TwoSided()
+    cutting: Cutting = Cutting()
+
+    def of(self, stream: Stream) -> tuple[tuple[AbstractCorrection, ...], str]:
+        """The corrections for one stream, and a note where the default one does not apply."""
+        if self.corrections is not None:
+            return self.corrections, ""
+        rate = sample_rate(stream.time)
+        if rate > 2 * _LOW_PASS:
+            return (LowPass(_LOW_PASS),), ""
+        return (), (
+            f"{stream.name} is recorded at {rate:.3g} Hz: the {_LOW_PASS:g} Hz low-pass has nothing "
+            "to remove and is left out"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One session, press by press; rows are the presses that can be used.
+
+    | meaning                                                          | shape             | unit |
+    |------------------------------------------------------------------|-------------------|------|
+    | position of the tip, true                                        | (presses, 2)      | m    |
+    | dv: change of the readings over the hold                         | (presses, readings)| V   |
+    | pressure: change of the pads' gage pressure over the hold        | (presses, pads)   | Pa   |
+    | force over the hold, from the load cell                          | (presses,)        | N    |
+    | channels: readings that were finite in every press               | (readings,)       |      |
+    | location: number of the place pressed, the same for the same one | (presses,)        |      |
+    | samples: pressure and force all along the presses                |                   |      |
+    | presses: all of them, with the reasons of those set aside        |                   |      |
+    | windows of all of them                                           |                   |      |
+    | notes: what a person should know                                 |                   |      |
+    """
+
+    session: Session
+    position: np.ndarray
+    dv: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+    channels: np.ndarray
+    location: np.ndarray
+    samples: PressSamples
+    presses: PressTable
+    windows: Windows
+    notes: tuple[str, ...]
+
+
+def measure(session: Session, skin: je.Skin, processing: Processing | None = None) -> Measured:
+    """Cut the presses out of a session's streams, on one clock, with noise and baseline removed.
+
+    Raises:
+        SessionError: if the session was not recorded on this skin, lacks a stream, or no press can
+            be used.
+    """
+    processing = processing or Processing()
+    streams = {name: session.stream(name) for name in ("eit", "pressure", "force")}
+    _require_skin(session, skin, streams)
+    presses = _presses(session, streams["force"])
+    windows = press_windows(presses, processing.cutting)
+    presses = check_overlap(presses, windows, streams.values(), processing.baseline)
+    chosen = {name: processing.of(stream) for name, stream in streams.items()}
+    means = {
+        name: press_means(
+            stream, windows, baseline=processing.baseline, corrections=chosen[name][0]
+        ).change.mean
+        for name, stream in streams.items()
+    }
+    channels, lost = _finite_channels(means["eit"], presses.accepted)
+    _require_pads(session, skin, means["pressure"][presses.accepted])
+    force = means["force"][:, 0]
+    presses = reject(presses, _without_force(force, means["pressure"]))
+    kept = presses.accepted
+    if not kept.any():
+        raise _error(session, "/presses", _why_none(presses), "see jaxeit check")
+    samples = press_samples(
+        streams["force"],
+        streams["pressure"],
+        presses,
+        windows,
+        baseline=processing.baseline,
+        corrections=chosen["force"][0],
+    )
+    position = np.stack([presses.x, presses.y], 1)[kept]
+    places = np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel()
+    notes = [note for _, note in chosen.values() if note]
+    return Measured(
+        session=session,
+        position=position,
+        dv=means["eit"][kept],
+        pressure=means["pressure"][kept],
+        force=force[kept],
+        channels=channels,
+        location=places,
+        samples=samples,
+        presses=presses,
+        windows=windows,
+        notes=(*notes, *lost, *_set_aside(presses)),
+    )
+
+
+def _error(session: Session, where: str, what: str, todo: str) -> SessionError:
+    return SessionError(f"{session.name}: {where}: {what}; {todo}")
+
+
+def _require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) -> None:
+    pattern = session.pattern
+    if pattern is None:
+        raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
+    if pattern.shape != skin.protocol.pattern.shape or (pattern != skin.protocol.pattern).any():
+        raise _error(
+            session,
+            "/device/eit_protocol/pattern",
+            f"is not that of the skin {skin.name!r}",
+            "calibrate with the skin that was recorded (--skin FILE)",
+        )
+    pads = streams["pressure"].channels
+    if pads != len(skin.pads):
+        raise _error(
+            session,
+            "/streams/pressure",
+            f"has {pads} columns, the skin {skin.name!r} has {len(skin.pads)} pads",
+            "record every pad, or describe the skin as it is in its TOML file",
+        )
+
+
+def _presses(session: Session, force: Stream) -> PressTable:
+    if session.presses is not None and len(session.presses):
+        return session.presses
+    if "stage" not in session.streams:
+        raise _error(
+            session,
+            "/presses",
+            "no table of presses, and no stage stream to place them by",
+            "record the stage, or write the table",
+        )
+    found = find_presses(force.time, force.read()[:, 0])
+    place = locate(found, session.streams["stage"])
+    count = len(found)
+    return PressTable(
+        x=place[:, 0],
+        y=place[:, 1],
+        tip_diameter=np.zeros(count),
+        target_force=np.zeros(count),
+        t_press=found.t_press,
+        t_hold0=found.t_hold0,
+        t_hold1=found.t_hold1,
+        t_release=found.t_release,
+        pad=np.full(count, -1),
+        accepted=found.accepted,
+        reason=found.reason,
+    )
+
+
+def _finite_channels(dv: np.ndarray, accepted: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    good = np.isfinite(dv[accepted]).all(0)
+    lost = np.flatnonzero(~good)
+    if not len(lost):
+        return good, []
+    some = ", ".join(map(str, lost[:8])) + (", ..." if len(lost) > 8 else "")
+    return good, [f"eit channels without a finite value in every press, left out: {some}"]
+
+
+def _require_pads(session: Session, skin: je.Skin, pressure: np.ndarray) -> None:
+    silent = ~np.isfinite(pressure).any(0)
+    if len(pressure) and silent.any():
+        number = int(np.argmax(silent))
+        raise _error(
+            session,
+            "/streams/pressure",
+            f"column {number}, pad {skin.pads[number].name!r}, holds no finite sample",
+            "see to its sensor and record again, or take the pad out of the skin's file",
+        )
+
+
+def _without_force(force: np.ndarray, pressure: np.ndarray) -> Sequence[str]:
+    finite = np.isfinite(force) & np.isfinite(pressure).all(1)
+    return [
+        "" if ok and f > 0 else ("no force" if ok else "force or pressure missing in the hold")
+        for ok, f in zip(finite, force, strict=True)
+    ]
+
+
+def _why_none(presses: PressTable) -> str:
+    reasons = sorted({r for r in presses.reason if r})
+    return f"none of {len(presses)} presses can be used" + (f": {reasons[0]}" if reasons else "")
+
+
+def _set_aside(presses: PressTable) -> list[str]:
+    bad = np.flatnonzero(~presses.accepted)
+    if not len(bad):
+        return []
+    first = f"press {bad[0]}: {presses.reason[bad[0]]}"
+    return [f"{len(bad)} of {len(presses)} presses set aside ({first})"]
+
+

@@ -1,0 +1,316 @@
+"""Result files (calibrations, force maps): named arrays with units, as guarded as sessions.
+
+An archive is an HDF5 file with ``format`` and ``format_version``, attributes that are single
+numbers or texts, and arrays, possibly in groups (``pads/0/covariance``). Arrays too large for
+memory are written row by row with `ArchiveWriter` and read in slices with `open_archive`.
+"""
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+
+import h5py
+import numpy as np
+from h5py import h5g
+from numpy.typing import ArrayLike, DTypeLike
+
+from calib.session.chunks import MAX_RANK, GuardedArray
+from calib.session.guard import Node, open_guarded, root_node, translated
+from calib.session.model import FORMAT, SessionError, printable, problem
+from calib.session.reader import check_version
+from calib.session.storage import (
+    DIMENSION_NAME,
+    GrowingArray,
+    Plain,
+    make_array,
+    make_dataset,
+    make_group,
+    new_file,
+    put_attributes,
+    text_array,
+)
+
+ARCHIVE_VERSION = "1.0"
+MAX_DEPTH = 4
+MAX_ARRAYS = 4096
+MAX_READ_BYTES = 2 << 30
+PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
+DIMENSION = re.compile(r"dim_\d+[a-d]?")
+OWN_ATTRIBUTES = {"format", "format_version", "Conventions", "complete"}
+
+
+@dataclass(frozen=True)
+class Archive:
+    """A result file in memory.
+
+    ``attrs`` name -> text or number; ``arrays`` name -> array (numbers, bool, or texts as ``U``);
+    ``units`` and ``long_names`` by the same names.
+    """
+
+    attrs: Mapping[str, str | int | float]
+    arrays: Mapping[str, np.ndarray]
+    units: Mapping[str, str]
+    long_names: Mapping[str, str]
+
+
+def write_archive(
+    path: str | os.PathLike[str],
+    format: str,
+    attrs: Mapping[str, Plain],
+    arrays: Mapping[str, tuple[ArrayLike, str, str]],
+) -> None:
+    """Write a result file, whole or not at all.
+
+    ``arrays`` maps a name, which may be nested as ``pads/0/covariance``, to (values, units, long
+    name); values are numbers, bools or texts of rank 0 to 4. Same input, same bytes. Raises
+    `SessionError` for names, types and attributes that the format cannot hold.
+    """
+    with ArchiveWriter(path, format, attrs) as writer:
+        for name, (values, units, long_name) in arrays.items():
+            writer.add(name, values, units, long_name)
+
+
+def read_archive(path: str | os.PathLike[str], format: str) -> Archive:
+    """Read a whole result file of the given ``format``; raises `SessionError`.
+
+    Arrays above 2 GiB together are refused: read those in slices with `open_archive`.
+    """
+    with open_archive(path, format) as reader:
+        total = sum(array.nbytes for array in reader.arrays.values())
+        if total > MAX_READ_BYTES:
+            what = f"holds {total:,} bytes"
+            raise problem(reader.path, "file", what, "read it in slices with open_archive")
+        arrays = {name: array.read() for name, array in reader.arrays.items()}
+        units = {name: array.units for name, array in reader.arrays.items()}
+        long_names = {name: array.long_name for name, array in reader.arrays.items()}
+        return Archive(
+            reader.attrs,
+            MappingProxyType(arrays),
+            MappingProxyType(units),
+            MappingProxyType(long_names),
+        )
+
+
+class ArchiveWriter:
+    """Write a result file piece by piece; use it as a context manager.
+
+    ``add`` writes an array at once; ``add_rows`` declares one that ``append`` extends, so that it
+    may be larger than memory. The file appears under its name only at a clean end.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], format: str, attrs: Mapping[str, Plain]):
+        self.path = Path(path)
+        clash = OWN_ATTRIBUTES & set(attrs)
+        if clash or format == FORMAT or not PART.fullmatch(format):
+            what = f"format {format!r} or attributes {sorted(clash)} are taken"
+            raise problem(self.path, "attributes", what, "use other names")
+        own = {"format": format, "format_version": ARCHIVE_VERSION, "Conventions": "CF-1.11"}
+        self._attrs = {**own, **attrs}
+        self._names: set[str] = set()
+        self._growing: dict[str, tuple[GrowingArray, tuple[int, ...], dict[str, Plain]]] = {}
+        self._stack = contextlib.ExitStack()
+        self._file: h5py.File | None = None
+
+    def __enter__(self) -> "ArchiveWriter":
+        with contextlib.ExitStack() as stack:
+            self._file, self._check_disk = stack.enter_context(new_file(self.path))
+            put_attributes(self._file, self._attrs)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with self._stack:
+            if error is not None:
+                self._stack.__exit__(kind, error, trace)
+            else:
+                self._finish()
+        self._file = None
+
+    def _finish(self) -> None:
+        for growing, _, attrs in self._growing.values():
+            self._name_axes(growing.finish(attrs))
+        put_attributes(self._open(), {"complete": True})
+
+    def _open(self) -> h5py.File:
+        if self._file is None:
+            what = "is not open"
+            raise problem(self.path, "writer", what, "use it as `with ArchiveWriter(...) as w`")
+        return self._file
+
+    def add(self, name: str, values: ArrayLike, units: str, long_name: str = "") -> None:
+        """Write one array of numbers, bools or texts."""
+        array, kind = _storable(self.path, name, np.asarray(values))
+        group, leaf = self._place(name)
+        attrs = {"units": units, "long_name": long_name, **kind}
+        self._name_axes(make_array(group, leaf, array, attrs))
+        self._check_disk()
+
+    def add_rows(
+        self,
+        name: str,
+        tail: tuple[int, ...],
+        units: str,
+        long_name: str = "",
+        dtype: DTypeLike = "f8",
+    ) -> None:
+        """Declare an array of shape (rows, *tail) that ``append`` fills."""
+        dtype = np.dtype(dtype)
+        _storable(self.path, name, np.empty((0, *tail), dtype))
+        if dtype.kind == "b":
+            raise problem(self.path, name, "bool rows", "use dtype u1")
+        group, leaf = self._place(name)
+        attrs: dict[str, Plain] = {"units": units, "long_name": long_name}
+        self._growing[name] = (GrowingArray(group, leaf, tail, dtype), tail, attrs)
+
+    def append(self, name: str, rows: ArrayLike) -> None:
+        """Add rows (n, *tail) to an array declared with ``add_rows``."""
+        if name not in self._growing:
+            raise problem(self.path, name, "was not declared", "call add_rows first")
+        growing, tail, _ = self._growing[name]
+        array = np.asarray(rows)
+        if array.shape[1:] != tail or array.ndim != len(tail) + 1 or array.dtype.kind not in "biuf":
+            raise problem(self.path, name, f"rows of shape {array.shape}", f"give (n, *{tail})")
+        growing.append(array)
+        self._check_disk()
+
+    def _place(self, name: str) -> tuple[h5py.Group, str]:
+        """The group an array belongs in (made if need be) and its name there."""
+        parts = name.split("/")
+        bad = [p for p in parts if not PART.fullmatch(p) or DIMENSION.fullmatch(p)]
+        taken = any(name == n or name.startswith(n + "/") or n.startswith(name + "/")
+                    for n in self._names)  # fmt: skip
+        if bad or taken or len(parts) > MAX_DEPTH:
+            raise problem(
+                self.path, name, "cannot be used as a name", "use letters, digits, _ and -"
+            )
+        self._names.add(name)
+        group = self._open()
+        for part in parts[:-1]:
+            group = group[part] if part in group else make_group(group, part, {})
+        return group, parts[-1]
+
+    def _name_axes(self, dataset: h5py.Dataset) -> None:
+        """Give every axis a dimension; axes of equal length in one array stay distinct."""
+        seen: list[int] = []
+        for axis, size in enumerate(dataset.shape):
+            again = seen.count(size)
+            seen.append(size)
+            scale = self._dimension(f"dim_{size}" + ("" if not again else "abcd"[again]), size)
+            dataset.dims[axis].attach_scale(scale)
+
+    def _dimension(self, name: str, size: int) -> h5py.Dataset:
+        """A dimension without values, as netCDF-4 writes them."""
+        file = self._open()
+        if name in file:
+            return file[name]
+        scale = make_dataset(file, name, (size,), np.dtype("i1"))
+        scale.make_scale(DIMENSION_NAME % size)
+        return scale
+
+
+def _storable(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, dict[str, Plain]]:
+    """Values in a type the format has, with an attribute if that type is a stand-in."""
+    plain = values.dtype.kind == "U" or (values.dtype.kind in "biuf" and values.itemsize <= 8)
+    if values.ndim > MAX_RANK or not plain:
+        what = f"has type {values.dtype} and rank {values.ndim}"
+        raise problem(path, name, what, f"give numbers or texts of rank 0 to {MAX_RANK}")
+    if values.dtype.kind == "b":
+        return values.astype("u1"), {"kind": "bool"}
+    if values.dtype.kind == "U":
+        return text_array(values.ravel().tolist()).reshape(values.shape), {}
+    return values, {}
+
+
+class ArchiveArray:
+    """One array of an open archive: ``shape``, ``units``, ``long_name``; rows by ``read``."""
+
+    def __init__(self, node: Node):
+        self._array = GuardedArray(node)
+        self.shape, self.nbytes = self._array.shape, self._array.nbytes
+        self.units, self.long_name = node.text("units", ""), node.text("long_name", "")
+        self._bool = node.text("kind", "") == "bool"
+
+    def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows ``start:stop`` (all by default); texts come as ``U``."""
+        values = self._array.read(start, stop)
+        if values.dtype.kind == "S":
+            with translated(self._array.node.path, self._array.node.where):
+                return np.char.decode(values, "utf-8")
+        return values.astype(bool) if self._bool else values
+
+
+class ArchiveReader:
+    """An open archive: ``attrs``, and ``arrays`` by name, read when asked for."""
+
+    def __init__(self, path: Path, file: h5py.File, format: str):
+        self.path, self._file = path, file
+        root = root_node(file, path)
+        _check_archive(root, format)
+        self.attrs = MappingProxyType(root.plain_attributes())
+        self.arrays = MappingProxyType({n: ArchiveArray(node) for n, node in [*_walk(root)]})
+
+    def __enter__(self) -> "ArchiveReader":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+
+def open_archive(path: str | os.PathLike[str], format: str) -> ArchiveReader:
+    """Open a result file for reading in slices; raises `SessionError`."""
+    where = Path(path)
+    file = open_guarded(where)
+    try:
+        return ArchiveReader(where, file, format)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _check_archive(root: Node, format: str) -> None:
+    found = root.attribute("format")
+    if found != format:
+        what = f"is {printable(found)!r}, not {format!r}" if found is not None else "has no format"
+        raise problem(root.path, "file", what, f"name a {format} file")
+    check_version(root)
+    if root.number("complete", 0) != 1:
+        raise problem(root.path, "file", "is not complete", "make it again")
+
+
+def _walk(root: Node) -> Iterator[tuple[str, Node]]:
+    """Every array with its name, within limits of depth and number."""
+    waiting, found = [("", root, 0)], 0
+    while waiting:
+        prefix, node, depth = waiting.pop(0)
+        for name in node.members():
+            found += 1
+            if found > MAX_ARRAYS or depth >= MAX_DEPTH:
+                raise node.error("holds too many or too deeply nested arrays", "not a result file")
+            member = node.child(name)
+            if depth == 0 and DIMENSION.fullmatch(name):
+                continue
+            assert member is not None
+            if isinstance(member.id, h5g.GroupID):
+                waiting.append((f"{prefix}{name}/", member, depth + 1))
+            else:
+                yield prefix + name, member
+
+
+__all__ = [
+    "Archive",
+    "ArchiveReader",
+    "ArchiveWriter",
+    "SessionError",
+    "open_archive",
+    "read_archive",
+    "write_archive",
+]

@@ -1,0 +1,294 @@
+"""The door: nothing in a file is believed before it has been checked.
+
+A session may come from anywhere, and the HDF5 library follows links to other files, loads
+plug-ins, allocates what a header claims and does not check every number. So a file is looked at
+here first: what it is, whether it is whole, then only groups and datasets on a list of names,
+through hard links only, with bounded numbers of members and attributes, and only plain numbers and
+fixed-length texts.
+"""
+
+import contextlib
+import os
+import stat
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+from h5py import h5a, h5d, h5g, h5l, h5o, h5t
+
+from calib.session.model import SessionError, printable, problem
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+MAX_LOGICAL_BYTES = 64 << 30
+MAX_ATTRIBUTES = 256
+MAX_ATTRIBUTE_BYTES = 256 << 10
+MAX_ATTRIBUTE_ITEMS = 64
+MAX_MEMBERS = 1024
+DEFLATE_RATIO = 1040
+"""A byte of deflate stands for at most 1032 bytes; a file cannot hold more than that."""
+
+REWRITE = 'write it with h5py.File(..., libver=("v110", "v110"))'
+DAMAGED = "the file is damaged; take another copy, or record it again"
+
+
+@dataclass
+class Budget:
+    """How many bytes the arrays of one file may claim together, and how many they have claimed."""
+
+    path: Path
+    limit: int = MAX_LOGICAL_BYTES
+    claimed: int = 0
+    seen: set[str] = field(default_factory=set)
+
+    def claim(self, where: str, size: int) -> None:
+        """Count `size` bytes of the array `where` once; `SessionError` beyond the limit."""
+        if where in self.seen:
+            return
+        self.seen.add(where)
+        self.claimed += size
+        plausible = DEFLATE_RATIO * os.path.getsize(self.path)
+        if size > plausible:
+            what = f"claims {size:,} bytes, more than a file of this size can hold"
+            raise problem(self.path, where, what, DAMAGED)
+        if self.claimed > self.limit:
+            what = f"arrays claim {self.claimed:,} bytes, the limit is {self.limit:,}"
+            raise problem(self.path, where, what, "split the recording into shorter sessions")
+
+
+@contextlib.contextmanager
+def translated(path: Path, where: str) -> Iterator[None]:
+    """Turn whatever the HDF5 library raises into one `SessionError`."""
+    try:
+        yield
+    except SessionError:
+        raise
+    except UnicodeDecodeError as error:
+        raise problem(path, where, "a text is not UTF-8", DAMAGED) from error
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise problem(path, where, f"HDF5 says {printable(error, 120)}", DAMAGED) from error
+
+
+def check_file(path: Path) -> None:
+    """Refuse what is not a whole HDF5 file with checksums, without calling the library."""
+    head = _first_bytes(path)
+    if not head:
+        raise problem(path, "file", "is empty", "check the recorder, or take another copy")
+    if not head.startswith(SIGNATURE):
+        what, todo = _foreign_kind(head)
+        raise problem(path, "file", what, todo)
+    _check_superblock(path, head)
+
+
+def _first_bytes(path: Path) -> bytes:
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise problem(path, "file", "is a folder", "name the .h5 file in it")
+        if not stat.S_ISREG(mode):
+            raise problem(path, "file", "is not a regular file", "name a .h5 file")
+        with path.open("rb") as stream:
+            return stream.read(512)
+    except FileNotFoundError:
+        raise problem(path, "file", "does not exist", "check the name and the folder") from None
+    except OSError as error:
+        raise problem(path, "file", f"cannot be read ({error.strerror})", "check access") from error
+
+
+def _foreign_kind(head: bytes) -> tuple[str, str]:
+    """What a file without the HDF5 signature looks like, and what to do about it."""
+    sessions = "give a session file (.h5)"
+    if head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
+        return "is a Python pickle, which could run any code", "it is never read; " + sessions
+    if head.startswith((b"\x93NUMPY", b"PK\x03\x04")):
+        return "is a NumPy or zip file, not HDF5", sessions
+    if head.startswith(b"CDF"):
+        return "is a classic netCDF file, not HDF5", "convert it with `nccopy -k nc4`"
+    if head.startswith(b"\x1f\x8b"):
+        return "is a gzip file, not HDF5", "unpack it, or use `jaxeit import csv` for a table"
+    if all(32 <= b < 127 or b in b"\t\r\n" or b >= 128 for b in head):
+        return "is text, not HDF5; it looks like CSV", "use `jaxeit import csv`"
+    return "is not an HDF5 file", sessions
+
+
+def _check_superblock(path: Path, head: bytes) -> None:
+    """Version, lengths, open flag and end of file, as in the HDF5 format, section II.A."""
+    if len(head) < 48:
+        raise problem(path, "file", f"is truncated after {len(head)} bytes", DAMAGED)
+    version, offsets, lengths, flags = head[8:12]
+    if version != 3:
+        what = f"is in an older HDF5 layout (superblock {version}) without checksums"
+        raise problem(path, "file", what, REWRITE)
+    base, _, end, _ = struct.unpack("<4Q", head[12:44])
+    if (offsets, lengths, base) != (8, 8, 0):
+        raise problem(path, "file", "has an unusual HDF5 header", DAMAGED)
+    if flags:
+        raise problem(path, "file", "was never closed by its writer", "use `jaxeit recover`")
+    size = path.stat().st_size
+    if end > size:
+        what = f"is truncated: {size:,} of {end:,} bytes are there"
+        raise problem(path, "file", what, "copy it again, or use `jaxeit recover`")
+
+
+def open_guarded(path: Path) -> h5py.File:
+    """The file, opened for reading after `check_file`; raises `SessionError`."""
+    check_file(path)
+    with translated(path, "file"):
+        return h5py.File(path, "r", locking="best-effort", rdcc_nbytes=1 << 20)
+
+
+@dataclass(frozen=True)
+class Node:
+    """A group or dataset that has been reached through the door: its file, its path, its handle."""
+
+    path: Path
+    where: str
+    id: h5g.GroupID | h5d.DatasetID
+    budget: Budget
+
+    def error(self, what: str, todo: str) -> Exception:
+        """A `SessionError` about this node."""
+        return problem(self.path, self.where, what, todo)
+
+    def child(self, name: str) -> "Node | None":
+        """The member `name`, or None; links to elsewhere are refused by name."""
+        where = f"{self.where.rstrip('/')}/{name}"
+        with translated(self.path, where):
+            if not self.id.links.exists(name.encode()):
+                return None
+            kind = self.id.links.get_info(name.encode()).type
+            if kind != h5l.TYPE_HARD:
+                what = f"is {_link_kind(kind)}, which may lead out of the file"
+                raise problem(self.path, where, what, "store the data itself in the file")
+            opened = h5o.open(self.id, name.encode())
+        if not isinstance(opened, h5g.GroupID | h5d.DatasetID):
+            raise problem(self.path, where, "is neither group nor dataset", DAMAGED)
+        return Node(self.path, where, opened, self.budget)
+
+    def group(self, name: str) -> "Node | None":
+        """The member `name` as a group, or None."""
+        node = self.child(name)
+        if node is not None and not isinstance(node.id, h5g.GroupID):
+            raise node.error("is a dataset where a group belongs", "see data/schema/README.md")
+        return node
+
+    def dataset(self, name: str) -> "Node | None":
+        """The member `name` as a dataset, or None."""
+        node = self.child(name)
+        if node is not None and not isinstance(node.id, h5d.DatasetID):
+            raise node.error("is a group where a dataset belongs", "see data/schema/README.md")
+        return node
+
+    def members(self, limit: int = MAX_MEMBERS) -> list[str]:
+        """Names of the members, sorted; refused before listing if there are more than `limit`."""
+        with translated(self.path, self.where):
+            count = self.id.get_num_objs()
+            if count > limit:
+                what = f"has {count:,} members, the limit is {limit:,}"
+                raise self.error(what, "not a file of this program; name another")
+            names: list[bytes] = []
+            self.id.links.iterate(names.append)
+            return sorted(name.decode() for name in names)
+
+    def attribute_names(self) -> list[str]:
+        """Names of the attributes, sorted; refused if there are more than `MAX_ATTRIBUTES`."""
+        with translated(self.path, self.where):
+            count = h5a.get_num_attrs(self.id)
+            if count > MAX_ATTRIBUTES:
+                what = f"has {count:,} attributes, the limit is {MAX_ATTRIBUTES}"
+                raise self.error(what, "not a file of this program; name another")
+            found = [h5a.open(self.id, index=i).name for i in range(count)]
+            return sorted(n.decode() if isinstance(n, bytes) else n for n in found)
+
+    def attribute(self, name: str) -> str | int | float | np.ndarray | None:
+        """The attribute's value, or None if it is not there; `SessionError` for other types."""
+        with translated(self.path, f"{self.where}@{name}"):
+            if not h5a.exists(self.id, name.encode()):
+                return None
+            return _attribute_value(self, name, h5a.open(self.id, name.encode()))
+
+    def plain_attributes(self) -> dict[str, str | int | float]:
+        """Every attribute that is one number or one fixed-length text; others are left alone."""
+        found = {}
+        for name in self.attribute_names():
+            with contextlib.suppress(ValueError):
+                value = self.attribute(name)
+                if isinstance(value, str | int | float):
+                    found[name] = value
+        return found
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """A text attribute; `SessionError` if it is missing (without default) or not a text."""
+        value = self.attribute(name)
+        if value is None and default is not None:
+            return default
+        if not isinstance(value, str):
+            what = f"attribute {name} is {'missing' if value is None else 'not a text'}"
+            raise self.error(what, f"write {name} as a fixed-length text")
+        return value
+
+    def number(self, name: str, default: float | None = None) -> float | int:
+        """A finite number attribute; `SessionError` if missing (without default) or not one."""
+        value = self.attribute(name)
+        if value is None and default is not None:
+            return default
+        if not isinstance(value, int | float) or not np.isfinite(value):
+            what = f"attribute {name} is {'missing' if value is None else 'not a finite number'}"
+            raise self.error(what, f"write {name} as one number")
+        return value
+
+
+def _link_kind(kind: int) -> str:
+    names = {h5l.TYPE_SOFT: "a soft link", h5l.TYPE_EXTERNAL: "an external link"}
+    return names.get(kind, "a user-defined link")
+
+
+def _attribute_value(
+    node: Node, name: str, attr: h5a.AttrID
+) -> str | int | float | np.ndarray | None:
+    """Read one attribute of a plain type and modest size."""
+    kind, shape = attr.get_type(), attr.get_space()
+    size = attr.get_storage_size()
+    items = shape.get_simple_extent_npoints() if shape.get_simple_extent_type() != 2 else 0
+    if size > MAX_ATTRIBUTE_BYTES or items > MAX_ATTRIBUTE_ITEMS:
+        raise node.error(f"attribute {name} holds {size:,} bytes", "keep attributes small")
+    if not plain_type(kind) or items < 1 or len(attr.shape) > 1:
+        what = f"attribute {name} is {type_kind(kind)}"
+        raise node.error(what, "write one number or one fixed-length text")
+    value = np.zeros(attr.shape, kind.dtype)
+    attr.read(value)
+    if kind.get_class() == h5t.STRING:
+        return np.char.decode(value, "utf-8") if attr.shape else bytes(value[()]).decode()
+    return value[()].item() if not attr.shape else value
+
+
+def plain_type(kind: h5t.TypeID) -> bool:
+    """Whether an HDF5 type is an ordinary integer, float or fixed-length text."""
+    if kind.get_class() == h5t.STRING:
+        return not kind.is_variable_str()
+    if kind.get_class() not in (h5t.INTEGER, h5t.FLOAT) or kind.get_size() not in (1, 2, 4, 8):
+        return False
+    return h5t.py_create(kind.dtype).equal(kind)
+
+
+def type_kind(kind: h5t.TypeID) -> str:
+    """A few words for an HDF5 type that is refused."""
+    if kind.get_class() == h5t.STRING and kind.is_variable_str():
+        return "a variable-length text"
+    names = {
+        h5t.VLEN: "of variable length",
+        h5t.REFERENCE: "an object reference",
+        h5t.COMPOUND: "a compound type",
+        h5t.OPAQUE: "opaque bytes",
+        h5t.ENUM: "an enumeration (h5py writes bool as one)",
+        h5t.ARRAY: "an array type",
+    }
+    return names.get(kind.get_class(), "of an unusual type, shape or size")
+
+
+def root_node(file: h5py.File, path: Path) -> Node:
+    """The root group of an opened file as a `Node` with a fresh `Budget`."""
+    with translated(path, "file"):
+        return Node(path, "/", h5g.open(file.id, b"/"), Budget(path))

@@ -1,0 +1,116 @@
+"""Curves: bounds, inverses, gradients, starts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calib.curves import CURVES, Affine, Linear, PowerLaw, Scale, curve_name, resistant_line, scale_of
+
+CASES = [
+    (Linear(), [4e-3]),
+    (Affine(), [4e-3, -2.0]),
+    (PowerLaw(2000.0), [4e-3, 0.6]),
+    (PowerLaw(2000.0), [4e-3, 1.7]),
+]
+
+
+def some_scale():
+    return Scale(*(jnp.asarray(x) for x in (3000.0, 2000.0, 1500.0, 15.0)))
+
+
+@pytest.mark.parametrize(("curve", "params"), CASES)
+def test_inverse_undoes_the_curve(curve, params):
+    pressure = jnp.linspace(10.0, 5000.0, 40)
+    params = jnp.asarray(params)
+    np.testing.assert_allclose(curve.inverse(params, curve(params, pressure)), pressure, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("curve", "params"), CASES)
+def test_free_and_bound_are_inverses(curve, params):
+    free = curve.free(jnp.asarray(params), some_scale())
+    np.testing.assert_allclose(curve.bound(free, some_scale()), params, rtol=1e-12)
+    assert np.abs(free).max() < 10
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_every_curve_rises_whatever_its_free_parameters(name):
+    curve = CURVES[name]().at(some_scale())
+    pressure = jnp.linspace(1.0, 6000.0, 200)
+    for free in np.random.default_rng(0).normal(0, 2, (20, curve.size)):
+        params = curve.bound(jnp.asarray(free), some_scale())
+        assert np.diff(curve(params, pressure)).min() > 0
+    assert curve_name(curve) == name
+    assert len(curve.names) == len(curve.units) == curve.size
+
+
+def test_power_law_is_the_textbook_formula():
+    pressure = np.linspace(1.0, 5000.0, 50)
+    expected = 4e-3 * 2000.0 * (pressure / 2000.0) ** 0.6
+    np.testing.assert_allclose(PowerLaw(2000.0)(jnp.array([4e-3, 0.6]), pressure), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("exponent", [0.3, 1.0, 2.5])
+def test_power_law_is_zero_with_finite_gradients_at_and_below_zero(dtype, exponent):
+    curve, params = PowerLaw(2000.0), jnp.array([4e-3, exponent], dtype)
+    pressure = jnp.array([-1e5, -1e-30, 0.0, 1e-30, 1e-3], dtype)
+    slopes = jax.jit(jax.vmap(jax.grad(curve, (0, 1)), (None, 0)))(params, pressure)
+    force = curve(params, pressure)
+    assert force.dtype == dtype
+    assert (force[:3] == 0).all()
+    assert force[4] > 0
+    for part in (*slopes, jax.jit(jax.hessian(curve))(params, pressure[2])):
+        assert np.isfinite(part).all()
+
+
+@pytest.mark.parametrize(("curve", "params"), CASES)
+def test_nan_pressure_gives_nan_force(curve, params):
+    force = curve(jnp.asarray(params), jnp.array([1.0, jnp.nan]))
+    assert np.isfinite(force[0])
+    assert np.isnan(force[1])
+    assert np.isnan(curve.inverse(jnp.asarray(params), jnp.nan))
+
+
+@pytest.mark.parametrize(("curve", "params"), CASES)
+def test_start_is_near_and_not_moved_by_a_fifth_of_outliers(curve, params):
+    pressure = np.random.default_rng(1).uniform(0, 4000, 400)
+    force = np.array(curve(jnp.asarray(params), pressure))
+    force[::5] += 200.0
+    valid = jnp.ones(400, bool)
+    scale = scale_of(pressure, force, valid)
+    start = curve.initial(pressure, force, valid, scale)
+    error = curve(start, pressure) - curve(jnp.asarray(params), pressure)
+    assert np.abs(error).max() < 0.25 * np.ptp(force[1::5])
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_start_is_finite_for_hopeless_samples(name):
+    for force in (np.zeros(5), -np.arange(5.0), np.full(5, 7.0)):
+        for valid in (np.ones(5, bool), np.zeros(5, bool)):
+            pressure = np.linspace(-3.0, 3.0, 5)
+            scale = scale_of(pressure, force, valid)
+            curve = CURVES[name]().at(scale)
+            free = curve.free(curve.initial(pressure, force, jnp.asarray(valid), scale), scale)
+            assert np.isfinite(free).all()
+
+
+def test_scale_ignores_a_spike_and_masked_samples():
+    pressure, force = np.full(100, 1000.0), np.full(100, 5.0)
+    pressure[0], force[0] = 1e12, 1e12
+    valid = np.arange(100) < 60
+    pressure[80:] = np.nan
+    scale = scale_of(pressure, force, valid)
+    assert float(scale.pressure) == 1000.0
+    assert float(scale.force) == 5.0
+
+
+def test_resistant_line_is_exact_on_a_line():
+    x = jnp.linspace(-3.0, 9.0, 31)
+    slope, intercept = resistant_line(x, 2.5 * x - 1, jnp.ones(31, bool))
+    np.testing.assert_allclose([slope, intercept], [2.5, -1.0], rtol=1e-12)
+
+
+def test_power_law_without_a_reference_says_what_to_do():
+    with pytest.raises(ValueError, match="give one"):
+        PowerLaw()(jnp.array([1e-3, 1.0]), jnp.array(1.0))
