@@ -112,7 +112,12 @@ def calibrate(
         channels=channels,
     )
     curves = fit_curves(
-        curve, data.sample_pressure, data.sample_force, mask=data.mask, groups=data.sample_place, loss=loss
+        curve,
+        data.sample_pressure,
+        data.sample_force,
+        mask=data.mask,
+        groups=data.sample_place,
+        loss=loss,
     )
     _require_fits(skin, curves)
     held_out = _held_out(curve, data, folds, loss)
@@ -324,7 +329,9 @@ def _from_archive(archive: Archive) -> Calibration:
         extent=tuple(map(float, arrays["image/extent"])),  # type: ignore[arg-type]
     )
     provenance = {
-        k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")
+        k.removeprefix("provenance_"): str(v)
+        for k, v in attrs.items()
+        if k.startswith("provenance_")
     }
     curve = CURVES[provenance["curve"]]()
     if "pads/reference" in arrays:

@@ -10,6 +10,7 @@ import abc
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import reduce
+from itertools import pairwise
 
 import numpy as np
 from scipy import signal
@@ -57,7 +58,7 @@ def _pieces(time: np.ndarray, rate: float) -> list[slice]:
     """Runs of samples without a gap of more than five periods: a filter knows nothing of what was not sampled."""
     breaks = np.flatnonzero(np.diff(time) > 5e9 / rate) + 1
     edges = [0, *breaks.tolist(), len(time)]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 @dataclass(frozen=True)
@@ -124,14 +125,10 @@ class AbstractBaseline(abc.ABC):
     """What to take off a press, as weights of the mean before it and the mean after it."""
 
     @abc.abstractmethod
-    def weights(
-        self, time: np.ndarray, before: np.ndarray, after: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def weights(self, time: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weights of both rest means at `time`; `before` and `after` are the windows' centres (all ns)."""
 
-    def remove(
-        self, held: Estimate, before: Estimate, after: Estimate, centres: tuple[np.ndarray, ...]
-    ) -> Estimate:
+    def remove(self, held: Estimate, before: Estimate, after: Estimate, centres: tuple[np.ndarray, ...]) -> Estimate:
         """Held means with the baseline off; the three windows' errors are independent and add in squares.
 
         `centres`: (windows,) ns of the held, before and after windows.

@@ -248,9 +248,7 @@ class PowerLaw(AbstractCurve):
         slope, intercept = resistant_line(x, y, loaded)
         exponent = jnp.clip(jnp.nan_to_num(slope, nan=1.0), 0.2, 5.0)
         straight = _start_slope(pressure, force, valid, scale)
-        secant = jnp.where(
-            jnp.isfinite(slope) & (slope > 0), jnp.exp(intercept) * scale.force / p0, straight
-        )
+        secant = jnp.where(jnp.isfinite(slope) & (slope > 0), jnp.exp(intercept) * scale.force / p0, straight)
         return jnp.stack([secant, exponent])
 
 

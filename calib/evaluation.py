@@ -155,7 +155,10 @@ def _bootstrap(values: np.ndarray, statistic) -> float:
 def render_table(evaluation: Evaluation, title: str) -> str:
     """The results as a table for a terminal."""
     s = evaluation.summary()
-    lines = [f"{title}: {s['presses']:.0f} presses, forces held out by {evaluation.held_out_by}", ""]
+    lines = [
+        f"{title}: {s['presses']:.0f} presses, forces held out by {evaluation.held_out_by}",
+        "",
+    ]
     lines.append("  localisation, mm        mean  (+- SE)  median     p95   inward bias")
     for name in evaluation.estimated:
         mean, error, median, p95, inward = (

@@ -217,9 +217,7 @@ class FittedCurve(eqx.Module):
 
 
 @eqx.filter_jit
-def predict_pads(
-    fitted: FittedCurve, pressures: Float[Array, "pads n"], tolerance: float = 0.05
-) -> Prediction:
+def predict_pads(fitted: FittedCurve, pressures: Float[Array, "pads n"], tolerance: float = 0.05) -> Prediction:
     """`FittedCurve.predict` for every pad of a batch: pressures (pads, n) -> arrays (pads, n)."""
     return eqx.filter_vmap(lambda f, p: f.predict(p, tolerance))(fitted, pressures)
 
@@ -250,9 +248,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     rtol: float
     atol: float
     norm: Callable = optx.max_norm
-    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(
-        linear_solver=lx.Normal(lx.Cholesky())
-    )
+    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Normal(lx.Cholesky()))
     search: TypedTrustRegion = TypedTrustRegion()
     verbose: Callable = _silent
 
@@ -286,9 +282,7 @@ def _solve(curve, samples, scale, start, loss, solver, max_steps, rounds):
 
     def one_round(free, _):
         spread = _spread(free, curve, samples, scale)
-        solution = optx.least_squares(
-            objective, solver, free, spread, max_steps=max_steps, throw=False
-        )
+        solution: optx.Solution = optx.least_squares(objective, solver, free, spread, max_steps=max_steps, throw=False)
         ended = solution.result == optx.RESULTS.successful
         return solution.value, (spread, ended)
 
@@ -435,18 +429,14 @@ def fit_samples(
 @eqx.filter_jit
 def _fit_batch(curve, samples, loss, solver, n_groups, max_steps, rounds):
     return eqx.filter_vmap(
-        lambda s: fit_samples(
-            curve, s, loss, solver, n_groups=n_groups, max_steps=max_steps, rounds=rounds
-        )
+        lambda s: fit_samples(curve, s, loss, solver, n_groups=n_groups, max_steps=max_steps, rounds=rounds)
     )(samples)
 
 
 def _floats(values, what: str, dtype) -> Array:
     """Host values -> device array of `dtype` (None: as they come), refusing a silent loss of precision."""
-    if dtype is not None and np.dtype(dtype) == np.float64 and not jax.config.jax_enable_x64:
-        raise FitError(
-            "float64 was asked for but JAX has 64-bit numbers off; set JAX_ENABLE_X64=1 or ask for float32."
-        )
+    if dtype is not None and np.dtype(dtype) == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise FitError("float64 was asked for but JAX has 64-bit numbers off; set JAX_ENABLE_X64=1 or ask for float32.")
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise FitError(f"{what} must be numbers, not {array.dtype}.")
@@ -454,7 +444,7 @@ def _floats(values, what: str, dtype) -> Array:
     return jnp.asarray(array, jax.dtypes.canonicalize_dtype(own if dtype is None else dtype))
 
 
-def _broadcast(array: Array, shape: tuple[int, int], what: str) -> Array:
+def _broadcast(array: Array, shape: tuple[int, ...], what: str) -> Array:
     try:
         return jnp.broadcast_to(array, shape)
     except ValueError:
@@ -528,14 +518,10 @@ def fit_curves(
 
     Raises: `FitError` for shapes that do not fit together, or sigma not above zero.
     """
-    samples, n_groups = gather(
-        pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype
-    )
+    samples, n_groups = gather(pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype)
     loss = SoftL1() if loss is None else loss
     solver = default_solver(samples.pressure.dtype) if solver is None else solver
-    return _fit_batch(
-        curve, _fill(samples), loss, solver, bucket(n_groups) if n_groups else 0, max_steps, 4
-    )
+    return _fit_batch(curve, _fill(samples), loss, solver, bucket(n_groups) if n_groups else 0, max_steps, 4)
 
 
 def fit_curve(curve: AbstractCurve, pressure, force, *, groups=None, mask=None, **options) -> FittedCurve:

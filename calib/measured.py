@@ -1,6 +1,6 @@
 """What a session says about each press, in the terms that a calibration needs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from .presses import (
     Windows,
     check_overlap,
     find_presses,
+    index_ranges,
     locate,
     press_means,
     press_samples,
@@ -96,7 +97,8 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
     streams = {name: session.stream(name) for name in ("eit", "pressure", "force")}
     _require_skin(session, skin, streams)
     presses = _presses(session, streams["force"])
-    windows = press_windows(presses, processing.cutting)
+    end = min(int(stream.time[-1]) + 1 for stream in streams.values())
+    windows = press_windows(presses, processing.cutting, end)
     presses = check_overlap(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
     means = {
@@ -233,3 +235,56 @@ def _set_aside(presses: PressTable) -> list[str]:
     return [f"{len(bad)} of {len(presses)} presses set aside ({first})"]
 
 
+def resting_levels(
+    session: Session, skin: je.Skin, processing: Processing
+) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """For the eit and pressure streams, the level without contact at any time: times ns -> values.
+
+    Straight lines between the means of the rest windows around the presses, constant outside them;
+    where no presses are known, the mean of the first second.
+
+    Raises:
+        SessionError: if the session was not recorded on this skin, or a stream is missing.
+    """
+    streams = {name: session.stream(name) for name in ("eit", "pressure")}
+    _require_skin(session, skin, streams)
+    return {
+        name: _level(stream, _rests(session, stream, processing))
+        for name, stream in streams.items()
+    }
+
+
+def _rests(session: Session, stream: Stream, processing: Processing) -> np.ndarray:
+    """Rest windows in time, (rests, 2) ns."""
+    table = session.presses
+    if table is None or not len(table):
+        start = int(stream.time[0])
+        return np.array([[start, start + 1_000_000_000]])
+    windows = press_windows(table, processing.cutting, int(stream.time[-1]) + 1)
+    both = np.concatenate([windows.rest_before, windows.rest_after])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    ranges = index_ranges(stream.time, both)
+    return both[ranges[:, 1] > ranges[:, 0]]
+
+
+def _level(stream: Stream, rests: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    means = [_mean(stream, span) for span in index_ranges(stream.time, rests)]
+    centres = rests.astype(float).mean(1)
+
+    def level(time: np.ndarray) -> np.ndarray:
+        right = np.clip(np.searchsorted(centres, time), 1, max(len(centres) - 1, 1))
+        left = right - 1
+        right = np.minimum(right, len(centres) - 1)
+        step = np.where(right > left, centres[right] - centres[left], 1.0)
+        share = np.clip((time - centres[left]) / step, 0.0, 1.0)[:, None]
+        table = np.array(means)
+        return (1 - share) * table[left] + share * table[right]
+
+    return level
+
+
+def _mean(stream: Stream, span: np.ndarray) -> np.ndarray:
+    values = stream.read(int(span[0]), int(span[1]))
+    count = np.isfinite(values).sum(0)
+    total = np.where(np.isfinite(values), values, 0.0).sum(0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -335,16 +335,17 @@ def _ns(seconds: float) -> int:
     return round(seconds * SECOND)
 
 
-def press_windows(presses: Presses, cutting: Cutting | None = None) -> Windows:
-    """Windows of every press, accepted or not. Rest windows never reach into a neighbouring press."""
+def press_windows(presses: Presses, cutting: Cutting | None = None, end: int | None = None) -> Windows:
+    """Windows of every press, accepted or not. Rest windows never reach into a neighbouring press,
+    nor beyond `end` (ns), where the recording stops."""
     c = Cutting() if cutting is None else cutting
     guard = _ns(c.guard)
     press, hold0, hold1, release = (
-        np.asarray(t, np.int64)
-        for t in (presses.t_press, presses.t_hold0, presses.t_hold1, presses.t_release)
+        np.asarray(t, np.int64) for t in (presses.t_press, presses.t_hold0, presses.t_hold1, presses.t_release)
     )
     previous = np.concatenate([[np.iinfo(np.int64).min // 2], release[:-1]])
-    following = np.concatenate([press[1:], [np.iinfo(np.int64).max // 2]])
+    last = np.iinfo(np.int64).max // 2 if end is None else end + guard
+    following = np.concatenate([press[1:], [last]])
     before = press - guard
     after = np.minimum(release + _ns(c.recovery), following - guard)
     end = np.maximum(hold1 - guard, hold0)
@@ -380,9 +381,7 @@ def check_overlap(presses: P, windows: Windows, streams: Iterable[Readable], bas
         for name in needed:
             times = getattr(windows, name)
             empty = np.diff(index_ranges(stream.time, times), axis=1)[:, 0] == 0
-            presses = reject(
-                presses, [f"no {noun} {_said(w)}" if e else "" for w, e in zip(times, empty, strict=True)]
-            )
+            presses = reject(presses, [f"no {noun} {_said(w)}" if e else "" for w, e in zip(times, empty, strict=True)])
     return presses
 
 
@@ -460,10 +459,7 @@ def press_means(
 def _column(parts: list[Estimate], k: int, width: int) -> Estimate:
     """The k-th window of every press."""
     return Estimate(
-        *(
-            np.array([getattr(p, f.name)[k] for p in parts]).reshape(len(parts), width)
-            for f in fields(Estimate)
-        )
+        *(np.array([getattr(p, f.name)[k] for p in parts]).reshape(len(parts), width) for f in fields(Estimate))
     )
 
 
@@ -541,10 +537,7 @@ def press_samples(
     Of a force stream of several columns the first is taken. Missing samples are NaN in either.
     """
     rule = TwoSided() if baseline is None else baseline
-    rows = [
-        _one_press(force, pressure, windows, int(i), rule, corrections)
-        for i in np.flatnonzero(presses.accepted)
-    ]
+    rows = [_one_press(force, pressure, windows, int(i), rule, corrections) for i in np.flatnonzero(presses.accepted)]
     if not rows:
         none = np.empty(0, int)
         return PressSamples(none, np.empty((0, pressure.channels)), np.empty(0), none, none)
@@ -596,8 +589,7 @@ def _rise(stream: Readable, windows: Windows, i: int, fraction: float, correctio
     time, values = _off_baseline(stream, windows, i, TwoSided(), corrections)
     signal = _magnitude(values)
     rest, hold = (
-        float(signal[slice(*index_ranges(time, getattr(windows, name)[i]))].mean())
-        for name in ("rest_before", "hold")
+        float(signal[slice(*index_ranges(time, getattr(windows, name)[i]))].mean()) for name in ("rest_before", "hold")
     )
     stop = np.searchsorted(time, windows.hold[i, 0])
     return crossing(time[:stop], signal[:stop], rest + fraction * (hold - rest)) - windows.ramp[i, 0]

@@ -311,4 +311,3 @@ def _one_signal(signals, force, train, curve, channels) -> tuple[np.ndarray, str
     choose = BlendChannels() if channels is None else channels
     make, source = choose(signals[train], force[train], curve)
     return make(signals), source
-

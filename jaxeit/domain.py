@@ -286,9 +286,7 @@ def _signed_area(points: np.ndarray) -> float:
 
 def _require_polygon(points: np.ndarray) -> None:
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
-        raise ValueError(
-            f"Polygon: vertices have shape {points.shape}; give three or more (x, y) pairs"
-        )
+        raise ValueError(f"Polygon: vertices have shape {points.shape}; give three or more (x, y) pairs")
     if not np.all(np.isfinite(points)):
         row = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
         raise ValueError(f"Polygon: vertex {row} is {points[row]}; give finite metres")
@@ -316,9 +314,7 @@ def _require_simple(points: np.ndarray) -> None:
 def _meeting_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     n = len(points)
     first, second = np.triu_indices(n, 1)
-    distance = _segment_distance(
-        points[first], points[(first + 1) % n], points[second], points[(second + 1) % n]
-    )
+    distance = _segment_distance(points[first], points[(first + 1) % n], points[second], points[(second + 1) % n])
     neighbours = (second == first + 1) | ((first == 0) & (second == n - 1))
     meet = np.where(neighbours, _folds_back(points, first, second), distance <= tolerance)
     return first[meet], second[meet]
@@ -342,9 +338,7 @@ def _segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray
             _point_segment(d, a, b),
         ]
     ).min(0)
-    crosses = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (
-        cross(d - c, a - c) * cross(d - c, b - c) < 0
-    )
+    crosses = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (cross(d - c, a - c) * cross(d - c, b - c) < 0)
     return np.where(crosses, 0.0, ends)
 
 

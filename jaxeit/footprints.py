@@ -40,9 +40,7 @@ class DiscFootprint:
     def __post_init__(self):
         _require_position("DiscFootprint", self.position)
         if not (np.isfinite(self.radius) and self.radius > 0):
-            raise ValueError(
-                f"DiscFootprint: radius is {self.radius}; give a positive length in metres"
-            )
+            raise ValueError(f"DiscFootprint: radius is {self.radius}; give a positive length in metres")
         if not _halves_to_a_hub(self.segments):
             raise ValueError(
                 f"DiscFootprint: segments is {self.segments}; give 6 to 12 times a power of two, "
@@ -99,9 +97,7 @@ def require_placed(domain: Domain, footprints: Sequence[Footprint]) -> None:
 
 def _name(index: int, footprint: Footprint) -> str:
     if isinstance(footprint, ArcFootprint):
-        return (
-            f"electrode {index} (arc {1e3 * footprint.start:.2f} to {1e3 * footprint.stop:.2f} mm)"
-        )
+        return f"electrode {index} (arc {1e3 * footprint.start:.2f} to {1e3 * footprint.stop:.2f} mm)"
     kind = "disc" if isinstance(footprint, DiscFootprint) else "point"
     return f"electrode {index} ({kind} at {place(np.asarray(footprint.position))})"
 

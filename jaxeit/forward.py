@@ -74,6 +74,8 @@ def conductivity(
     Args:
         pressure: on the sheet, (elements,) Pa; default: none.
     """
+    if not any(isinstance(effect, AbstractSheetEffect) for effect in model.effects):
+        return model.background  # nothing to compute: the program is that of the ideal sensor
     pressure = jnp.zeros_like(model.background) if pressure is None else pressure
     sheet = Sheet(model.background, pressure, model.centroids)
     return fold(model.effects, AbstractSheetEffect, sheet).sigma

@@ -97,9 +97,7 @@ def _size_samples(domain: Domain, size: SizeField) -> np.ndarray:
     return np.concatenate([once, once + domain.perimeter])
 
 
-def _divide(
-    domain: Domain, start: float, stop: float, size: SizeField, samples: np.ndarray
-) -> np.ndarray:
+def _divide(domain: Domain, start: float, stop: float, size: SizeField, samples: np.ndarray) -> np.ndarray:
     """``start`` and nodes up to, not including, ``stop``, evenly spread in the integral of 1/h."""
     inside = samples[(samples > start) & (samples < stop)]
     s = np.concatenate([[start], inside, np.linspace(start, stop, 33)[1:-1], [stop]])
@@ -126,9 +124,7 @@ def fill(domain: Domain, size: SizeField) -> np.ndarray:
     return points[np.lexsort((points[:, 0], points[:, 1], -level))]
 
 
-def _lattice_points(
-    extent: np.ndarray, middle: np.ndarray, size: SizeField
-) -> Iterator[tuple[int, np.ndarray]]:
+def _lattice_points(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[tuple[int, np.ndarray]]:
     """Points of each lattice where its level is the wanted one: (level, points (n, 2))."""
     for side, centres, wanted in _cells(extent, middle, size):
         reach = size.slope * side / np.sqrt(2)
@@ -140,9 +136,7 @@ def _lattice_points(
             yield level, points[size.level(size(points)) == level]
 
 
-def _cells(
-    extent: np.ndarray, middle: np.ndarray, size: SizeField
-) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+def _cells(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Leaves of a quadtree no larger than about four wanted edges: (side, centres, sizes there)."""
     side = 2.0 * size.cap
     counts = np.ceil(extent / side + 1e-9).astype(int)

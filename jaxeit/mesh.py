@@ -26,8 +26,8 @@ from .footprints import (
     require_placed,
 )
 from .grading import SizeField, divide_rim, fill, narrow_places, thin
-from .smoothing import Problem, relax
-from .triangles import Mesh, MeshError, Surface
+from .smoothing import Problem, missing_edges, relax
+from .triangles import Mesh, MeshError, Surface, place
 
 __all__ = [
     "ArcFootprint",
@@ -91,7 +91,18 @@ def triangulate(
     free = fill(domain, size)
     free = free[problem.open_to(free)]
     points, triangles = relax(problem, thin(free, problem.fixed, 0.72 * size(free)))
+    _require_followed(problem, triangles)
     return Mesh(points, triangles).check()
+
+
+def _require_followed(problem: Problem, triangles: np.ndarray) -> None:
+    missing = missing_edges(problem, triangles)
+    if len(missing):
+        where = problem.fixed[missing[0]].mean(0)
+        raise MeshError(
+            f"triangulate: the mesh cannot follow the outline at {place(where)}; use a shorter "
+            "edge_length there, or move what is crowded apart"
+        )
 
 
 def _lengths(domain: Domain, edge_length: float, growth: float, edge: float | None) -> float:
@@ -121,16 +132,10 @@ def _subdivided(domain: Domain, footprints: list[Footprint], edge_length: float)
     ]
 
 
-def _subdivide(
-    domain: Domain, disc: DiscFootprint, others: list[Footprint], edge_length: float
-) -> DiscFootprint:
+def _subdivide(domain: Domain, disc: DiscFootprint, others: list[Footprint], edge_length: float) -> DiscFootprint:
     position = np.asarray(disc.position, float)
     room = [float(domain.boundary_distance(position[None])[0])]
-    room += [
-        float(np.linalg.norm(position - f.position)) - reach(f)
-        for f in others
-        if not isinstance(f, ArcFootprint)
-    ]
+    room += [float(np.linalg.norm(position - f.position)) - reach(f) for f in others if not isinstance(f, ArcFootprint)]
     gap, segments = min(room) - reach(disc), disc.segments
     while 2 * np.pi * disc.radius / segments > 1.3 * min(edge_length, gap):
         segments *= 2
@@ -182,9 +187,7 @@ def _size_field(
     )
 
 
-def _features(
-    domain: Domain, footprints: list[Footprint], rim: np.ndarray, cap: float, fine: float
-) -> list[_Feature]:
+def _features(domain: Domain, footprints: list[Footprint], rim: np.ndarray, cap: float, fine: float) -> list[_Feature]:
     """One per disc, point, arc end and fixed node of the rim, with the edge length asked there."""
     features = [_Feature(p, 0.0, cap) for p in domain.boundary_point(rim)]
     for f in footprints:
@@ -212,22 +215,15 @@ def _fitted(features: list[_Feature], domain: Domain) -> list[_Feature]:
     rim = domain.boundary_distance(centres) - radii
     rim[rim <= 4 * domain.tolerance] = np.inf
     room = np.minimum(gaps.min(1), rim)
-    return [
-        _Feature(f.centre, f.radius, min(f.size, r))
-        for f, r in zip(features, room.tolist(), strict=True)
-    ]
+    return [_Feature(f.centre, f.radius, min(f.size, r)) for f, r in zip(features, room.tolist(), strict=True)]
 
 
-def _problem(
-    domain: Domain, footprints: list[Footprint], rim: np.ndarray, size: SizeField
-) -> Problem:
+def _problem(domain: Domain, footprints: list[Footprint], rim: np.ndarray, size: SizeField) -> Problem:
     """Fixed nodes and the edges between them: the rim, then each footprint's own."""
     around = domain.boundary_point(divide_rim(domain, rim, size))
     own = [_own_nodes(domain, f) for f in footprints]
     first = len(around) + np.cumsum([0, *map(len, own)])
-    discs = [
-        (k, f) for k, f in zip(first, footprints, strict=False) if isinstance(f, DiscFootprint)
-    ]
+    discs = [(k, f) for k, f in zip(first, footprints, strict=False) if isinstance(f, DiscFootprint)]
     return Problem(
         domain=domain,
         size=size,
@@ -267,9 +263,7 @@ def _disc_nodes(disc: DiscFootprint) -> np.ndarray:
     return np.asarray(disc.position) + np.concatenate([*rings, np.zeros((1, 2))])
 
 
-def _open_to(
-    domain: Domain, discs: list[DiscFootprint], size: SizeField, points: np.ndarray
-) -> np.ndarray:
+def _open_to(domain: Domain, discs: list[DiscFootprint], size: SizeField, points: np.ndarray) -> np.ndarray:
     """Whether a free node may be put at each of points: inside, off the rim and off the discs."""
     wanted = size(points)
     allowed = domain.contains(points) & (domain.boundary_distance(points) > 0.45 * wanted)
@@ -295,9 +289,7 @@ class Pattern(Enum):
     CROSSED = "crossed"
 
 
-def structured(
-    rectangle: Rectangle, nx: int, ny: int, *, pattern: Pattern = Pattern.ALTERNATING
-) -> Mesh:
+def structured(rectangle: Rectangle, nx: int, ny: int, *, pattern: Pattern = Pattern.ALTERNATING) -> Mesh:
     """A regular mesh of nx by ny cells.
 
     Node ``j (nx + 1) + i`` is at column i of row j (rows upward, y outer, x inner); for
@@ -323,9 +315,7 @@ def structured(
 def _require_counts(nx: int, ny: int) -> None:
     for name, value in {"nx": nx, "ny": ny}.items():
         if value != int(value) or value < 1:
-            raise ValueError(
-                f"structured: {name} is {value}; give a whole number of cells, 1 or more"
-            )
+            raise ValueError(f"structured: {name} is {value}; give a whole number of cells, 1 or more")
 
 
 def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:

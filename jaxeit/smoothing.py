@@ -72,16 +72,21 @@ def _first(entry: tuple[float, np.ndarray, np.ndarray]) -> float:
 
 def quality(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> float:
     """Smallest angle in degrees, or -1 where an edge of the rim or of a ring is missing."""
-    return float(corner_angles(points[triangles]).min()) if _follows(problem, triangles) else -1.0
+    if len(missing_edges(problem, triangles)):
+        return -1.0
+    return float(corner_angles(points[triangles]).min())
 
 
-def _follows(problem: Problem, triangles: np.ndarray) -> bool:
+def missing_edges(problem: Problem, triangles: np.ndarray) -> np.ndarray:
+    """Edges (k, 2) of the rim and the rings that no triangle has, or of the rim with triangles
+    beyond them."""
     directed = directed_edges(triangles)
     # Only edges between fixed nodes can be among those looked for.
     present = edge_keys(directed[(directed < len(problem.fixed)).all(1)])
-    wanted = edge_keys(np.concatenate([problem.rim, problem.rings]))
-    beyond = edge_keys(problem.rim[:, ::-1])
-    return bool(np.isin(wanted, present).all() and not np.isin(beyond, present).any())
+    wanted = np.concatenate([problem.rim, problem.rings])
+    absent = wanted[~np.isin(edge_keys(wanted), present)]
+    crossed = problem.rim[np.isin(edge_keys(problem.rim[:, ::-1]), present)]
+    return np.concatenate([absent, crossed])
 
 
 def edge_keys(edges: np.ndarray) -> np.ndarray:
@@ -152,9 +157,7 @@ def _sweep(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.nd
     return moved
 
 
-def _vertex_means(
-    triangles: np.ndarray, values: np.ndarray, weights: np.ndarray, count: int
-) -> np.ndarray:
+def _vertex_means(triangles: np.ndarray, values: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
     """Weighted mean of triangle values (m, 2) around each of ``count`` nodes."""
     at, repeated = triangles.ravel(), np.repeat(weights, 3)
     total = np.bincount(at, repeated, count)
@@ -224,9 +227,7 @@ def _astray(problem: Problem, points: np.ndarray) -> np.ndarray:
     return astray
 
 
-def _polish(
-    problem: Problem, angle: float, points: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _polish(problem: Problem, angle: float, points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Raise the smallest angles by moving single nodes; never makes the smallest one smaller."""
     for _ in range(POLISHES):
         if angle >= GOOD_ANGLE:
@@ -242,9 +243,7 @@ def _polish(
     return points, triangles
 
 
-def _improve_stars(
-    points: np.ndarray, triangles: np.ndarray, fixed: int, reach: float
-) -> np.ndarray:
+def _improve_stars(points: np.ndarray, triangles: np.ndarray, fixed: int, reach: float) -> np.ndarray:
     """Move free nodes of poor triangles, no two in one triangle, to the best of eight places at
     ``reach`` times their mean edge, if that raises the smallest angle around them."""
     smallest = corner_angles(points[triangles]).min(1)
@@ -256,9 +255,7 @@ def _improve_stars(
     return _best_places(points, triangles, nodes, reach) if len(nodes) else points
 
 
-def _best_places(
-    points: np.ndarray, triangles: np.ndarray, nodes: np.ndarray, reach: float
-) -> np.ndarray:
+def _best_places(points: np.ndarray, triangles: np.ndarray, nodes: np.ndarray, reach: float) -> np.ndarray:
     row, corner = np.nonzero(np.isin(triangles, nodes))
     order = np.argsort(triangles[row, corner], kind="stable")
     row, corner = row[order], corner[order]
@@ -276,9 +273,7 @@ def _best_places(
     return moved
 
 
-def _star_angles(
-    places: np.ndarray, own: np.ndarray, others: np.ndarray, starts: np.ndarray
-) -> np.ndarray:
+def _star_angles(places: np.ndarray, own: np.ndarray, others: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Smallest angle around each node if put at ``places`` (k, 2); -1 where a triangle flips."""
     corners = np.concatenate([places[own, None], others], axis=1)
     angles = np.where(doubled_areas(corners) > 0, corner_angles(corners).min(1), -1.0)

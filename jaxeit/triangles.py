@@ -41,10 +41,7 @@ class Mesh:
         _set(self, "triangles", _array("triangles", self.triangles, np.int32, (3,)))
         _set(self, "chart", _array("chart", chart, np.float64, (2,)))
         if len(self.chart) != len(self.nodes):
-            raise MeshError(
-                f"mesh: {len(self.nodes)} nodes but {len(self.chart)} chart positions; give each "
-                "node one"
-            )
+            raise MeshError(f"mesh: {len(self.nodes)} nodes but {len(self.chart)} chart positions; give each node one")
 
     @cached_property
     def areas(self) -> np.ndarray:
@@ -135,8 +132,7 @@ def _on_surface(surface: Surface, chart: np.ndarray) -> np.ndarray:
     nodes = np.asarray(surface(chart), float)
     if nodes.shape != (len(chart), 3):
         raise MeshError(
-            f"mesh: the surface returned shape {nodes.shape} for {len(chart)} points; "
-            f"it must map (n, 2) to (n, 3)"
+            f"mesh: the surface returned shape {nodes.shape} for {len(chart)} points; it must map (n, 2) to (n, 3)"
         )
     return nodes
 

@@ -63,7 +63,11 @@ def fitted_power():
 
 @pytest.mark.parametrize(
     ("loss", "name", "width"),
-    [(SoftL1(), "soft_l1", 1.287), (Huber(), "huber", 1.345), (Cauchy(), "cauchy", 2.385)],
+    [
+        (SoftL1(), "soft_l1", 1.287),
+        pytest.param(Huber(), "huber", 1.345, marks=pytest.mark.slow),
+        pytest.param(Cauchy(), "cauchy", 2.385, marks=pytest.mark.slow),
+    ],
 )
 def test_robust_fit_is_scipys_at_the_same_scale(loss, name, width):
     pressure, force = (a[0] for a in pads())
@@ -143,7 +147,7 @@ def test_losses_are_what_they_are_called():
     }
     for kind, value in rho.items():
         loss = kind(2.0)
-        np.testing.assert_allclose(loss.transform(jnp.asarray(r)) ** 2, 4 * value, rtol=1e-12)
+        np.testing.assert_allclose(loss.transform(jnp.asarray(r)) ** 2, 4 * value, rtol=1e-10)
         h = 1e-5
         slope = (loss.transform(r + h) ** 2 - loss.transform(r - h) ** 2) / (4 * h)
         np.testing.assert_allclose(loss.psi(jnp.asarray(r)), slope, atol=1e-6)
@@ -229,6 +233,7 @@ def test_hopeless_samples_each_get_their_own_result():
     assert few.result[0] == FitResult.TOO_FEW
 
 
+@pytest.mark.slow
 def test_out_of_steps_says_so():
     pressure, force = pads()
     got = fit_curves(PowerLaw(2000.0), pressure, force, max_steps=1)
@@ -272,6 +277,7 @@ def test_wrong_shapes_and_weights_are_refused_in_one_line():
             call()
 
 
+@pytest.mark.slow
 def test_the_pure_fit_has_gradients():
     pressure, force = (a[:1, :60] for a in pads())
     samples, _ = gather(pressure, force)
@@ -383,11 +389,12 @@ def simulated_log(n=400):
     signals = load[:, None] * gains + rng.normal(0, [20.0, 8.0, 5.0], (n, 3))
     force = load.copy()
     force[::7] = np.nan
-    return np.arange(n) * 0.1, signals, force, load
+    return np.arange(n) * 0.1, signals, force
 
 
+@pytest.mark.slow
 def test_log_is_fitted_on_its_first_half_only_and_missing_forces_are_counted():
-    time, signals, force, load = simulated_log()
+    time, signals, force = simulated_log()
     best = fit_log(Linear(), time, signals, force, channels=BestChannel())
     blend = fit_log(Affine(), time, signals, force)
     assert best.source == "channel 1"
@@ -410,6 +417,7 @@ def real(*parts):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", ["Circle_1bar", "Circle_5bar", "O-ring257_3bar", "Stadium_1bar"])
 def test_pneumatic_logs_are_predicted_within_their_friction(log):
     rows = np.genfromtxt(real("pneumatic_actuator", f"{log}.csv.gz"))

@@ -520,6 +520,11 @@ def many_streams(file: h5py.File) -> None:
         file[f"streams/x{i}"] = h5py.SoftLink("/")
 
 
+def wide_root(file: h5py.File) -> None:
+    for i in range(2000):
+        file[f"x{i}"] = h5py.SoftLink("/")
+
+
 def many_attributes(file: h5py.File) -> None:
     for i in range(400):
         file.attrs[f"x{i}"] = i
@@ -578,6 +583,7 @@ REFUSED_FILES: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "chunks of 32 MB": (replace(FORCE, shape=(1 << 22, 1), dtype="f8", chunks=(1 << 22, 1)), "c"),
     "holes": (replace(FORCE, shape=(200, 1), dtype="f4"), "1 of 1 chunks missing"),
     "many streams": (many_streams, "has 5,002 members"),
+    "wide root": (wide_root, "members, the limit is 1,024"),
     "many attributes": (many_attributes, "attributes, the limit is 256"),
     "large attribute": (attribute("/", "title", np.bytes_("x" * 5_000_000)), "5,000,000 bytes"),
     "not UTF-8": (attribute("/", "title", np.bytes_(b"\xff\xfe")), "is not UTF-8"),

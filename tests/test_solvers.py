@@ -1,5 +1,7 @@
 """Linear solvers against SuperLU and dense algebra, on the shapes that break orderings."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,7 @@ from jaxeit.solvers import (
     solve_spd,
 )
 
-SOLVERS = [Dense(), NestedDissection(leaf_size=4), NestedDissection(leaf_size=6, merge=2)]
+SOLVERS = [Dense(), NestedDissection(leaf_size=4)]
 
 
 @pytest.fixture(autouse=True)
@@ -51,8 +53,8 @@ def square_sheet(side, contrast, conductances, seed=0):
     xy = np.stack(np.divmod(np.arange(side**2), side)[::-1], 1).astype(float)
     for number, g in enumerate(conductances):
         near = np.argsort(((xy - rng.uniform(0, side, 2)) ** 2).sum(1))[:20]
-        edges = np.concatenate([edges, np.stack([near, np.full(20, side**2 + number)], 1)])
-        weights = np.concatenate([weights, np.full(20, g / 20)])
+        edges = np.concatenate([edges, np.stack([near, np.full_like(near, side**2 + number)], 1)])
+        weights = np.concatenate([weights, np.full(near.size, g / near.size)])
     n = side**2 + len(conductances)
     coords = np.concatenate([xy, np.full((len(conductances), 2), np.nan)])
     return laplacian(edges, weights, n), coords
@@ -65,7 +67,12 @@ def as_pattern(matrix, coords=None, root=()):
 
 
 def solution(solver, pattern, values, rhs):
-    return np.asarray(solve_spd(solver, solver.analyse(pattern), values, jnp.asarray(rhs)))
+    return np.asarray(SOLVE(solver, solver.analyse(pattern), values, jnp.asarray(rhs)))
+
+
+# These programs run once each: what the compiler would gain it never earns back.
+quick = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+SOLVE = quick(solve_spd)
 
 
 def relative(found, expected):
@@ -78,9 +85,7 @@ def star(n=40):
 
 def strip():
     index = np.arange(3 * 41)
-    return laplacian(mesh_edges(41, 3), np.ones(242), index.size), np.stack(
-        [index % 41, index // 41], 1
-    ).astype(float)
+    return laplacian(mesh_edges(41, 3), np.ones(282), index.size), np.stack([index % 41, index // 41], 1).astype(float)
 
 
 def islands():
@@ -129,13 +134,21 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("solver", SOLVERS, ids=str)
+@pytest.mark.parametrize("merge", [1, 2])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_solution_is_that_of_superlu(shape, solver):
+def test_solution_is_that_of_superlu(shape, merge):
     matrix, coords = SHAPES[shape]()
     pattern, values = as_pattern(matrix, coords)
+    solver = NestedDissection(leaf_size=max(1, pattern.n // (5 * merge)), merge=merge)
     rhs = np.random.default_rng(2).normal(size=(pattern.n, 3))
     found = solution(solver, pattern, values, rhs)
+    assert relative(found, splu(matrix).solve(rhs)) < 1e-11
+
+
+def test_dense_solution_is_that_of_superlu():
+    matrix, _ = SHAPES["sheet"]()
+    rhs = np.random.default_rng(2).normal(size=(matrix.shape[0], 3))
+    found = solution(Dense(), *as_pattern(matrix), rhs)
     assert relative(found, splu(matrix).solve(rhs)) < 1e-11
 
 
@@ -145,7 +158,7 @@ def test_neither_numbering_nor_entry_order_matters(shape):
     rng = np.random.default_rng(3)
     p = rng.permutation(matrix.shape[0])
     rhs = rng.normal(size=(p.size, 2))
-    solver = NestedDissection(leaf_size=4)
+    solver = NestedDissection(leaf_size=30)
     moved = as_pattern(matrix[p][:, p], None if coords is None else coords[p])
     found = solution(solver, *moved, rhs[p])
     assert relative(found, solution(solver, *as_pattern(matrix, coords), rhs)[p]) < 1e-12
@@ -165,12 +178,12 @@ def test_separators_of_a_square_are_its_narrowest_lines():
     assert [shape[2] for shape in plan.panel_shapes][:3] == [16, 8, 8]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_contacts_over_24_decades_lose_nothing_against_dense(seed):
     """Where conductances bury each other no elimination keeps every digit (compare residuals, row
     by row, with the dense ones on the same matrix)."""
     rng = np.random.default_rng(seed)
-    matrix, coords = square_sheet(20, 4, 10.0 ** rng.uniform(-12, 12, 25), seed)
+    matrix, coords = square_sheet(14, 4, 10.0 ** rng.uniform(-12, 12, 25), seed)
     pattern, values = as_pattern(matrix, coords)
     rhs = rng.normal(size=(pattern.n, 4))
 
@@ -183,7 +196,7 @@ def test_contacts_over_24_decades_lose_nothing_against_dense(seed):
 
 
 def test_weak_contacts_keep_the_solution():
-    matrix, coords = square_sheet(20, 2, 10.0 ** np.linspace(-12, 0, 25))
+    matrix, coords = square_sheet(14, 2, 10.0 ** np.linspace(-12, 0, 25))
     pattern, values = as_pattern(matrix, coords)
     rhs = np.eye(pattern.n)[:, -25:]
     found = solution(NestedDissection(), pattern, values, rhs)
@@ -193,9 +206,11 @@ def test_weak_contacts_keep_the_solution():
 
 @pytest.mark.parametrize("solver", [Dense(), NestedDissection()], ids=str)
 def test_single_precision_stays_within_1e_4(solver):
-    matrix, coords = square_sheet(32, 0, np.ones(9))
+    """A leaky sheet: of one grounded at a point alone, rounding the entries moves the ground."""
+    sheet, coords = square_sheet(20, 0, np.ones(9))
+    matrix = (sheet + 0.01 * sp.eye_array(409)).tocsc()
     pattern, values = as_pattern(matrix, coords)
-    rhs = np.eye(pattern.n)[:, -9:] - 1 / 9 * (np.arange(pattern.n) >= 32**2)[:, None]
+    rhs = np.eye(pattern.n)[:, -9:]
     found = solution(solver, pattern, values.astype(jnp.float32), rhs.astype(np.float32))
     assert found.dtype == np.float32
     assert relative(found, splu(matrix).solve(rhs)) < 1e-4
@@ -220,9 +235,7 @@ TRANSFORMS = {
     "jacrev": lambda f: jax.jacrev(f, (0, 1)),
     "hessian": lambda f: jax.hessian(lambda v, b: jnp.sum(f(v, b) ** 2), (0, 1)),
     "reverse over reverse": lambda f: jax.jacrev(jax.jacrev(lambda v, b: jnp.sum(f(v, b) ** 3))),
-    "reverse over forward": lambda f: jax.grad(
-        lambda v, b: jnp.sum(jax.jvp(f, (v, b), (v**2, b**2))[1] ** 2)
-    ),
+    "reverse over forward": lambda f: jax.grad(lambda v, b: jnp.sum(jax.jvp(f, (v, b), (v**2, b**2))[1] ** 2)),
 }
 
 
@@ -232,8 +245,8 @@ def test_derivatives_are_those_of_dense_autodiff(solver, transform, small):
     pattern, values, rhs = small
     plan = solver.analyse(pattern)
     wrap = TRANSFORMS[transform]
-    found = jax.jit(wrap(lambda v, b: solve_spd(solver, plan, v, b)))(values, rhs)
-    expected = jax.jit(wrap(lambda v, b: dense_solve(pattern, v, b)))(values, rhs)
+    found = quick(wrap(lambda v, b: solve_spd(solver, plan, v, b)))(values, rhs)
+    expected = quick(wrap(lambda v, b: dense_solve(pattern, v, b)))(values, rhs)
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert relative(ours, theirs) < 1e-10
 
@@ -242,8 +255,8 @@ def test_derivatives_reuse_the_factorisation(small):
     pattern, values, rhs = small
     solver = NestedDissection(leaf_size=100)
     plan = solver.analyse(pattern)
-    program = jax.make_jaxpr(jax.jacrev(lambda v: solve_spd(solver, plan, v, rhs)))(values)
-    assert str(program).count("= cholesky[") == 1
+    jacobian = jax.jit(jax.jacrev(lambda v: solve_spd(solver, plan, v, rhs)))
+    assert jacobian.lower(values).as_text().count("potrf") == 1
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
@@ -252,8 +265,9 @@ def test_vmap_is_the_loop(solver, small):
     plan = solver.analyse(pattern)
     batch = values * jnp.asarray([[1.0], [3.0], [0.5]])
     gradient = jax.grad(lambda v, b: jnp.sum(solve_spd(solver, plan, v, b) ** 2))
-    found = jax.vmap(gradient, (0, None))(batch, rhs)
-    expected = jnp.stack([gradient(v, rhs) for v in batch])
+    found = quick(jax.vmap(gradient, (0, None)))(batch, rhs)
+    one = quick(gradient)
+    expected = jnp.stack([one(v, rhs) for v in batch])
     assert relative(found, expected) < 1e-12
 
 
@@ -261,9 +275,9 @@ def test_factor_survives_vmap_and_serves_many_loads(small):
     pattern, values, rhs = small
     solver = NestedDissection(leaf_size=4)
     plan = solver.analyse(pattern)
-    factors = jax.vmap(lambda v: solver.factor(plan, v))(jnp.stack([values, 2 * values]))
-    found = jax.vmap(solver.solve, (0, None))(factors, rhs)
-    single = solver.solve(solver.factor(plan, values), rhs)
+    factors = quick(jax.vmap(solver.factor, (None, 0)))(plan, jnp.stack([values, 2 * values]))
+    found = quick(jax.vmap(solver.solve, (0, None)))(factors, rhs)
+    single = SOLVE(solver, plan, values, rhs)
     assert relative(found, jnp.stack([single, single / 2])) < 1e-13
 
 
@@ -272,7 +286,7 @@ def test_new_values_retrace_nothing(solver, small):
     pattern, values, rhs = small
     traces = []
 
-    @jax.jit
+    @quick
     def run(plan, v, b):
         traces.append(1)
         return solve_spd(solver, plan, v, b)

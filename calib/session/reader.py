@@ -64,6 +64,7 @@ class Session:
         self.path, self.name, self._file = path, path.name, file
         root = self._root = root_node(file, path)
         _check_format(root)
+        root.members()  # refuses a root too wide to be ours
         self.attrs: Mapping[str, str | int | float] = MappingProxyType(root.plain_attributes())
         self.session_id = root.text("session_id")
         self.title = root.text("title", "")

@@ -114,9 +114,7 @@ class AbstractLinearSolver(eqx.Module):
         """Solve for k right-hand sides."""
 
 
-def matvec(
-    plan: AbstractPlan, values: Float[Array, " nnz"], x: Float[Array, "n k"]
-) -> Float[Array, "n k"]:
+def matvec(plan: AbstractPlan, values: Float[Array, " nnz"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """A x from the lower triangle: each entry acts once as (i, j), off the diagonal also as (j, i).
 
     Linear in values and in x.
@@ -127,9 +125,7 @@ def matvec(
     return lower.at[cols].add(mirrored[:, None] * x[rows])
 
 
-def jacobi_scale(
-    plan: AbstractPlan, values: Float[Array, " nnz"]
-) -> tuple[Float[Array, " n"], Float[Array, " nnz"]]:
+def jacobi_scale(plan: AbstractPlan, values: Float[Array, " nnz"]) -> tuple[Float[Array, " n"], Float[Array, " nnz"]]:
     """d with d_i = A_ii^-1/2, and the values of the scaled matrix D A D, whose diagonal is one.
 
     Contact conductances may put 24 decades between diagonal entries.  Unit-diagonal scaling is

@@ -1,9 +1,9 @@
 """Nested dissection of a graph, on the host: which unknown belongs to which separator.
 
-The unknowns are halved at the median of a coordinate; those of one half that touch the other form a
-separator, and each half is treated alike (George 1973).  All parts of one depth are cut together, so
-the work is a few sorts per depth.  The result is a complete binary tree in heap numbering: 1 is the
-root separator, 2 t and 2 t + 1 are the halves below t, and the deepest nodes are the leaves.
+The unknowns are halved at the median of a coordinate; those of one half that touch the other form
+a separator, and each half is treated alike (George 1973).  All parts of one depth are cut together,
+so the work is a few sorts per depth.  The result is a complete binary tree in heap numbering: 1 is
+the root separator, 2 t and 2 t + 1 are the halves below t, and the deepest nodes are the leaves.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def dissect(pattern: Pattern, leaf_size: int) -> tuple[np.ndarray, int]:
     Unknowns of `Pattern.root` or without a place are owned by the root.
     """
     coords, placed = _places(pattern)
-    depth = _depth(np.count_nonzero(placed), leaf_size)
+    depth = _depth(int(np.count_nonzero(placed)), leaf_size)
     edges = np.stack([pattern.rows, pattern.cols])[:, pattern.rows != pattern.cols]
     part = np.ones(pattern.n, np.int64)
     free = placed.copy()

@@ -134,10 +134,7 @@ def _handed(tree: _Tree, bound: _Boundaries, level: int) -> np.ndarray:
 
 def _levels(tree: _Tree, bounds: list[_Boundaries]) -> tuple[Level, ...]:
     ups = [_up(tree, bounds, level) for level in range(len(bounds))]
-    return tuple(
-        Level(tree.pivots[level], ups[level], _down(tree, bounds, ups, level))
-        for level in range(len(bounds))
-    )
+    return tuple(Level(tree.pivots[level], ups[level], _down(tree, bounds, ups, level)) for level in range(len(bounds)))
 
 
 def _front_size(tree: _Tree, bounds: list[_Boundaries], level: int) -> int:
@@ -155,9 +152,7 @@ def _up(tree: _Tree, bounds: list[_Boundaries], level: int) -> np.ndarray:
     return table
 
 
-def _place(
-    tree: _Tree, bounds: list[_Boundaries], level: int, fronts: np.ndarray, unknowns: np.ndarray
-) -> np.ndarray:
+def _place(tree: _Tree, bounds: list[_Boundaries], level: int, fronts: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
     """Place of unknowns in fronts of a level: among the pivots, or behind them in the boundary."""
     place = tree.rank[unknowns]
     outside = tree.level[unknowns] < level
@@ -177,9 +172,7 @@ def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: 
     return table.reshape(fronts, -1, size)
 
 
-def _slots(
-    pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]
-) -> tuple[np.ndarray, np.ndarray]:
+def _slots(pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]) -> tuple[np.ndarray, np.ndarray]:
     """Each entry stands in the column of whichever of its unknowns is eliminated first."""
     first, second = _elimination_order(pattern, tree)
     slots, ones, offset = np.zeros(first.size, np.int64), [], 0

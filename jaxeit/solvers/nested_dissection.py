@@ -97,24 +97,18 @@ class NestedDissection(AbstractLinearSolver):
             n=pattern.n,
         )
 
-    def factor(
-        self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]
-    ) -> NestedDissectionFactor:
+    def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
         scale, scaled = jacobi_scale(plan, values)
         panels: list[Float[Array, "m q p"]] = []
-        update = None
-        for level, panel in _upwards(plan.levels, _assemble(plan, scaled)):
-            kept: Array | float = 0.0
-            if update is not None:
-                panel, kept = _extend_add(level, panel, update)
-            panel, lost = _eliminate(panel)
-            update = kept - lost
+        update = jnp.zeros((0, 1, 1), values.dtype)
+        for level, entries in _upwards(plan.levels, _assemble(plan, scaled)):
+            extended = _extended(level, update)
+            panel, lost = _eliminate(entries + extended[:, :, : level.pivots])
+            update = extended[:, level.pivots :, level.pivots :] - lost
             panels.append(panel)
         return NestedDissectionFactor(tuple(panels[::-1]), scale, plan)
 
-    def solve(
-        self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]
-    ) -> Float[Array, "n k"]:
+    def solve(self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
         padded = jnp.concatenate([scale * rhs, jnp.zeros_like(rhs, shape=(1, rhs.shape[1]))])
         loads = _split(padded[plan.gather], [(m, p) for m, _, p in plan.panel_shapes])
@@ -135,16 +129,12 @@ def _level_starts(depth: int, merge: int) -> tuple[int, ...]:
     return tuple(sorted({0, *range(depth, 0, -merge)}))
 
 
-def _assemble(
-    plan: NestedDissectionPlan, values: Float[Array, " nnz"]
-) -> list[Float[Array, "m q p"]]:
+def _assemble(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> list[Float[Array, "m q p"]]:
     """The columns of the pivots in every front, from the matrix alone."""
     shapes = plan.panel_shapes
     ones = jnp.ones(plan.slots.size - values.size, values.dtype)
     flat = jnp.zeros(sum(map(prod, shapes)), values.dtype)
-    flat = flat.at[plan.slots].set(
-        jnp.concatenate([values, ones]), unique_indices=True, mode="promise_in_bounds"
-    )
+    flat = flat.at[plan.slots].set(jnp.concatenate([values, ones]), unique_indices=True, mode="promise_in_bounds")
     return _split(flat, shapes)
 
 
@@ -152,18 +142,15 @@ def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     """Cut the leading axis into pieces, and fold each into its shape."""
     ends = np.cumsum([0, *map(prod, shapes)])
     pieces = [rows[begin:end] for begin, end in pairwise(ends)]
-    return [
-        piece.reshape(*shape, *rows.shape[1:]) for piece, shape in zip(pieces, shapes, strict=True)
-    ]
+    return [piece.reshape(*shape, *rows.shape[1:]) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
-def _extend_add(
-    level: LevelPlan, panel: Float[Array, "m q p"], updates: Float[Array, "mc bc bc"]
-) -> tuple[Float[Array, "m q p"], Float[Array, "m b b"]]:
-    """Add the children's updates at their places in the front; its panel and its F22."""
+def _extended(level: LevelPlan, updates: Float[Array, "mc bc bc"]) -> Float[Array, "m q q"]:
+    """Sum of the children's updates, each at its places in the front; zero for leaves."""
     by_child = _by_child(level, updates)
-    extended = sum(_spread(by_child[:, c], level.down[:, c]) for c in range(by_child.shape[1]))
-    return panel + extended[:, :, : level.pivots], extended[:, level.pivots :, level.pivots :]
+    spread = (_spread(by_child[:, c], level.down[:, c]) for c in range(by_child.shape[1]))
+    fronts, _, size = level.down.shape
+    return sum(spread, jnp.zeros((fronts, size, size), updates.dtype))
 
 
 def _by_child(level: LevelPlan, children: Array) -> Array:
@@ -189,19 +176,15 @@ def _eliminate(
     return jnp.concatenate([inverse, below], 1), jnp.einsum("mip,mjp->mij", w, w)
 
 
-def _forward(
-    factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]
-) -> list[Float[Array, "m p k"]]:
+def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]) -> list[Float[Array, "m p k"]]:
     """y = L^-1 r from the leaves up; every front hands what its boundary gained to its parent."""
     ys: list[Float[Array, "m p k"]] = []
-    handed = None
+    handed = jnp.zeros_like(loads[0], shape=(0, 1, loads[0].shape[2]))
     for level, panel, load in _upwards(factor.plan.levels, factor.panels, loads):
-        gained = 0.0 if handed is None else _gained(level, handed)
-        pivots, boundary = _cut(gained, level.pivots)
-        out = jnp.einsum("mqp,mpk->mqk", panel, load + pivots)
-        y, handed = _cut(out, level.pivots)
-        handed = handed + boundary
-        ys.append(y)
+        gained, p = _gained(level, handed), level.pivots
+        out = jnp.einsum("mqp,mpk->mqk", panel, load + gained[:, :p])
+        handed = out[:, p:] + gained[:, p:]
+        ys.append(out[:, :p])
     return ys[::-1]
 
 
@@ -211,9 +194,7 @@ def _gained(level: LevelPlan, handed: Float[Array, "mc bc k"]) -> Float[Array, "
     return jnp.take_along_axis(by_child, places, 2, mode="promise_in_bounds").sum(1)
 
 
-def _backward(
-    factor: NestedDissectionFactor, ys: list[Float[Array, "m p k"]]
-) -> Float[Array, "places k"]:
+def _backward(factor: NestedDissectionFactor, ys: list[Float[Array, "m p k"]]) -> Float[Array, "places k"]:
     """x = L^-T y from the root down; every front finds its boundary's x in its parent's front."""
     front = jnp.zeros_like(ys[0], shape=(1, 1, ys[0].shape[2]))
     xs = []
@@ -234,7 +215,3 @@ def _inherited(level: LevelPlan, front: Float[Array, "mp qp k"]) -> Float[Array,
 def _upwards(*columns: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
     """The levels from the leaves up."""
     return zip(*(column[::-1] for column in columns), strict=True)
-
-
-def _cut(rows: Array | float, p: int) -> tuple[Array | float, Array | float]:
-    return (rows, rows) if isinstance(rows, float) else (rows[:, :p], rows[:, p:])

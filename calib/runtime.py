@@ -1,0 +1,35 @@
+"""What a command sets up before its first computation; the library itself never does."""
+
+import os
+import stat
+import warnings
+from pathlib import Path
+
+import jax
+
+
+def set_up() -> None:
+    """64-bit numbers, and compiled programs kept between runs."""
+    jax.config.update("jax_enable_x64", True)
+    folder = cache_folder()
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def cache_folder() -> Path | None:
+    """A folder that only this user can write, or None: a program put there by others would be run."""
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(root) / "jaxeit"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return None
+    private = not stat.S_IMODE(found.st_mode) & 0o077
+    mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+    if stat.S_ISDIR(found.st_mode) and private and mine:
+        return folder
+    warnings.warn(f"{folder} is open to others and not used as a cache; chmod 700 it", stacklevel=2)
+    return None

@@ -1,0 +1,105 @@
+"""Fusion: the map sums to the pads' forces, whatever the image."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+
+
+@pytest.fixture(scope="module")
+def masks(skin, pixels):
+    return je.pad_masks(skin, pixels)
+
+
+def _bump(pixels, centre, width=0.012):
+    square = jnp.sum((pixels.centres - jnp.asarray(centre)) ** 2, -1)
+    return jnp.exp(-0.5 * square / width**2)
+
+
+def _per_pad(fmap, masks):
+    """Sums over pads that do not overlap."""
+    return np.asarray(masks.weights) @ np.asarray(fmap.force)
+
+
+def test_sums_to_the_pad_forces(pixels, masks):
+    image = _bump(pixels, (0.05, 0.05)) + 0.3 * jax.random.normal(jax.random.key(0), (pixels.size,))
+    forces = jnp.array([12.0, 0.5, 3.0, 7.0])
+    fmap = je.fuse(image, masks, forces)
+    np.testing.assert_allclose(_per_pad(fmap, masks), forces, rtol=1e-12)
+    assert float(fmap.force.sum()) == pytest.approx(22.5, rel=1e-12)
+    assert (np.asarray(fmap.force) >= 0).all()
+
+
+def test_the_formula_of_the_paper_where_the_image_is_positive(pixels, masks):
+    image = _bump(pixels, (0.05, 0.05), width=0.05)
+    fmap = je.fuse(image, masks, jnp.array([10.0, 4.0, 3.0, 2.0]))
+    assert np.asarray(fmap.valid).all()
+    mine = np.asarray(masks.weights[0] * image * masks.areas)
+    inside = np.asarray(masks.weights[0]) == 1
+    np.testing.assert_allclose(np.asarray(fmap.force)[inside], (10 * mine / mine.sum())[inside], rtol=1e-12)
+
+
+def test_noise_is_spread_evenly_and_flagged(pixels, masks):
+    """The printed equation 4 would divide by a sum near zero here."""
+    noise = jax.random.normal(jax.random.key(3), (pixels.size,))
+    noise = noise - noise.mean()
+    fmap = je.fuse(noise, masks, jnp.full(4, 5.0))
+    assert not np.asarray(fmap.valid).any()
+    pressure = np.asarray(fmap.pressure)
+    np.testing.assert_allclose(pressure, 5.0 / 0.01, rtol=1e-3)
+    printed = np.asarray(masks.weights[0] * noise)
+    assert np.abs(5.0 * printed / printed.sum()).sum() > 3 * 5.0  # what the gate prevents
+
+
+def test_a_dead_image_or_pad_leaves_the_other_pads_alone(pixels, masks):
+    image = _bump(pixels, (0.05, 0.05)) + _bump(pixels, (0.15, 0.15))
+    forces = jnp.array([10.0, 1.0, 1.0, 8.0])
+    healthy = je.fuse(image, masks, forces)
+    pad0 = np.asarray(masks.weights[0]) > 0
+
+    silent = je.fuse(image, masks, forces.at[0].set(jnp.nan))
+    assert np.isnan(np.asarray(silent.force)[pad0]).all()
+    np.testing.assert_array_equal(np.asarray(silent.force)[~pad0], np.asarray(healthy.force)[~pad0])
+
+    broken = je.fuse(image.at[int(np.flatnonzero(pad0)[5])].set(jnp.nan), masks, forces)
+    assert not bool(broken.valid[0])
+    assert np.isfinite(np.asarray(broken.force)).all()
+    np.testing.assert_array_equal(np.asarray(broken.force)[~pad0], np.asarray(healthy.force)[~pad0])
+
+
+@pytest.mark.parametrize("force", [0.0, -3.0])
+def test_no_force_or_suction_is_not_a_contact(pixels, masks, force):
+    fmap = je.fuse(_bump(pixels, (0.05, 0.05)), masks, jnp.array([force, 0.0, 0.0, 0.0]))
+    assert not bool(fmap.valid[0])
+    assert float(fmap.force.sum()) == pytest.approx(force, abs=1e-12)
+
+
+def test_overlapping_pads_share(skin, pixels):
+    wide = [replace(skin.pads[0], outline=np.array([[0, 0], [0.12, 0], [0.12, 0.2], [0, 0.2]]))]
+    wide += [replace(skin.pads[1], outline=np.array([[0.08, 0], [0.2, 0], [0.2, 0.2], [0.08, 0.2]]))]
+    masks = je.pad_masks(replace(skin, pads=tuple(wide)), pixels)
+    np.testing.assert_allclose(np.asarray(masks.weights).sum(0), 1.0, rtol=1e-9)
+    fmap = je.fuse(_bump(pixels, (0.1, 0.1)), masks, jnp.array([6.0, 4.0]))
+    assert float(fmap.force.sum()) == pytest.approx(10.0, rel=1e-12)
+
+
+def test_batches_and_gradients(pixels, masks):
+    image = jnp.stack([_bump(pixels, (0.05, 0.05)), -_bump(pixels, (0.05, 0.15))])
+    forces = jnp.array([[1.0, 2.0, 3.0, 4.0], [4.0, 3.0, 2.0, 1.0]])
+    fmap = je.fuse(image, masks, forces)
+    np.testing.assert_allclose(fmap.force[1], je.fuse(image[1], masks, forces[1]).force, rtol=1e-12)
+    slope = jax.grad(lambda x: (je.fuse(x, masks, forces[0]).force ** 2).sum())(jnp.zeros(pixels.size))
+    assert np.isfinite(np.asarray(slope)).all()
+    assert np.asarray(fmap).shape == (2, pixels.size)
+
+
+def test_shapes_that_do_not_fit_are_refused(skin, pixels, masks):
+    with pytest.raises(je.FusionError, match="400 pixels and 4 pads"):
+        je.fuse(jnp.zeros(10), masks, jnp.zeros(4))
+    away = replace(skin.pads[0], outline=np.array([[1.0, 1.0], [1.1, 1.0], [1.1, 1.1]]))
+    with pytest.raises(je.FusionError, match="lower left"):
+        je.pad_masks(replace(skin, pads=(away,)), pixels)

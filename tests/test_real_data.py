@@ -1,0 +1,58 @@
+"""Recordings of others, on real hardware; skipped where they are not at hand."""
+
+import os
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+
+from .helpers import skin_of
+
+DATA = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
+TANK = sorted((DATA / "pyeidors_tank" / "tank").glob("*_latest_tank_data/*/*_1000Hz.csv"))
+
+needs_tank = pytest.mark.skipif(not TANK, reason="pyeidors_tank is not at hand; set JAXEIT_REAL_DATA to its folder")
+
+
+@pytest.fixture(scope="module")
+def tank():
+    """A 60 mm saline tank with 16 electrodes, in two dimensions."""
+    disc = je.Disc(0.03)
+    step, width = disc.perimeter / 16, 0.4 * disc.perimeter / 16
+    starts = (np.arange(16) * step - width / 2) % disc.perimeter
+    patches = [je.BoundaryPatch(float(s), float(s + width), 1e-3) for s in starts]
+    skin = skin_of(disc, patches, je.adjacent(16))
+    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.05))
+    return skin, model, je.prepare(model, basis=je.Pixels(24), hyperparameter=0.1)
+
+
+def _frames(path):
+    """Empty tank and targets; the instrument's polarity is the reverse of ours."""
+    table = np.loadtxt(path, delimiter=",")
+    return -table[:, 0], -table[:, 2]
+
+
+@needs_tank
+def test_homogeneous_tank_looks_like_the_model(tank):
+    _, model, _ = tank
+    empty, _ = _frames(TANK[0])
+    assert np.corrcoef(empty, np.asarray(je.forward(model)))[0, 1] > 0.98
+
+
+@needs_tank
+@pytest.mark.parametrize("path", TANK, ids=lambda p: p.parent.name[-40:] + p.name[11:19])
+def test_sign_of_the_change_at_every_labelled_electrode(tank, path):
+    skin, model, recon = tank
+    empty, full = _frames(path)
+    scale = np.asarray(je.forward(model)) @ empty / (empty @ empty)
+    image = np.asarray(recon(jnp.asarray(scale * (full - empty))))
+    labels = re.findall(r"electrode(\d+)_(metal|plastic)", path.parent.name)
+    assert labels
+    for number, kind in labels:
+        place = 0.8 * skin.electrode_positions[int(number) - 1]
+        near = np.linalg.norm(np.asarray(recon.centres) - place, axis=1) < 0.006
+        assert np.sign(image[near].sum()) == (1 if kind == "metal" else -1), (number, kind)

@@ -1,0 +1,80 @@
+"""Skin files: what is read, and what is said about a wrong one."""
+
+import importlib.resources
+
+import numpy as np
+import pytest
+
+import jaxeit as je
+
+TEXT = importlib.resources.files("jaxeit").joinpath("skins/testbed.toml").read_text()
+
+
+def test_the_testbed(skin):
+    assert skin.name == "testbed"
+    assert skin.domain.area == pytest.approx(0.04)
+    assert len(skin.electrodes) == 25
+    assert len(skin.pads) == 4
+    assert skin.protocol.readings == 550
+    assert skin.protocol.frame_time == pytest.approx(5.5e-3)
+    steps = np.linalg.norm(np.diff(skin.electrode_positions, axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.04)  # a snake: every number next to its neighbour
+
+
+def test_a_copied_and_edited_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(TEXT.replace('name = "testbed"', 'name = "mine"').replace("radius = 0.003", "radius = 0.004"))
+    skin = je.load_skin(path)
+    assert (skin.name, skin.electrodes[0].radius) == ("mine", 0.004)
+    assert skin.toml == path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("radius = 0.003", "raduis = 0.003", r"\[electrodes\]: radius: missing"),
+        ("radius = 0.003", "radius = 0.003\nfoo = 1", r"foo: unknown key"),
+        ("radius = 0.003", "radius = -1.0", r"radius: is -1.0; give the contact radius"),
+        ("radius = 0.003", 'radius = "3 mm"', r"radius: is '3 mm'"),
+        ("radius = 0.003", "radius = nan", "radius: is nan"),
+        ("size = [0.2, 0.2]", "size = [0.2]", r"\[sheet\]: size: has 1 numbers"),
+        ('kind = "bolt"', 'kind = "screw"', 'give one of "bolt"'),
+        ('pattern = "adjacent"', "rows = [[0, 1, 2, 99]]", "names an electrode outside 0 to 24"),
+        ('pattern = "adjacent"', "rows = [[0, 0, 2, 3]]", "uses one electrode twice"),
+        ("pitch = 0.04", "pitch = 0.06", "electrode 4 at .* lies outside the sheet"),
+        ("current = 1e-3", "current = 0", "current"),
+        ("version = 1", "version = 2", "version: is 2"),
+        ('format = "jaxeit-skin"', 'format = "other"', "format"),
+        ("rectangle = [0.0, 0.0, 0.1, 0.1]", "rectangle = [0.1, 0.0, 0.0, 0.1]", r"\[\[pads\]\] number 1"),
+        ("[sheet]", "[sheet", "not valid TOML"),
+        ("maximum = 34474.0", "maximum = -1.0", r"\[pressure_sensor\]: maximum"),
+    ],
+)
+def test_a_wrong_file_names_key_and_reason(old, new, message):
+    assert old in TEXT
+    with pytest.raises(je.TomlError, match=message) as caught:
+        je.parse_skin(TEXT.replace(old, new, 1), "mine.toml")
+    assert str(caught.value).startswith("mine.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_says_what_is_shipped():
+    with pytest.raises(je.TomlError, match="shipped are testbed"):
+        je.load_skin("tesbed")
+
+
+def test_edge_electrodes_and_points():
+    text = TEXT[: TEXT.index("[electrodes]")] + TEXT[TEXT.index("[protocol]") :]
+    edge = text + '[electrodes]\nkind = "edge"\ncount = 16\nwidth = 0.01\ncontact = 1e-3\n'
+    skin = je.parse_skin(edge)
+    assert len(skin.electrodes) == 16
+    np.testing.assert_allclose(skin.electrode_positions[0], [0, 0], atol=1e-12)
+    points = text + '[electrodes]\nkind = "point"\npositions = [[0.05, 0.05], [0.15, 0.05], [0.15, 0.15], [0.05, 0.15]]\n'
+    assert je.parse_skin(points).protocol.readings == 4
+
+
+def test_adjacent_never_senses_what_it_drives():
+    pattern = je.adjacent(32)
+    assert pattern.shape == (32 * 29, 4)
+    assert (pattern[:, :2, None] != pattern[:, None, 2:]).all()
+    assert (je.reciprocal_rows(pattern) >= 0).all()
