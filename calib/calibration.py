@@ -122,7 +122,7 @@ def calibrate(
     _require_fits(skin, curves)
     held_out = _held_out(curve, data, folds, loss)
     evaluation = evaluate_presses(
-        recon, skin, data.position, data.dv, data.force, held_out, held_out_by="location"
+        recon, skin, data.position, data.dv, data.force, data.pressure, held_out, held_out_by="location"
     )
     options = {
         "curve": curve_name(curve),
@@ -165,6 +165,7 @@ def evaluate(
         found.position,
         found.dv,
         found.force,
+        found.pressure,
         force,
         held_out_by="session",
         notes=found.notes,
@@ -173,13 +174,16 @@ def evaluate(
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """Sessions one after the other: presses, and the samples of their ramps, holds and releases."""
+    """Sessions one after the other: presses, and the samples of their ramps, holds and releases.
+
+    The means over the holds ride along as the last samples; no fit may use them, so that what is
+    predicted for them is predicted like any held-out sample.
+    """
 
     position: np.ndarray
     dv: np.ndarray
     pressure: np.ndarray
     force: np.ndarray
-    place: np.ndarray
     sample_pressure: np.ndarray  # (pads, n)
     sample_force: np.ndarray
     sample_place: np.ndarray
@@ -190,25 +194,31 @@ def _join(measured: Sequence[Measured]) -> _Joined:
     position = np.concatenate([m.position for m in measured])
     place = np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel()
     pressure = np.concatenate([m.pressure for m in measured])
+    force = np.concatenate([m.force for m in measured])
     owner = dominant_pad(pressure)
-    row, first = [], 0
-    for m in measured:
-        number = np.cumsum(m.presses.accepted) - 1
-        row.append(first + number[m.samples.press])
-        first += len(m.force)
-    press = np.concatenate(row)
+    press = _press_of_samples(measured)
     pads = np.arange(pressure.shape[1])[:, None]
+    unseen = np.zeros((len(pads), len(force)), bool)
     return _Joined(
         position=position,
         dv=np.concatenate([m.dv for m in measured]),
         pressure=pressure,
-        force=np.concatenate([m.force for m in measured]),
-        place=place,
-        sample_pressure=np.concatenate([m.samples.pressure for m in measured]).T,
-        sample_force=np.concatenate([m.samples.force for m in measured]),
-        sample_place=place[press],
-        mask=_finite(measured) & (owner[press] == pads),
+        force=force,
+        sample_pressure=np.concatenate([*(m.samples.pressure for m in measured), pressure]).T,
+        sample_force=np.concatenate([*(m.samples.force for m in measured), force]),
+        sample_place=np.concatenate([place[press], place]),
+        mask=np.concatenate([_finite(measured) & (owner[press] == pads), unseen], 1),
     )
+
+
+def _press_of_samples(measured: Sequence[Measured]) -> np.ndarray:
+    """Row of each sample's press among all presses kept."""
+    rows, first = [], 0
+    for m in measured:
+        number = np.cumsum(m.presses.accepted) - 1
+        rows.append(first + number[m.samples.press])
+        first += len(m.force)
+    return np.concatenate(rows)
 
 
 def _finite(measured: Sequence[Measured]) -> np.ndarray:
@@ -227,22 +237,17 @@ def _require_fits(skin: je.Skin, curves: FittedCurve) -> None:
 
 
 def _held_out(curve: AbstractCurve, data: _Joined, folds: int, loss: AbstractLoss) -> np.ndarray:
-    """Pad forces over the hold of every press, (presses, pads) N, from curves that never saw its place.
-
-    The holds ride along as samples that no fit may use.
-    """
-    presses, samples = len(data.force), len(data.sample_force)
-    unseen = np.zeros((data.pressure.shape[1], presses), bool)
+    """Pad forces over the hold of every press, (presses, pads) N, by curves that never saw its place."""
     found = cross_validate(
         curve,
-        np.concatenate([data.sample_pressure, data.pressure.T], 1),
-        np.concatenate([data.sample_force, data.force]),
-        groups=np.concatenate([data.sample_place, data.place]),
-        mask=np.concatenate([data.mask, unseen], 1),
-        folds=min(folds, int(data.place.max()) + 1),
+        data.sample_pressure,
+        data.sample_force,
+        groups=data.sample_place,
+        mask=data.mask,
+        folds=min(folds, len(np.unique(data.sample_place))),
         loss=loss,
     )
-    return found.predicted[:, samples:].T
+    return found.predicted[:, -len(data.force) :].T
 
 
 def _provenance(sessions: Sequence[Session], options: dict[str, str]) -> dict[str, str]:

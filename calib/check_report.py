@@ -156,7 +156,7 @@ class CheckReport:
 def to_json(report: CheckReport) -> str:
     """The whole report as JSON; the same report gives the same text. NaN becomes null."""
     body = {"format": "skin-check", "ok": report.ok, **_plain(report)}
-    return json.dumps(body, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(body, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
 
 
 def _plain(value):
@@ -249,7 +249,7 @@ def _streams(rows: Sequence[StreamRow]) -> Iterator[str]:
             _number(r.nominal_rate),
             str(r.gaps),
             str(r.dropped),
-            _number(1e3 * r.jitter, ".3g"),
+            _number(1e3 * r.jitter, ".2f"),
             _percent(r.missing),
         )
         for r in rows
@@ -295,8 +295,8 @@ def _presses(report: CheckReport) -> Iterator[str]:
     for name, onset in report.onsets:
         if onset.presses:
             yield (
-                f"  {printable(name, 16)} rises {1e3 * onset.delay:+.0f} ms after the force "
-                f"(spread {1e3 * onset.spread:.0f} ms, {onset.presses} presses)"
+                f"  {printable(name, 16)} rises {round(1e3 * onset.delay):+d} ms after the force "
+                f"(spread {1e3 * onset.spread:.0f} ms, {counted(onset.presses, 'press', 'presses')})"
             )
 
 
@@ -305,7 +305,7 @@ def _channels(report: CheckReport, verbose: bool) -> Iterator[str]:
     if table is None:
         return
     yield (
-        f"EIT      {len(table)} readings, over {table.frames} frames without contact: "
+        f"EIT      {len(table)} readings, {table.frames} frames without contact: "
         f"median SNR {_number(_median(table.snr), '.1f')} dB, "
         f"reciprocity error {_percent(_median(table.reciprocity))}"
     )
@@ -320,7 +320,7 @@ def _channels(report: CheckReport, verbose: bool) -> Iterator[str]:
             f"amplitude {_number(order.scale, '.3g')} of the model's"
         )
     rows = np.arange(len(table)) if verbose else worst(table)
-    title = "  all readings" if verbose else f"  the worst {len(rows)} (all: --all)"
+    title = "  all readings" if verbose else f"  the worst {len(rows)} that live (all: --all)"
     yield from _table(title, _CHANNEL_HEAD, [_channel(table, int(i)) for i in rows])
 
 
@@ -343,9 +343,9 @@ def _channel(table: ChannelTable, i: int) -> tuple[str, ...]:
 
 
 def worst(table: ChannelTable, count: int = _WORST) -> np.ndarray:
-    """Readings to look at first: flagged, then with most missing, then by reciprocity error."""
-    flagged = 4 * table.dead + 2 * table.saturated + 1 * table.noisy
-    keys = (-np.nan_to_num(table.reciprocity), -table.missing.round(3), -flagged)
+    """Living readings to look at first: flagged, with most missing, by reciprocity error; then the dead."""
+    flagged = 2 * table.saturated + 1 * table.noisy
+    keys = (-np.nan_to_num(table.reciprocity), -table.missing.round(3), -flagged, table.dead)
     return np.lexsort(keys)[:count]
 
 
@@ -359,10 +359,11 @@ def _verdict(report: CheckReport) -> Iterator[str]:
     if not errors and not warnings:
         yield "Nothing wrong was found."
         return
-    counts = [_counted(errors, "error"), _counted(warnings, "warning")]
+    counts = [counted(errors, "error"), counted(warnings, "warning")]
     end = "Mend the errors before calibrating." if errors else "It can be calibrated."
     yield ", ".join(c for c in counts if c) + ". " + end
 
 
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' if count > 1 else ''}" if count else ""
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """ "1 gap", "2 gaps", or nothing for none."""
+    return f"{count} {(plural or noun + 's') if count > 1 else noun}" if count else ""

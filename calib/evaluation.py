@@ -25,6 +25,7 @@ class Evaluation:
     | position of the tip, true                                          | (presses, 2)    | m    |
     | estimated positions, by each named estimator                       | (presses, 2)    | m    |
     | force: true, from the load cell                                    | (presses,)      | N    |
+    | pressure: change of each pad's pressure over the hold              | (presses, pads) | Pa   |
     | pad_force: estimated for each pad, by a fit that had not seen it   | (presses, pads) | N    |
     | image_sum: integral of the image, what the image alone tells       | (presses,)      | S m^2|
     | centre of the sheet                                                | (2,)            | m    |
@@ -35,6 +36,7 @@ class Evaluation:
     position: np.ndarray
     estimated: dict[str, np.ndarray]
     force: np.ndarray
+    pressure: np.ndarray
     pad_force: np.ndarray
     image_sum: np.ndarray
     centre: np.ndarray
@@ -96,6 +98,7 @@ class Evaluation:
         out = {
             "position": (self.position, "m", "true position of the tip"),
             "force": (self.force, "N", "load cell"),
+            "pressure": (self.pressure, "Pa", "change of each pad's pressure over the hold"),
             "pad_force": (self.pad_force, "N", f"estimated, held out by {self.held_out_by}"),
             "image_sum": (self.image_sum, "S m2", "integral of the image"),
             "centre": (self.centre, "m", "centre of the sheet"),
@@ -111,7 +114,7 @@ class Evaluation:
         """The evaluation that `attributes` and `arrays` described, found under these prefixes."""
         mark = f"{array}estimated_"
         estimated = {k.removeprefix(mark): v for k, v in arrays.items() if k.startswith(mark)}
-        names = ("position", "force", "pad_force", "image_sum", "centre")
+        names = ("position", "force", "pressure", "pad_force", "image_sum", "centre")
         return cls(
             **{name: arrays[array + name] for name in names},
             estimated=estimated,
@@ -126,6 +129,7 @@ def evaluate_presses(
     position: np.ndarray,
     dv: np.ndarray,
     force: np.ndarray,
+    pressure: np.ndarray,
     pad_force: np.ndarray,
     *,
     held_out_by: str,
@@ -138,6 +142,7 @@ def evaluate_presses(
         position=position,
         estimated={n: np.asarray(e(image, recon), float) for n, e in je.ESTIMATORS.items()},
         force=force,
+        pressure=np.asarray(pressure, float),
         pad_force=np.asarray(pad_force, float),
         image_sum=np.asarray(je.image_sum(image, recon.areas), float),
         centre=np.array([(x0 + x1) / 2, (y0 + y1) / 2]),

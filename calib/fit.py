@@ -120,7 +120,7 @@ class Cauchy(AbstractLoss):
     def ratio(self, s):
         small = s < 1e-4
         safe = jnp.where(small, 1.0, s)
-        return jnp.where(small, 1 - s / 2, jnp.log1p(safe) / safe)
+        return jnp.where(small, 1 - s / 2 + s**2 / 3, jnp.log1p(safe) / safe)
 
 
 LOSSES: dict[str, type[AbstractLoss]] = {
@@ -435,7 +435,7 @@ def _fit_batch(curve, samples, loss, solver, n_groups, max_steps, rounds):
 
 def _floats(values, what: str, dtype) -> Array:
     """Host values -> device array of `dtype` (None: as they come), refusing a silent loss of precision."""
-    if dtype is not None and np.dtype(dtype) == np.float64 and not jax.config.read("jax_enable_x64"):
+    if dtype is not None and jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
         raise FitError("float64 was asked for but JAX has 64-bit numbers off; set JAX_ENABLE_X64=1 or ask for float32.")
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":

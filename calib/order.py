@@ -6,6 +6,7 @@ solve predicts the frame under any numbering of electrodes and any order of read
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ import jaxeit as je
 _AS_IS_ENOUGH = 0.95  # a uniform sheet reaches 0.99 on healthy sessions; two swapped bolts 0.93 at most
 _SHRINKS = 1 / 3  # what a better order must leave of 1 - correlation
 _CONVINCING = 0.7
+_LATEST, _SWAPPED = 4096, 64  # readings and electrodes tried, so that large skins are checked in seconds
 _TIE = 0.005  # a simpler explanation this close to the best is preferred
 
 
@@ -62,18 +64,18 @@ class Hypothesis:
 class OrderCheck:
     """How well the readings fit a uniform sheet, as they are and under the best other order.
 
-    ``as_is`` and ``best`` are correlations; ``what`` and ``remedy`` belong to ``best``; ``same`` are
-    other explanations that predict the very same readings; ``scale`` is measured over modelled
-    voltage, of the recorded order and, where that does not fit, not meaningful.
+    ``as_is`` and ``best`` are correlations; ``what`` and ``remedy`` belong to ``best`` and are empty
+    where the recorded order fits; ``same`` are other explanations that predict the very same
+    readings; ``scale`` is measured over modelled voltage, of no meaning unless ``as_is`` is high.
     """
 
     readings: int
     as_is: float
     best: float
-    what: str
-    remedy: str
-    same: tuple[str, ...]
     scale: float
+    what: str = ""
+    remedy: str = ""
+    same: tuple[str, ...] = ()
 
     @property
     def claimed(self) -> bool:
@@ -101,24 +103,44 @@ def check_order(
         usual: the skin's own pattern, should the recorded one be a wrong claim.
     """
     v, model = voltage[good], current * predict(transfer, pattern[good])
-    guesses = [
-        h for h in _hypotheses(pattern, len(transfer), positions, usual) if not h.magnitude or _one_sign(v, model)
-    ]
-    signed = np.array([_correlation(v, current * predict(transfer, h.pattern[good]), h) for h in guesses])
-    fit = np.abs(signed)
-    fit[0] = -signed[0]  # as recorded, but for the sign
-    first = int(np.flatnonzero(fit >= fit.max() - _TIE)[0])
-    equal = np.flatnonzero(np.abs(fit - fit[first]) < 1e-9)
-    chosen = guesses[first]
-    flips = first > 0 and signed[first] < 0
-    return OrderCheck(
+    power = model @ model
+    as_is = OrderCheck(
         readings=len(v),
-        as_is=float(signed[0]),
+        as_is=_correlation(v, model),
+        best=_correlation(v, model),
+        scale=float(v @ model / power) if power > 0 else float("nan"),
+    )
+    if as_is.as_is >= _AS_IS_ENOUGH:
+        return as_is
+    guesses = [
+        _Guess(h.what, h.remedy, _fit(v, current * predict(transfer, h.pattern[good]), h))
+        for h in _hypotheses(pattern, len(transfer), positions, usual)
+    ]
+    return _best(as_is, guesses)
+
+
+class _Guess(NamedTuple):
+    """A hypothesis and the correlation that it reaches."""
+
+    what: str
+    remedy: str
+    signed: float
+
+
+def _best(as_is: OrderCheck, guesses: list[_Guess]) -> OrderCheck:
+    """The simplest of the guesses whose correlations, but for the sign, are highest."""
+    fit = np.abs([g.signed for g in guesses])
+    fit[0] = -guesses[0].signed  # the recorded order explains something only with its signs reversed
+    first = int(np.flatnonzero(fit >= fit.max() - _TIE)[0])
+    equal = np.flatnonzero(np.abs(fit - fit[first]) < 1e-9).tolist()
+    chosen = guesses[first]
+    flips = first > 0 and chosen.signed < 0
+    return replace(
+        as_is,
         best=float(fit[first]),
         what=chosen.what + (", and every sign is reversed" if flips else ""),
         remedy=chosen.remedy + (", and exchange sense+ with sense-" if flips else ""),
         same=tuple(guesses[i].what for i in equal if i != first)[:3],
-        scale=float(v @ model / (model @ model)) if (model @ model) > 0 else float("nan"),
     )
 
 
@@ -127,11 +149,16 @@ def _one_sign(v: np.ndarray, model: np.ndarray) -> bool:
     return bool((np.all(v >= 0) or np.all(v <= 0)) and (model < 0).any() and (model > 0).any())
 
 
-def _correlation(v: np.ndarray, model: np.ndarray, hypothesis: Hypothesis) -> float:
-    a, b = (np.abs(v), np.abs(model)) if hypothesis.magnitude else (v, model)
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     a, b = a - a.mean(), b - b.mean()
     size = np.linalg.norm(a) * np.linalg.norm(b)
     return float(a @ b / size) if size > 0 else 0.0
+
+
+def _fit(v: np.ndarray, model: np.ndarray, hypothesis: Hypothesis) -> float:
+    if not hypothesis.magnitude:
+        return _correlation(v, model)
+    return _correlation(np.abs(v), np.abs(model)) if _one_sign(v, model) else 0.0
 
 
 def _hypotheses(
@@ -218,14 +245,14 @@ def _grid_numberings(pattern: np.ndarray, positions: np.ndarray | None) -> Itera
 
 
 def _late_frames(pattern: np.ndarray) -> Iterator[Hypothesis]:
-    for start in range(1, len(pattern)):
+    for start in range(1, min(len(pattern), _LATEST)):
         what = f"each frame starts at reading {start} of the pattern"
         yield Hypothesis(what, "synchronise the recorder with the scan", np.roll(pattern, -start, 0))
 
 
 def _swapped(pattern: np.ndarray, electrodes: int) -> Iterator[Hypothesis]:
-    for i in range(electrodes):
-        for j in range(i + 1, electrodes):
+    for i in range(min(electrodes, _SWAPPED)):
+        for j in range(i + 1, min(electrodes, _SWAPPED)):
             number = np.arange(electrodes)
             number[[i, j]] = j, i
             what = f"electrodes {i} and {j} are exchanged"

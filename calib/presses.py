@@ -281,10 +281,10 @@ def _describe(time, force, signal, run, noise, rate, finder):
 
 def _timeline(rows: list[tuple]) -> Timeline:
     columns = list(zip(*rows, strict=True)) or [()] * 6
-    times = [np.array(c, np.int64) for c in columns[:4]]
+    press, hold0, hold1, release = (np.array(c, np.int64) for c in columns[:4])
     reason = tuple(columns[5])
     accepted = np.array([not r for r in reason], bool)
-    return Timeline(*times, np.array(columns[4], float), accepted, reason)
+    return Timeline(press, hold0, hold1, release, np.array(columns[4], float), accepted, reason)
 
 
 def locate(presses: Presses, stage: Readable) -> np.ndarray:
@@ -348,11 +348,11 @@ def press_windows(presses: Presses, cutting: Cutting | None = None, end: int | N
     following = np.concatenate([press[1:], [last]])
     before = press - guard
     after = np.minimum(release + _ns(c.recovery), following - guard)
-    end = np.maximum(hold1 - guard, hold0)
+    held = np.maximum(hold1 - guard, hold0)
     return Windows(
         rest_before=np.stack([np.clip(before - _ns(c.rest), previous, before), before], 1),
         ramp=np.stack([press, hold0], 1),
-        hold=np.stack([np.maximum(end - _ns(c.hold), hold0), end], 1),
+        hold=np.stack([np.maximum(held - _ns(c.hold), hold0), held], 1),
         release=np.stack([hold1, release], 1),
         rest_after=np.stack([np.clip(after - _ns(c.rest), np.minimum(release, after), after), after], 1),
     )

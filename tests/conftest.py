@@ -1,9 +1,14 @@
+from pathlib import Path
+
 import jax
 import pytest
 
 import jaxeit as je
 
 jax.config.update("jax_enable_x64", True)
+# Programs compiled once serve all later tests, and the next run.
+jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 @pytest.fixture(scope="session")
@@ -20,3 +25,13 @@ def model(skin):
 @pytest.fixture(scope="session")
 def pixels(model):
     return je.Pixels(20).on(model)
+
+
+@pytest.fixture(scope="session")
+def root():
+    return Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def bundled(root):
+    return sorted((root / "data" / "sessions").glob("*.h5"))

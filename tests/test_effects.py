@@ -15,6 +15,7 @@ from .helpers import square_model
 SMALL = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.12)]
 EVERY = [kind() for kind in je.EFFECTS.values()]
 IDS = list(je.EFFECTS)
+NEEDS = {je.ContactGain: (je.ContactPiezoresistance(),)}  # what acts on the effect's result
 
 
 @pytest.fixture(scope="module")
@@ -33,18 +34,23 @@ def _everything(model, key):
     distance = jnp.full((1, spread.size), 0.02)
     pads = je.fold(model.effects, AbstractPadEffect, jnp.ones_like(distance), distance)
     series = je.fold(model.effects, je.AbstractReadoutEffect, voltage[None], key, jnp.asarray(0.01))
-    return series, pads
+    return series, pads, spread
 
 
 def _program(model):
     return eqx.filter_jit(_everything).lower(model, jax.random.key(0)).compile().compiled.as_text()
 
 
+@pytest.fixture(scope="module")
+def bare_program(bare):
+    return _program(bare)
+
+
 @pytest.mark.parametrize("effect", EVERY, ids=IDS)
-def test_an_effect_is_in_the_program_if_and_only_if_it_is_listed(bare, effect):
-    name = type(effect).__name__
-    assert f"/{name}/" not in _program(bare)
-    assert f"/{name}/" in _program(_with(bare, effect))
+def test_an_effect_is_in_the_program_if_and_only_if_it_is_listed(bare, bare_program, effect):
+    name, others = type(effect).__name__, NEEDS.get(type(effect), ())
+    assert f"/{name}/" not in bare_program
+    assert f"/{name}/" in _program(_with(bare, effect, *others))
 
 
 def test_no_effects_leave_no_trace(bare):

@@ -360,7 +360,7 @@ def test_cross_validation_is_the_loop_written_out_and_sums_over_pads():
 def test_a_failed_pad_has_no_held_out_score():
     pressure, force = pads(count=2, outliers=False)
     pressure[1] = np.nan
-    cv = cross_validate(Linear(), pressure, force[0], groups=GROUPS, folds=4)
+    cv = cross_validate(Linear(), pressure, force[0], groups=GROUPS, folds=4, loss=Squared())
     assert cv.pads[1].n == 0
     assert np.isnan(cv.pads[1].rmse)
     assert cv.pads[0].n == N

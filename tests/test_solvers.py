@@ -19,7 +19,7 @@ from jaxeit.solvers import (
     solve_spd,
 )
 
-SOLVERS = [Dense(), NestedDissection(leaf_size=4)]
+SOLVERS = [Dense(), NestedDissection(leaf_size=6)]
 
 
 @pytest.fixture(autouse=True)
@@ -70,8 +70,18 @@ def solution(solver, pattern, values, rhs):
     return np.asarray(SOLVE(solver, solver.analyse(pattern), values, jnp.asarray(rhs)))
 
 
-# These programs run once each: what the compiler would gain it never earns back.
-quick = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+def _cheap_compilation():
+    """These programs run once each: what the compiler would gain it never earns back.  A compiler
+    that no longer knows these options takes longer, that is all."""
+    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(jnp.negative, compiler_options=options)(1.0)
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return options
+
+
+quick = partial(jax.jit, compiler_options=_cheap_compilation())
 SOLVE = quick(solve_spd)
 
 
@@ -134,12 +144,11 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("merge", [1, 2])
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("shape", "merge"), [*((shape, 1) for shape in SHAPES), ("islands", 2), ("sheet", 2)])
 def test_solution_is_that_of_superlu(shape, merge):
     matrix, coords = SHAPES[shape]()
     pattern, values = as_pattern(matrix, coords)
-    solver = NestedDissection(leaf_size=max(1, pattern.n // (5 * merge)), merge=merge)
+    solver = NestedDissection(leaf_size=max(1, pattern.n // 4), merge=merge)
     rhs = np.random.default_rng(2).normal(size=(pattern.n, 3))
     found = solution(solver, pattern, values, rhs)
     assert relative(found, splu(matrix).solve(rhs)) < 1e-11
@@ -152,7 +161,7 @@ def test_dense_solution_is_that_of_superlu():
     assert relative(found, splu(matrix).solve(rhs)) < 1e-11
 
 
-@pytest.mark.parametrize("shape", ["star", "strip", "sheet"])
+@pytest.mark.parametrize("shape", ["star", "sheet"])
 def test_neither_numbering_nor_entry_order_matters(shape):
     matrix, coords = SHAPES[shape]()
     rng = np.random.default_rng(3)
@@ -178,12 +187,11 @@ def test_separators_of_a_square_are_its_narrowest_lines():
     assert [shape[2] for shape in plan.panel_shapes][:3] == [16, 8, 8]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_contacts_over_24_decades_lose_nothing_against_dense(seed):
+def test_contacts_over_24_decades_lose_nothing_against_dense():
     """Where conductances bury each other no elimination keeps every digit (compare residuals, row
     by row, with the dense ones on the same matrix)."""
-    rng = np.random.default_rng(seed)
-    matrix, coords = square_sheet(14, 4, 10.0 ** rng.uniform(-12, 12, 25), seed)
+    rng = np.random.default_rng(6)
+    matrix, coords = square_sheet(14, 4, 10.0 ** rng.uniform(-12, 12, 25))
     pattern, values = as_pattern(matrix, coords)
     rhs = rng.normal(size=(pattern.n, 4))
 

@@ -1,0 +1,287 @@
+"""The pictures of a calibration: the paper's figures 5 and 6, and the pads' curves with their residuals.
+
+Lengths are drawn in mm, pressures in kPa, forces in N. Nothing here touches matplotlib's global state.
+"""
+
+import io
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+
+from .calibration import Calibration
+from .evaluation import Evaluation
+from .presses import dominant_pad
+
+try:  # an extra: without it everything but the figures works
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+except ImportError:
+    Figure = None  # type: ignore[assignment,misc]
+
+_MM = 1e3
+_DPI = 125
+_RED, _GREEN, _BLUE, _GREY = "#c62828", "#2e7d32", "#1f5fa8", "#8a8a8a"
+_MARKS = ("#d9730d", "#7b3fa0", "#00838f", "#6d4c41")
+_LAST_IN_FONT = "\u052f"  # the font that comes with matplotlib has Latin, Greek and Cyrillic letters
+
+ESTIMATOR_MEANING: Mapping[str, str] = MappingProxyType(
+    {
+        "peak": "largest pixel",
+        "half": "centroid of the pixels at or above 1/2 of the maximum",
+        "quarter": "centroid of the pixels at or above 1/4 of the maximum",
+        "positive": "value-weighted centroid of the positive part",
+    }
+)
+"""What each named estimator of `jaxeit.ESTIMATORS` takes as the position, for a person."""
+
+
+class ReportError(ValueError):
+    """A figure or a report cannot be made."""
+
+
+def require_matplotlib() -> None:
+    """Raise `ReportError` where matplotlib is not installed."""
+    if Figure is None:
+        raise ReportError("figures and reports need matplotlib, which is not installed; install jaxeit[report]")
+
+
+def png(figure: "Figure") -> bytes:
+    """The figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def localisation_figure(
+    evaluation: Evaluation, skin: je.Skin, estimator: str = "quarter", *, simulated: bool = False
+) -> "Figure":
+    """The paper's figure 5: true positions (black), estimated ones (red), a line between.
+
+    Args:
+        evaluation: of the presses.
+        skin: for its outline, electrodes (green) and pads.
+        estimator: one of ``evaluation.estimated``.
+        simulated: say so in the picture.
+
+    Raises:
+        ReportError: no such estimator, or matplotlib is not installed.
+    """
+    if estimator not in evaluation.estimated:
+        known = ", ".join(evaluation.estimated) or "none"
+        raise ReportError(f"no estimator {estimator!r} in this evaluation; there are: {known}")
+    figure = _figure(6.6, 7.2, simulated)
+    axes = figure.add_subplot()
+    _sheet(axes, skin)
+    _electrodes(axes, skin)
+    true, estimated = evaluation.position * _MM, evaluation.estimated[estimator] * _MM
+    axes.add_collection(LineCollection(list(np.stack([true, estimated], 1)), colors=_GREY, linewidths=0.8))
+    axes.plot(*true.T, "o", ms=3.2, color="black", label="true", zorder=3)
+    axes.plot(*estimated.T, "o", ms=3.2, color=_RED, label="estimated", zorder=4)
+    axes.set_title(_localisation_title(evaluation, estimator), fontsize=10.5)
+    _legend_below(axes)
+    return figure
+
+
+def _localisation_title(evaluation: Evaluation, estimator: str) -> str:
+    estimate = evaluation.estimated[estimator]
+    error = np.linalg.norm(estimate - evaluation.position, axis=1) * _MM
+    found = np.isfinite(error)
+    mean = f"{error[found].mean():.1f} mm" if found.any() else "unknown"
+    lost = f", {np.count_nonzero(~found)} not found" if not found.all() else ""
+    meaning = ESTIMATOR_MEANING.get(estimator, "")
+    return f"Mean localisation error {mean} ({len(error)} presses{lost})\nestimator {_plain(estimator)}" + (
+        f": {meaning}" if meaning else ""
+    )
+
+
+def sensitivity_figure(evaluation: Evaluation, skin: je.Skin, *, simulated: bool = False) -> "Figure":
+    """The paper's figure 6: sensitivity over its mean at every place, EIT only and hybrid.
+
+    Both maps have one colour scale, symmetric about 1.
+
+    Raises:
+        ReportError: matplotlib is not installed.
+    """
+    figure = _figure(9.6, 5.4, simulated)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    summary = evaluation.summary()
+    maps = {
+        "eit": evaluation.sensitivity_eit,
+        "hybrid": evaluation.sensitivity_hybrid / evaluation.sensitivity_hybrid.mean(),
+    }
+    reach = _reach(np.concatenate(list(maps.values())) - 1)
+    for axes, (name, values) in zip(panels, maps.items(), strict=True):
+        _sheet(axes, skin)
+        drawn = _value_map(axes, evaluation.position, values, 1 - reach, 1 + reach, "RdBu_r")
+        axes.set_title(_sensitivity_title(name, summary), fontsize=10.5)
+    panels[1].set_ylabel("")
+    bar = figure.colorbar(drawn, ax=panels, shrink=0.8, extend="both", pad=0.02)
+    bar.set_label("sensitivity / its mean")
+    return figure
+
+
+def _sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
+    label = {"eit": "EIT only: image sum / force", "hybrid": "Hybrid: estimated / true force"}[name]
+    if f"cv_{name}_ddof1" not in summary:
+        return f"{label}\nCV needs two presses or more"
+    cv, error = summary[f"cv_{name}_ddof1"], summary[f"cv_{name}_se"]
+    return f"{label}\nCV {cv:.3f} ± {error:.3f} (SE), ddof 1"
+
+
+def curves_figure(calibration: Calibration, evaluations: Mapping[str, Evaluation] = MappingProxyType({})) -> "Figure":
+    """Each pad's curve and 95 % band with the presses it carried; residuals by place and by force.
+
+    Residuals are estimated minus true force of presses that the fit had not seen; those of other
+    sessions (``evaluations``, by name) join the last panel.
+
+    Raises:
+        ReportError: matplotlib is not installed.
+    """
+    pads = len(calibration.skin.pads)
+    columns = min(max(pads, 1), 4)
+    rows = -(-pads // columns)
+    figure = _figure(9.6, 2.9 * rows + 4.4, calibration.simulated)
+    top, bottom = figure.subfigures(2, 1, height_ratios=[2.9 * rows, 4.4], hspace=0.04)
+    if pads:
+        _curve_panels(top, calibration, rows, columns)
+    place, force = bottom.subplots(1, 2, width_ratios=[1.15, 1])
+    figure.get_layout_engine().set(w_pad=0.09)
+    _residual_map(bottom, place, calibration)
+    _residuals_by_force(force, calibration.evaluation, evaluations)
+    return figure
+
+
+def _curve_panels(figure: Any, calibration: Calibration, rows: int, columns: int) -> None:
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    owner = dominant_pad(calibration.evaluation.pressure)
+    for number, axes in enumerate(panels.flat):
+        if number < len(calibration.skin.pads):
+            _curve_panel(axes, calibration, number, owner == number)
+        else:
+            axes.set_visible(False)
+    figure.supxlabel("pad pressure, kPa", fontsize=10)
+    figure.supylabel("force, N", fontsize=10)
+
+
+def _curve_panel(axes: Any, calibration: Calibration, number: int, mine: np.ndarray) -> None:
+    fitted, found = calibration.curves.pad(number), calibration.evaluation
+    axes.plot(found.pressure[mine, number] / 1e3, found.force[mine], "o", ms=3, color="black", alpha=0.5)
+    low, high = np.asarray(fitted.pressure_range, float)
+    if np.isfinite([low, high]).all():
+        pressure = np.linspace(low, high, 101)
+        force, error, _ = fitted.predict(jnp.asarray(pressure))
+        force, half = np.asarray(force, float), 1.96 * np.asarray(error, float)
+        axes.fill_between(pressure / 1e3, force - half, force + half, color=_BLUE, alpha=0.3, lw=0)
+        axes.plot(pressure / 1e3, force, color=_BLUE, lw=1.5)
+    title = f"pad {number} {_plain(calibration.skin.pads[number].name)}"
+    axes.set_title(f"{title}\n{np.count_nonzero(mine)} presses", fontsize=9.5)
+    axes.grid(alpha=0.25)
+
+
+def _residual(evaluation: Evaluation) -> np.ndarray:
+    """Estimated minus true force, (presses,) N."""
+    return evaluation.total_force - evaluation.force
+
+
+def _residual_map(figure: Any, axes: Any, calibration: Calibration) -> None:
+    residual = _residual(calibration.evaluation)
+    reach = _reach(residual)
+    _sheet(axes, calibration.skin)
+    position = calibration.evaluation.position
+    drawn = _value_map(axes, position, residual, -reach, reach, "RdBu_r")
+    figure.colorbar(drawn, ax=axes, shrink=0.85, extend="both").set_label("estimated − true force, N")
+    axes.set_title("Force error by place", fontsize=10.5)
+
+
+def _residuals_by_force(axes: Any, own: Evaluation, evaluations: Mapping[str, Evaluation]) -> None:
+    axes.axhline(0, color=_GREY, lw=1)
+    axes.plot(
+        own.force,
+        _residual(own),
+        "o",
+        ms=3,
+        alpha=0.5,
+        color="black",
+        label=f"this calibration, held out by {_plain(own.held_out_by)}",
+    )
+    for number, (name, other) in enumerate(evaluations.items()):
+        colour = _MARKS[number % len(_MARKS)]
+        axes.plot(other.force, _residual(other), "D", ms=5, color=colour, label=_plain(name))
+    axes.set_xlim(left=0)
+    axes.set_xlabel("true force, N")
+    axes.set_ylabel("estimated − true force, N")
+    axes.set_title("Force error by force", fontsize=10.5)
+    axes.grid(alpha=0.25)
+    if evaluations:
+        axes.legend(fontsize=8.5, loc="best")
+
+
+# --- parts -----------------------------------------------------------------------------------------
+
+
+def _figure(width: float, height: float, simulated: bool) -> "Figure":
+    require_matplotlib()
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    if simulated:
+        figure.suptitle("SIMULATED", color=_RED, fontsize=11, fontweight="bold")
+    return figure
+
+
+def _plain(text: str, limit: int = 24) -> str:
+    """A name from a file as a label: on one line, never read as mathematics, in letters of the font."""
+    known = "".join(c if c.isprintable() and c <= _LAST_IN_FONT else "?" for c in text)
+    short = known if len(known) <= limit else known[: limit - 3] + "..."
+    return short.replace("\\", "/").replace("$", r"\$")
+
+
+def _reach(deviation: np.ndarray) -> float:
+    """Half the span of a symmetric colour scale: nearly all values, so that one cannot wash out the rest."""
+    size = np.abs(deviation[np.isfinite(deviation)])
+    return float(max(np.percentile(size, 98), 1e-6)) if size.size else 1.0
+
+
+def _sheet(axes: Any, skin: je.Skin) -> None:
+    """The outlines of the sheet and its pads, and axes in mm."""
+    rim = np.union1d(np.linspace(0, skin.domain.perimeter, 181), skin.domain.corners)
+    axes.plot(*(skin.domain.boundary_point(rim) * _MM).T, color=_GREY, lw=1.2, zorder=1)
+    for pad in skin.pads:
+        axes.fill(*(pad.outline * _MM).T, fill=False, edgecolor="#555555", lw=0.9, zorder=2)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, mm")
+    axes.set_ylabel("y, mm")
+
+
+def _electrodes(axes: Any, skin: je.Skin) -> None:
+    place = skin.electrode_positions * _MM
+    axes.plot(*place.T, "o", ms=9, mfc="none", mec=_GREEN, mew=1.6, label="electrode", zorder=2)
+
+
+def _legend_below(axes: Any) -> None:
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, frameon=False)
+
+
+def _value_map(axes: Any, position, values, low: float, high: float, colours: str) -> Any:
+    """Values at places as coloured cells where the places form a grid, else as coloured marks."""
+    options = {"vmin": low, "vmax": high, "cmap": colours}
+    place, index = np.unique(np.round(position, 6), axis=0, return_inverse=True)
+    index = index.ravel()
+    mean = np.bincount(index, values) / np.bincount(index)
+    x, y = np.unique(place[:, 0]), np.unique(place[:, 1])
+    if min(len(x), len(y)) > 1 and len(x) * len(y) == len(place):
+        cells = mean.reshape(len(x), len(y)).T
+        return axes.pcolormesh(_edges(x) * _MM, _edges(y) * _MM, cells, zorder=0, **options)
+    marks = {"s": 60, "edgecolors": "black", "linewidths": 0.5, "zorder": 3}
+    return axes.scatter(*(place * _MM).T, c=mean, **marks, **options)
+
+
+def _edges(centres: np.ndarray) -> np.ndarray:
+    """Borders of cells about ascending centres."""
+    middle = (centres[1:] + centres[:-1]) / 2
+    return np.concatenate([[2 * centres[0] - middle[0]], middle, [2 * centres[-1] - middle[-1]]])

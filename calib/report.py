@@ -1,0 +1,409 @@
+"""A calibration as one HTML page that needs nothing else, with the paper's figures beside it."""
+
+import base64
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from .calibration import Calibration
+from .evaluation import Evaluation
+from .figures import (
+    ESTIMATOR_MEANING,
+    curves_figure,
+    localisation_figure,
+    png,
+    require_matplotlib,
+    sensitivity_figure,
+)
+from .session import replacing
+
+_NO_EVALUATIONS: Mapping[str, Evaluation] = MappingProxyType({})
+_HEADLINE = "quarter"  # of the named estimators, the one nearest to the paper's figure on simulated skins
+
+
+def write_report(
+    calibration: Calibration,
+    path: str | Path,
+    *,
+    evaluations: Mapping[str, Evaluation] = _NO_EVALUATIONS,
+) -> list[Path]:
+    """Write the page and, beside it, its figures as PNG; each file whole or not at all.
+
+    Args:
+        calibration: what the page is about.
+        path: of the page; for ``report.html`` the figures are ``report_localisation.png``,
+            ``report_sensitivity.png`` and ``report_curves.png``.
+        evaluations: of the calibration on other sessions, by name.
+
+    Returns: the paths written, the page first.
+
+    Raises:
+        ReportError: matplotlib is not installed.
+        SessionError, OSError: a file cannot be written.
+    """
+    require_matplotlib()
+    page = Path(path)
+    figures = _figures(calibration, evaluations)
+    text = _page(calibration, evaluations, figures)
+    pictures = [page.with_name(f"{page.stem}_{figure.name}.png") for figure in figures]
+    for target, figure in zip(pictures, figures, strict=True):
+        _write(target, figure.data)
+    _write(page, text.encode())
+    return [page, *pictures]
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+# --- figures -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A PNG file with its title, what it shows for who cannot see it, and what to look for."""
+
+    name: str
+    title: str
+    data: bytes
+    alt: str
+    caption: str
+
+
+def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[_Picture]:
+    found, skin, simulated = calibration.evaluation, calibration.skin, calibration.simulated
+    estimator = _HEADLINE if _HEADLINE in found.estimated else next(iter(found.estimated))
+    localisation = localisation_figure(found, skin, estimator, simulated=simulated)
+    sensitivity = sensitivity_figure(found, skin, simulated=simulated)
+    curves = curves_figure(calibration, evaluations)
+    return [
+        _Picture("localisation", "Localisation", png(localisation), *_about_localisation(found, estimator)),
+        _Picture("sensitivity", "Sensitivity over the sheet", png(sensitivity), *_about_sensitivity(found)),
+        _Picture("curves", "Curves and force errors", png(curves), *_about_curves(calibration, evaluations)),
+    ]
+
+
+def _about_localisation(evaluation: Evaluation, estimator: str) -> tuple[str, str]:
+    s = evaluation.summary()
+    mean, inward = (1e3 * s[f"localisation_{estimator}_{k}"] for k in ("mean", "inward_bias"))
+    alt = (
+        f"Map of the sheet with true and estimated positions of {len(evaluation.force)} presses; "
+        f"mean error {_number(mean, 1)} mm by the estimator {estimator}."
+    )
+    caption = (
+        "True positions of the tip are black, estimated ones red; green circles are the electrodes, dark lines the "
+        "outlines of the pads. Look for lines that all point one way: towards the centre they are the inward shift "
+        f"of presses near the rim ({_number(inward, 1)} mm on average here, positive is inward); all in parallel they "
+        "are an offset between the stage and the sheet; swapped or mirrored regions are electrodes in another order."
+    )
+    return alt, caption
+
+
+def _about_sensitivity(evaluation: Evaluation) -> tuple[str, str]:
+    s = evaluation.summary()
+    eit, hybrid = (_number(s.get(f"cv_{name}_ddof1", math.nan), 3) for name in ("eit", "hybrid"))
+    alt = (
+        "Two maps of sensitivity over its mean at every place pressed: EIT only, coefficient of variation "
+        f"{eit}, and hybrid, {hybrid}."
+    )
+    caption = (
+        "The same newton reads high where the map is red and low where it is blue; both maps share one colour scale, "
+        "which is cut at the largest 2 % of the values. Look for a pale rim in EIT only (fewer electrodes see it), for "
+        "patches (uneven coating or contact), and in hybrid for lines along the edges of pads, where the stiff "
+        "border carries part of the load or two pads share it. The hybrid map shows the pads and their curves, not the "
+        "image: a force map sums to the pad's force whatever the image is."
+    )
+    return alt, caption
+
+
+def _about_curves(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> tuple[str, str]:
+    alt = (
+        f"Pressure-force curves of {len(calibration.skin.pads)} pads with their presses; a map of force errors over "
+        "the sheet; force errors against force."
+    )
+    caption = (
+        "Top: the curve of each pad over the pressures fitted, with the 95 % band of the curve itself (1.96 standard "
+        "errors; single presses scatter more), and the means over the hold of presses that this pad carried to 90 % "
+        "or more. The curve is fitted to whole presses, loading to release. Points in groups beside the curve "
+        "are places that respond differently. Bottom: estimated minus true force of presses the fit had not seen, "
+        "by place and by force. Structure in the map asks for a correction by location; a slope or bend over force "
+        "asks for another curve." + _one_level(calibration.evaluation, bool(evaluations))
+    )
+    return alt, caption
+
+
+def _one_level(evaluation: Evaluation, others: bool) -> str:
+    force = evaluation.force
+    if np.ptp(force) > 0.1 * force.max():
+        return ""
+    more = "" if others else " Evaluate on presses at other forces before trusting those."
+    return f" All presses were held at about {force.mean():.3g} N, so the errors here are those of that force." + more
+
+
+# --- the page ------------------------------------------------------------------------------------------------------
+
+
+def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figures: Iterable[_Picture]) -> str:
+    mark = "SIMULATED: " if calibration.simulated else ""
+    title = escape(f"{mark}Calibration of the skin {calibration.skin.name}")
+    parts = [
+        f"<h1>{escape(f'Calibration of the skin {calibration.skin.name}')}</h1>",
+        _banner(calibration.simulated),
+        f"<p>{escape(_lead(calibration))}</p>",
+        _results(calibration, evaluations),
+        _localisation({"this calibration": calibration.evaluation, **evaluations}),
+        *map(_figure, figures),
+        _pads(calibration),
+        _notes(calibration, evaluations),
+        _provenance(calibration),
+    ]
+    return _SHELL.format(title=title, style=_STYLE, body="\n".join(filter(None, parts)))
+
+
+def _banner(simulated: bool) -> str:
+    if not simulated:
+        return ""
+    return (
+        '<p class="banner" role="note"><strong>SIMULATED</strong> This calibration rests on simulated recordings. '
+        "Its numbers say how the method behaves on a model of the skin, not what a real skin does.</p>"
+    )
+
+
+def _lead(calibration: Calibration) -> str:
+    skin, found = calibration.skin, calibration.evaluation
+    rows, columns = calibration.recon.shape
+    return (
+        f"{len(skin.pads)} pads, {len(skin.electrodes)} electrodes, {len(skin.protocol.pattern)} readings a frame, "
+        f"image of {columns} x {rows} pixels. {len(found.force)} presses at {_places(found)} places, held at "
+        f"{found.force.min():.3g} to {found.force.max():.3g} N. All forces below are predictions for presses that "
+        f"the fit had not seen (held out by {found.held_out_by})."
+    )
+
+
+def _places(evaluation: Evaluation) -> int:
+    return len(np.unique(np.round(evaluation.position, 6), axis=0))
+
+
+def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> str:
+    found = {"this calibration": calibration.evaluation, **evaluations}
+    numbers = [_headlines(e) for e in found.values()]
+    heads = [f"{name} (held out by {e.held_out_by})" for name, e in found.items()]
+    rows = [(label, *(n[label] for n in numbers), paper) for label, paper in _PAPER.items()]
+    table = _table(["", *heads, "paper, measured on hardware"], rows)
+    about = (
+        "After ±: standard error over presses (bootstrap). CV: standard deviation over mean of the sensitivity over "
+        "the presses. Full scale: the largest force pressed. The paper is arXiv 2605.28468; it states neither its "
+        "estimator of position nor ddof."
+    )
+    if calibration.simulated:
+        about += (
+            " Its numbers were measured on a real skin, ours come from a simulation whose parameters were chosen to "
+            "resemble it: likeness is consistency, not validation."
+        )
+    return f"<h2>Results</h2>{table}<p class='small'>{escape(about)}</p>"
+
+
+_PAPER = {
+    f"localisation error, mean, estimator {_HEADLINE}, mm": "6.9",
+    "CV, EIT only, ddof 1": "0.31",
+    "CV, hybrid, ddof 1": "0.14",
+    "force RMSE, N": "not stated",
+    "force RMSE, % of full scale": "not stated",
+    "force, mean absolute error, N": "not stated",
+    "force, worst error, N": "not stated",
+    "presses": "225",
+}
+"""Rows of the table of results, and what the paper says."""
+
+
+def _headlines(evaluation: Evaluation) -> dict[str, str]:
+    """The rows of `_PAPER` for one evaluation."""
+    s = evaluation.summary()
+    get = {k: float(v) for k, v in s.items()}
+    place = f"localisation_{_HEADLINE}_mean"
+    values = (
+        _with_error(1e3 * get.get(place, math.nan), 1e3 * get.get(f"{place}_se", math.nan), 1),
+        *(_with_error(get.get(f"cv_{n}_ddof1", math.nan), get.get(f"cv_{n}_se", math.nan), 3) for n in _KINDS),
+        _number(get["force_rmse"], 2),
+        _number(get["force_rmse_percent_full_scale"], 1),
+        _number(get["force_mean_absolute"], 2),
+        _number(get["force_worst"], 2),
+        _number(get["presses"], 0),
+    )
+    return dict(zip(_PAPER, values, strict=True))
+
+
+_KINDS = ("eit", "hybrid")
+
+
+def _localisation(found: Mapping[str, Evaluation]) -> str:
+    rows = [
+        (estimator, *row, name)
+        for name, e in found.items()
+        for estimator, row in zip(e.estimated, _localisation_rows(e), strict=True)
+    ]
+    head = ["estimator", "mean, mm", "median, mm", "95th percentile, mm", "inward bias, mm", "session"]
+    meaning = "; ".join(f"{name}: {text}" for name, text in ESTIMATOR_MEANING.items())
+    return (
+        f"<h2>Localisation by estimator</h2>{_table(head, rows)}<p class='small'>{escape(meaning)}. Inward bias: how "
+        "much nearer to the centre of the sheet the estimate lies than the truth.</p>"
+    )
+
+
+def _localisation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    s = evaluation.summary()
+    out = []
+    for name in evaluation.estimated:
+        mean, error, *rest = (
+            1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
+        )
+        out.append((_with_error(mean, error, 1), *(_number(value, 1) for value in rest)))
+    return out
+
+
+def _figure(picture: _Picture) -> str:
+    data = base64.b64encode(picture.data).decode()
+    return (
+        f"<h2>{escape(picture.title)}</h2><figure class='{picture.name}'>"
+        f'<img alt="{escape(picture.alt)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
+    )
+
+
+def _pads(calibration: Calibration) -> str:
+    curve = calibration.curves.curve
+    head = [
+        "pad",
+        *(f"{n}, {u}" if u != "1" else n for n, u in zip(curve.names, curve.units, strict=True)),
+        "pressures fitted, Pa",
+        "samples",
+        "places",
+        "residual RMS, N",
+        "fit",
+    ]
+    rows = [_pad_row(calibration, number) for number in range(len(calibration.skin.pads))]
+    kind = escape(calibration.provenance.get("curve", type(curve).__name__))
+    return (
+        f"<h2>Pads</h2>{_table(head, rows)}<p class='small'>Curve: {kind}. After ±: standard error, from the scatter "
+        "between places. Residual RMS: of all samples fitted, not held out. Outside the pressures fitted a force is "
+        "marked as not valid.</p>"
+    )
+
+
+def _pad_row(calibration: Calibration, number: int) -> tuple[str, ...]:
+    fitted = calibration.curves.pad(number)
+    values, errors = np.asarray(fitted.parameters, float), np.asarray(fitted.standard_errors, float)
+    low, high = np.asarray(fitted.pressure_range, float)
+    return (
+        f"{number} {calibration.skin.pads[number].name}",
+        *(f"{_significant(v, 5)} ± {_significant(e, 2)}" for v, e in zip(values, errors, strict=True)),
+        f"{_number(low, 0)} to {_number(high, 0)}",
+        str(int(fitted.n)),
+        str(int(fitted.n_groups)),
+        _number(float(fitted.residual_rms), 2),
+        fitted.message(),
+    )
+
+
+def _notes(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> str:
+    notes = list(calibration.notes) + [f"{name}: {note}" for name, e in evaluations.items() for note in e.notes]
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes) or "<li>none</li>"
+    return f"<h2>Notes</h2><ul>{items}</ul>"
+
+
+def _provenance(calibration: Calibration) -> str:
+    rows = [(key.replace("_", " "), value) for key, value in calibration.provenance.items()]
+    return f"<h2>Provenance</h2>{_table(['what', 'value'], rows, 'provenance')}"
+
+
+# --- parts -----------------------------------------------------------------------------------------
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "numbers") -> str:
+    """A table from plain texts; the first column names the row."""
+    top = "".join(f"<th scope='col'>{escape(cell)}</th>" for cell in head)
+    body = "".join(
+        f"<tr><th scope='row'>{escape(first)}</th>{''.join(f'<td>{escape(cell)}</td>' for cell in rest)}</tr>\n"
+        for first, *rest in rows
+    )
+    return f"<div class='wide'><table class='{kind}'><thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "—"
+
+
+def _significant(value: float, digits: int) -> str:
+    return f"{value:.{digits}g}".replace("-", "−") if math.isfinite(value) else "—"
+
+
+def _with_error(value: float, error: float, digits: int) -> str:
+    """A value and its standard error, which gets one digit more where it would be lost."""
+    shown = _number(error, digits + (error < 10.0**-digits))
+    return f"{_number(value, digits)} ± {shown}" if math.isfinite(error) else _number(value, digits)
+
+
+_SHELL = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<main>
+{body}
+</main>
+</body>
+</html>
+"""
+
+_STYLE = """
+:root { --text: #1b1b1b; --page: #ffffff; --soft: #555555; --line: #cfcfcf; --head: #f1f3f5;
+  --warn-text: #7a0c0c; --warn-page: #fdecea; --warn-line: #c62828; }
+@media (prefers-color-scheme: dark) {
+  :root { --text: #e8e8e8; --page: #16181b; --soft: #b3b3b3; --line: #444a50; --head: #22262b;
+    --warn-text: #ffd9d4; --warn-page: #4a1512; --warn-line: #ff6f60; } }
+body { margin: 0; background: var(--page); color: var(--text);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; }
+main { max-width: 62rem; margin: 0 auto; padding: 1.5rem 1rem 3rem; }
+h1 { font-size: 1.7rem; margin: 0 0 .8rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.25rem; margin: 2.2rem 0 .6rem; }
+.banner { background: var(--warn-page); color: var(--warn-text); border: 2px solid var(--warn-line);
+  border-radius: 6px; padding: .6rem 1rem; }
+.banner strong { font-size: 1.25rem; letter-spacing: .06em; margin-right: .6rem; }
+.small, figcaption { font-size: .9rem; color: var(--soft); }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .95rem; }
+th, td { border-bottom: 1px solid var(--line); padding: .35rem .8rem; text-align: right; vertical-align: top; }
+thead th { background: var(--head); font-weight: 600; }
+th:first-child { text-align: left; }
+tbody th { font-weight: 400; }
+td { overflow-wrap: anywhere; }
+td:last-child { text-align: right; }
+.provenance td, .provenance th { text-align: left; white-space: pre-wrap; }
+.provenance td { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .85rem; }
+figure { margin: 0; }
+figure img { display: block; width: 100%; height: auto; background: #ffffff; border: 1px solid var(--line);
+  border-radius: 4px; margin-bottom: .5rem; }
+figure.localisation img { max-width: 42rem; }
+li { overflow-wrap: anywhere; }
+@media print {
+  :root { --text: #000000; --page: #ffffff; --soft: #333333; --line: #999999; --head: #eeeeee;
+    --warn-text: #7a0c0c; --warn-page: #ffffff; --warn-line: #c62828; }
+  body { font-size: 10.5pt; }
+  main { max-width: none; padding: 0; }
+  h2 { break-after: avoid; }
+  figure, tr, .banner { break-inside: avoid; }
+  figure.localisation img { max-width: 13cm; }
+  .wide { overflow: visible; } }
+"""

@@ -1,0 +1,234 @@
+"""From a simulated bench to newtons and back, and what is said when something is wrong."""
+
+from dataclasses import replace
+from datetime import datetime
+
+import h5py
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.bench import Bench, Timing, simulate
+
+SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
+EFFECTS = (
+    je.LoadSpreading(width=0.008),
+    je.ContactPiezoresistance(),
+    je.Noise(std=1e-6, stream=je.Stream.EIT),
+    je.Noise(std=2.0, stream=je.Stream.PRESSURE),
+    je.Noise(std=0.01, stream=je.Stream.FORCE),
+)
+
+
+def bench(skin, sites, seed=0, **changes):
+    timing = Timing(rest=0.6, ramp=0.6, hold=1.2, release=0.6, recovery=0.6)
+    settings = dict(timing=timing, blank=1.0, eit_rate=10.0, pad_rate=50.0, eit_step=1e-6, seed=seed)
+    return Bench(je.Scene(skin, EFFECTS), sites, np.array([20.0]), **(settings | changes), toml="simulated in a test")
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("sessions")
+
+
+@pytest.fixture(scope="session")
+def grid(skin, folder):
+    """16 presses, four on each pad."""
+    return simulate(bench(skin, SITES), folder / "grid.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+
+
+@pytest.fixture(scope="session")
+def calibration(grid):
+    with calib.open_session(grid) as session:
+        return calib.calibrate([session], basis=je.Pixels(20), fidelity=je.Fidelity.draft())
+
+
+def test_recovers_the_pads(calibration):
+    """Without effects in the pads, force = pressure x area wherever the whole load is on one pad."""
+    slope = np.asarray(calibration.curves.parameters)[:, 0]
+    np.testing.assert_allclose(slope, 0.01, rtol=0.02)
+
+
+def test_results_are_sane(calibration):
+    s = calibration.evaluation.summary()
+    assert s["presses"] == 16
+    assert s["localisation_half_mean"] < 0.01  # of the size of a pixel
+    assert s["force_rmse"] < 0.5
+    assert s["cv_hybrid_ddof1"] < 0.03 < s["cv_eit_ddof1"]
+    assert calibration.simulated
+
+
+def test_saved_and_loaded_it_is_the_same(calibration, folder):
+    path = folder / "calibration.h5"
+    calibration.save(path)
+    loaded = calib.load_calibration(path)
+    assert loaded.evaluation.summary() == calibration.evaluation.summary()
+    assert loaded.provenance == calibration.provenance
+    dv = np.random.default_rng(0).normal(size=(3, 550)) * 1e-4
+    pressures = np.array([[500.0, 0, 0, 100.0], [0, 0, 0, 0], [2000.0, 1, 2, 3]])
+    first, second = (calib.force_map(c, dv, pressures) for c in (calibration, loaded))
+    np.testing.assert_array_equal(first.map.force, second.map.force)
+    np.testing.assert_array_equal(first.standard_error, second.standard_error)
+
+
+@pytest.mark.parametrize("curve", [calib.PowerLaw(), calib.Affine()], ids=lambda c: type(c).__name__)
+def test_every_curve_survives_the_file(grid, folder, curve):
+    with calib.open_session(grid) as session:
+        found = calib.calibrate([session], curve=curve, basis=je.Pixels(20), fidelity=je.Fidelity.draft())
+    found.save(folder / "one.h5")
+    pressures = np.linspace(0, 2000, 7)[:, None] * np.ones(4)
+    again = calib.load_calibration(folder / "one.h5").pad_forces(pressures)
+    for mine, theirs in zip(found.pad_forces(pressures), again, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_force_maps_sum_to_the_pads_and_know_their_limits(calibration):
+    pressures = np.array([[1000.0, 0.0, 0.0, 500.0], [9000.0, 0.0, 0.0, 0.0]])
+    found = calib.force_map(calibration, np.zeros((2, 550)), pressures)
+    np.testing.assert_allclose(np.asarray(found.map.force).sum(1), found.force.sum(1), rtol=1e-12)
+    assert found.valid[0].all()
+    assert not found.valid[1, 0]  # beyond what was calibrated
+    assert (found.standard_error > 0).all()
+    with pytest.raises(ValueError, match=r"give \(n, 550\) V and \(n, 4\) Pa"):
+        calib.force_map(calibration, np.zeros((2, 3)), pressures)
+
+
+def test_evaluate_on_another_session(calibration, skin, folder):
+    sites = np.array([[0.05, 0.05], [0.15, 0.14]])
+    path = simulate(bench(skin, sites, seed=7), folder / "other.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    with calib.open_session(path) as session:
+        found = calib.evaluate(calibration, session)
+        assert found.held_out_by == "session"
+        assert found.summary()["force_rmse"] < 0.5
+        np.testing.assert_allclose(found.position, sites)
+
+
+def test_apply_writes_the_force_of_every_frame(calibration, grid, folder):
+    out = folder / "forcemap.h5"
+    with calib.open_session(grid) as session:
+        calib.apply(calibration, session, out)
+        frames = len(session.stream("eit"))
+    archive = calib.read_archive(out, "skin-forcemap")
+    force, pads = archive.arrays["force"], archive.arrays["pad_force"]
+    assert force.shape == (frames, 400)
+    np.testing.assert_allclose(force.sum(1), pads.sum(1), atol=1e-4)
+    with calib.open_session(grid) as session:
+        middle = (session.presses.t_hold0[3] + session.presses.t_hold1[3]) // 2
+    held = np.argmin(np.abs(archive.arrays["time"] - middle))
+    assert pads[held].sum() == pytest.approx(20.0, rel=0.1)
+    assert archive.arrays["shape_valid"][held].any()
+    assert np.abs(pads[:8].sum(1)).max() < 0.5  # the blank
+
+
+def test_a_failed_apply_leaves_no_file(calibration, grid, folder):
+    out = folder / "never.h5"
+
+    def break_off(blocks):
+        yield from list(blocks)[:1]
+        raise KeyboardInterrupt
+
+    with calib.open_session(grid) as session, pytest.raises(KeyboardInterrupt):
+        calib.apply(calibration, session, out, progress=break_off)
+    assert not out.exists()
+    assert not list(folder.glob("*never*"))
+
+
+def test_the_same_bench_makes_the_same_file(skin, folder):
+    few = bench(skin, SITES[:1])
+    paths = [
+        simulate(few, folder / f"same{i}.h5", fidelity=je.Fidelity.draft(edge_length=0.05)).read_bytes() for i in (0, 1)
+    ]
+    assert paths[0] == paths[1]
+
+
+# --- what is said when something is wrong --------------------------------------------------------
+
+
+def _rewritten(grid, path, change):
+    """A copy of the session with its streams changed by ``change(name, values)``."""
+    with calib.open_session(grid) as s:
+        writer = calib.SessionWriter(
+            path, title="t", skin_name=s.skin_name, skin_toml=s.skin_toml, pattern=s.pattern,
+            current=s.current, frequency=s.frequency, epoch=datetime.fromisoformat(s.epoch),
+        )  # fmt: skip
+        with writer:
+            for name, stream in s.streams.items():
+                values = change(name, stream.read())
+                writer.add_stream(
+                    name, stream.variable, units=stream.unit, channels=values.shape[1], rate_hz=stream.nominal_rate
+                )
+                writer.append(name, stream.time, values)
+            writer.set_presses(s.presses)
+    return path
+
+
+def test_a_dead_eit_channel_is_left_out_and_named(grid, folder):
+    def kill(name, values):
+        return np.where(np.arange(values.shape[1]) == 12, np.nan, values) if name == "eit" else values
+
+    path = _rewritten(grid, folder / "dead.h5", kill)
+    with calib.open_session(path) as session:
+        found = calib.calibrate([session], basis=je.Pixels(20), fidelity=je.Fidelity.draft())
+    assert any("left out: 12" in note for note in found.notes)
+    assert found.evaluation.summary()["localisation_half_mean"] < 0.01
+    assert not found.simulated
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda n, v: v[:, :3] if n == "pressure" else v, "has 3 columns, the skin 'testbed' has 4 pads"),
+        (
+            lambda n, v: np.where(np.arange(v.shape[1]) == 2, np.nan, v) if n == "pressure" else v,
+            "column 2, pad 'upper left', holds no finite sample",
+        ),
+        (lambda n, v: np.nan * v if n == "force" else v, "none of 16 presses can be used"),
+    ],
+)
+def test_a_missing_pad_or_load_cell_is_one_clear_line(grid, folder, change, message):
+    path = _rewritten(grid, folder / "broken.h5", change)
+    with calib.open_session(path) as session, pytest.raises(calib.SessionError, match=message) as caught:
+        calib.calibrate([session])
+    assert str(caught.value).startswith("broken.h5: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_another_skin_is_refused(grid, skin):
+    other = replace(skin, protocol=je.Protocol(skin.protocol.pattern[::-1]))
+    with calib.open_session(grid) as session, pytest.raises(calib.SessionError, match="is not that of the skin"):
+        calib.calibrate([session], other)
+
+
+def test_a_low_pass_the_stream_cannot_carry_is_refused(grid):
+    asked = calib.Processing(corrections=(calib.LowPass(50.0),))
+    with calib.open_session(grid) as session, pytest.raises(ValueError, match="eit.*10"):
+        calib.calibrate([session], processing=asked)
+
+
+def test_a_pad_that_was_never_pressed(skin, folder):
+    path = simulate(
+        bench(skin, SITES[:2]), folder / "two.h5", fidelity=je.Fidelity.draft(edge_length=0.05)
+    )  # both on the lower left pad
+    with calib.open_session(path) as session, pytest.raises(ValueError, match="pad 1 .*lower right"):
+        calib.calibrate([session], basis=je.Pixels(20), fidelity=je.Fidelity.draft())
+
+
+def test_no_session_at_all():
+    with pytest.raises(calib.SessionError, match="no session"):
+        calib.calibrate([])
+
+
+def test_sites_outside_the_sheet(skin):
+    with pytest.raises(ValueError, match="site 0"):
+        bench(skin, np.array([[0.3, 0.1]]))
+
+
+def test_bundled_sessions_say_that_they_are_simulated(bundled):
+    for path in bundled:
+        with calib.open_session(path) as session:
+            assert session.simulated
+            assert session.scene == path.with_suffix(".toml").read_text()
+            assert session.seed == calib.load_bench(path.with_suffix(".toml")).seed
+        with h5py.File(path) as file:
+            assert file.attrs["simulated"] == 1

@@ -1,0 +1,122 @@
+"""The command line: what it prints, how it exits, and one clear line for every wrong input."""
+
+import json
+
+import numpy as np
+import pytest
+
+from calib.cli import main
+
+
+@pytest.fixture(scope="module")
+def grid_file(bundled):
+    return next(path for path in bundled if path.stem == "testbed_grid")
+
+
+@pytest.fixture(scope="module")
+def presses_file(bundled):
+    return next(path for path in bundled if path.stem == "testbed_presses")
+
+
+@pytest.fixture(scope="module")
+def calibrated(grid_file, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    assert main(["calibrate", str(grid_file), "-o", str(folder / "new" / "calibration.h5"), "--pixels", "20"]) == 0
+    return folder / "new" / "calibration.h5"
+
+
+def test_evaluate_as_text_and_json(calibrated, presses_file, capsys):
+    assert main(["evaluate", str(calibrated), str(presses_file)]) == 0
+    text = capsys.readouterr().out
+    assert "SIMULATED" in text
+    assert "held out by session" in text
+    assert main(["evaluate", str(calibrated), str(presses_file), "--json"]) == 0
+    first = capsys.readouterr().out
+    assert json.loads(first)["testbed_presses.h5"]["presses"] == 4
+    main(["evaluate", str(calibrated), str(presses_file), "--json"])
+    assert capsys.readouterr().out == first
+
+
+def test_apply(calibrated, presses_file, tmp_path, capsys):
+    assert main(["apply", str(calibrated), str(presses_file), "-o", str(tmp_path / "map.h5")]) == 0
+    assert "4680 force maps" in capsys.readouterr().out
+    assert (tmp_path / "map.h5").exists()
+
+
+def test_a_log_without_eit(tmp_path, capsys):
+    t = np.arange(0, 20, 0.01)
+    force = 10 * (1 - np.cos(t))
+    rows = np.column_stack([1e3 * t, force, force * 100 + np.random.default_rng(0).normal(size=len(t))])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",")
+    log, session = str(tmp_path / "log.csv"), str(tmp_path / "log.h5")
+    streams = ["--stream", "force=1:N", "--stream", "pressure=2:Pa"]
+    assert main(["import", "csv", log, "--time", "0:ms", *streams, "-o", session]) == 0
+    assert main(["calibrate", session, "-o", str(tmp_path / "curve.h5")]) == 0
+    out = capsys.readouterr().out
+    assert "slope 0.01 " in out
+    assert "held out" in out
+
+
+def test_simulate_refuses_a_wrong_scene(tmp_path, root, capsys):
+    text = (root / "data" / "sessions" / "testbed_grid.toml").read_text()
+    (tmp_path / "scene.toml").write_text(text.replace("columns = 15", "colums = 15"))
+    assert main(["simulate", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "s.h5")]) == 2
+    assert "columns: missing" in capsys.readouterr().err
+    assert not (tmp_path / "s.h5").exists()
+
+
+def _csv(path):
+    path.write_text("1,2,3\n" * 100)
+
+
+def _truncated(path, whole):
+    path.write_bytes(whole.read_bytes()[:300_000])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda p, w: None, "does not exist"),
+        (lambda p, w: p.write_bytes(b""), "empty"),
+        (lambda p, w: _truncated(p, w), ""),
+        (lambda p, w: _csv(p), "jaxeit import csv"),
+        (lambda p, w: p.mkdir(), "folder"),
+    ],
+    ids=["missing", "empty", "truncated", "foreign", "folder"],
+)
+@pytest.mark.parametrize("command", ["check", "calibrate"])
+def test_a_file_that_is_no_session_is_one_line_and_status_2(make, message, command, grid_file, tmp_path, capsys):
+    path = tmp_path / "session.h5"
+    make(path, grid_file)
+    extra = ["-o", str(tmp_path / "c.h5")] if command == "calibrate" else []
+    assert main([command, str(path), *extra]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jaxeit: session.h5")
+    assert error.count("\n") == 1
+    assert message in error
+    assert not (tmp_path / "c.h5").exists()
+
+
+def test_a_session_is_not_a_calibration(grid_file, presses_file, capsys):
+    assert main(["evaluate", str(grid_file), str(presses_file)]) == 2
+    error = capsys.readouterr().err
+    assert "skin-calibration" in error
+    assert error.count("\n") == 1
+
+
+def test_a_low_pass_beyond_the_frame_rate(grid_file, tmp_path, capsys):
+    assert main(["calibrate", str(grid_file), "-o", str(tmp_path / "c.h5"), "--low-pass", "50"]) == 2
+    error = capsys.readouterr().err
+    assert "eit" in error
+    assert error.count("\n") == 1
+
+
+def test_check_of_the_bundled_sessions(bundled, capsys):
+    assert main(["check", *map(str, bundled)]) == 0
+    assert "SIMULATED" in capsys.readouterr().out
+
+
+def test_no_command_is_an_error():
+    with pytest.raises(SystemExit) as caught:
+        main([])
+    assert caught.value.code == 2

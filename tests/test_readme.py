@@ -1,0 +1,33 @@
+"""The README's program runs, and its commands and links exist."""
+
+import re
+
+import numpy as np
+
+from calib.cli import _COMMANDS
+
+
+def test_the_program_of_the_first_screen_runs(root, capsys):
+    text = (root / "README.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names: dict = {}
+    exec(compile(program, "README.md", "exec"), names)
+    assert float(capsys.readouterr().out) == 12.0
+    assert np.linalg.norm(np.asarray(names["where"]) - [0.06, 0.13]) < 5e-3
+    assert names["v"].shape == (550,)
+    assert names["image"].shape == (1600,)
+
+
+def test_commands_and_links(root):
+    text = (root / "README.md").read_text()
+    assert set(re.findall(r"`jaxeit (\w+)", text)) == set(_COMMANDS)
+    for link in re.findall(r"\]\(([^)]+)\)", text):
+        assert (root / link).exists(), link
+    for target in re.findall(r"^make (\w+)", text, re.MULTILINE):
+        assert f"\n{target}:" in (root / "Makefile").read_text()
+
+
+def test_results_table_is_filled(root):
+    text = (root / "README.md").read_text()
+    table = text[text.index("<!-- results") : text.index("<!-- end of results")]
+    assert table.count("|") > 20
