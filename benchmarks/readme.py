@@ -1,6 +1,6 @@
 """Write the results table and the picture of the README from the bundled session.
 
-    python benchmarks/readme.py
+python benchmarks/readme.py
 """
 
 import re
@@ -13,7 +13,7 @@ from calib.figures import front_page_figure
 from calib.runtime import set_up
 
 ROOT = Path(__file__).parents[1]
-PAPER = {"localisation": "6.9 (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
+PAPER = {"localisation": "6.9 mm (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
 
 
 def main() -> None:
@@ -37,7 +37,7 @@ def main() -> None:
 def _table(s: dict[str, float]) -> str:
     rows = [
         f"| localisation error, {name} estimator, mean | {1e3 * s[f'localisation_{name}_mean']:.1f} ± "
-        f"{1e3 * s[f'localisation_{name}_mean_se']:.1f} mm | {PAPER['localisation'] + ' mm' if name == 'quarter' else ''} |"
+        f"{1e3 * s[f'localisation_{name}_mean_se']:.1f} mm | {PAPER['localisation'] if name == 'quarter' else ''} |"
         for name in je.ESTIMATORS
     ]
     rows += [
@@ -49,7 +49,7 @@ def _table(s: dict[str, float]) -> str:
         f"| force error on presses held out by place, RMSE | {s['force_rmse']:.2f} N, "
         f"{s['force_rmse_percent_full_scale']:.1f} % of 20 N | |"
     )
-    head = "| simulated, 225 presses | this run (± standard error over places) | the paper, on hardware |\n|---|---|---|\n"
+    head = "| simulated, 225 presses | this run, ± SE over places | the paper, on hardware |\n|---|---|---|\n"
     return head + "\n".join(rows) + "\n"
 
 

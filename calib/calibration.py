@@ -143,9 +143,7 @@ def calibrate(
     )
 
 
-def evaluate(
-    calibration: Calibration, session: Session, processing: Processing | None = None
-) -> Evaluation:
+def evaluate(calibration: Calibration, session: Session, processing: Processing | None = None) -> Evaluation:
     """How well a calibration does on the presses of another session.
 
     Raises:
@@ -222,18 +220,13 @@ def _press_of_samples(measured: Sequence[Measured]) -> np.ndarray:
 
 
 def _finite(measured: Sequence[Measured]) -> np.ndarray:
-    return np.concatenate(
-        [np.isfinite(m.samples.pressure).all(1) & np.isfinite(m.samples.force) for m in measured]
-    )
+    return np.concatenate([np.isfinite(m.samples.pressure).all(1) & np.isfinite(m.samples.force) for m in measured])
 
 
 def _require_fits(skin: je.Skin, curves: FittedCurve) -> None:
     for number, pad in enumerate(skin.pads):
         if int(curves.result[number]) != FitResult.SUCCESS:
-            raise FitError(
-                f"pad {number} ({pad.name}): the curve could not be fitted: "
-                f"{curves.pad(number).message()}"
-            )
+            raise FitError(f"pad {number} ({pad.name}): the curve could not be fitted: {curves.pad(number).message()}")
 
 
 def _held_out(curve: AbstractCurve, data: _Joined, folds: int, loss: AbstractLoss) -> np.ndarray:
@@ -253,8 +246,7 @@ def _held_out(curve: AbstractCurve, data: _Joined, folds: int, loss: AbstractLos
 def _provenance(sessions: Sequence[Session], options: dict[str, str]) -> dict[str, str]:
     return {
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, "
-        f"Python {platform.python_version()}",
+        "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, Python {platform.python_version()}",
         "sessions": "\n".join(f"{s.hash}  {s.name}" for s in sessions),
         **options,
     }
@@ -333,11 +325,7 @@ def _from_archive(archive: Archive) -> Calibration:
         shape=(int(attrs["image_rows"]), int(attrs["image_columns"])),
         extent=tuple(map(float, arrays["image/extent"])),  # type: ignore[arg-type]
     )
-    provenance = {
-        k.removeprefix("provenance_"): str(v)
-        for k, v in attrs.items()
-        if k.startswith("provenance_")
-    }
+    provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
     curve = CURVES[provenance["curve"]]()
     if "pads/reference" in arrays:
         curve = type(curve)(reference=jnp.asarray(arrays["pads/reference"]))

@@ -80,7 +80,9 @@ def press_findings(
     lost = int(before - presses.accepted.sum())
     if not presses.accepted.any():
         what = f"none of {len(presses)} presses can be used: {presses.reason[0]}"
-        findings.append(Finding(Severity.ERROR, "/presses", what, "see the reasons below; record again"))
+        # a log of force alone is fitted sample by sample and needs no presses
+        severity = Severity.ERROR if "eit" in streams else Severity.WARNING
+        findings.append(Finding(severity, "/presses", what, "see the reasons below; record again"))
         return presses, ()
     if lost:
         what = f"{lost} of {len(presses)} presses lack samples of a stream and are set aside"

@@ -13,6 +13,7 @@ from calib.session import Session, SessionError, Status, Stream
 Progress = Callable[[Iterable], Iterable]
 
 _MISSING = 0.001  # tolerated fraction of missing values
+_IRREGULAR = 0.1  # fraction of intervals that are gaps from which they are no exception
 _RATE = 0.02  # tolerated difference from the nominal rate
 _SMALLEST_PRESSURE = 5.0  # Pa; no touch is that light, but bar and kPa give such numbers
 
@@ -143,7 +144,11 @@ def stream_findings(scan: Scan) -> Iterator[Finding]:
     if np.isfinite(row.rate) and abs(row.rate / row.nominal_rate - 1) > _RATE:
         what = f"comes at {row.rate:.4g} Hz, not at the nominal {row.nominal_rate:.4g} Hz"
         yield Finding(Severity.WARNING, where, what, "correct nominal_rate_hz, or the recorder's clock")
-    if row.gaps:
+    if row.gaps > _IRREGULAR * row.samples:
+        share = f"{100 * row.gaps / row.samples:.0f} % of intervals exceed one and a half periods"
+        what = f"comes irregularly: {share}, the longest {row.longest_gap:.3g} s"
+        yield Finding(Severity.WARNING, where, what, "see to the recorder; what it dropped cannot be told")
+    elif row.gaps:
         steps = np.diff(scan.time)
         start = (scan.time[steps.argmax()] - scan.time[0]) / SECOND
         what = (

@@ -142,9 +142,7 @@ def _calibrate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", metavar="REPORT.html", help="write a page with figures")
     parser.add_argument("--curve", choices=_CURVE_NAMES, default="linear", help="default: linear")
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
-    parser.add_argument(
-        "--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits"
-    )
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
     parser.add_argument("--hyperparameter", type=float, default=0.1, help="default: 0.1")
     parser.add_argument("--pixels", type=int, default=40, help="along x; default: 40")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
@@ -230,9 +228,7 @@ def _folder(path: str) -> Path:
 def _evaluate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
-    parser.add_argument(
-        "--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits"
-    )
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
 
 
@@ -265,9 +261,7 @@ def _apply_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("session", metavar="SESSION.h5")
     parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
-    parser.add_argument(
-        "--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits"
-    )
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
 
 
 def _apply(args: argparse.Namespace) -> int:

@@ -108,9 +108,7 @@ class Evaluation:
         return out
 
     @classmethod
-    def restore(
-        cls, attrs: Mapping, arrays: Mapping[str, np.ndarray], attribute: str, array: str
-    ) -> "Evaluation":
+    def restore(cls, attrs: Mapping, arrays: Mapping[str, np.ndarray], attribute: str, array: str) -> "Evaluation":
         """The evaluation that `attributes` and `arrays` described, found under these prefixes."""
         mark = f"{array}estimated_"
         estimated = {k.removeprefix(mark): v for k, v in arrays.items() if k.startswith(mark)}
@@ -167,18 +165,13 @@ def render_table(evaluation: Evaluation, title: str) -> str:
     lines.append("  localisation, mm        mean  (+- SE)  median     p95   inward bias")
     for name in evaluation.estimated:
         mean, error, median, p95, inward = (
-            1e3 * s[f"localisation_{name}_{k}"]
-            for k in ("mean", "mean_se", "median", "p95", "inward_bias")
+            1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
-        lines.append(
-            f"    {name:<16}{mean:12.1f}  ({error:5.2f}) {median:7.1f} {p95:7.1f} {inward:13.1f}"
-        )
+        lines.append(f"    {name:<16}{mean:12.1f}  ({error:5.2f}) {median:7.1f} {p95:7.1f} {inward:13.1f}")
     if "cv_eit_ddof1" in s:
         lines += ["", "  sensitivity              CV    (+- SE)"]
         for name, label in (("eit", "EIT only"), ("hybrid", "hybrid")):
-            lines.append(
-                f"    {label:<16}{s[f'cv_{name}_ddof1']:12.3f}  ({s[f'cv_{name}_se']:.3f})   ddof 1"
-            )
+            lines.append(f"    {label:<16}{s[f'cv_{name}_ddof1']:12.3f}  ({s[f'cv_{name}_se']:.3f})   ddof 1")
     lines += [
         "",
         f"  force: RMSE {s['force_rmse']:.2f} N ({s['force_rmse_percent_full_scale']:.1f} % of the "

@@ -151,9 +151,7 @@ def parse_time(text: str) -> tuple[str, str]:
     """``COLUMN:UNIT`` of the clock, as ``0:ms``; raises `SessionError`."""
     column, colon, unit = text.rpartition(":")
     if not colon or not column or unit not in UNITS or UNITS[unit].si != "s":
-        raise SessionError(
-            f"--time {printable(text)}: not COLUMN:UNIT; write it as 0:ms (s, us, ns)"
-        )
+        raise SessionError(f"--time {printable(text)}: not COLUMN:UNIT; write it as 0:ms (s, us, ns)")
     return column.strip(), unit
 
 
@@ -165,9 +163,7 @@ def parse_stream(text: str) -> StreamSpec:
     if not (equals and colon and name and columns):
         raise SessionError(f"{where}: not NAME=COLUMNS:UNIT; write it as force=4:N")
     if unit not in UNITS:
-        raise SessionError(
-            f"{where}: unit {printable(unit)!r} not known; use one of: {KNOWN_UNITS}"
-        )
+        raise SessionError(f"{where}: unit {printable(unit)!r} not known; use one of: {KNOWN_UNITS}")
     parts = tuple(itertools.chain(*(_column_range(c.strip()) for c in columns.split(","))))
     return StreamSpec(name, parts, unit)
 
@@ -297,9 +293,7 @@ def _read_table(path: Path, dialect: _Dialect, columns: Sequence[int]) -> _Table
     return _Table(np.concatenate(values), np.concatenate(numbers), np.concatenate(bad))
 
 
-def _parse_block(
-    lines: list[str], dialect: _Dialect, columns: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray]:
+def _parse_block(lines: list[str], dialect: _Dialect, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (rows, columns), and where a cell held none."""
     try:
         options: dict[str, Any] = {"delimiter": dialect.delimiter, "usecols": columns}
@@ -423,9 +417,7 @@ def _load(spec: FileSpec, sort: bool) -> _Loaded:
     return _Loaded(spec, table, clock, places)
 
 
-def _write_stream(
-    writer: SessionWriter, loaded: _Loaded, spec: StreamSpec, times: np.ndarray
-) -> StreamReport:
+def _write_stream(writer: SessionWriter, loaded: _Loaded, spec: StreamSpec, times: np.ndarray) -> StreamReport:
     """Convert, write and count one stream."""
     rows, places = loaded.clock.rows, loaded.places[spec.name]
     raw, bad = loaded.table.values[rows][:, places], loaded.table.bad[rows][:, places]
@@ -563,9 +555,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "the clock's column and unit, as 0:ms"
     parser.add_argument("--time", metavar="COLUMN:UNIT", help=text, **grouped)
     text = "a stream, as force=4:N or sensor=1-15:counts; repeat for more"
-    parser.add_argument(
-        "--stream", dest="streams", metavar="NAME=COLUMNS:UNIT", help=text, **grouped
-    )
+    parser.add_argument("--stream", dest="streams", metavar="NAME=COLUMNS:UNIT", help=text, **grouped)
     text = "a number that means no reading, as -1; repeat for more"
     parser.add_argument("--missing", metavar="VALUE", type=float, help=text, **grouped)
     text = "a further file; the options after it are its own"
@@ -603,7 +593,5 @@ def _epoch(text: str | None) -> datetime | None:
     except ValueError:
         moment = None
     if moment is None or moment.tzinfo is None:
-        raise SessionError(
-            f"--epoch {printable(text)}: not a time; write it as 2025-01-31T12:00:00Z"
-        )
+        raise SessionError(f"--epoch {printable(text)}: not a time; write it as 2025-01-31T12:00:00Z")
     return moment

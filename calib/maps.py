@@ -84,7 +84,7 @@ def apply(
     eit, pressure = session.stream("eit"), session.stream("pressure")
     filters = {s.name: processing.of(s)[0] for s in (eit, pressure)}
     recon, pads = calibration.recon, len(calibration.skin.pads)
-    attrs = {
+    attrs: dict[str, str | int] = {
         "skin": calibration.skin.name,
         "session": session.name,
         "session_sha256": session.hash,

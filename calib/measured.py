@@ -1,7 +1,7 @@
 """What a session says about each press, in the terms that a calibration needs."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,8 +39,8 @@ class Processing:
     """
 
     corrections: tuple[AbstractCorrection, ...] | None = None
-    baseline: AbstractBaseline = TwoSided()
-    cutting: Cutting = Cutting()
+    baseline: AbstractBaseline = field(default_factory=TwoSided)
+    cutting: Cutting = field(default_factory=Cutting)
 
     def of(self, stream: Stream) -> tuple[tuple[AbstractCorrection, ...], str]:
         """The corrections for one stream, and a note where the default one does not apply."""
@@ -102,9 +102,7 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
     presses = check_overlap(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
     means = {
-        name: press_means(
-            stream, windows, baseline=processing.baseline, corrections=chosen[name][0]
-        ).change.mean
+        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0]).change.mean
         for name, stream in streams.items()
     }
     channels, lost = _finite_channels(means["eit"], presses.accepted)
@@ -248,10 +246,7 @@ def resting_levels(
     """
     streams = {name: session.stream(name) for name in ("eit", "pressure")}
     _require_skin(session, skin, streams)
-    return {
-        name: _level(stream, _rests(session, stream, processing))
-        for name, stream in streams.items()
-    }
+    return {name: _level(stream, _rests(session, stream, processing)) for name, stream in streams.items()}
 
 
 def _rests(session: Session, stream: Stream, processing: Processing) -> np.ndarray:

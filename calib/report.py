@@ -114,7 +114,7 @@ def _about_sensitivity(evaluation: Evaluation) -> tuple[str, str]:
     )
     caption = (
         "The same newton reads high where the map is red and low where it is blue; both maps share one colour scale, "
-        "which is cut at the largest 2 % of the values. Look for a pale rim in EIT only (fewer electrodes see it), for "
+        "which is cut at the largest 2 % of the values. Look for a blue rim in EIT only (fewer electrodes see it), for "
         "patches (uneven coating or contact), and in hybrid for lines along the edges of pads, where the stiff "
         "border carries part of the load or two pads share it. The hybrid map shows the pads and their curves, not the "
         "image: a force map sums to the pad's force whatever the image is."
@@ -181,9 +181,14 @@ def _lead(calibration: Calibration) -> str:
     return (
         f"{len(skin.pads)} pads, {len(skin.electrodes)} electrodes, {len(skin.protocol.pattern)} readings a frame, "
         f"image of {columns} x {rows} pixels. {len(found.force)} presses at {_places(found)} places, held at "
-        f"{found.force.min():.3g} to {found.force.max():.3g} N. All forces below are predictions for presses that "
+        f"{_levels(found.force)}. All forces below are predictions for presses that "
         f"the fit had not seen (held out by {found.held_out_by})."
     )
+
+
+def _levels(force: np.ndarray) -> str:
+    low, high = f"{force.min():.3g}", f"{force.max():.3g}"
+    return f"about {low} N" if low == high else f"{low} to {high} N"
 
 
 def _places(evaluation: Evaluation) -> int:
@@ -372,7 +377,8 @@ _STYLE = """
   --warn-text: #7a0c0c; --warn-page: #fdecea; --warn-line: #c62828; }
 @media (prefers-color-scheme: dark) {
   :root { --text: #e8e8e8; --page: #16181b; --soft: #b3b3b3; --line: #444a50; --head: #22262b;
-    --warn-text: #ffd9d4; --warn-page: #4a1512; --warn-line: #ff6f60; } }
+    --warn-text: #ffd9d4; --warn-page: #4a1512; --warn-line: #ff6f60; }
+  figure img { filter: brightness(.92); } }
 body { margin: 0; background: var(--page); color: var(--text);
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; }
 main { max-width: 62rem; margin: 0 auto; padding: 1.5rem 1rem 3rem; }
@@ -404,6 +410,7 @@ li { overflow-wrap: anywhere; }
   main { max-width: none; padding: 0; }
   h2 { break-after: avoid; }
   figure, tr, .banner { break-inside: avoid; }
+  figure img { filter: none; }
   figure.localisation img { max-width: 13cm; }
   .wide { overflow: visible; } }
 """

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -68,9 +69,7 @@ class Elements(AbstractBasis):
         every = np.arange(len(areas))
         chart = _host(model.chart)
         weight = np.ones(len(areas))
-        return _basis_map(
-            model, (every, every, weight), _host(model.centroids), areas, (len(areas),), chart
-        )
+        return _basis_map(model, (every, every, weight), _host(model.centroids), areas, (len(areas),), chart)
 
 
 @dataclass(frozen=True)
@@ -131,15 +130,13 @@ def _basis_map(model, entries, centres, areas, shape, chart) -> BasisMap:
 
 
 def _host(array: Array) -> np.ndarray:
-    if eqx.is_array(array) and not isinstance(array, np.ndarray):
-        try:
-            array = np.asarray(array)
-        except Exception as error:
-            raise BasisError(
-                "a basis needs a model's geometry, which jit hides; make basis.on(model) outside "
-                "and pass the result in"
-            ) from error
-    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
+    try:
+        host = np.asarray(array)
+    except jax.errors.TracerArrayConversionError as error:
+        raise BasisError(
+            "a basis needs a model's geometry, which jit hides; make basis.on(model) outside and pass the result in"
+        ) from error
+    return host.astype(np.float64) if np.issubdtype(host.dtype, np.floating) else host
 
 
 def _candidates(corners: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ matrix stays symmetric positive definite.)
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -137,21 +138,21 @@ def discretise(
     layout = _lay_out(space, scene, ground)
     system, solver = _system(space, layout, fidelity)
     contact = [1 / e.contact if e.contact > 0 else 0.0 for e in skin.electrodes]
-    model = Model(
-        nodes=mesh.nodes,
-        chart=mesh.chart,
-        triangles=mesh.triangles,
-        centroids=mesh.chart_centroids,
-        areas=mesh.areas,
-        background=np.full(len(mesh.triangles), 1 / skin.sheet_resistance),
-        contact=np.array(contact),
-        pattern=skin.protocol.pattern,
-        current=np.array(skin.protocol.current),
-        effects=scene.effects,
+    put = partial(_put, dtype=fidelity.dtype)
+    return Model(
+        nodes=put(mesh.nodes),
+        chart=put(mesh.chart),
+        triangles=put(mesh.triangles),
+        centroids=put(mesh.chart_centroids),
+        areas=put(mesh.areas),
+        background=put(np.full(len(mesh.triangles), 1 / skin.sheet_resistance)),
+        contact=put(np.array(contact)),
+        pattern=put(skin.protocol.pattern),
+        current=put(np.array(skin.protocol.current)),
+        effects=jax.tree.map(put, scene.effects),
         system=system,
         solver=solver,
     )
-    return _to_device(model, fidelity.dtype)
 
 
 def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
@@ -162,13 +163,10 @@ def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
     return triangulate(skin.domain, footprints, length, growth=fidelity.growth).check()
 
 
-def _to_device(model: Model, dtype: np.dtype) -> Model:
-    def convert(leaf):
-        leaf = np.asarray(leaf)
-        floating = np.issubdtype(leaf.dtype, np.floating)
-        return jnp.asarray(leaf, dtype if floating else leaf.dtype)
-
-    return jax.tree.map(convert, model)
+def _put(values: np.ndarray | Array, dtype: np.dtype) -> Array:
+    """An array on the device: numbers in the model's precision, indices as 32-bit integers."""
+    floating = np.issubdtype(np.asarray(values).dtype, np.floating)
+    return jnp.asarray(values, dtype if floating else np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +207,7 @@ def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
     if taken.any():
         other = int(owner[patch][taken][0])
         raise ElectrodeError(
-            f"electrodes {other} and {number} touch the same mesh node; move them apart or make "
-            "the mesh finer"
+            f"electrodes {other} and {number} touch the same mesh node; move them apart or make the mesh finer"
         )
     owner[patch] = number
 
@@ -234,22 +231,16 @@ def _ground(
     return ground
 
 
-def _system(
-    space: Space, layout: _Layout, fidelity: Fidelity
-) -> tuple[System, AbstractLinearSolver]:
+def _system(space: Space, layout: _Layout, fidelity: Fidelity) -> tuple[System, AbstractLinearSolver]:
     electrodes = len(layout.electrode_dof)
     width = space.dofs.shape[1]
     dofs = layout.index[space.dofs]
     contact_dofs, contact_mass, contact_electrode = _contacts(layout, width)
     measure = np.bincount(contact_electrode, contact_mass.sum((1, 2)), minlength=electrodes)
     under = np.full(layout.unknowns + 1, electrodes)
-    under[contact_dofs[contact_mass.any(2)]] = np.repeat(
-        contact_electrode, contact_mass.any(2).sum(1)
-    )
+    under[contact_dofs[contact_mass.any(2)]] = np.repeat(contact_electrode, contact_mass.any(2).sum(1))
     rim_element, rim_electrode, rim_chi = _rims(dofs, under, electrodes)
-    rows, cols = _entries(
-        dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, layout.electrode_dof
-    )
+    rows, cols = _entries(dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, layout.electrode_dof)
     slots, pattern_rows, pattern_cols = _slots(rows, cols, layout.unknowns)
     roots = np.unique(layout.electrode_dof)
     pattern = Pattern(
@@ -260,19 +251,20 @@ def _system(
         roots[roots < layout.unknowns],
     )
     solver = fidelity.solver or default_solver(layout.unknowns)
+    put = partial(_put, dtype=fidelity.dtype)
     system = System(
-        dofs=dofs,
-        stiffness=space.stiffness,
-        contact_dofs=contact_dofs,
-        contact_mass=contact_mass,
-        contact_electrode=contact_electrode,
-        rim_element=rim_element,
-        rim_electrode=rim_electrode,
-        rim_chi=rim_chi,
-        measure=measure,
-        under=under,
-        electrode_dof=layout.electrode_dof,
-        slots=slots,
+        dofs=put(dofs),
+        stiffness=put(space.stiffness),
+        contact_dofs=put(contact_dofs),
+        contact_mass=put(contact_mass),
+        contact_electrode=put(contact_electrode),
+        rim_element=put(rim_element),
+        rim_electrode=put(rim_electrode),
+        rim_chi=put(rim_chi),
+        measure=put(measure),
+        under=put(under),
+        electrode_dof=put(layout.electrode_dof),
+        slots=put(slots),
         plan=solver.analyse(pattern),
     )
     return system, solver
@@ -290,9 +282,7 @@ def _contacts(layout: _Layout, width: int) -> tuple[np.ndarray, np.ndarray, np.n
     return np.concatenate(dofs), np.concatenate(masses), owner
 
 
-def _rims(
-    dofs: np.ndarray, under: np.ndarray, electrodes: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rims(dofs: np.ndarray, under: np.ndarray, electrodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Elements with some nodes under an electrode: K chi vanishes where all are."""
     above = under[dofs]
     element, corner = np.nonzero(above < electrodes)
@@ -323,9 +313,7 @@ def _entries(
     return np.concatenate(rows), np.concatenate(cols)
 
 
-def _slots(
-    rows: np.ndarray, cols: np.ndarray, unknowns: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _slots(rows: np.ndarray, cols: np.ndarray, unknowns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Number the distinct places of the lower triangle; what is dropped goes past the last."""
     kept = (rows >= cols) & (rows < unknowns)
     keys, inverse = np.unique(rows[kept] * np.int64(unknowns) + cols[kept], return_inverse=True)

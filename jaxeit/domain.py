@@ -241,7 +241,7 @@ class Polygon(_Polygonal):
     sides that cross, touch or fold back on each other.
     """
 
-    vertices: tuple[tuple[float, float], ...]
+    vertices: ArrayLike
 
     def __post_init__(self):
         points = np.asarray(self.vertices, float)

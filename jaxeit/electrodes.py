@@ -65,9 +65,7 @@ def _positive(**values: float) -> None:
 
 def _contact(value: float, unit: str) -> None:
     if not (np.isfinite(value) and value >= 0):
-        raise ElectrodeError(
-            f"an electrode's contact is {value} {unit}; give zero (perfect) or a positive number"
-        )
+        raise ElectrodeError(f"an electrode's contact is {value} {unit}; give zero (perfect) or a positive number")
 
 
 @dataclass(frozen=True)
@@ -160,9 +158,7 @@ class BoundaryPatch(AbstractElectrode):
         along = (domain.boundary_coordinate(middles) - self.start) % domain.perimeter
         touched = np.flatnonzero(along < self.stop - self.start)
         if not len(touched):
-            raise ElectrodeError(
-                f"the mesh has no edge under the electrode from {self.start} to {self.stop} m"
-            )
+            raise ElectrodeError(f"the mesh has no edge under the electrode from {self.start} to {self.stop} m")
         return Pieces(space.boundary_dofs[touched], space.edge_mass(touched))
 
     def centre(self, domain: Domain) -> np.ndarray:

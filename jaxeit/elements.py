@@ -82,18 +82,12 @@ def _integral(p: _Poly) -> float:
 
 def _edge_integral(p: _Poly) -> float:
     """Along edge 01 of unit length: integral of l0^a l1^b = a! b! / (a + b + 1)!."""
-    return sum(
-        x * factorial(a) * factorial(b) / factorial(a + b + 1)
-        for (a, b, c), x in p.items()
-        if c == 0
-    )
+    return sum(x * factorial(a) * factorial(b) / factorial(a + b + 1) for (a, b, c), x in p.items() if c == 0)
 
 
 def _lagrange(order: int, functions: list[_Poly]) -> Lagrange:
     slopes = [[_along(p, axis) for p in functions] for axis in (0, 1)]
-    stiffness = [
-        [[[_integral(_product(p, q)) for q in sb] for p in sa] for sb in slopes] for sa in slopes
-    ]
+    stiffness = [[[[_integral(_product(p, q)) for q in sb] for p in sa] for sb in slopes] for sa in slopes]
     mass = [[2.0 * _integral(_product(p, q)) for q in functions] for p in functions]
     ends = [functions[i] for i in _EDGE[order]]
     edge_mass = [[_edge_integral(_product(p, q)) for q in ends] for p in ends]

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .discretise import Model, System
@@ -45,9 +46,7 @@ class Fields(NamedTuple):
     terminal: Float[Array, "electrodes electrodes"]
 
 
-def forward(
-    model: Model, sigma: Float[Array, " elements"] | None = None
-) -> Float[Array, " readings"]:
+def forward(model: Model, sigma: Float[Array, " elements"] | None = None) -> Float[Array, " readings"]:
     """Voltages of one frame.
 
     Args:
@@ -65,10 +64,9 @@ def forward(
 
 # `forward` and `jacobian` are made of jitted parts, so that they share one compiled solver.
 
+
 @eqx.filter_jit
-def conductivity(
-    model: Model, pressure: Float[Array, " elements"] | None = None
-) -> Float[Array, " elements"]:
+def conductivity(model: Model, pressure: Float[Array, " elements"] | None = None) -> Float[Array, " elements"]:
     """Sheet conductivity, (elements,) S, under the scene's material effects.
 
     Args:
@@ -83,7 +81,7 @@ def conductivity(
 
 @eqx.filter_jit
 def load_spread(
-    model: Model, centre: Float[Array, "2"], diameter: Float[Array, ""]
+    model: Model, centre: Float[ArrayLike, "2"], diameter: Float[ArrayLike, ""]
 ) -> Float[Array, " elements"]:
     """Pressure on the sheet per unit load of a flat round tip, (elements,) 1/m^2.
 

@@ -114,8 +114,7 @@ def fuse(
     pads, pixels = masks.weights.shape
     if image.shape[-1:] != (pixels,) or forces.shape[-1:] != (pads,):
         raise FusionError(
-            f"image {image.shape} and pad_forces {forces.shape} must end in {pixels} pixels and "
-            f"{pads} pads"
+            f"image {image.shape} and pad_forces {forces.shape} must end in {pixels} pixels and {pads} pads"
         )
     finite = jnp.isfinite(image)
     mass = jnp.where(finite, image, 0) * masks.areas

@@ -75,9 +75,7 @@ class OneStep(AbstractMethod):
         square = hyperparameter**2 * jnp.sum(b**2) / readings
         if readings <= basis:
             small = b @ b.T + square * jnp.eye(readings, dtype=b.dtype)
-            return (b.T / root[:, None]) @ cho_solve(
-                cho_factor(small), jnp.eye(readings, dtype=b.dtype)
-            )
+            return (b.T / root[:, None]) @ cho_solve(cho_factor(small), jnp.eye(readings, dtype=b.dtype))
         small = b.T @ b + square * jnp.eye(basis, dtype=b.dtype)
         return cho_solve(cho_factor(small), b.T) / root[:, None]
 
@@ -110,15 +108,15 @@ def prepare(
     """
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
     readings = model.pattern.shape[0]
-    channels = _channels(channels, readings)
-    std = _noise(noise, readings, channels)
+    used = _channels(channels, readings)
+    std = _noise(noise, readings, used)
     if not (np.isfinite(hyperparameter) and hyperparameter > 0):
         raise InverseError(f"the hyperparameter is {hyperparameter}; give a number above zero")
     j = jacobian(model, sigma, image)
     matrix = _build(
         j,
         image.areas,
-        jnp.asarray(np.where(channels, 1 / std, 0.0), model.dtype),
+        jnp.asarray(np.where(used, 1 / std, 0.0), model.dtype),
         jnp.asarray(hyperparameter, model.dtype),
         Noser() if prior is None else prior,
         OneStep() if method is None else method,
@@ -128,9 +126,7 @@ def prepare(
             "the reconstruction matrix is not finite: the conductivity must be positive, and in "
             "float32 the hyperparameter not below 1e-3"
         )
-    return Reconstructor(
-        matrix, image.centres, image.areas, jnp.asarray(channels), image.shape, image.extent
-    )
+    return Reconstructor(matrix, image.centres, image.areas, jnp.asarray(used), image.shape, image.extent)
 
 
 @eqx.filter_jit

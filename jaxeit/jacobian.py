@@ -47,9 +47,9 @@ def _jacobian(model: Model, x: Fields, image: BasisMap) -> Float[Array, "reading
 
     pairs = jax.lax.map(slope, (jnp.asarray(first), jnp.asarray(second)), batch_size=_BATCH)
     # dZ is symmetric: `row` finds an unordered pair among the gradients.
-    row = np.zeros((model.electrodes, model.electrodes), int)
-    row[first, second] = row[second, first] = np.arange(len(first))
-    row = jnp.asarray(row)
+    number = np.zeros((model.electrodes, model.electrodes), int)
+    number[first, second] = number[second, first] = np.arange(len(first))
+    row = jnp.asarray(number)
     source, sink, plus, minus = model.pattern.T
     out = pairs[row[plus, source]] - pairs[row[minus, source]]
     return model.current * (out - pairs[row[plus, sink]] + pairs[row[minus, sink]])

@@ -4,6 +4,7 @@ from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .inverse import Reconstructor
@@ -13,9 +14,7 @@ class AbstractEstimator(eqx.Module):
     """Where an image says that the contact is."""
 
     @abstractmethod
-    def __call__(
-        self, image: Float[Array, "... pixels"], recon: Reconstructor
-    ) -> Float[Array, "... 2"]:
+    def __call__(self, image: Float[Array, "... pixels"], recon: Reconstructor) -> Float[Array, "... 2"]:
         """Position, (..., 2) m; NaN where the image is nowhere positive."""
 
 
@@ -62,15 +61,13 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
 }
 
 
-def localisation_error(
-    estimated: Float[Array, "... 2"], true: Float[Array, "... 2"]
-) -> Float[Array, "..."]:
+def localisation_error(estimated: Float[ArrayLike, "... 2"], true: Float[ArrayLike, "... 2"]) -> Float[Array, "..."]:
     """Distance between estimated and true positions, m."""
     return jnp.linalg.norm(jnp.asarray(estimated) - jnp.asarray(true), axis=-1)
 
 
 def inward_bias(
-    estimated: Float[Array, "... 2"], true: Float[Array, "... 2"], centre: Float[Array, "2"]
+    estimated: Float[ArrayLike, "... 2"], true: Float[ArrayLike, "... 2"], centre: Float[ArrayLike, "2"]
 ) -> Float[Array, "..."]:
     """How much nearer to the sheet's centre the estimate lies than the truth, m, signed.
 
@@ -79,14 +76,12 @@ def inward_bias(
     return localisation_error(true, centre) - localisation_error(estimated, centre)
 
 
-def image_sum(
-    image: Float[Array, "... pixels"], areas: Float[Array, " pixels"]
-) -> Float[Array, "..."]:
+def image_sum(image: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " pixels"]) -> Float[Array, "..."]:
     """Integral of the image over the sheet, S m^2."""
     return jnp.asarray(image) @ jnp.asarray(areas)
 
 
-def coefficient_of_variation(values: Float[Array, "... n"], *, ddof: int) -> Float[Array, "..."]:
+def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) -> Float[Array, "..."]:
     """Standard deviation over mean along the last axis; ``ddof`` is 0 or 1, and must be said."""
     values = jnp.asarray(values)
     return jnp.std(values, -1, ddof=ddof) / jnp.mean(values, -1)

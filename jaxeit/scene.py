@@ -32,9 +32,7 @@ class Scene:
             raise SceneError(f"effects must be a tuple, not {type(self.effects).__name__}")
         for effect in self.effects:
             if not isinstance(effect, AbstractEffect):
-                raise SceneError(
-                    f"{effect!r} is not an effect; make one, such as jaxeit.LoadSpreading()"
-                )
+                raise SceneError(f"{effect!r} is not an effect; make one, such as jaxeit.LoadSpreading()")
 
 
 def read_effects(table: TomlTable) -> tuple[AbstractEffect, ...]:

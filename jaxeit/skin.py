@@ -85,8 +85,7 @@ def load_skin(name_or_path: str | Path) -> Skin:
     path = Path(name_or_path)
     if not path.is_file():
         raise TomlError(
-            f"{name_or_path}: no such file, and not a shipped skin; shipped are "
-            f"{', '.join(shipped_skins())}"
+            f"{name_or_path}: no such file, and not a shipped skin; shipped are {', '.join(shipped_skins())}"
         )
     return parse_skin(read_text(path), str(path))
 
@@ -148,10 +147,8 @@ def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ..
 
 
 def _positions(table: TomlTable) -> list[tuple[float, float]]:
-    if table.has("positions"):
-        rows = table.array("positions", 2, "[[x, y], ...] in m")
-    else:
-        rows = _grid(table.table("grid"))
+    given = table.has("positions")
+    rows = table.array("positions", 2, "[[x, y], ...] in m") if given else _grid(table.table("grid"))
     return [(float(x), float(y)) for x, y in rows]
 
 
@@ -171,18 +168,14 @@ def _require_inside(table: TomlTable, positions: list, domain: Domain) -> None:
     outside = ~domain.contains(np.array(positions))
     if outside.any():
         number = int(np.argmax(outside))
-        raise table.error(
-            "positions", f"electrode {number} at {positions[number]} m lies outside the sheet"
-        )
+        raise table.error("positions", f"electrode {number} at {positions[number]} m lies outside the sheet")
 
 
 def _edge_electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ...]:
     count = table.count("count")
     width = table.positive("width", "a length in m")
     first = table.number("first", "arc length of electrode 0's centre in m", 0.0)
-    direction = table.choice(
-        "direction", "counter-clockwise", "clockwise", default="counter-clockwise"
-    )
+    direction = table.choice("direction", "counter-clockwise", "clockwise", default="counter-clockwise")
     contact = table.number("contact", "the contact impedance in ohm m, zero or more")
     if count * width > domain.perimeter:
         raise table.error("width", f"{count} electrodes of {width} m do not fit along the edge")
@@ -209,12 +202,10 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
     if table.has("rectangle"):
         x0, y0, x1, y1 = table.vector("rectangle", 4, "[x0, y0, x1, y1] in m")
         if not (x0 < x1 and y0 < y1):
-            raise table.error(
-                "rectangle", "the second corner must lie right of and above the first"
-            )
+            raise table.error("rectangle", "the second corner must lie right of and above the first")
         outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     else:
-        outline = Polygon(table.array("polygon", 2, "corners [[x, y], ...] in m")).vertices
+        outline = Polygon(table.array("polygon", 2, "corners [[x, y], ...] in m")).corner_points
     table.done()
     return Pad(name, np.asarray(outline, float))
 

@@ -102,9 +102,7 @@ class TomlTable:
             return isinstance(value, list) and all(isinstance(v, dict) for v in value)
 
         values = self.get(key, good, f"tables [[{key}]]", [])
-        return [
-            TomlTable(v, f"{self._where}: [[{key}]] number {i + 1}") for i, v in enumerate(values)
-        ]
+        return [TomlTable(v, f"{self._where}: [[{key}]] number {i + 1}") for i, v in enumerate(values)]
 
     def done(self) -> None:
         for key in self._values:

@@ -12,12 +12,12 @@ def skin_of(domain, electrodes, pattern, *, sheet_resistance=1.0, current=1.0, p
     return je.Skin("test", domain, sheet_resistance, tuple(electrodes), protocol, pads)
 
 
-def square_model(points, pattern, cells, *, order=1, dtype="float64", ground=None, solver=Dense()):
+def square_model(points, pattern, cells, *, order=1, dtype="float64", ground=None, solver=None):
     """The 0.2 m square with point electrodes on a structured mesh of ``cells`` a side."""
     square = je.Rectangle(0.2, 0.2)
     skin = skin_of(square, [je.PointElectrode(p) for p in points], pattern)
     mesh = je.structured(square, cells, cells)
-    fidelity = je.Fidelity(order=order, dtype=dtype, solver=solver)
+    fidelity = je.Fidelity(order=order, dtype=dtype, solver=solver or Dense())
     return je.discretise(je.Scene(skin), fidelity, mesh=mesh, ground=ground)
 
 

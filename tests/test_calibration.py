@@ -23,7 +23,7 @@ EFFECTS = (
 
 def bench(skin, sites, seed=0, **changes):
     timing = Timing(rest=0.6, ramp=0.6, hold=1.2, release=0.6, recovery=0.6)
-    settings = dict(timing=timing, blank=1.0, eit_rate=10.0, pad_rate=50.0, eit_step=1e-6, seed=seed)
+    settings = {"timing": timing, "blank": 1.0, "eit_rate": 10.0, "pad_rate": 50.0, "eit_step": 1e-6, "seed": seed}
     return Bench(je.Scene(skin, EFFECTS), sites, np.array([20.0]), **(settings | changes), toml="simulated in a test")
 
 
@@ -202,7 +202,7 @@ def test_another_skin_is_refused(grid, skin):
 
 def test_a_low_pass_the_stream_cannot_carry_is_refused(grid):
     asked = calib.Processing(corrections=(calib.LowPass(50.0),))
-    with calib.open_session(grid) as session, pytest.raises(ValueError, match="eit.*10"):
+    with calib.open_session(grid) as session, pytest.raises(ValueError, match=r"eit.*10"):
         calib.calibrate([session], processing=asked)
 
 
@@ -210,7 +210,7 @@ def test_a_pad_that_was_never_pressed(skin, folder):
     path = simulate(
         bench(skin, SITES[:2]), folder / "two.h5", fidelity=je.Fidelity.draft(edge_length=0.05)
     )  # both on the lower left pad
-    with calib.open_session(path) as session, pytest.raises(ValueError, match="pad 1 .*lower right"):
+    with calib.open_session(path) as session, pytest.raises(ValueError, match=r"pad 1 .*lower right"):
         calib.calibrate([session], basis=je.Pixels(20), fidelity=je.Fidelity.draft())
 
 

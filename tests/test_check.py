@@ -383,6 +383,18 @@ def test_a_gap_sets_a_press_aside(parts, look):
     assert "no pressure sample" in report.presses.rejected[0][1]
 
 
+def test_an_irregular_log_of_force_alone_is_no_error(parts, look):
+    time, values = parts.streams["force"][3], parts.values("force")
+    keep = np.random.default_rng(3).random(len(time)) < 0.6
+    values[::2] = np.nan
+    parts.streams = {"force": ("force", "N", 100.0, time[keep], values[keep])}
+    parts.presses = None
+    report = look(parts)
+    has(report, Severity.WARNING, "comes irregularly")
+    has(report, Severity.WARNING, "none of 2 presses can be used", "of its force samples are missing")
+    assert report.ok
+
+
 def test_lost_samples_are_counted_from_sequence_numbers(parts, look):
     seq = np.arange(1800, dtype=np.int64) + 2**32 - 900  # wraps half-way
     seq[1000:] += 5

@@ -171,8 +171,7 @@ def test_jit_vmap_and_grad_of_forward():
 
 def test_float32_follows_float64():
     single, double = (
-        np.asarray(je.forward(square_model(POINTS, [[0, 1, 2, 3]], 20, dtype=d)))
-        for d in ("float32", "float64")
+        np.asarray(je.forward(square_model(POINTS, [[0, 1, 2, 3]], 20, dtype=d))) for d in ("float32", "float64")
     )
     assert single.dtype == np.float32
     assert single[0] == pytest.approx(double[0], rel=1e-4)

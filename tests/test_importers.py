@@ -129,9 +129,7 @@ def test_sentinels_are_pointed_out_but_resting_values_are_not() -> None:
     rng = np.random.default_rng(0)
     force = np.linspace(0, 50, 1000) + rng.normal(size=1000)
     held = np.where(np.arange(1000) % 2 == 0, -1.0, force)
-    assert (
-        "500 of 1,000 rows of force are exactly -1" in sentinel_warnings("force", held[:, None])[0]
-    )
+    assert "500 of 1,000 rows of force are exactly -1" in sentinel_warnings("force", held[:, None])[0]
     beyond = np.where(np.arange(1000) % 3 == 0, 9999.0, force)
     said = sentinel_warnings("p", np.stack([force, beyond], axis=1))
     assert [line.split(":")[0] for line in said] == ["334 of 1,000 rows of p[1] are exactly 9999"]

@@ -631,9 +631,7 @@ def test_a_gzip_bomb_is_refused_before_it_unfolds(good: Path, tmp_path: Path) ->
         (bytes(80_000), 0, "too long"),
     ],
 )
-def test_false_chunks_are_refused(
-    raw: bytes, mask: int, words: str, good: Path, tmp_path: Path
-) -> None:
+def test_false_chunks_are_refused(raw: bytes, mask: int, words: str, good: Path, tmp_path: Path) -> None:
     assert words in refusal(changed(good, tmp_path, lambda f: put_chunk(f, raw, mask)))
 
 

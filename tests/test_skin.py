@@ -69,7 +69,8 @@ def test_edge_electrodes_and_points():
     skin = je.parse_skin(edge)
     assert len(skin.electrodes) == 16
     np.testing.assert_allclose(skin.electrode_positions[0], [0, 0], atol=1e-12)
-    points = text + '[electrodes]\nkind = "point"\npositions = [[0.05, 0.05], [0.15, 0.05], [0.15, 0.15], [0.05, 0.15]]\n'
+    places = [[0.05, 0.05], [0.15, 0.05], [0.15, 0.15], [0.05, 0.15]]
+    points = f'{text}[electrodes]\nkind = "point"\npositions = {places}\n'
     assert je.parse_skin(points).protocol.readings == 4
 
 

@@ -189,9 +189,7 @@ class ArchiveWriter:
         taken = any(name == n or name.startswith(n + "/") or n.startswith(name + "/")
                     for n in self._names)  # fmt: skip
         if bad or taken or len(parts) > MAX_DEPTH:
-            raise problem(
-                self.path, name, "cannot be used as a name", "use letters, digits, _ and -"
-            )
+            raise problem(self.path, name, "cannot be used as a name", "use letters, digits, _ and -")
         self._names.add(name)
         group = self._open()
         for part in parts[:-1]:

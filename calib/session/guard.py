@@ -245,9 +245,7 @@ def _link_kind(kind: int) -> str:
     return names.get(kind, "a user-defined link")
 
 
-def _attribute_value(
-    node: Node, name: str, attr: h5a.AttrID
-) -> str | int | float | np.ndarray | None:
+def _attribute_value(node: Node, name: str, attr: h5a.AttrID) -> str | int | float | np.ndarray | None:
     """Read one attribute of a plain type and modest size."""
     kind, shape = attr.get_type(), attr.get_space()
     size = attr.get_storage_size()

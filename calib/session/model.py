@@ -101,9 +101,7 @@ class PressTable:
     def _check(self) -> None:
         sizes = {f.name: len(getattr(self, f.name)) for f in fields(self)}
         if len(set(sizes.values())) > 1:
-            raise SessionError(
-                f"presses: columns of unequal length {sizes}; give one row per press"
-            )
+            raise SessionError(f"presses: columns of unequal length {sizes}; give one row per press")
         for name in ("x", "y", "tip_diameter", "target_force"):
             bad = ~np.isfinite(getattr(self, name))
             if bad.any():

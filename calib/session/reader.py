@@ -117,9 +117,7 @@ class Session:
         """The stream `name`; `SessionError` that names those there are."""
         if name not in self.streams:
             there = ", ".join(self.streams)
-            raise problem(
-                self.path, f"/streams/{printable(name)}", "missing", f"there are: {there}"
-            )
+            raise problem(self.path, f"/streams/{printable(name)}", "missing", f"there are: {there}")
         return self.streams[name]
 
     @functools.cached_property
@@ -366,9 +364,7 @@ def _small(node: Node, shape: tuple[int | None, ...], kinds: str) -> np.ndarray:
     )
     if not fits or array.dtype.kind not in kinds or (array.shape or (1,))[0] > MAX_TABLE_ROWS:
         want = "(" + ", ".join("rows" if n is None else str(n) for n in shape) + ")"
-        raise node.error(
-            f"is {array.dtype} of shape {array.shape}", f"write shape {want}; {SCHEMA}"
-        )
+        raise node.error(f"is {array.dtype} of shape {array.shape}", f"write shape {want}; {SCHEMA}")
     return array.read()
 
 

@@ -264,9 +264,7 @@ def make_dataset(
     return h5py.Dataset(h5d.create(parent.id, name.encode(), kind, space, plist))
 
 
-def make_array(
-    parent: h5py.Group, name: str, values: np.ndarray, attrs: Mapping[str, Plain]
-) -> h5py.Dataset:
+def make_array(parent: h5py.Group, name: str, values: np.ndarray, attrs: Mapping[str, Plain]) -> h5py.Dataset:
     """A dataset holding `values` at once."""
     values = np.asarray(values)
     dataset = make_dataset(parent, name, values.shape, values.dtype)

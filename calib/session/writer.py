@@ -223,9 +223,7 @@ class SessionWriter:
         kind = f"{dtype.kind}{dtype.itemsize}"
         if kind not in STREAM_TYPES or channels < 1 or not np.isfinite(rate_hz) or rate_hz <= 0:
             what = f"{channels} channels of {kind} at {rate_hz} Hz cannot be stored"
-            raise self._problem(
-                where, what, f"use {sorted(STREAM_TYPES)}, >= 1 channel, a rate > 0"
-            )
+            raise self._problem(where, what, f"use {sorted(STREAM_TYPES)}, >= 1 channel, a rate > 0")
         scale, offset = self._packing(where, dtype, units, scale_factor, add_offset)
         attrs: dict[str, Plain] = {"NX_class": "NXdata", "signal": variable}
         attrs["axes"] = ["time", "channel"]
@@ -237,9 +235,7 @@ class SessionWriter:
             "status": GrowingArray(group, "status", (), np.dtype("u2")),
         }
         about: dict[str, Plain] = {"units": units, "long_name": long_name or f"{name} {variable}"}
-        self._streams[name] = _Stream(
-            group, variable, channels, dtype, scale, offset, about, columns
-        )
+        self._streams[name] = _Stream(group, variable, channels, dtype, scale, offset, about, columns)
 
     def _check_units(self, where: str, variable: str, units: str) -> None:
         expected = VARIABLE_UNIT.get(variable, units)
@@ -252,9 +248,7 @@ class SessionWriter:
         self, where: str, dtype: np.dtype, units: str, scale: float | None, offset: float | None
     ) -> tuple[float, float]:
         if dtype.kind == "f" and (scale is not None or offset is not None):
-            raise self._problem(
-                where, "floats are not packed", "leave scale_factor, add_offset out"
-            )
+            raise self._problem(where, "floats are not packed", "leave scale_factor, add_offset out")
         if dtype.kind == "i" and scale is None and units != "1":
             raise self._problem(where, f"whole {units} are too coarse", "give scale_factor")
         scale, offset = 1.0 if scale is None else float(scale), float(offset or 0.0)

@@ -44,6 +44,10 @@ class AbstractEffect(eqx.Module):
 
     rank: ClassVar[int] = 0
 
+    @abstractmethod
+    def __call__(self, state: Any, *context: Any) -> Any:
+        """The state of its stage after this effect; each family says what that is."""
+
 
 class AbstractLoadEffect(AbstractEffect):
     """Mechanics: how a unit load spreads from the indenter to the sheet."""

@@ -13,8 +13,13 @@ from scipy.special import eval_legendre, roots_legendre, spherical_jn
 
 
 def disc_potentials(
-    z: float, electrodes: int = 16, cover: float = 0.5, sigma1: float = 1.0, rho: float = 0.0,
-    degree: int = 12, modes: int = 20000,
+    z: float,
+    electrodes: int = 16,
+    cover: float = 0.5,
+    sigma1: float = 1.0,
+    rho: float = 0.0,
+    degree: int = 12,
+    modes: int = 20000,
 ) -> np.ndarray:
     """Electrode potentials for +1 A in electrode 0 and -1 A in electrode 1, summing to zero."""
     width = cover * np.pi / electrodes
@@ -26,7 +31,7 @@ def disc_potentials(
     bessel = np.array([spherical_jn(i, n * width) for i in k])
     moments = 2 * width * bessel  # times i^k and the phase of the centre
     phase = np.exp(1j * np.outer(centres, n))
-    table = (1j ** k)[:, None] * moments
+    table = (1j**k)[:, None] * moments
     modal = (phase[:, None, :] * table).reshape(electrodes * degree, modes)
     galerkin = (modal * q) @ modal.conj().T
     galerkin = galerkin.real
@@ -37,11 +42,13 @@ def disc_potentials(
     current = np.zeros(electrodes)
     current[:2] = 1, -1
     ones = np.ones((electrodes, 1))
-    block = np.block([
-        [system, -net, np.zeros((electrodes * degree, 1))],
-        [net.T, np.zeros((electrodes, electrodes)), 0 * ones],
-        [np.zeros((1, electrodes * degree)), ones.T, np.zeros((1, 1))],
-    ])
+    block = np.block(
+        [
+            [system, -net, np.zeros((electrodes * degree, 1))],
+            [net.T, np.zeros((electrodes, electrodes)), 0 * ones],
+            [np.zeros((1, electrodes * degree)), ones.T, np.zeros((1, 1))],
+        ]
+    )
     # j = sum c P_k; the potential of the disc is fixed up to a constant, which U sum = 0 sets: the
     # mean of N j is zero, so a free constant joins the electrode equations.
     constant = np.concatenate([-net.sum(1), np.zeros(electrodes), [0]])

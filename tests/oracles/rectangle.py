@@ -23,9 +23,4 @@ def green(a: float, b: float, at, source, terms: int = 4000) -> float:
 
 def four_point(a: float, b: float, source, sink, plus, minus) -> float:
     """Voltage between two points per ampere between two others, sheet resistance one."""
-    return (
-        green(a, b, plus, source)
-        - green(a, b, minus, source)
-        - green(a, b, plus, sink)
-        + green(a, b, minus, sink)
-    )
+    return green(a, b, plus, source) - green(a, b, minus, source) - green(a, b, plus, sink) + green(a, b, minus, sink)

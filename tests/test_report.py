@@ -1,0 +1,313 @@
+"""The report page and its figures, from a small calibration made by hand."""
+
+import importlib.util
+import re
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from calib import figures, report
+from calib.calibration import Calibration
+from calib.curves import Linear
+from calib.evaluation import Evaluation
+from calib.figures import ReportError, curves_figure, localisation_figure, png, sensitivity_figure
+from calib.fit import FittedCurve
+from calib.report import write_report
+
+HOSTILE = "<script>alert(\"$x_1$\")</script> & 'pad' \u65e5\x00"
+SLOPE = 0.01  # N/Pa
+
+
+def evaluation_on(places, levels=(5.0, 20.0), held_out_by="location"):
+    """Presses on a grid of places a side, each at every force level, each on the pad under it."""
+    x, y, force = np.meshgrid(*2 * [np.linspace(0.02, 0.18, places)], levels, indexing="ij")
+    position, force = np.stack([x.ravel(), y.ravel()], 1), force.ravel()
+    gain = 1 + np.random.default_rng(0).normal(0, 0.1, len(force))
+    pad = (position[:, 0] > 0.1) + 2 * (position[:, 1] > 0.1)
+    pad_force = np.eye(4)[pad] * (force * gain)[:, None]
+    return Evaluation(
+        position=position,
+        estimated={"peak": position + 0.004, "quarter": position + np.array([0.003, 0.0])},
+        force=force,
+        pressure=pad_force / SLOPE,
+        pad_force=pad_force,
+        image_sum=1e-4 * force * gain**2,
+        centre=np.array([0.1, 0.1]),
+        held_out_by=held_out_by,
+    )
+
+
+def fitted_curves(pads):
+    def each(value, dtype=float):
+        return jnp.asarray([value] * pads, dtype)
+
+    return FittedCurve(
+        curve=Linear(),
+        parameters=each([SLOPE]),
+        covariance=each([[1e-8]]),
+        pressure_range=each([0.0, 2000.0]),
+        scale=each(0.5),
+        residual_rms=each(0.75),
+        n=each(80, int),
+        n_missing=each(0, int),
+        n_groups=each(9, int),
+        rank=each(1, int),
+        result=each(0, int),
+    )
+
+
+@pytest.fixture(scope="module")
+def calibration(skin):
+    recon = je.Reconstructor(
+        matrix=jnp.zeros((4, 3)),
+        centres=jnp.asarray([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15]]),
+        areas=jnp.full(4, 0.01),
+        channels=jnp.ones(3, bool),
+        shape=(2, 2),
+        extent=(0.0, 0.2, 0.0, 0.2),
+    )
+    return Calibration(
+        skin=skin,
+        recon=recon,
+        masks=je.PadMasks(jnp.eye(4), recon.areas),
+        curves=fitted_curves(4),
+        evaluation=evaluation_on(4),
+        provenance={"created_utc": "2026-01-01T00:00:00+00:00", "curve": "linear", "sessions": "0123abcd  grid.h5"},
+        simulated=False,
+        notes=("grid.h5: 1 of 33 presses set aside",),
+    )
+
+
+@pytest.fixture(scope="module")
+def written(calibration, tmp_path_factory):
+    return write_report(calibration, tmp_path_factory.mktemp("report") / "r.html")
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Figures that cost nothing, for tests of the page alone."""
+    for name in ("localisation_figure", "sensitivity_figure", "curves_figure"):
+        monkeypatch.setattr(report, name, lambda *_, **__: None)
+    monkeypatch.setattr(report, "png", lambda _: b"picture")
+
+
+def page_of(calibration, folder, **options):
+    return write_report(calibration, folder / "page.html", **options)[0].read_text(encoding="utf-8")
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, the texts of table cells, and whether every tag is closed in order."""
+
+    VOID = ("meta", "img")
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.cells = [], [], []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag in ("td", "th"):
+            self.cells.append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] in ("td", "th"):
+            self.cells[-1] += data
+
+
+def test_page_and_figures_are_written_beside_each_other(written):
+    assert [p.name for p in written] == ["r.html", "r_localisation.png", "r_sensitivity.png", "r_curves.png"]
+    assert all(p.read_bytes().startswith(b"\x89PNG\r\n") for p in written[1:])
+    assert sorted(p.name for p in written[0].parent.iterdir()) == sorted(p.name for p in written)
+
+
+def test_page_needs_nothing_but_itself(written):
+    text = written[0].read_text(encoding="utf-8")
+    reader = Reader(text)
+    assert reader.open == []
+    loads = [a[k] for _, a in reader.tags for k in ("src", "href", "srcset", "data", "action") if k in a]
+    assert len(loads) == 3
+    assert all(load.startswith("data:image/png;base64,") for load in loads)
+    assert not re.search(r"https?://|url\(|@import|<script|<link|<iframe", text)
+    assert len(text) < 500_000
+
+
+def test_page_is_readable_without_seeing_it(written):
+    tags = Reader(written[0].read_text(encoding="utf-8")).tags
+    assert all(len(a["alt"]) > 40 for tag, a in tags if tag == "img")
+    assert {a.get("scope") for tag, a in tags if tag == "th"} == {"row", "col"}
+    assert ("html", {"lang": "en"}) in tags
+
+
+def test_numbers_are_those_of_the_evaluation(calibration, written):
+    cells = Reader(written[0].read_text(encoding="utf-8")).cells
+    s = calibration.evaluation.summary()
+    row = cells.index("localisation error, mean, estimator quarter, mm")
+    assert cells[row + 1 : row + 3] == ["3.0 ± 0.00", "6.9"]
+    row = cells.index("CV, hybrid, ddof 1")
+    assert cells[row + 1] == f"{s['cv_hybrid_ddof1']:.3f} ± {s['cv_hybrid_se']:.3f}"
+    assert cells[row + 2] == "0.14"
+    assert cells[cells.index("force RMSE, N") + 1] == f"{s['force_rmse']:.2f}"
+    row = cells.index("0 lower left")
+    assert cells[row + 1 : row + 7] == ["0.01 ± 0.0001", "0 to 2000", "80", "9", "0.75", "fitted"]
+
+
+def test_simulated_is_said_only_of_simulated(calibration, no_pictures, tmp_path):
+    assert "SIMULATED" not in page_of(calibration, tmp_path)
+    page = page_of(replace(calibration, simulated=True), tmp_path)
+    assert page.count("SIMULATED") == 2  # banner and title of the window
+    assert "not validation" in page
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_simulated_is_said_in_every_picture(calibration, skin, simulated):
+    made = [
+        localisation_figure(calibration.evaluation, skin, simulated=simulated),
+        sensitivity_figure(calibration.evaluation, skin, simulated=simulated),
+        curves_figure(replace(calibration, simulated=simulated)),
+    ]
+    assert [f.get_suptitle() for f in made] == ["SIMULATED" if simulated else ""] * 3
+
+
+def hostile_calibration(calibration):
+    skin = replace(calibration.skin, name=HOSTILE, pads=(je.Pad(HOSTILE, calibration.skin.pads[0].outline),) * 4)
+    found = replace(calibration.evaluation, held_out_by=HOSTILE)
+    provenance = {HOSTILE: HOSTILE, "curve": HOSTILE}
+    return replace(calibration, skin=skin, evaluation=found, provenance=provenance, notes=(HOSTILE,))
+
+
+def test_names_from_files_are_escaped(calibration, no_pictures, tmp_path):
+    text = page_of(
+        hostile_calibration(calibration),
+        tmp_path,
+        evaluations={HOSTILE: replace(evaluation_on(3), notes=(HOSTILE,))},
+    )
+    tags = Reader(text).tags
+    assert "<script" not in text
+    assert "script" not in {tag for tag, _ in tags}
+    assert text.count("&lt;script&gt;") >= 12
+
+
+def test_names_from_files_can_be_drawn(calibration):
+    found = curves_figure(hostile_calibration(calibration), {HOSTILE: evaluation_on(3)})
+    assert png(found)[:4] == b"\x89PNG"  # warnings are errors: no mathematics, no missing letter
+
+
+def test_other_sessions_have_their_own_column(calibration, no_pictures, tmp_path):
+    page = page_of(calibration, tmp_path, evaluations={"next day.h5": evaluation_on(2, held_out_by="session")})
+    cells = Reader(page).cells
+    assert "next day.h5 (held out by session)" in cells
+    row = cells.index("presses")
+    assert cells[row : row + 4] == ["presses", "32", "8", "225"]
+
+
+def test_errors_at_one_force_are_said_to_be_of_that_force(calibration, no_pictures, tmp_path):
+    one = replace(calibration, evaluation=evaluation_on(3, levels=(20.0,)))
+    assert "All presses were held at about 20 N" in page_of(one, tmp_path)
+    assert "All presses were held" not in page_of(calibration, tmp_path)
+
+
+def test_same_input_same_bytes(calibration, written, tmp_path):
+    again = write_report(calibration, tmp_path / "r.html")
+    assert [p.read_bytes() for p in again] == [p.read_bytes() for p in written]
+
+
+def test_failure_leaves_the_old_files_and_nothing_else(calibration, no_pictures, tmp_path, monkeypatch):
+    page = tmp_path / "page.html"
+    page.write_text("old")
+
+    def full(path, data):
+        with open(path, "wb") as file:
+            file.write(data[: len(data) // 2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(page), "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_report(calibration, page)
+    assert page.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [page]
+
+
+def test_missing_folder_is_named(calibration, no_pictures, tmp_path):
+    with pytest.raises(ValueError, match="does not exist"):
+        write_report(calibration, tmp_path / "nowhere" / "page.html")
+
+
+def test_without_matplotlib_the_error_says_what_to_install(calibration, skin, tmp_path, monkeypatch):
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.collections", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    spec = importlib.util.spec_from_file_location("calib._figures_alone", figures.__file__)
+    alone = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(alone)
+    for draw in (alone.localisation_figure, alone.sensitivity_figure):
+        with pytest.raises(alone.ReportError, match=r"jaxeit\[report\]"):
+            draw(calibration.evaluation, skin)
+    monkeypatch.setattr(figures, "Figure", None)
+    with pytest.raises(ReportError, match=r"jaxeit\[report\]"):
+        write_report(calibration, tmp_path / "page.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_estimator_is_refused_by_name(calibration, skin):
+    with pytest.raises(ReportError, match=r"'half'.*peak, quarter"):
+        localisation_figure(calibration.evaluation, skin, "half")
+
+
+def test_localisation_title_states_error_and_estimator(calibration, skin):
+    quarter = calibration.evaluation.estimated["quarter"].copy()
+    quarter[0] = np.nan
+    found = replace(calibration.evaluation, estimated={"quarter": quarter})
+    title = localisation_figure(found, skin).axes[0].get_title()
+    assert "3.0 mm (32 presses, 1 not found)" in title
+    assert "estimator quarter" in title
+
+
+def test_both_sensitivity_maps_have_one_scale_about_their_mean(calibration, skin):
+    found = calibration.evaluation
+    eit, hybrid, _ = sensitivity_figure(found, skin).axes
+    maps = [axes.collections[0] for axes in (eit, hybrid)]
+    assert maps[0].get_clim() == maps[1].get_clim()
+    assert sum(maps[0].get_clim()) == pytest.approx(2)
+    assert [np.mean(m.get_array()) for m in maps] == pytest.approx([1, 1])
+    first = found.sensitivity_hybrid[:2].mean() / found.sensitivity_hybrid.mean()
+    assert maps[1].get_array().ravel()[0] == pytest.approx(first)
+    right_of_it = found.sensitivity_eit[8:10].mean()  # x runs slowest in the presses, fastest in the picture
+    assert maps[0].get_array().ravel()[1] == pytest.approx(right_of_it)
+
+
+def test_places_that_form_no_grid_are_marks(calibration, skin):
+    found = calibration.evaluation
+    part = {k: getattr(found, k)[:5] for k in ("position", "force", "pressure", "pad_force", "image_sum")}
+    part["estimated"] = {k: v[:5] for k, v in found.estimated.items()}
+    axes = sensitivity_figure(replace(found, **part), skin).axes[0]
+    assert len(axes.collections[0].get_offsets()) == 3  # five presses at two levels: three places
+
+
+def test_one_press_is_enough_for_a_page(calibration, tmp_path):
+    found = calibration.evaluation
+    part = {k: getattr(found, k)[:1] for k in ("position", "force", "pressure", "pad_force", "image_sum")}
+    part["estimated"] = {k: v[:1] for k, v in found.estimated.items()}
+    text = page_of(replace(calibration, evaluation=replace(found, **part)), tmp_path)
+    cells = Reader(text).cells
+    assert cells[cells.index("CV, hybrid, ddof 1") + 1] == "—"
+
+
+def test_curve_and_band_are_those_of_the_fit(calibration):
+    axes = curves_figure(calibration).subfigs[0].axes[0]
+    pressure, force = axes.lines[-1].get_data()
+    assert force == pytest.approx(1e3 * SLOPE * pressure)
+    band = axes.collections[0].get_paths()[0].vertices
+    top = band[np.isclose(band[:, 0], 2.0)][:, 1].max()
+    assert top == pytest.approx(2000 * (SLOPE + 1.96e-4))
+    assert len(axes.lines[0].get_xdata()) == 8  # two places a side, two levels
