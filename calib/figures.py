@@ -146,7 +146,7 @@ def curves_figure(calibration: Calibration, evaluations: Mapping[str, Evaluation
     pads = len(calibration.skin.pads)
     columns = min(max(pads, 1), 4)
     rows = -(-pads // columns)
-    figure = _figure(9.6, 2.9 * rows + 4.4, calibration.simulated)
+    figure: Any = _figure(9.6, 2.9 * rows + 4.4, calibration.simulated)
     top, bottom = figure.subfigures(2, 1, height_ratios=[2.9 * rows, 4.4], hspace=0.04)
     if pads:
         _curve_panels(top, calibration, rows, columns)
@@ -175,8 +175,9 @@ def _curve_panel(axes: Any, calibration: Calibration, number: int, mine: np.ndar
     low, high = np.asarray(fitted.pressure_range, float)
     if np.isfinite([low, high]).all():
         pressure = np.linspace(low, high, 101)
-        force, error, _ = fitted.predict(jnp.asarray(pressure))
-        force, half = np.asarray(force, float), 1.96 * np.asarray(error, float)
+        predicted = fitted.predict(jnp.asarray(pressure))
+        force = np.asarray(predicted.force, float)
+        half = 1.96 * np.asarray(predicted.standard_error, float)
         axes.fill_between(pressure / 1e3, force - half, force + half, color=_BLUE, alpha=0.3, lw=0)
         axes.plot(pressure / 1e3, force, color=_BLUE, lw=1.5)
     title = f"pad {number} {_plain(calibration.skin.pads[number].name)}"

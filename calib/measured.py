@@ -19,6 +19,7 @@ from .presses import (
     press_means,
     press_samples,
     press_windows,
+    recording_end,
     reject,
 )
 from .session import PressTable, Session, SessionError, Stream
@@ -97,8 +98,7 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
     streams = {name: session.stream(name) for name in ("eit", "pressure", "force")}
     _require_skin(session, skin, streams)
     presses = _presses(session, streams["force"])
-    end = min(int(stream.time[-1]) + 1 for stream in streams.values())
-    windows = press_windows(presses, processing.cutting, end)
+    windows = press_windows(presses, processing.cutting, recording_end(streams.values()))
     presses = check_overlap(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
     means = {
@@ -255,7 +255,7 @@ def _rests(session: Session, stream: Stream, processing: Processing) -> np.ndarr
     if table is None or not len(table):
         start = int(stream.time[0])
         return np.array([[start, start + 1_000_000_000]])
-    windows = press_windows(table, processing.cutting, int(stream.time[-1]) + 1)
+    windows = press_windows(table, processing.cutting, recording_end([stream]))
     both = np.concatenate([windows.rest_before, windows.rest_after])
     both = both[np.argsort(both[:, 0], kind="stable")]
     ranges = index_ranges(stream.time, both)

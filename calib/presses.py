@@ -358,6 +358,11 @@ def press_windows(presses: Presses, cutting: Cutting | None = None, end: int | N
     )
 
 
+def recording_end(streams: Iterable[Readable]) -> int:
+    """Time in ns at which the first of the streams has ended."""
+    return min(int(stream.time[-1]) + 1 for stream in streams)
+
+
 def index_ranges(time: np.ndarray, windows: np.ndarray) -> np.ndarray:
     """(windows, 2) half-open index ranges of a stream's time stamps within time windows."""
     return np.searchsorted(time, windows, side="left")

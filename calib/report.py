@@ -200,7 +200,7 @@ def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
     numbers = [_headlines(e) for e in found.values()]
     heads = [f"{name} (held out by {e.held_out_by})" for name, e in found.items()]
     rows = [(label, *(n[label] for n in numbers), paper) for label, paper in _PAPER.items()]
-    table = _table(["", *heads, "paper, measured on hardware"], rows)
+    table = _table(["quantity", *heads, "paper, measured on hardware"], rows)
     about = (
         "After ±: standard error over presses (bootstrap). CV: standard deviation over mean of the sensitivity over "
         "the presses. Full scale: the largest force pressed. The paper is arXiv 2605.28468; it states neither its "
@@ -307,7 +307,7 @@ def _pad_row(calibration: Calibration, number: int) -> tuple[str, ...]:
     low, high = np.asarray(fitted.pressure_range, float)
     return (
         f"{number} {calibration.skin.pads[number].name}",
-        *(f"{_significant(v, 5)} ± {_significant(e, 2)}" for v, e in zip(values, errors, strict=True)),
+        *(f"{_significant(v, 5)}{_PLUS_MINUS}{_significant(e, 2)}" for v, e in zip(values, errors, strict=True)),
         f"{_number(low, 0)} to {_number(high, 0)}",
         str(int(fitted.n)),
         str(int(fitted.n_groups)),
@@ -340,6 +340,9 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "numb
     return f"<div class='wide'><table class='{kind}'><thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
 
 
+_PLUS_MINUS = "\u00a0±\u00a0"  # never broken over two lines
+
+
 def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "—"
 
@@ -351,7 +354,7 @@ def _significant(value: float, digits: int) -> str:
 def _with_error(value: float, error: float, digits: int) -> str:
     """A value and its standard error, which gets one digit more where it would be lost."""
     shown = _number(error, digits + (error < 10.0**-digits))
-    return f"{_number(value, digits)} ± {shown}" if math.isfinite(error) else _number(value, digits)
+    return f"{_number(value, digits)}{_PLUS_MINUS}{shown}" if math.isfinite(error) else _number(value, digits)
 
 
 _SHELL = """<!DOCTYPE html>
@@ -387,17 +390,16 @@ h2 { font-size: 1.25rem; margin: 2.2rem 0 .6rem; }
 .banner { background: var(--warn-page); color: var(--warn-text); border: 2px solid var(--warn-line);
   border-radius: 6px; padding: .6rem 1rem; }
 .banner strong { font-size: 1.25rem; letter-spacing: .06em; margin-right: .6rem; }
-.small, figcaption { font-size: .9rem; color: var(--soft); }
+.small, figcaption { font-size: .9em; color: var(--soft); }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .95rem; }
-th, td { border-bottom: 1px solid var(--line); padding: .35rem .8rem; text-align: right; vertical-align: top; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .95em; }
+th, td { border-bottom: 1px solid var(--line); padding: .35em .8em; text-align: right; vertical-align: top; }
 thead th { background: var(--head); font-weight: 600; }
 th:first-child { text-align: left; }
 tbody th { font-weight: 400; }
-td { overflow-wrap: anywhere; }
-td:last-child { text-align: right; }
+td { overflow-wrap: break-word; }
 .provenance td, .provenance th { text-align: left; white-space: pre-wrap; }
-.provenance td { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .85rem; }
+.provenance td { overflow-wrap: anywhere; font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .9em; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; background: #ffffff; border: 1px solid var(--line);
   border-radius: 4px; margin-bottom: .5rem; }
@@ -406,7 +408,11 @@ li { overflow-wrap: anywhere; }
 @media print {
   :root { --text: #000000; --page: #ffffff; --soft: #333333; --line: #999999; --head: #eeeeee;
     --warn-text: #7a0c0c; --warn-page: #ffffff; --warn-line: #c62828; }
-  body { font-size: 10.5pt; }
+  body { font-size: 9.5pt; }
+  h1 { font-size: 16pt; }
+  h2 { font-size: 12pt; margin-top: 1.2em; }
+  table { font-size: .9em; }
+  th, td { padding: .25em .6em; }
   main { max-width: none; padding: 0; }
   h2 { break-after: avoid; }
   figure, tr, .banner { break-inside: avoid; }

@@ -47,6 +47,7 @@ from .priors import Noser, Tikhonov
 from .protocol import Protocol, adjacent, reciprocal_rows
 from .scene import Scene, read_effects
 from .skin import Pad, PressureSensor, Skin, load_skin, parse_skin, shipped_skins
+from .solvers import Dense, NestedDissection
 from .toml import TomlError, TomlTable, parse_toml, read_text
 
 __version__ = metadata.version("jaxeit")
@@ -64,6 +65,7 @@ __all__ = [
     "CoatingNonUniformity",
     "ContactGain",
     "ContactPiezoresistance",
+    "Dense",
     "Disc",
     "ElectrodeError",
     "Elements",
@@ -77,6 +79,7 @@ __all__ = [
     "Mesh",
     "MeshError",
     "Model",
+    "NestedDissection",
     "Noise",
     "Noser",
     "OneStep",

@@ -10,7 +10,7 @@ import pytest
 
 import jaxeit as je
 from calib.check import Severity, check_session, render, to_json, transfer_matrix
-from calib.order import predict
+from calib.check.order import predict
 from calib.session import PressTable, SessionWriter, Status, open_session
 from jaxeit.solvers import Dense
 

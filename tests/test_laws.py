@@ -22,8 +22,7 @@ ORDER = [
 ]  # fmt: skip
 BENCH = [
     "session", "units", "corrections", "presses", "curves", "fit", "response", "measured", "evaluation",
-    "calibration", "maps", "bench", "order", "check_report", "check_streams", "check_presses", "check_eit",
-    "check", "importers", "logs", "figures", "report", "runtime", "cli",
+    "calibration", "maps", "bench", "check", "importers", "logs", "figures", "report", "runtime", "cli",
 ]  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from calib.report import write_report
 
 HOSTILE = "<script>alert(\"$x_1$\")</script> & 'pad' \u65e5\x00"
 SLOPE = 0.01  # N/Pa
+PM = "\u00a0±\u00a0"
 
 
 def evaluation_on(places, levels=(5.0, 20.0), held_out_by="location"):
@@ -154,13 +155,13 @@ def test_numbers_are_those_of_the_evaluation(calibration, written):
     cells = Reader(written[0].read_text(encoding="utf-8")).cells
     s = calibration.evaluation.summary()
     row = cells.index("localisation error, mean, estimator quarter, mm")
-    assert cells[row + 1 : row + 3] == ["3.0 ± 0.00", "6.9"]
+    assert cells[row + 1 : row + 3] == [f"3.0{PM}0.00", "6.9"]
     row = cells.index("CV, hybrid, ddof 1")
-    assert cells[row + 1] == f"{s['cv_hybrid_ddof1']:.3f} ± {s['cv_hybrid_se']:.3f}"
+    assert cells[row + 1] == f"{s['cv_hybrid_ddof1']:.3f}{PM}{s['cv_hybrid_se']:.3f}"
     assert cells[row + 2] == "0.14"
     assert cells[cells.index("force RMSE, N") + 1] == f"{s['force_rmse']:.2f}"
     row = cells.index("0 lower left")
-    assert cells[row + 1 : row + 7] == ["0.01 ± 0.0001", "0 to 2000", "80", "9", "0.75", "fitted"]
+    assert cells[row + 1 : row + 7] == [f"0.01{PM}0.0001", "0 to 2000", "80", "9", "0.75", "fitted"]
 
 
 def test_simulated_is_said_only_of_simulated(calibration, no_pictures, tmp_path):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
 
-from calib.order import OrderCheck
+from calib.check.order import OrderCheck
 from calib.presses import Onset
 from calib.session.model import printable
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 import jaxeit as je
-from calib.check_report import Finding, PressSummary, Severity
-from calib.check_streams import Scan
+from calib.check.report import Finding, PressSummary, Severity
+from calib.check.streams import Scan
 from calib.corrections import Estimate
 from calib.presses import (
     SECOND,
@@ -20,6 +20,7 @@ from calib.presses import (
     onset_delays,
     press_means,
     press_windows,
+    recording_end,
 )
 from calib.session import Session, SessionError
 
@@ -73,9 +74,9 @@ def press_findings(
     """The presses less those that lack samples, and onsets; findings on force, sites, pads, clocks."""
     if presses is None or not len(presses):
         return presses, ()
-    windows = press_windows(presses)
     before = presses.accepted.sum()
     streams = {n: s.stream for n, s in scans.items() if n in ("eit", "pressure", "force")}
+    windows = press_windows(presses, end=recording_end(streams.values()))
     presses = check_overlap(presses, windows, streams.values())
     lost = int(before - presses.accepted.sum())
     if not presses.accepted.any():

@@ -36,7 +36,7 @@ def transfer_matrix(skin: je.Skin) -> np.ndarray:
     column = np.tile(np.arange(1, count), count - 1)
     ground = np.zeros_like(row)
     protocol = je.Protocol(np.stack([row, ground, column, ground], 1), 1.0)
-    fidelity = je.Fidelity.draft(dtype=jnp.result_type(float), solver=je.solvers.Dense())
+    fidelity = je.Fidelity.draft(dtype=jnp.result_type(float), solver=je.Dense())
     model = je.discretise(je.Scene(replace(skin, protocol=protocol)), fidelity)
     matrix = np.zeros((count, count))
     matrix[1:, 1:] = np.asarray(je.forward(model)).reshape(count - 1, count - 1)

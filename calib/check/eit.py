@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 import jaxeit as je
-from calib.check_report import ChannelTable, Finding, Severity
-from calib.check_streams import Scan
-from calib.order import OrderCheck, check_order, transfer_matrix
+from calib.check.order import OrderCheck, check_order, transfer_matrix
+from calib.check.report import ChannelTable, Finding, Severity
+from calib.check.streams import Scan
 from calib.presses import SECOND, Presses
 from calib.session import Session, Status
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import jaxeit as je
-from calib.check_report import Finding, PadRow, Severity, StreamRow, counted
+from calib.check.report import Finding, PadRow, Severity, StreamRow, counted
 from calib.presses import SECOND
 from calib.session import Session, SessionError, Status, Stream
 

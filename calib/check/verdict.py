@@ -6,23 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 
 import jaxeit as je
-from calib.check_eit import check_eit
-from calib.check_presses import find_or_list, press_findings, summary
-from calib.check_report import ChannelTable, CheckReport, Finding, Severity, render, to_json
-from calib.check_streams import Progress, check_pads, scan_streams, stream_findings
-from calib.order import transfer_matrix
+from calib.check.eit import check_eit
+from calib.check.presses import find_or_list, press_findings, summary
+from calib.check.report import CheckReport, Finding, Severity
+from calib.check.streams import Progress, check_pads, scan_streams, stream_findings
 from calib.session import Session
-
-__all__ = [
-    "ChannelTable",
-    "CheckReport",
-    "Finding",
-    "Severity",
-    "check_session",
-    "render",
-    "to_json",
-    "transfer_matrix",
-]
 
 
 def check_session(
