@@ -4,13 +4,13 @@ python benchmarks/readme.py
 """
 
 import re
-import tempfile
 from pathlib import Path
 
 import calib
 import jaxeit as je
-from calib.figures import front_page_figure
+from calib.figures import png, sensitivity_figure
 from calib.runtime import set_up
+from calib.session import replacing
 
 ROOT = Path(__file__).parents[1]
 PAPER = {"localisation": "6.9 mm (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
@@ -27,11 +27,11 @@ def main() -> None:
         readme.read_text(encoding="utf-8"),
         flags=re.DOTALL,
     )
-    with tempfile.NamedTemporaryFile("w", dir=ROOT, delete=False, encoding="utf-8") as new:
-        new.write(text)
-    Path(new.name).replace(readme)
+    with replacing(readme) as new:
+        new.write_text(text, encoding="utf-8")
     (ROOT / "docs").mkdir(exist_ok=True)
-    front_page_figure(calibration.evaluation, calibration.skin).savefig(ROOT / "docs" / "testbed.png", dpi=110)
+    figure = sensitivity_figure(calibration.evaluation, calibration.skin, simulated=True)
+    (ROOT / "docs" / "sensitivity.png").write_bytes(png(figure))
 
 
 def _table(s: dict[str, float]) -> str:

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from calib.cli import _COMMANDS
 
@@ -12,7 +13,7 @@ def test_the_program_of_the_first_screen_runs(root, capsys):
     (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict = {}
     exec(compile(program, "README.md", "exec"), names)
-    assert float(capsys.readouterr().out) == 12.0
+    assert float(capsys.readouterr().out) == pytest.approx(12.0, rel=1e-12)
     assert np.linalg.norm(np.asarray(names["where"]) - [0.06, 0.13]) < 5e-3
     assert names["v"].shape == (550,)
     assert names["image"].shape == (1600,)

@@ -19,7 +19,7 @@ from calib.figures import ReportError, curves_figure, localisation_figure, png, 
 from calib.fit import FittedCurve
 from calib.report import write_report
 
-HOSTILE = "<script>alert(\"$x_1$\")</script> & 'pad' \u65e5\x00"
+HOSTILE = "\u65e5 $x^$ <script>alert(1)</script> & 'pad' \"\x00"  # the start is what fits into a figure
 SLOPE = 0.01  # N/Pa
 PM = "\u00a0±\u00a0"
 
