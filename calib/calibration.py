@@ -1,7 +1,7 @@
 """Calibration: from recorded sessions to the numbers that turn a skin's signals into newtons."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +21,7 @@ from .response import cross_validate
 from .session import Archive, Session, SessionError, read_archive, write_archive
 
 FORMAT = "skin-calibration"
+STAGES = ("reading", "fitting curves", "holding out", "model and images")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,7 @@ def calibrate(
     loss: AbstractLoss | None = None,
     processing: Processing | None = None,
     folds: int = 5,
+    progress: Callable[[str], object] = lambda stage: None,
 ) -> Calibration:
     """Fit one pressure-force curve per pad and prepare the image reconstruction.
 
@@ -91,6 +93,7 @@ def calibrate(
         loss: of the curve fit; default `SoftL1`.
         processing: how sessions are cut and corrected.
         folds: parts into which the locations are divided; each is predicted from the others.
+        progress: told the name of each of the `STAGES` as it begins.
 
     Raises:
         SessionError: a session cannot be used, or was recorded on another skin.
@@ -100,35 +103,33 @@ def calibrate(
         raise SessionError("calibrate: no session given; give one or more session files")
     skin = skin or je.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
     curve, loss = curve or Linear(), loss or SoftL1()
+    progress("reading")
     measured = [measure(session, skin, processing) for session in sessions]
     data = _join(measured)
-    channels = np.logical_and.reduce([m.channels for m in measured])
-    model = je.discretise(je.Scene(skin), fidelity)
+    progress("fitting curves")
+    curves = _fit(curve, data, loss)
+    _require_fits(skin, curves)
+    progress("holding out")
+    held_out = _held_out(curve, data, folds, loss)
+    progress("model and images")
     recon = je.prepare(
-        model,
+        je.discretise(je.Scene(skin), fidelity),
         prior,
         basis=basis,
         hyperparameter=hyperparameter,
-        channels=channels,
+        channels=np.logical_and.reduce([m.channels for m in measured]),
     )
-    curves = fit_curves(
-        curve,
-        data.sample_pressure,
-        data.sample_force,
-        mask=data.mask,
-        groups=data.sample_place,
-        loss=loss,
-    )
-    _require_fits(skin, curves)
-    held_out = _held_out(curve, data, folds, loss)
     evaluation = evaluate_presses(
         recon, skin, data.position, data.dv, data.force, data.pressure, held_out, held_out_by="location"
     )
     options = {
         "curve": curve_name(curve),
+        "loss": type(loss).__name__,
         "hyperparameter": repr(float(hyperparameter)),
+        "prior": repr(prior or je.Noser()),
         "pixels": "x".join(map(str, recon.shape[::-1])),
         "fidelity": repr(fidelity or je.Fidelity.standard()),
+        "processing": repr(processing or Processing()),
         "folds": str(folds),
     }
     return Calibration(
@@ -227,6 +228,17 @@ def _require_fits(skin: je.Skin, curves: FittedCurve) -> None:
     for number, pad in enumerate(skin.pads):
         if int(curves.result[number]) != FitResult.SUCCESS:
             raise FitError(f"pad {number} ({pad.name}): the curve could not be fitted: {curves.pad(number).message()}")
+
+
+def _fit(curve: AbstractCurve, data: _Joined, loss: AbstractLoss) -> FittedCurve:
+    return fit_curves(
+        curve,
+        data.sample_pressure,
+        data.sample_force,
+        mask=data.mask,
+        groups=data.sample_place,
+        loss=loss,
+    )
 
 
 def _held_out(curve: AbstractCurve, data: _Joined, folds: int, loss: AbstractLoss) -> np.ndarray:

@@ -3,8 +3,8 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -57,6 +57,20 @@ def _progress(text: str) -> Callable:
     from tqdm import tqdm
 
     return partial(tqdm, desc=text, disable=None, leave=False)  # silent where nobody watches
+
+
+@contextmanager
+def _stages(count: int) -> Iterator[Callable[[str], None]]:
+    """A bar that is told the name of each stage as it begins."""
+    from tqdm import tqdm
+
+    with tqdm(total=count, disable=None, leave=False) as bar:
+
+        def begin(stage: str) -> None:
+            bar.set_description(stage)
+            bar.update()
+
+        yield begin
 
 
 # --- simulate ------------------------------------------------------------------------------------
@@ -161,7 +175,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     set_up()
     import jaxeit as je
 
-    from .calibration import calibrate
+    from .calibration import STAGES, calibrate
     from .curves import CURVES
     from .evaluation import render_table
     from .session import open_session
@@ -172,6 +186,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         sessions = [stack.enter_context(open_session(path)) for path in args.sessions]
         if all("eit" not in session.streams for session in sessions):
             return _calibrate_logs(args, sessions)
+        stages = stack.enter_context(_stages(len(STAGES)))
         calibration = calibrate(
             sessions,
             _skin(args.skin),
@@ -179,6 +194,7 @@ def _calibrate(args: argparse.Namespace) -> int:
             basis=je.Pixels(args.pixels),
             hyperparameter=args.hyperparameter,
             processing=_processing(args.low_pass),
+            progress=stages,
         )
     calibration.save(_folder(args.output))
     if args.report:

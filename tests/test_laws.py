@@ -125,3 +125,22 @@ def test_help_imports_nothing_heavy():
     )
     assert done.returncode == 0, done.stderr
     assert "calibrate" in done.stdout
+
+
+def test_float32_runs_without_x64():
+    """Nothing in the library asks for 64 bits behind the user's back; warnings are errors."""
+    code = (
+        "import jax, numpy as np, jaxeit as je\n"
+        "skin = je.load_skin('testbed')\n"
+        "model = je.discretise(je.Scene(skin), je.Fidelity.draft(dtype='float32', solver=je.Dense()))\n"
+        "recon = je.prepare(model, basis=je.Pixels(20))\n"
+        "image = recon(je.forward(model, 1.1 * model.background) - je.forward(model))\n"
+        "fmap = je.fuse(image, je.pad_masks(skin, recon), jax.numpy.ones(4))\n"
+        "assert fmap.force.dtype == np.float32\n"
+        "assert abs(float(fmap.force.sum()) - 4) < 1e-5\n"
+    )
+    quiet = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False, env=quiet, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr

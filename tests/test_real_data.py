@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from calib.cli import main
 
 from .helpers import skin_of
 
@@ -56,3 +57,35 @@ def test_sign_of_the_change_at_every_labelled_electrode(tank, path):
         place = 0.8 * skin.electrode_positions[int(number) - 1]
         near = np.linalg.norm(np.asarray(recon.centres) - place, axis=1) < 0.006
         assert np.sign(image[near].sum()) == (1 if kind == "metal" else -1), (number, kind)
+
+
+LOGS = {
+    # name: import options, curve, largest held-out error in N
+    **{
+        f"pneumatic_actuator/{name}.csv.gz": (["--stream", "pressure=5:bar", "--stream", "force=6:N"], "affine", limit)
+        for name, limit in (("Circle_1bar", 1.6), ("Circle_5bar", 1.4), ("O-ring257_3bar", 1.5), ("Stadium_1bar", 2.2))
+    },
+    "eflesh/20250401_014340_probe/states.csv": (["--stream", "force=4:g", "--missing", "-1"], "affine", 0.5),
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_logs_of_others_are_imported_and_fitted(name, tmp_path, capsys):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{name} is not at hand; set JAXEIT_REAL_DATA to its folder")
+    streams, curve, limit = LOGS[name]
+    session, clock = tmp_path / "log.h5", "0:s" if "eflesh" in name else "0:ms"
+    more = []
+    if "eflesh" in name:
+        sensor = str(path.with_name("sensor_post_baselines.csv"))
+        more = ["--from", sensor, "--time", clock, "--stream", "sensor=1-15:counts"]
+    assert main(["import", "csv", str(path), "--time", clock, *streams, *more, "-o", str(session)]) == 0
+    imported = capsys.readouterr().out
+    assert main(["calibrate", str(session), "--curve", curve, "-o", str(tmp_path / "curve.h5")]) == 0
+    printed = capsys.readouterr().out
+    error = float(re.search(r"held out\) ([\d.]+) N", printed)[1])
+    assert error < limit
+    if "eflesh" in name:
+        assert "1,740 values declared missing" in imported
+        assert "1740 samples without a force" in printed
