@@ -55,7 +55,7 @@ class Fidelity:
     @classmethod
     def draft(cls, **changes: Any) -> "Fidelity":
         """For a first look: coarse and linear."""
-        return replace(cls(edge_length=0.06, electrode_segments=8), **changes)
+        return replace(cls(edge_length=0.06, electrode_segments=8, growth=1.6), **changes)
 
     @classmethod
     def standard(cls, **changes: Any) -> "Fidelity":

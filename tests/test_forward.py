@@ -29,6 +29,7 @@ def test_rectangle_oracle_has_the_published_value():
         (10, 1, 0, (51.6185019, -0.2197156, -0.0061858)),
         (1, 1, 0, (5.7807020, -0.2192019, -0.0061849)),
         (0.1, 1, 0, (1.1881339, -0.2156918, -0.0061783)),
+        (0.01, 1, 0, (0.705300, -0.208999, -0.006163)),  # to 1e-5, its own convergence
         (0.1, 2, 0.5, (1.1817891, -0.1996226, -0.0038618)),
         (0.1, 1e6, 0.5, (1.1707565, -0.1720916, -0.0004739)),
         (0.1, 1e-6, 0.5, (1.2123886, -0.2785202, -0.0174209)),
@@ -36,7 +37,7 @@ def test_rectangle_oracle_has_the_published_value():
 )
 def test_disc_oracle_has_the_published_values(z, sigma1, rho, golden):
     potentials = disc_potentials(z, sigma1=sigma1, rho=rho)
-    np.testing.assert_allclose(potentials[[0, 2, 8]], golden, atol=3e-7)
+    np.testing.assert_allclose(potentials[[0, 2, 8]], golden, atol=3e-7 if z >= 0.1 else 1e-5)
 
 
 @pytest.mark.parametrize(("order", "bound"), [(1, 2e-4), (2, 6e-5)])

@@ -1,15 +1,20 @@
 """The disc with the complete electrode model, semi-analytically.
 
 Unit disc, conductivity one, concentric inclusion of radius rho and conductivity s1.  The current
-density j on each electrode is expanded in Legendre polynomials; the Neumann-to-Dirichlet map acts
-on Fourier modes, ``(N j)(t) = sum_n q_n / (n pi) integral of cos n(t - p) j(p)``, with
-``q_n = (1 + mu rho^2n) / (1 - mu rho^2n)``, ``mu = (1 - s1) / (1 + s1)``, and on each electrode
-``N j + z j = U_l``, ``integral of j = I_l``.  The modes of a Legendre polynomial on an electrode of
-half-width w are ``2 w i^k j_k(n w)`` (spherical Bessel).
+density j on each electrode is a sum of Legendre polynomials; the Neumann-to-Dirichlet map acts on
+Fourier modes,
+
+    (N j)(t) = sum_n q_n / (n pi) integral of cos n(t - p) j(p) dp,
+    q_n = (1 + mu rho^2n) / (1 - mu rho^2n),    mu = (1 - s1) / (1 + s1),
+
+and on electrode l   N j + c + z j = U_l,   integral of j = I_l,   with sum U = 0 and c the free
+constant of the potential.  The n-th moment of the k-th Legendre polynomial on an electrode of
+half-width w is ``2 w i^k j_k(n w)`` with the spherical Bessel function j_k, times the phase of the
+electrode's centre.
 """
 
 import numpy as np
-from scipy.special import eval_legendre, roots_legendre, spherical_jn
+from scipy.special import spherical_jn
 
 
 def disc_potentials(
@@ -23,38 +28,31 @@ def disc_potentials(
 ) -> np.ndarray:
     """Electrode potentials for +1 A in electrode 0 and -1 A in electrode 1, summing to zero."""
     width = cover * np.pi / electrodes
-    centres = 2 * np.pi * np.arange(electrodes) / electrodes
-    n, k = np.arange(1, modes + 1), np.arange(degree)
-    mu = (1 - sigma1) / (1 + sigma1)
-    damp = mu * rho ** (2.0 * n)
-    q = (1 + damp) / (1 - damp) / (n * np.pi)
-    bessel = np.array([spherical_jn(i, n * width) for i in k])
-    moments = 2 * width * bessel  # times i^k and the phase of the centre
-    phase = np.exp(1j * np.outer(centres, n))
-    table = (1j**k)[:, None] * moments
-    modal = (phase[:, None, :] * table).reshape(electrodes * degree, modes)
-    galerkin = (modal * q) @ modal.conj().T
-    galerkin = galerkin.real
-    mass = np.tile(2 * width / (2 * k + 1), electrodes)
-    system = galerkin + z * np.diag(mass)
-    net = np.zeros((electrodes * degree, electrodes))
-    net[np.arange(electrodes) * degree, np.arange(electrodes)] = 2 * width
-    current = np.zeros(electrodes)
-    current[:2] = 1, -1
+    net = np.kron(np.eye(electrodes), 2 * width * np.eye(degree, 1))  # only P_0 carries net current
+    contact = z * np.diag(np.tile(2 * width / (2 * np.arange(degree) + 1), electrodes))
+    total = _neumann_to_dirichlet(electrodes, width, degree, modes, sigma1, rho) + contact
     ones = np.ones((electrodes, 1))
-    block = np.block(
+    system = np.block(
         [
-            [system, -net, np.zeros((electrodes * degree, 1))],
-            [net.T, np.zeros((electrodes, electrodes)), 0 * ones],
-            [np.zeros((1, electrodes * degree)), ones.T, np.zeros((1, 1))],
+            [total, -net, net @ ones],
+            [net.T, np.zeros((electrodes, electrodes + 1))],
+            [np.zeros((1, len(net))), ones.T, np.zeros((1, 1))],
         ]
     )
-    # j = sum c P_k; the potential of the disc is fixed up to a constant, which U sum = 0 sets: the
-    # mean of N j is zero, so a free constant joins the electrode equations.
-    constant = np.concatenate([-net.sum(1), np.zeros(electrodes), [0]])
-    block[:, -1] = constant
-    solution = np.linalg.lstsq(block, np.concatenate([np.zeros(electrodes * degree), current, [0]]), rcond=None)[0]
-    return solution[electrodes * degree : -1]
+    current = np.zeros(electrodes)
+    current[:2] = 1, -1
+    right = np.concatenate([np.zeros(len(net)), current, [0]])
+    # One equation too many: the currents sum to zero already.
+    solution = np.linalg.lstsq(system, right, rcond=None)[0]
+    return solution[len(net) : -1]
 
 
-__all__ = ["disc_potentials", "eval_legendre", "roots_legendre"]
+def _neumann_to_dirichlet(electrodes, width, degree, modes, sigma1, rho) -> np.ndarray:
+    """Its Galerkin matrix over Legendre polynomials on all electrodes."""
+    n, k = np.arange(1, modes + 1), np.arange(degree)
+    damp = (1 - sigma1) / (1 + sigma1) * rho ** (2.0 * n)
+    q = (1 + damp) / (1 - damp) / (n * np.pi)
+    moments = (1j**k)[:, None] * 2 * width * np.array([spherical_jn(i, n * width) for i in k])
+    phase = np.exp(2j * np.pi / electrodes * np.outer(np.arange(electrodes), n))
+    modal = (phase[:, None, :] * moments).reshape(electrodes * degree, modes)
+    return ((modal * q) @ modal.conj().T).real
