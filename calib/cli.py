@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -87,6 +88,7 @@ def _simulate(args: argparse.Namespace) -> int:
     set_up()
     from .bench import load_bench, simulate
 
+    _outputs(args.output)
     bench = load_bench(args.scene)
     simulate(bench, args.output, progress=_progress("presses"))
     print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
@@ -180,6 +182,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     from .evaluation import render_table
     from .session import open_session
 
+    _outputs(args.output, args.report)
     if args.report:
         _require_report()
     with ExitStack() as stack:
@@ -196,11 +199,11 @@ def _calibrate(args: argparse.Namespace) -> int:
             processing=_processing(args.low_pass),
             progress=stages,
         )
-    calibration.save(_folder(args.output))
+    calibration.save(args.output)
     if args.report:
         from .report import write_report
 
-        write_report(calibration, _folder(args.report))
+        write_report(calibration, args.report)
     if args.json:
         print(json.dumps(calibration.evaluation.summary(), indent=2, sort_keys=True))
         return 0
@@ -219,7 +222,7 @@ def _calibrate_logs(args: argparse.Namespace, sessions) -> int:
     from .logs import fit_session, render_log, save_logs
 
     fits = {session.name: fit_session(session, CURVES[args.curve]()) for session in sessions}
-    save_logs(fits, _folder(args.output))
+    save_logs(fits, args.output)
     print("\n".join(render_log(name, fit) for name, fit in fits.items()))
     print(f"\nwrote {args.output}")
     return 0
@@ -232,10 +235,14 @@ def _require_report() -> None:
         raise ImportError("--report needs matplotlib: pip install 'jaxeit[report]'")
 
 
-def _folder(path: str) -> Path:
-    """The path, its folder made."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    return Path(path)
+def _outputs(*paths: str | None) -> None:
+    """Make the folders of what will be written, and say before the work begins if that cannot be."""
+    for path in map(Path, filter(None, paths)):
+        if path.is_dir():
+            raise ValueError(f"{path}: is a folder; give a file name")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK):
+            raise ValueError(f"{path}: the folder cannot be written to; choose another")
 
 
 # --- evaluate ------------------------------------------------------------------------------------
@@ -288,12 +295,13 @@ def _apply(args: argparse.Namespace) -> int:
     from .maps import apply
     from .session import open_session
 
+    _outputs(args.output)
     calibration = load_calibration(args.calibration)
     with open_session(args.session) as session:
         apply(
             calibration,
             session,
-            _folder(args.output),
+            args.output,
             processing=_processing(args.low_pass),
             progress=_progress("frames"),
         )

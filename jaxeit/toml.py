@@ -20,8 +20,10 @@ def read_text(path: Path) -> str:
     """The text of a file, or a `TomlError` that names it."""
     try:
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TomlError(f"{path}: cannot be read as text ({error})") from None
+    except UnicodeDecodeError:
+        raise TomlError(f"{path}: is not text; give a TOML file") from None
+    except OSError as error:
+        raise TomlError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
 
 
 def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T]) -> T:

@@ -116,6 +116,15 @@ def test_check_of_the_bundled_sessions(bundled, capsys):
     assert "SIMULATED" in capsys.readouterr().out
 
 
+def test_an_output_that_cannot_be_written_is_said_at_once(grid_file, tmp_path, capsys):
+    assert main(["calibrate", str(grid_file), "-o", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+    scene = str(grid_file.with_suffix(".toml"))
+    assert main(["simulate", scene, "-o", str(tmp_path)]) == 2
+    assert main(["simulate", str(grid_file), "-o", str(tmp_path / "s.h5")]) == 2
+    assert "is not text; give a TOML file" in capsys.readouterr().err
+
+
 def test_no_command_is_an_error():
     with pytest.raises(SystemExit) as caught:
         main([])
