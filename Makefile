@@ -18,8 +18,8 @@ $(VENV)/.dev: pyproject.toml
 	touch $@ $(VENV)/.report
 
 demo: $(VENV)/.report
-	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 -o $(OUT)/calibration.h5 --report $(OUT)/report.html
-	$(BIN)/jaxeit evaluate $(OUT)/calibration.h5 data/sessions/testbed_presses.h5
+	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 --test data/sessions/testbed_presses.h5 \
+	    -o $(OUT)/calibration.h5 --report $(OUT)/report.html
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest

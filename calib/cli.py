@@ -156,6 +156,8 @@ def _calibrate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
     parser.add_argument("-o", "--output", required=True, metavar="CALIBRATION.h5")
     parser.add_argument("--report", metavar="REPORT.html", help="write a page with figures")
+    text = "sessions the fit does not see, to judge it on"
+    parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
     parser.add_argument("--curve", choices=_CURVE_NAMES, default="linear", help="default: linear")
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
     parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
@@ -177,12 +179,13 @@ def _calibrate(args: argparse.Namespace) -> int:
     set_up()
     import jaxeit as je
 
-    from .calibration import STAGES, calibrate
+    from .calibration import STAGES, calibrate, evaluate
     from .curves import CURVES
     from .evaluation import render_table
     from .session import open_session
 
     _outputs(args.output, args.report)
+    processing = _processing(args.low_pass)
     if args.report:
         _require_report()
     with ExitStack() as stack:
@@ -196,22 +199,27 @@ def _calibrate(args: argparse.Namespace) -> int:
             curve=CURVES[args.curve](),
             basis=je.Pixels(args.pixels),
             hyperparameter=args.hyperparameter,
-            processing=_processing(args.low_pass),
+            processing=processing,
             progress=stages,
         )
+        tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}
+        tried = {name: evaluate(calibration, session, processing) for name, session in tests.items()}
     calibration.save(args.output)
     if args.report:
         from .report import write_report
 
-        write_report(calibration, args.report)
+        write_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
-        print(json.dumps(calibration.evaluation.summary(), indent=2, sort_keys=True))
+        results = {"calibration": calibration.evaluation.summary()} | {n: e.summary() for n, e in tried.items()}
+        print(json.dumps(results, indent=2, sort_keys=True))
         return 0
     mark = "SIMULATED, " if calibration.simulated else ""
     names = ", ".join(Path(path).name for path in args.sessions)
     print(render_table(calibration.evaluation, mark + names))
     for note in calibration.notes:
         print(f"  note: {note}")
+    for name, found in tried.items():
+        print("\n" + render_table(found, ("SIMULATED, " if tests[name].simulated else "") + name))
     print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
     return 0
 
