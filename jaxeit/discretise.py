@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .effects import AbstractEffect
-from .electrodes import AbstractElectrode, ElectrodeError
+from .electrodes import AbstractElectrode, AreaPatch, ElectrodeError
 from .elements import Space, function_space
 from .fidelity import Fidelity, require_dtype
 from .mesh import Mesh, triangulate
@@ -50,6 +50,9 @@ class System(eqx.Module):
     | under: the complete electrode over each unknown, and over the ground    | (unknowns + 1,) |
     | electrode_dof: the unknown that is each electrode's potential           | (electrodes,)   |
     | slots: place in the matrix of every contribution (`forward.assemble`)   | (contributions,)|
+    | lumped: radius of discs whose contact is in closed form, else 0, m      | (electrodes,)   |
+    | near_element, near_electrode, near_share: elements under those discs,   | (q,), (q,), (q,)|
+    |   and their shares of each disc's area                                  |                 |
     """
 
     dofs: Int[Array, "elements k"]
@@ -64,6 +67,10 @@ class System(eqx.Module):
     under: Int[Array, " unknowns_and_ground"]
     electrode_dof: Int[Array, " electrodes"]
     slots: Int[Array, " contributions"]
+    lumped: Float[Array, " electrodes"]
+    near_element: Int[Array, " q"]
+    near_electrode: Int[Array, " q"]
+    near_share: Float[Array, " q"]
     plan: AbstractPlan
 
     @property
@@ -136,7 +143,7 @@ def discretise(
     mesh = make_mesh(scene, fidelity) if mesh is None else mesh.check()
     space = function_space(mesh, fidelity.order)
     layout = _lay_out(space, scene, ground)
-    system, solver = _system(space, layout, fidelity)
+    system, solver = _system(space, layout, skin.electrodes, fidelity)
     contact = [1 / e.contact if e.contact > 0 else 0.0 for e in skin.electrodes]
     put = partial(_put, dtype=fidelity.dtype)
     return Model(
@@ -178,6 +185,7 @@ class _Layout:
     coords: np.ndarray  # (unknowns, 2), NaN for electrodes
     electrode_dof: np.ndarray
     complete: list[tuple[int, np.ndarray, np.ndarray]]  # electrode, dofs and mass of its pieces
+    lumped: np.ndarray  # (electrodes,) radius of the disc, or 0
 
 
 def _lay_out(space: Space, scene: Scene, ground: int | None) -> _Layout:
@@ -185,21 +193,23 @@ def _lay_out(space: Space, scene: Scene, ground: int | None) -> _Layout:
     count = len(space.points)
     alias = np.arange(count + len(electrodes))
     owner = np.full(count, -1)
-    complete = []
+    complete, lumped = [], np.zeros(len(electrodes))
     for number, electrode in enumerate(electrodes):
         pieces = electrode.pieces(space, domain)
         patch = np.unique(pieces.dofs)
         _claim(owner, patch, number)
-        if electrode.contact > 0:
+        lumped[number] = electrode.lumped_radius(space, scene.skin.sheet_resistance)
+        if electrode.contact > 0 and not lumped[number]:
             complete.append((number, pieces.dofs, pieces.mass))
-        else:  # a perfect contact: one potential under the whole electrode
+        else:  # a perfect contact, or one in series: one potential under the whole electrode
             alias[patch] = alias[count + number] = patch[0]
-    grounded = _ground(space, alias, owner, electrodes, ground)
+    covered = [number for number, _, _ in complete]
+    grounded = _ground(space, np.isin(owner, covered), ground)
     names = np.setdiff1d(alias, alias[grounded])
     index = np.searchsorted(names, alias)
     index[alias == alias[grounded]] = len(names)
     places = np.concatenate([space.chart, np.full((len(electrodes), 2), np.nan)])
-    return _Layout(index, len(names), places[names], index[count:], complete)
+    return _Layout(index, len(names), places[names], index[count:], complete, lumped)
 
 
 def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
@@ -212,26 +222,23 @@ def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
     owner[patch] = number
 
 
-def _ground(
-    space: Space,
-    alias: np.ndarray,
-    owner: np.ndarray,
-    electrodes: tuple[AbstractElectrode, ...],
-    ground: int | None,
-) -> int:
+def _ground(space: Space, covered: np.ndarray, ground: int | None) -> int:
     """A node amid the sheet that no complete electrode covers, as one at the rim would see more
     resistance and cost a digit."""
-    complete = np.array([e.contact > 0 for e in electrodes])
-    free = (owner < 0) | ~complete[owner]
     if ground is None:
         away = np.linalg.norm(space.chart - space.chart.mean(0), axis=1)
-        return int(np.argmin(np.where(free, away, np.inf)))
-    if not (0 <= ground < len(owner) and free[ground]):
+        return int(np.argmin(np.where(covered, np.inf, away)))
+    if not (0 <= ground < len(covered)) or covered[ground]:
         raise ElectrodeError(f"node {ground} cannot be the ground: it is under an electrode")
     return ground
 
 
-def _system(space: Space, layout: _Layout, fidelity: Fidelity) -> tuple[System, AbstractLinearSolver]:
+def _system(
+    space: Space,
+    layout: _Layout,
+    hardware: tuple[AbstractElectrode, ...],
+    fidelity: Fidelity,
+) -> tuple[System, AbstractLinearSolver]:
     electrodes = len(layout.electrode_dof)
     width = space.dofs.shape[1]
     dofs = layout.index[space.dofs]
@@ -265,9 +272,25 @@ def _system(space: Space, layout: _Layout, fidelity: Fidelity) -> tuple[System, 
         under=put(under),
         electrode_dof=put(layout.electrode_dof),
         slots=put(slots),
+        lumped=put(layout.lumped),
+        **{name: put(part) for name, part in _near(space, layout, hardware).items()},
         plan=solver.analyse(pattern),
     )
     return system, solver
+
+
+def _near(space: Space, layout: _Layout, electrodes: tuple[AbstractElectrode, ...]) -> dict[str, np.ndarray]:
+    """Elements under discs in closed form, whose mean conductivity the closed form takes."""
+    elements, owners, shares = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+    for number, electrode in enumerate(electrodes):
+        if layout.lumped[number] and isinstance(electrode, AreaPatch):
+            inside = electrode.elements(space)
+            areas = space.mesh.areas[inside]
+            elements.append(inside)
+            owners.append(np.full(len(inside), number))
+            shares.append(areas / areas.sum())
+    parts = (np.concatenate(part) for part in (elements, owners, shares))
+    return dict(zip(("near_element", "near_electrode", "near_share"), parts, strict=True))
 
 
 def _contacts(layout: _Layout, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

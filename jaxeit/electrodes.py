@@ -52,6 +52,11 @@ class AbstractElectrode(ABC):
     def pieces(self, space: Space, domain: Domain) -> Pieces:
         """The parts of the space that it touches."""
 
+    def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
+        """Radius in m of the disc whose contact is taken in closed form because the mesh does not
+        resolve it; 0 where it does, or where there is no closed form."""
+        return 0.0
+
     @abstractmethod
     def centre(self, domain: Domain) -> np.ndarray:
         """Its middle in the sheet's flat coordinates, (2,) m."""
@@ -106,8 +111,9 @@ class AreaPatch(AbstractElectrode):
     | contact: specific contact resistance    | ()    | ohm m^2 |
 
     The current passes within the transfer length ``sqrt(contact / sheet resistance)`` of the rim,
-    0.08 mm for the default: a mesh that does not resolve it gives the perfect-contact limit, which
-    leaves four-terminal readings unchanged; `disc_resistance` is what a two-terminal reading lacks.
+    0.08 mm for the default.  Where triangles under the bolt are larger, the bolt is a perfect
+    contact in series with the closed form `disc_resistance`; where they are smaller, the area
+    integral over ``(u - U) / contact`` is resolved.  Four-terminal readings feel neither.
     """
 
     position: tuple[float, float]
@@ -121,12 +127,25 @@ class AreaPatch(AbstractElectrode):
     def footprint(self, segments: int) -> DiscFootprint:
         return DiscFootprint(self.position, self.radius, segments)
 
-    def pieces(self, space: Space, domain: Domain) -> Pieces:
+    def elements(self, space: Space) -> np.ndarray:
+        """Triangles under the bolt."""
         offset = space.mesh.chart_centroids - np.asarray(self.position)
         inside = np.flatnonzero(np.linalg.norm(offset, axis=1) < self.radius)
         if not len(inside):
             raise ElectrodeError(f"the mesh has no triangle under the bolt at {self.position}")
+        return inside
+
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        inside = self.elements(space)
         return Pieces(space.dofs[inside], space.element_mass(inside))
+
+    def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
+        inside = self.elements(space)
+        distance = np.linalg.norm(space.mesh.chart_centroids[inside] - np.asarray(self.position), axis=1)
+        rim = inside[distance >= np.quantile(distance, 0.75)]  # where the current passes
+        edge = np.sqrt(4 / np.sqrt(3) * space.mesh.areas[rim].mean())  # of equilateral triangles
+        transfer = np.sqrt(self.contact / sheet_resistance)
+        return self.radius if 0 < transfer < edge / space.element.order else 0.0
 
     def centre(self, domain: Domain) -> np.ndarray:
         return np.asarray(self.position, float)

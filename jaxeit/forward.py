@@ -16,6 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import i0e, i1e
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -119,7 +120,23 @@ def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Ar
 
 def transfer(model: Model, theta: Coefficients) -> Float[Array, "electrodes electrodes"]:
     """The transfer matrix Z in ohm; its derivatives of first order cost no further solve."""
-    return _transfer(theta, model)
+    return _transfer(theta, model) + jnp.diag(series_resistance(model.system, theta))
+
+
+def series_resistance(system: System, theta: Coefficients) -> Float[Array, " electrodes"]:
+    """Contact resistance of discs taken in closed form (`electrodes.disc_resistance`), ohm; else 0.
+
+    With x = a sqrt(g / sigma), the radius over the transfer length:
+    ``R = I0(x) / I1(x) / (2 pi a sqrt(sigma g))``.
+    """
+    near = system.near_share * theta.sigma[system.near_element]
+    sigma = jnp.zeros_like(theta.contact).at[system.near_electrode].add(near)
+    lumped = system.lumped > 0
+    # Electrodes without a closed form take harmless numbers, so that no NaN enters a gradient.
+    radius, sigma, contact = (jnp.where(lumped, v, 1.0) for v in (system.lumped, sigma, theta.contact))
+    x = radius * jnp.sqrt(contact / sigma)
+    resistance = i0e(x) / i1e(x) / (2 * jnp.pi * radius * jnp.sqrt(sigma * contact))
+    return jnp.where(lumped, resistance, 0.0)
 
 
 @eqx.filter_custom_jvp

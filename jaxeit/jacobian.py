@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .basis import AbstractBasis, BasisMap, Elements
 from .discretise import Model
-from .forward import Fields, coefficients, fields
+from .forward import Coefficients, Fields, coefficients, fields, series_resistance
 
 _BATCH = 64  # electrode pairs differentiated at once: bounds the memory to 64 images of the mesh
 
@@ -34,16 +34,23 @@ def jacobian(
     """
     basis = Elements() if basis is None else basis
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
-    return _jacobian(model, fields(model, coefficients(model, sigma)), image)
+    theta = coefficients(model, sigma)
+    return _jacobian(model, theta, fields(model, theta), image)
 
 
 @eqx.filter_jit
-def _jacobian(model: Model, x: Fields, image: BasisMap) -> Float[Array, "readings basis"]:
+def _jacobian(model: Model, theta: Coefficients, x: Fields, image: BasisMap) -> Float[Array, "readings basis"]:
     first, second = np.triu_indices(model.electrodes)
     zero = jnp.zeros(image.size, model.dtype)
 
     def slope(pair):
-        return jax.grad(lambda c: -_pair_energy(model, image.expand(c), x, pair))(zero)
+        def resistance(coefficients):
+            change = image.expand(coefficients)
+            series = series_resistance(model.system, theta._replace(sigma=theta.sigma + change))
+            own = jnp.where(pair[0] == pair[1], series[pair[0]], 0.0)
+            return own - _pair_energy(model, change, x, pair)
+
+        return jax.grad(resistance)(zero)
 
     pairs = jax.lax.map(slope, (jnp.asarray(first), jnp.asarray(second)), batch_size=_BATCH)
     # dZ is symmetric: `row` finds an unordered pair among the gradients.
