@@ -48,6 +48,7 @@ from .protocol import Protocol, adjacent, reciprocal_rows
 from .scene import Scene, read_effects
 from .skin import Pad, PressureSensor, Skin, load_skin, parse_skin, shipped_skins
 from .solvers import Dense, NestedDissection
+from .surface import AbstractSurface, Cylinder, Sphere
 from .toml import TomlError, TomlTable, parse_toml, read_text
 
 __version__ = metadata.version("jaxeit")
@@ -58,6 +59,7 @@ __all__ = [
     "AbstractEffect",
     "AbstractPadEffect",
     "AbstractReadoutEffect",
+    "AbstractSurface",
     "AreaPatch",
     "BaselineDrift",
     "BasisMap",
@@ -65,6 +67,7 @@ __all__ = [
     "CoatingNonUniformity",
     "ContactGain",
     "ContactPiezoresistance",
+    "Cylinder",
     "Dense",
     "Disc",
     "ElectrodeError",
@@ -99,6 +102,7 @@ __all__ = [
     "Rectangle",
     "Scene",
     "Skin",
+    "Sphere",
     "Stream",
     "Tikhonov",
     "TomlError",

@@ -167,7 +167,8 @@ def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
     skin = scene.skin
     footprints = [e.footprint(fidelity.electrode_segments) for e in skin.electrodes]
     length = fidelity.edge_length * np.sqrt(skin.domain.area)
-    return triangulate(skin.domain, footprints, length, growth=fidelity.growth).check()
+    mesh = triangulate(skin.domain, footprints, length, growth=fidelity.growth).check()
+    return mesh if skin.surface is None else mesh.lift(skin.surface).check()
 
 
 def _put(values: np.ndarray | Array, dtype: np.dtype) -> Array:

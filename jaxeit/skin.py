@@ -10,6 +10,7 @@ import numpy as np
 from .domain import Disc, Domain, Polygon, Rectangle
 from .electrodes import AbstractElectrode, AreaPatch, BoundaryPatch, PointElectrode
 from .protocol import Protocol, adjacent
+from .surface import AbstractSurface, Cylinder, Sphere
 from .toml import TomlError, TomlTable, parse_toml, read_text
 
 
@@ -46,6 +47,7 @@ class Skin:
     | electrodes, in the order of their numbers |                |
     | protocol: one scan                        |                |
     | pads, in the order of pressure channels   |                |
+    | surface: its shape in space; None: flat   |                |
     | toml: the text that describes all this    |                |
     """
 
@@ -57,6 +59,7 @@ class Skin:
     pads: tuple[Pad, ...] = ()
     pressure_sensor: PressureSensor = PressureSensor()
     toml: str = ""
+    surface: AbstractSurface | None = None
 
     def __post_init__(self):
         self.protocol.check(len(self.electrodes))
@@ -103,7 +106,7 @@ def _skin(top: TomlTable, text: str) -> Skin:
     top.choice("format", "jaxeit-skin")
     top.get("version", lambda v: v == 1, "1, the version this jaxeit reads")
     name = top.get("name", lambda v: isinstance(v, str) and v != "", "the skin's name as text")
-    domain, sheet_resistance = _sheet(top.table("sheet"))
+    domain, sheet_resistance, surface = _sheet(top.table("sheet"))
     electrodes = _electrodes(top.table("electrodes"), domain)
     protocol = _protocol(top.table("protocol"), len(electrodes))
     pads = tuple(_pad(table, domain) for table in top.tables("pads"))
@@ -111,10 +114,10 @@ def _skin(top: TomlTable, text: str) -> Skin:
     if top.has("pressure_sensor"):
         sensor = _sensor(top.table("pressure_sensor"))
     top.done()
-    return Skin(name, domain, sheet_resistance, electrodes, protocol, pads, sensor, text)
+    return Skin(name, domain, sheet_resistance, electrodes, protocol, pads, sensor, text, surface)
 
 
-def _sheet(table: TomlTable) -> tuple[Domain, float]:
+def _sheet(table: TomlTable) -> tuple[Domain, float, AbstractSurface | None]:
     shape = table.choice("shape", "rectangle", "disc", "polygon")
     domain: Domain
     if shape == "rectangle":
@@ -124,8 +127,18 @@ def _sheet(table: TomlTable) -> tuple[Domain, float]:
     else:
         domain = Polygon(table.array("vertices", 2, "corners [[x, y], ...] in m"))
     resistance = table.positive("sheet_resistance", "ohm per square")
+    surface = _surface(table.table("surface"), domain) if table.has("surface") else None
     table.done()
-    return domain, resistance
+    return domain, resistance, surface
+
+
+def _surface(table: TomlTable, domain: Domain) -> AbstractSurface:
+    kind = table.choice("kind", "cylinder", "sphere")
+    radius = table.positive("radius", "a length in m")
+    table.done()
+    (x0, y0), (x1, y1) = domain.bounds
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    return Cylinder(radius, x) if kind == "cylinder" else Sphere(radius, (x, y))
 
 
 def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ...]:

@@ -16,7 +16,7 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "toml", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements", "electrodes",
+    "toml", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements", "electrodes",
     "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
     "basis", "jacobian", "priors", "inverse", "fusion", "metrics",
 ]  # fmt: skip

@@ -59,7 +59,7 @@ def test_a_wrong_file_names_key_and_reason(old, new, message):
 
 
 def test_a_missing_file_says_what_is_shipped():
-    with pytest.raises(je.TomlError, match="shipped are testbed"):
+    with pytest.raises(je.TomlError, match="shipped are chest, testbed"):
         je.load_skin("tesbed")
 
 
