@@ -1,0 +1,235 @@
+"""The work that every tool gets, the clock, and where results go."""
+
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import jaxeit as je
+from calib.session import replacing
+from jaxeit.solvers import NestedDissection
+
+ROOT = Path(__file__).parents[1]
+RESULTS = Path(__file__).parent / "results"
+SIZES = (30, 60, 120, 240)  # cells a side, multiples of 10: the electrodes are nodes
+SMOKE = (30,)
+SIDE, PITCH, MARGIN = 0.2, 0.04, 0.02
+AGREE = 1e-9
+
+Tool = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The testbed sheet with 25 point electrodes on a regular mesh; SI units, P1, sheet resistance 1.
+
+    | meaning                                                          | shape         |
+    |------------------------------------------------------------------|---------------|
+    | pairs: the neighbours of the 5x5 grid, both drives and senses    | (40, 2)       |
+    | drive, sense: pair of each reading; the two share no electrode   | (1372,)       |
+    | pattern: drive+, drive-, sense+, sense-                          | (1372, 4)     |
+    | electrode_nodes                                                  | (25,)         |
+    | sigma: conductivity, varied so that no tool can profit from one  | (elements,)   |
+    """
+
+    cells: int
+
+    @cached_property
+    def mesh(self) -> je.Mesh:
+        return je.structured(je.Rectangle(SIDE, SIDE), self.cells, self.cells)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        line = MARGIN + PITCH * np.arange(5)
+        return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+
+    @cached_property
+    def electrode_nodes(self) -> np.ndarray:
+        column, row = np.rint(self.points / SIDE * self.cells).astype(int).T
+        nodes = row * (self.cells + 1) + column
+        if not np.allclose(self.mesh.nodes[nodes], self.points, atol=1e-12):
+            raise ValueError(f"{self.cells} cells a side put no nodes at the electrodes; give a multiple of 10")
+        return nodes
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        grid = np.arange(25).reshape(5, 5)
+        along = np.stack([grid[:, :-1].ravel(), grid[:, 1:].ravel()], 1)
+        return np.concatenate([along, np.stack([grid[:-1].ravel(), grid[1:].ravel()], 1)])
+
+    @cached_property
+    def kept(self) -> np.ndarray:
+        """(40, 40) whether drive and sense share no electrode."""
+        shared = self.pairs[:, None, :, None] == self.pairs[None, :, None, :]
+        return ~shared.any((2, 3))
+
+    @cached_property
+    def pattern(self) -> np.ndarray:
+        drive, sense = np.nonzero(self.kept)
+        return np.concatenate([self.pairs[drive], self.pairs[sense]], 1)
+
+    @cached_property
+    def sigma(self) -> np.ndarray:
+        x, y = (self.mesh.chart_centroids / SIDE).T
+        return 1 + 0.3 * np.sin(5 * x) * np.cos(4 * y)
+
+    def model(self, dtype: str = "float64", order: int = 1) -> je.Model:
+        electrodes = tuple(je.PointElectrode(tuple(p)) for p in self.points.tolist())
+        skin = je.Skin("bench", je.Rectangle(SIDE, SIDE), 1.0, electrodes, je.Protocol(self.pattern, 1.0), ())
+        fidelity = je.Fidelity(order=order, dtype=dtype, solver=NestedDissection())
+        return je.discretise(je.Scene(skin), fidelity, mesh=self.mesh)
+
+
+def compiled(verb: Callable, model: je.Model, *extra: Any, options: Mapping[str, Any] | None = None) -> Callable:
+    """``verb(model, sigma, *extra)`` under one jit, with compiler options; a function of sigma."""
+    leaves, rest = eqx.partition((model, extra), eqx.is_array)
+
+    def program(leaves, sigma):
+        model, extra = eqx.combine(leaves, rest)
+        return verb(model, sigma, *extra)
+
+    run = jax.jit(program, compiler_options=dict(options) if options else None)
+    return lambda sigma: jax.block_until_ready(run(leaves, sigma))
+
+
+def as_tool(run: Callable, dtype: str = "float64") -> Tool:
+    """A jitted function as the other tools are: NumPy in, NumPy out, transfers included."""
+    return lambda sigma: np.asarray(run(np.asarray(sigma, dtype)))
+
+
+def seconds(call: Callable, *args: Any) -> tuple[float, Any]:
+    start = time.perf_counter()
+    out = call(*args)
+    return time.perf_counter() - start, out
+
+
+def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budget: float) -> dict[str, list[float]]:
+    """Times in s: all tools in turn, round after round; a slow one stops after ``budget`` seconds."""
+    times: dict[str, list[float]] = {name: [] for name in tools}
+    for turn in range(repeats):
+        for name, tool in tools.items():
+            if sum(times[name]) < budget:
+                times[name].append(seconds(tool, sigma * (1 + 1e-3 * turn))[0])
+    return times
+
+
+def spread(times: list[float]) -> dict[str, float]:
+    """Median, least and most in ms."""
+    ms = 1e3 * np.array(times)
+    summary = {"median_ms": np.median(ms), "min_ms": ms.min(), "max_ms": ms.max()}
+    return {key: round(float(value), 4) for key, value in summary.items()} | {"repeats": len(times)}
+
+
+def difference(values: np.ndarray, reference: np.ndarray) -> float:
+    """Largest difference relative to the largest value."""
+    return float(np.abs(values - reference).max() / np.abs(reference).max())
+
+
+def require_agreement(outputs: Mapping[str, np.ndarray], reference: str, loose: Mapping[str, float]) -> dict:
+    """Print how far tools differ; refuse to go on where one computes something else."""
+    found = {name: difference(out, outputs[reference]) for name, out in outputs.items() if name != reference}
+    for name, value in found.items():
+        print(f"  {name} against {reference}: {value:.1e}")
+        if not value <= loose.get(name, AGREE):
+            raise SystemExit(f"{name} disagrees with {reference}: nothing is timed")
+    return found
+
+
+def peak_megabytes() -> float:
+    """Of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+
+
+def peak_in_child(module: str, tool: str, cells: int) -> dict[str, float]:
+    """Peak memory of one tool at one size, alone in a process; MB in all, and beyond the imports."""
+    command = [sys.executable, "-m", f"benchmarks.{module}", "--peak", tool, str(cells)]
+    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def add_peaks(rows: list[dict[str, Any]], module: str, cells: int) -> None:
+    """Peak memory of the tools at one size, into their rows."""
+    for row in rows:
+        if row["nodes"] == (cells + 1) ** 2:
+            row |= peak_in_child(module, row["tool"], cells)
+
+
+def print_peak(prepare: Callable[[Problem], Tool], cells: int) -> None:
+    before = peak_megabytes()
+    problem = Problem(cells)
+    prepare(problem)(problem.sigma)
+    after = peak_megabytes()
+    print(json.dumps({"peak_mb": round(after), "beyond_imports_mb": round(after - before)}))
+
+
+def machine() -> str:
+    """A neutral name: cores and kind of processor."""
+    kind = {"x86_64": "x86", "AMD64": "x86", "aarch64": "arm", "arm64": "arm"}
+    return f"{os.cpu_count()}-core-{kind.get(platform.machine(), platform.machine())}"
+
+
+def circumstances() -> dict[str, Any]:
+    """What a reader needs to judge the times."""
+    names = ("jax", "jaxlib", "numpy", "scipy", "pyeit", "scikit-sparse")
+    threads = ("XLA_FLAGS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    return {
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "device": jax.devices()[0].platform,
+        "threads": {name: os.environ.get(name, "not set") for name in threads},
+        "load_before": [round(load, 2) for load in os.getloadavg()],
+        "versions": {name: _version(name) for name in names},
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def closed(data: dict[str, Any]) -> dict[str, Any]:
+    """The results so far, with the machine's load now."""
+    return data | {"circumstances": data["circumstances"] | {"load_after": [round(x, 2) for x in os.getloadavg()]}}
+
+
+def write(section: str, data: dict[str, Any], folder: Path = RESULTS) -> Path:
+    """Replace one section of this machine's results."""
+    path = folder / f"{machine()}.json"
+    results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    folder.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as new:
+        new.write_text(json.dumps(results | {section: data}, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: a line per tool, a column per size, median (least to most) in ms."""
+    sizes = sorted({row["nodes"] for row in rows})
+    lines = [
+        "| ms, median (min to max) | " + " | ".join(f"{n:,} nodes" for n in sizes) + " |",
+        "|---" * (1 + len(sizes)) + "|",
+    ]
+    for tool in dict.fromkeys(row["tool"] for row in rows):
+        cells = {row["nodes"]: cell(row) for row in rows if row["tool"] == tool}
+        lines.append(f"| {tool} | " + " | ".join(cells.get(n, "") for n in sizes) + " |")
+    return "\n".join(lines)
+
+
+def cell(row: dict[str, Any]) -> str:
+    return f"{row['median_ms']:.3g} ({row['min_ms']:.3g} to {row['max_ms']:.3g})"

@@ -1,0 +1,183 @@
+"""Forward solves of every tool on the same work, in one run; and error against time.
+
+python -m benchmarks.bench_forward [--smoke] [--no-memory]
+"""
+
+import argparse
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from tests.oracles.rectangle import green
+
+from . import _common as c
+from .peers import cholmod, pyeit, superlu
+
+# Single precision is no direct float64 solver: how far it is off is reported, not required to be nothing.
+LOOSE = {"jaxeit float32": 1e-2}
+UNFUSED = {"xla_cpu_use_fusion_emitters": False}
+
+
+def ours(problem: c.Problem, dtype: str = "float64", options=None) -> c.Tool:
+    return c.as_tool(c.compiled(je.forward, problem.model(dtype), options=options), dtype)
+
+
+PREPARE = {
+    "jaxeit float64": ours,
+    "jaxeit float32": lambda problem: ours(problem, "float32"),
+    "jaxeit float64, no fusion emitters": lambda problem: ours(problem, options=UNFUSED),
+    superlu.NAME: superlu.prepare,
+    cholmod.NAME: cholmod.prepare,
+    pyeit.NAME: pyeit.prepare,
+}
+PYEIT_LARGEST = 120
+PEERS = (superlu, cholmod, pyeit)
+
+
+def present(cells: int) -> dict[str, Any]:
+    """Tools to run at this size; says which are not run, and why."""
+    absent = {peer.NAME: peer.missing() for peer in PEERS if peer.missing()}
+    if cells > PYEIT_LARGEST:
+        absent.setdefault(pyeit.NAME, f"beyond {PYEIT_LARGEST} cells a side it takes too long")
+    for name, reason in absent.items():
+        print(f"{name} left out: {reason}")
+    return {name: prepare for name, prepare in PREPARE.items() if name not in absent}
+
+
+def measure(cells: int, repeats: int, budget: float) -> list[dict[str, Any]]:
+    problem = c.Problem(cells)
+    nodes, readings = len(problem.mesh.nodes), len(problem.pattern)
+    print(f"{nodes} nodes, {readings} readings; largest difference of the voltages")
+    prepared = {name: c.seconds(prepare, problem) for name, prepare in present(cells).items()}
+    tools = {name: tool for name, (_, tool) in prepared.items()}
+    first = {name: c.seconds(tool, problem.sigma) for name, tool in tools.items()}
+    outputs = {name: out for name, (_, out) in first.items()}
+    found = c.require_agreement(outputs, superlu.NAME, LOOSE)
+    times = c.interleaved(tools, problem.sigma, repeats, budget)
+    return [
+        {
+            "tool": name,
+            "nodes": nodes,
+            "readings": readings,
+            "difference": found.get(name, 0.0),
+            "prepare_s": round(prepared[name][0], 3),
+            "first_call_s": round(first[name][0], 3),
+            **c.spread(times[name]),
+        }
+        for name in tools
+    ]
+
+
+def factorisation(cells: int) -> dict[str, float]:
+    """Least work of a multifrontal Cholesky factorisation and 25 solves on our (padded) fronts."""
+    plan: Any = c.Problem(cells).model().system.plan
+    m, q, p = np.array(plan.panel_shapes, np.float64).T
+    b, solves = q - p, 25
+    factor = m * (p**3 / 3 + b * p**2 + b**2 * p)
+    entries = m * (p * (p + 1) / 2 + b * p)
+    return {
+        "flops": float(np.sum(factor + 4 * entries * solves)),
+        "bytes": float(8 * 3 * np.sum(entries)),  # written once, read by either sweep
+    }
+
+
+def limits() -> dict[str, float]:
+    """What is reached here: flop/s of XLA's matrix product on all cores, byte/s of a copy; best of five."""
+    a, big = jnp.asarray(np.random.default_rng(0).random((1500, 1500))), np.ones(1 << 24)
+    product, into = jax.jit(jnp.matmul), np.ones_like(big)
+    flops = 2 * 1500**3 / min(_finished(product, a, a) for _ in range(5))
+    copied = 2 * big.nbytes / min(c.seconds(np.copyto, into, big)[0] for _ in range(5))
+    return {"flop_per_s": flops, "byte_per_s": copied}
+
+
+def _finished(call, *args) -> float:
+    return c.seconds(lambda: jax.block_until_ready(call(*args)))[0]
+
+
+def with_limits(rows: list[dict[str, Any]], machine: dict[str, float], cells: int) -> dict[str, Any]:
+    work = factorisation(cells)
+    least = max(work["flops"] / machine["flop_per_s"], work["bytes"] / machine["byte_per_s"])
+    reached = {row["tool"]: round(1e3 * least / row["median_ms"], 4) for row in rows if "float64" in row["tool"]}
+    return {"nodes": rows[0]["nodes"], **work, "least_ms": round(1e3 * least, 4), "fraction_reached": reached}
+
+
+def exact(problem: c.Problem) -> np.ndarray:
+    """Voltages of the homogeneous square; along the axis in which two points lie farther apart."""
+    source, sink, plus, minus = problem.pattern.T
+    z = np.zeros((25, 25))
+    for i, j in zip(*np.triu_indices(25, 1), strict=True):
+        a, b = problem.points[i], problem.points[j]
+        flip = slice(None, None, -1 if abs(a - b)[0] > abs(a - b)[1] else 1)
+        z[i, j] = z[j, i] = green(c.SIDE, c.SIDE, a[flip], b[flip])
+    return z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink]
+
+
+def accuracy(ladder: tuple[tuple[int, ...], ...], repeats: int) -> list[dict[str, Any]]:
+    """Error against the exact voltages, and time, for the sizes of order 1 and of order 2."""
+    runs = {}
+    for order, cells in ((order, cells) for order, several in enumerate(ladder, 1) for cells in several):
+        for dtype in ("float64", "float32"):
+            problem = c.Problem(cells)
+            model = problem.model(dtype, order)
+            flat = np.ones(len(problem.sigma))
+            tool = c.as_tool(c.compiled(je.forward, model), dtype)
+            want = exact(problem)
+            error = np.linalg.norm(tool(flat) - want) / np.linalg.norm(want)
+            runs[order, dtype, cells] = (tool, flat, model.system.unknowns, float(error))
+    times: dict[Any, list[float]] = {key: [] for key in runs}
+    for _ in range(repeats):
+        for key, (tool, flat, _, _) in runs.items():
+            times[key].append(c.seconds(tool, flat)[0])
+    return [
+        {"order": order, "dtype": dtype, "cells": cells, "unknowns": n, "relative_error": error, **c.spread(times[key])}
+        for key, (_, _, n, error) in runs.items()
+        for order, dtype, cells in [key]
+    ]
+
+
+def accuracy_table(rows: list[dict[str, Any]]) -> str:
+    lines = ["| element | precision | unknowns | relative error | ms |", "|---|---|---|---|---|"]
+    lines += [
+        f"| P{r['order']} | {r['dtype']} | {r['unknowns']:,} | {100 * r['relative_error']:.4f} % | {c.cell(r)} |"
+        for r in rows
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
+    parser.add_argument("--no-memory", action="store_true", help="skip each tool's peak memory at the largest size")
+    parser.add_argument("--largest", type=int, default=c.SIZES[-1], help="most cells a side")
+    parser.add_argument("--section", default="forward", help="name of this run among the results")
+    parser.add_argument("--peak", nargs=2, metavar=("TOOL", "CELLS"), help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    if args.peak:
+        c.print_peak(PREPARE[args.peak[0]], int(args.peak[1]))
+        return {}
+    sizes = c.SMOKE if args.smoke else tuple(s for s in c.SIZES if s <= args.largest)
+    data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": limits(), "rows": [], "work": []}
+    save = (lambda: None) if args.smoke else (lambda: c.write(args.section, c.closed(data)))
+    for cells in sizes:
+        rows = measure(cells, repeats=3 if args.smoke else 15, budget=8.0)
+        data["rows"] += rows
+        data["work"].append(with_limits(rows, data["limits"], cells))
+        save()
+    print(c.table(data["rows"]), flush=True)
+    ladder = (sizes, tuple(s for s in (10, 20, 30, 60, 120) if s < sizes[-1]))
+    data["accuracy"] = accuracy(((10,), (10,)) if args.smoke else ladder, 3 if args.smoke else 9)
+    save()
+    print(accuracy_table(data["accuracy"]), flush=True)
+    if not (args.smoke or args.no_memory):
+        c.add_peaks(data["rows"], "bench_forward", sizes[-1])
+        save()
+    return data
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
