@@ -116,7 +116,7 @@ def _check(args: argparse.Namespace) -> int:
     for path in args.sessions:
         try:
             with open_session(path) as session:
-                report = check_session(session, skin)
+                report = check_session(session, skin, progress=_progress(session.name))
         except SessionError as error:
             print(f"jaxeit: {_one_line(error)}", file=sys.stderr)
             worst = 2
@@ -273,7 +273,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     calibration = load_calibration(args.calibration)
     results = {}
-    for path in args.sessions:
+    for path in _progress("sessions")(args.sessions):
         with open_session(path) as session:
             found = evaluate(calibration, session, _processing(args.low_pass))
             mark = "SIMULATED, " if session.simulated else ""
