@@ -18,18 +18,22 @@ import itertools
 import math
 import os
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+from tqdm import tqdm
 
 from calib.session import SessionError, SessionWriter
 from calib.session.model import printable, problem
 from calib.session.storage import file_hash
 from calib.session.units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, Unit
+
+Progress = Callable[[Iterable], Iterable]
 
 SENTINELS = (-1.0, -99.0, -999.0, -9999.0, 999.0, 9999.0, 99999.0)
 """Numbers that recorders write where they have no reading."""
@@ -279,9 +283,9 @@ def _index(path: Path, column: str, dialect: _Dialect) -> int:
     raise problem(path, f"column {column!r}", what, "use one of them, or count from zero")
 
 
-def _read_table(path: Path, dialect: _Dialect, columns: Sequence[int]) -> _Table:
+def _read_table(path: Path, dialect: _Dialect, columns: Sequence[int], progress: Progress) -> _Table:
     """The given columns of every row."""
-    lines = itertools.islice(_lines(path), 1 if dialect.header else 0, None)
+    lines = iter(progress(itertools.islice(_lines(path), 1 if dialect.header else 0, None)))
     values, numbers, bad = [np.empty((0, len(columns)))], [np.empty(0, np.int64)], []
     bad.append(np.empty((0, len(columns)), bool))
     while block := list(itertools.islice(lines, BLOCK_LINES)):
@@ -402,7 +406,7 @@ class _Loaded:
     places: dict[str, list[int]]
 
 
-def _load(spec: FileSpec, sort: bool) -> _Loaded:
+def _load(spec: FileSpec, sort: bool, progress: Progress) -> _Loaded:
     """Read the columns that are asked for."""
     first = [line for _, line in itertools.islice(_lines(spec.path), 20)]
     dialect = _sniff(spec.path, first)
@@ -412,7 +416,7 @@ def _load(spec: FileSpec, sort: bool) -> _Loaded:
         indices = [_index(spec.path, c, dialect) for c in stream.columns]
         places[stream.name] = list(range(len(wanted), len(wanted) + len(indices)))
         wanted += indices
-    table = _read_table(spec.path, dialect, wanted)
+    table = _read_table(spec.path, dialect, wanted, progress)
     clock = _clock(spec.path, table, spec.time, UNITS[spec.time_unit], sort)
     return _Loaded(spec, table, clock, places)
 
@@ -475,15 +479,17 @@ def import_csv(
     epoch: datetime | None = None,
     sort: bool = False,
     license: str = "",
+    progress: Progress = iter,
 ) -> ImportReport:
     """Write the described columns of text files as one session file.
 
     ``epoch`` (with time zone) is when the clocks read zero; clocks that count from 1970 need none.
-    ``sort`` allows rows that go back in time. The same files and options give the same bytes.
+    ``sort`` allows rows that go back in time; ``progress`` wraps the iteration over lines, such as
+    `tqdm.tqdm`. The same files and options give the same bytes.
     Raises `SessionError` for what cannot be read or understood, and then writes nothing.
     """
     _check_specs(files)
-    loaded = [_load(spec, sort) for spec in files]
+    loaded = [_load(spec, sort, progress) for spec in files]
     start, zero, known = _start([f.clock for f in loaded], epoch)
     name = title or "import of " + ", ".join(printable(f.path.name) for f in files)
     about: dict[str, Any] = {"title": name, "epoch": start, "license": license}
@@ -571,6 +577,7 @@ def run(args: argparse.Namespace) -> int:
     """Import as parsed by `add_arguments`; prints the report. Raises `SessionError`."""
     files = [_file_spec(group) for group in args.groups]
     options: dict[str, Any] = {"title": args.title, "license": args.license, "sort": args.sort}
+    options["progress"] = partial(tqdm, desc="lines", unit="", disable=None, leave=False)
     report = import_csv(files, args.output, epoch=_epoch(args.epoch), **options)
     print(report.summary())
     return 0
