@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import BarycentricInterpolator
 
 import jaxeit as je
 
@@ -199,20 +200,11 @@ def _profile(times: np.ndarray, start: float, timing: Timing) -> tuple[slice, np
 
 def _voltages(model: je.Model, spread, force: float, load: np.ndarray) -> np.ndarray:
     """Frames at shares of the full load, from solves at Chebyshev points and the polynomial
-    through them: the response is analytic in the load, and nine points leave 1e-7 of it."""
-    angle = (2 * np.arange(_LEVELS) + 1) * np.pi / (2 * _LEVELS)
-    levels = 0.5 * (1 - np.cos(angle))
+    through them: the response is analytic in the load.  At 20 N nine points leave 3e-6 of the change
+    for a load spread over 12 mm, 8e-5 over 8 mm, where the piezoresistance is nearer its limit."""
+    levels = 0.5 * (1 + np.polynomial.chebyshev.chebpts1(_LEVELS))
     solved = np.asarray(_solve(model, spread, jnp.asarray(force * levels)))
-    return np.polynomial.chebyshev.chebvander(2 * load - 1, _LEVELS - 1) @ _chebyshev(solved)
-
-
-def _chebyshev(values: np.ndarray) -> np.ndarray:
-    """Chebyshev coefficients of the polynomial through values at the points of `_voltages`."""
-    angle = (2 * np.arange(_LEVELS) + 1) * np.pi / (2 * _LEVELS)
-    table = np.cos(np.outer(np.arange(_LEVELS), np.pi - angle))
-    coefficients = 2 / _LEVELS * table @ values
-    coefficients[0] /= 2
-    return coefficients
+    return BarycentricInterpolator(levels, solved)(load)
 
 
 @eqx.filter_jit

@@ -160,10 +160,18 @@ def _calibrate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
     parser.add_argument("--curve", choices=_CURVE_NAMES, default="linear", help="default: linear")
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
-    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
+    _low_pass_arg(parser)
     parser.add_argument("--hyperparameter", type=float, default=0.1, help="default: 0.1")
     parser.add_argument("--pixels", type=int, default=40, help="along x; default: 40")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
+
+
+def _low_pass_arg(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
+
+
+def _title(names: str, simulated: bool) -> str:
+    return ("SIMULATED, " if simulated else "") + names
 
 
 def _processing(low_pass: float | None):
@@ -213,13 +221,12 @@ def _calibrate(args: argparse.Namespace) -> int:
         results = {"calibration": calibration.evaluation.summary()} | {n: e.summary() for n, e in tried.items()}
         print(json.dumps(results, indent=2, sort_keys=True))
         return 0
-    mark = "SIMULATED, " if calibration.simulated else ""
     names = ", ".join(Path(path).name for path in args.sessions)
-    print(render_table(calibration.evaluation, mark + names))
+    print(render_table(calibration.evaluation, _title(names, calibration.simulated)))
     for note in calibration.notes:
         print(f"  note: {note}")
     for name, found in tried.items():
-        print("\n" + render_table(found, ("SIMULATED, " if tests[name].simulated else "") + name))
+        print("\n" + render_table(found, _title(name, tests[name].simulated)))
     print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
     return 0
 
@@ -259,7 +266,7 @@ def _outputs(*paths: str | None) -> None:
 def _evaluate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
-    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
+    _low_pass_arg(parser)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
 
 
@@ -276,10 +283,10 @@ def _evaluate(args: argparse.Namespace) -> int:
     for path in _progress("sessions")(args.sessions):
         with open_session(path) as session:
             found = evaluate(calibration, session, _processing(args.low_pass))
-            mark = "SIMULATED, " if session.simulated else ""
+            title = _title(session.name, session.simulated)
         results[Path(path).name] = found.summary()
         if not args.json:
-            print(render_table(found, mark + Path(path).name))
+            print(render_table(found, title))
     if args.json:
         print(json.dumps(results, indent=2, sort_keys=True))
     return 0
@@ -292,7 +299,7 @@ def _apply_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("session", metavar="SESSION.h5")
     parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
-    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
+    _low_pass_arg(parser)
 
 
 def _apply(args: argparse.Namespace) -> int:

@@ -123,15 +123,6 @@ class Cauchy(AbstractLoss):
         return jnp.where(small, 1 - s / 2 + s**2 / 3, jnp.log1p(safe) / safe)
 
 
-LOSSES: dict[str, type[AbstractLoss]] = {
-    "squared": Squared,
-    "huber": Huber,
-    "soft-l1": SoftL1,
-    "cauchy": Cauchy,
-}
-"""Names used on the command line and in calibration files."""
-
-
 class Samples(eqx.Module):
     """What one pad's fit is given; values at samples that are not `valid` are never looked at.
 

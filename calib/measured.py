@@ -67,7 +67,6 @@ class Measured:
     | pressure: change of the pads' gage pressure over the hold        | (presses, pads)   | Pa   |
     | force over the hold, from the load cell                          | (presses,)        | N    |
     | channels: readings that were finite in every press               | (readings,)       |      |
-    | location: number of the place pressed, the same for the same one | (presses,)        |      |
     | samples: pressure and force all along the presses                |                   |      |
     | presses: all of them, with the reasons of those set aside        |                   |      |
     | windows of all of them                                           |                   |      |
@@ -80,7 +79,6 @@ class Measured:
     pressure: np.ndarray
     force: np.ndarray
     channels: np.ndarray
-    location: np.ndarray
     samples: PressSamples
     presses: PressTable
     windows: Windows
@@ -121,7 +119,6 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
         corrections=chosen["force"][0],
     )
     position = np.stack([presses.x, presses.y], 1)[kept]
-    places = np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel()
     notes = [note for _, note in chosen.values() if note]
     return Measured(
         session=session,
@@ -130,7 +127,6 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
         pressure=means["pressure"][kept],
         force=force[kept],
         channels=channels,
-        location=places,
         samples=samples,
         presses=presses,
         windows=windows,

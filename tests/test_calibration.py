@@ -9,7 +9,7 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.bench import Bench, Timing, simulate
+from calib.bench import Bench, Timing, _voltages, simulate
 
 SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
 EFFECTS = (
@@ -132,6 +132,18 @@ def test_a_failed_apply_leaves_no_file(calibration, grid, folder):
         calib.apply(calibration, session, out, progress=break_off)
     assert not out.exists()
     assert not list(folder.glob("*never*"))
+
+
+@pytest.mark.parametrize(("width", "error"), [(0.012, 5e-6), (0.008, 1e-4)])
+def test_loads_between_the_solved_ones_are_interpolated(skin, width, error):
+    """What `calib.bench` says of its nine loads, far below the noise of any of its frames."""
+    scene = je.Scene(skin, (je.LoadSpreading(width=width), je.ContactPiezoresistance()))
+    model = je.discretise(scene, je.Fidelity.draft(solver=je.Dense()))
+    spread = je.load_spread(model, np.array([0.07, 0.06]), 0.02)
+    load = np.linspace(0, 1, 12)
+    exact = np.array([je.forward(model, je.conductivity(model, 20.0 * f * spread)) for f in load])
+    found = _voltages(model, spread, 20.0, load)
+    assert np.abs(found - exact).max() < error * np.abs(exact - exact[0]).max()
 
 
 def test_the_same_bench_makes_the_same_file(skin, folder):

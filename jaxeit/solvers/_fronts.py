@@ -68,10 +68,6 @@ class _Tree:
             tables.append(table)
         return rank, tables
 
-    def ancestor(self, unknowns: np.ndarray, level: int) -> np.ndarray:
-        """Index of the front on that level at or above each unknown's own."""
-        return self.index[unknowns] >> (self.starts[self.level[unknowns]] - self.starts[level])
-
 
 def _ranks(groups: np.ndarray, count: int) -> tuple[np.ndarray, int]:
     """Position of each element within its (sorted) group, and the size of the largest group."""
