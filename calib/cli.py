@@ -236,6 +236,8 @@ def _calibrate_logs(args: argparse.Namespace, sessions) -> int:
     from .curves import CURVES
     from .logs import fit_session, render_log, save_logs
 
+    if args.report or args.test or args.skin:
+        raise ValueError("--report, --test and --skin need sessions with EIT; these hold none: leave them out")
     fits = {session.name: fit_session(session, CURVES[args.curve]()) for session in sessions}
     save_logs(fits, args.output)
     print("\n".join(render_log(name, fit) for name, fit in fits.items()))

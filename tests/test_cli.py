@@ -55,6 +55,8 @@ def test_a_log_without_eit(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "slope 0.01 " in out
     assert "held out" in out
+    assert main(["calibrate", session, "-o", str(tmp_path / "x.h5"), "--report", str(tmp_path / "r.html")]) == 2
+    assert "--report" in capsys.readouterr().err
 
 
 def test_simulate_refuses_a_wrong_scene(tmp_path, root, capsys):
