@@ -22,6 +22,8 @@ import jaxeit as je
 from calib.session import replacing
 from jaxeit.solvers import NestedDissection
 
+from .peers import eidors
+
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
 SIZES = (30, 60, 120, 240)  # cells a side, multiples of 10: the electrodes are nodes
@@ -116,13 +118,19 @@ def seconds(call: Callable, *args: Any) -> tuple[float, Any]:
     return time.perf_counter() - start, out
 
 
+def taken(tool: Tool, sigma: np.ndarray) -> tuple[float, np.ndarray]:
+    """Seconds of a call and what it gives; a tool in another process reads the clock itself, without the transport."""
+    outside, out = seconds(tool, sigma)
+    return getattr(tool, "last_seconds", outside), out
+
+
 def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budget: float) -> dict[str, list[float]]:
     """Times in s: all tools in turn, round after round; a slow one stops after ``budget`` seconds."""
     times: dict[str, list[float]] = {name: [] for name in tools}
     for turn in range(repeats):
         for name, tool in tools.items():
             if sum(times[name]) < budget:
-                times[name].append(seconds(tool, sigma * (1 + 1e-3 * turn))[0])
+                times[name].append(taken(tool, sigma * (1 + 1e-3 * turn))[0])
     return times
 
 
@@ -171,9 +179,11 @@ def add_peaks(rows: list[dict[str, Any]], module: str, cells: int) -> None:
 def print_peak(prepare: Callable[[Problem], Tool], cells: int) -> None:
     before = peak_megabytes()
     problem = Problem(cells)
-    prepare(problem)(problem.sigma)
+    tool = prepare(problem)
+    tool(problem.sigma)
     after = peak_megabytes()
-    print(json.dumps({"peak_mb": round(after), "beyond_imports_mb": round(after - before)}))
+    own = {"peak_mb": round(after), "beyond_imports_mb": round(after - before)}
+    print(json.dumps(tool.peaks() if hasattr(tool, "peaks") else own))
 
 
 def machine() -> str:
@@ -192,7 +202,7 @@ def circumstances() -> dict[str, Any]:
         "device": jax.devices()[0].platform,
         "threads": {name: os.environ.get(name, "not set") for name in threads},
         "load_before": [round(load, 2) for load in os.getloadavg()],
-        "versions": {name: _version(name) for name in names},
+        "versions": {name: _version(name) for name in names} | eidors.versions(),
     }
 
 

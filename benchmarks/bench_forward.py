@@ -15,7 +15,7 @@ import jaxeit as je
 from tests.oracles.rectangle import green
 
 from . import _common as c
-from .peers import cholmod, pyeit, superlu
+from .peers import cholmod, eidors, pyeit, superlu
 
 # Single precision is no direct float64 solver: how far it is off is reported, not required to be nothing.
 LOOSE = {"jaxeit float32": 1e-2}
@@ -33,9 +33,11 @@ PREPARE = {
     superlu.NAME: superlu.prepare,
     cholmod.NAME: cholmod.prepare,
     pyeit.NAME: pyeit.prepare,
+    eidors.NAME: eidors.prepare,
 }
 PYEIT_LARGEST = 120
-PEERS = (superlu, cholmod, pyeit)
+EIDORS_QUADRATIC_LARGEST = 60  # it assembles in a loop over elements, in Octave
+PEERS = (superlu, cholmod, pyeit, eidors)
 
 
 def present(cells: int) -> dict[str, Any]:
@@ -54,7 +56,7 @@ def measure(cells: int, repeats: int, budget: float) -> list[dict[str, Any]]:
     print(f"{nodes} nodes, {readings} readings; largest difference of the voltages")
     prepared = {name: c.seconds(prepare, problem) for name, prepare in present(cells).items()}
     tools = {name: tool for name, (_, tool) in prepared.items()}
-    first = {name: c.seconds(tool, problem.sigma) for name, tool in tools.items()}
+    first = {name: c.taken(tool, problem.sigma) for name, tool in tools.items()}
     outputs = {name: out for name, (_, out) in first.items()}
     found = c.require_agreement(outputs, superlu.NAME, LOOSE)
     times = c.interleaved(tools, problem.sigma, repeats, budget)
@@ -116,25 +118,31 @@ def exact(problem: c.Problem) -> np.ndarray:
     return z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink]
 
 
+def with_error(problem: c.Problem, tool: c.Tool) -> tuple[c.Tool, np.ndarray, float]:
+    """The tool, the homogeneous conductivity, and how far the tool is off there."""
+    flat, want = np.ones(len(problem.sigma)), exact(problem)
+    return tool, flat, float(np.linalg.norm(tool(flat) - want) / np.linalg.norm(want))
+
+
 def accuracy(ladder: tuple[tuple[int, ...], ...], repeats: int) -> list[dict[str, Any]]:
     """Error against the exact voltages, and time, for the sizes of order 1 and of order 2."""
     runs = {}
     for order, cells in ((order, cells) for order, several in enumerate(ladder, 1) for cells in several):
+        problem = c.Problem(cells)
         for dtype in ("float64", "float32"):
-            problem = c.Problem(cells)
             model = problem.model(dtype, order)
-            flat = np.ones(len(problem.sigma))
             tool = c.as_tool(c.compiled(je.forward, model), dtype)
-            want = exact(problem)
-            error = np.linalg.norm(tool(flat) - want) / np.linalg.norm(want)
-            runs[order, dtype, cells] = (tool, flat, model.system.unknowns, float(error))
+            runs[order, dtype, cells] = (*with_error(problem, tool), model.system.unknowns)
+        if order == 2 and cells <= EIDORS_QUADRATIC_LARGEST and not eidors.missing():
+            tool = eidors.prepare_quadratic(problem)
+            runs[order, f"float64, {eidors.NAME}", cells] = (*with_error(problem, tool), model.system.unknowns)
     times: dict[Any, list[float]] = {key: [] for key in runs}
     for _ in range(repeats):
         for key, (tool, flat, _, _) in runs.items():
-            times[key].append(c.seconds(tool, flat)[0])
+            times[key].append(c.taken(tool, flat)[0])
     return [
         {"order": order, "dtype": dtype, "cells": cells, "unknowns": n, "relative_error": error, **c.spread(times[key])}
-        for key, (_, _, n, error) in runs.items()
+        for key, (_, _, error, n) in runs.items()
         for order, dtype, cells in [key]
     ]
 

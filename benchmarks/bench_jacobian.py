@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 import jaxeit as je
 
 from . import _common as c
-from .peers import adjoint, pyeit
+from .peers import adjoint, eidors, pyeit
 
 PIXELS = 30
 PYEIT_LARGEST = 30  # it inverts the matrix as a dense one and loops over elements in Python
@@ -42,6 +42,8 @@ PREPARE = {
     "jaxeit float64, elements": lambda problem: ours(problem, False),
     f"{adjoint.NAME}, elements": adjoint.prepare,
     f"{pyeit.NAME}, elements": pyeit.prepare_jacobian,
+    f"{eidors.NAME}, pixels": lambda problem: eidors.prepare_jacobian(problem, pixel_matrix(problem)),
+    f"{eidors.NAME}, elements": eidors.prepare_jacobian,
 }
 
 
@@ -51,6 +53,9 @@ def present(cells: int) -> list[str]:
     if pyeit.missing() or cells > PYEIT_LARGEST:
         names = [name for name in names if not name.startswith(pyeit.NAME)]
         print(f"{pyeit.NAME} left out: {pyeit.missing() or 'too slow beyond the smallest size'}")
+    if eidors.missing():
+        names = [name for name in names if not name.startswith(eidors.NAME)]
+        print(f"{eidors.NAME} left out: {eidors.missing()}")
     return names
 
 
@@ -63,7 +68,7 @@ def measure(cells: int, image: str, repeats: int, budget: float) -> list[dict[st
     print(f"{nodes} nodes, {readings} readings, onto {image}; largest difference of the Jacobians")
     prepared = {name: c.seconds(PREPARE[name], problem) for name in names}
     tools = {name: tool for name, (_, tool) in prepared.items()}
-    first = {name: c.seconds(tool, problem.sigma) for name, tool in tools.items()}
+    first = {name: c.taken(tool, problem.sigma) for name, tool in tools.items()}
     found = c.require_agreement({name: out for name, (_, out) in first.items()}, f"{adjoint.NAME}, {image}", LOOSE)
     first_call = {name: round(taken, 3) for name, (taken, _) in first.items()}
     del first  # the Jacobians

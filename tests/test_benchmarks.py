@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
+import jaxeit as je
 from benchmarks import _common as common
 from benchmarks import bench_forward, bench_jacobian
-from benchmarks.peers import adjoint, cholmod, pyeit, superlu
+from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
 
 from .oracles.rectangle import four_point
 
@@ -40,7 +41,7 @@ def test_exact_voltages(problem):
         assert exact[row] == pytest.approx(four_point(0.2, 0.2, *points), rel=1e-3)
 
 
-@pytest.mark.parametrize("peer", [superlu, cholmod, pyeit])
+@pytest.mark.parametrize("peer", [superlu, cholmod, pyeit, eidors])
 def test_peers_and_jaxeit_agree(problem, peer):
     if peer.missing():
         pytest.skip(peer.missing())
@@ -63,6 +64,61 @@ def test_jacobians_agree(problem):
     assert common.difference(adjoint.prepare(problem, pixels)(problem.sigma), by_hand @ pixels) < 1e-11
     if not pyeit.missing():
         assert common.difference(pyeit.prepare_jacobian(problem)(problem.sigma), by_hand) < 1e-9
+
+
+with_eidors = pytest.mark.skipif(bool(eidors.missing()), reason=str(eidors.missing()))
+
+
+@with_eidors
+@pytest.mark.parametrize("pixels", [False, True])
+def test_jacobian_of_eidors(problem, pixels):
+    matrix = bench_jacobian.pixel_matrix(problem) if pixels else None
+    tool = eidors.prepare_jacobian(problem, matrix)
+    assert common.difference(tool(problem.sigma), adjoint.prepare(problem, matrix)(problem.sigma)) < 1e-11
+    assert tool.last_seconds > 0
+    tool.close()
+
+
+@with_eidors
+def test_quadratic_elements_of_eidors(problem):
+    ours = common.as_tool(common.compiled(je.forward, problem.model(order=2)))
+    tool = eidors.prepare_quadratic(problem)
+    assert common.difference(tool(problem.sigma), ours(problem.sigma)) < 1e-11
+    tool.close()
+
+
+@with_eidors
+def test_what_octave_said_last_is_told_when_it_stops(problem):
+    tool = eidors.prepare(problem)
+    with pytest.raises(RuntimeError, match="error:"):
+        tool(np.ones(3))
+    tool.close()
+
+
+def test_eidors_missing(monkeypatch, tmp_path):
+    monkeypatch.setattr(eidors.shutil, "which", lambda name: name)
+    monkeypatch.setenv("EIDORS", str(tmp_path))
+    assert "startup.m" in eidors.missing()
+    (tmp_path / "startup.m").touch()
+    assert eidors.missing() is None
+    monkeypatch.setattr(eidors.shutil, "which", lambda name: name if name == "octave-cli" else None)
+    assert "mkoctfile" in eidors.missing()
+    (tmp_path / "arch/octave/any").mkdir(parents=True)
+    (tmp_path / "arch/octave/any/eidors_var_id.mex").touch()
+    assert eidors.missing() is None
+    monkeypatch.setattr(eidors.shutil, "which", lambda name: None)
+    assert "octave-cli" in eidors.missing()
+    assert eidors.versions() == {}
+
+
+def test_the_clock_of_a_tool_in_another_process_counts():
+    class Elsewhere:
+        last_seconds = 123.0
+
+        def __call__(self, sigma):
+            return sigma
+
+    assert common.interleaved({"a": Elsewhere()}, np.ones(3), 2, budget=1e3) == {"a": [123.0, 123.0]}
 
 
 def test_a_slow_tool_stops_after_its_budget():

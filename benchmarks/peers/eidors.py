@@ -1,0 +1,125 @@
+"""EIDORS (GPL: a peer to measure against, never a dependency) in GNU Octave, as its users call it.
+
+`fwd_solve` and `calc_jacobian` on the same mesh, electrode nodes and pairs.  Octave is a process of its own and
+reads the clock itself: its start and the files that carry conductivity and readings do not count.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import weakref
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import savemat
+
+NAME = "EIDORS"
+SCRIPT = Path(__file__).with_suffix(".m")
+
+
+def missing() -> str | None:
+    home = Path(os.environ.get("EIDORS", ""))
+    if not shutil.which("octave-cli"):
+        return "octave-cli is not on PATH (install GNU Octave)"
+    if not (home / "startup.m").is_file():
+        return "the environment variable EIDORS does not name the folder that holds EIDORS's startup.m"
+    if not (shutil.which("mkoctfile") or any(home.glob("arch/octave/*/eidors_var_id.mex"))):
+        return "mkoctfile is not on PATH (install Octave's development files): EIDORS compiles a part of itself once"
+    return None
+
+
+class Eidors:
+    """A tool that has Octave at work; `last_seconds` is what Octave measured around its last call."""
+
+    def __init__(self, problem, verb: str, order: int = 1, pixels=None) -> None:
+        folder = tempfile.TemporaryDirectory(prefix="eidors-")
+        self.folder, self.readings, self.last_seconds = Path(folder.name), len(problem.pattern), float("nan")
+        savemat(self.folder / "work.mat", _work(problem, pixels) | {"verb": verb, "order": order})
+        self.process: Any = subprocess.Popen(
+            ["octave-cli", "--norc", "--quiet", SCRIPT, self.folder],
+            env=os.environ | {"EIDORS": str(Path(os.environ["EIDORS"]).resolve())},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.close = weakref.finalize(self, _stop, self.process, folder)
+        self._say("")  # EIDORS asks whether to compile anew where its source is newer: its own choice
+        self._wait("started")
+        self.peak_before = self._peak_megabytes()
+        self._wait("ready")
+
+    def __call__(self, sigma: np.ndarray) -> np.ndarray:
+        np.asarray(sigma, np.float64).tofile(self.folder / "sigma")
+        self._say("go")
+        self.last_seconds = float(self._wait("seconds"))
+        return np.fromfile(self.folder / "result").reshape(-1, self.readings).T.squeeze()
+
+    def peaks(self) -> dict[str, int]:
+        """Most memory Octave has used, in all and beyond its start; nothing where the system does not say."""
+        peak = self._peak_megabytes()
+        return {"peak_mb": round(peak), "beyond_imports_mb": round(peak - self.peak_before)} if peak else {}
+
+    def _peak_megabytes(self) -> float:
+        status = Path(f"/proc/{self.process.pid}/status")
+        return int(re.findall(r"VmHWM:\s+(\d+)", status.read_text())[0]) / 1024 if status.exists() else 0.0
+
+    def _say(self, line: str) -> None:
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def _wait(self, word: str) -> str:
+        """The rest of the first line that starts with ``word``."""
+        said = []
+        for line in self.process.stdout:
+            if line.startswith(word):
+                return line.removeprefix(word)
+            said.append(line)
+        raise RuntimeError(f"Octave stopped:\n{''.join(said[-20:])}")
+
+
+def _work(problem, pixels) -> dict:
+    """What Octave loads; it counts from one."""
+    nodes = problem.mesh.nodes
+    ground = int(np.setdiff1d(np.arange(len(nodes)), problem.electrode_nodes)[0])
+    work = {
+        "nodes": nodes,
+        "elems": problem.mesh.triangles + 1.0,
+        "electrodes": problem.electrode_nodes + 1.0,
+        "ground": ground + 1.0,
+        "pairs": problem.pairs + 1.0,
+        "kept": problem.kept,
+    }
+    return work if pixels is None else work | {"coarse2fine": pixels}
+
+
+def _stop(process: subprocess.Popen, folder: tempfile.TemporaryDirectory) -> None:
+    process.communicate("stop\n")
+    folder.cleanup()
+
+
+def versions() -> dict[str, str]:
+    """Of Octave and of EIDORS; empty where one of them is missing."""
+    if missing():
+        return {}
+    ask = "addpath(getenv('EIDORS')); printf('%s %s', version(), eidors_obj('eidors_version'))"
+    command = ["octave-cli", "--norc", "--quiet", "--eval", ask]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return dict(zip(("octave", "eidors"), done.stdout.split(), strict=True))
+
+
+def prepare(problem) -> Eidors:
+    return Eidors(problem, "forward")
+
+
+def prepare_quadratic(problem) -> Eidors:
+    """Six-node triangles (`fwd_solve_higher_order`)."""
+    return Eidors(problem, "forward", order=2)
+
+
+def prepare_jacobian(problem, pixels=None) -> Eidors:
+    """Onto elements, or onto ``pixels`` (elements, basis): the quicker of EIDORS's `coarse2fine` and a product."""
+    return Eidors(problem, "jacobian", pixels=pixels)
