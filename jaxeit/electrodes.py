@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ive
 
-from .domain import Domain
+from .domain import Domain, Polygon, cross
 from .elements import Space
 from .mesh import ArcFootprint, DiscFootprint, Footprint, PointFootprint
+from .smoothing import doubled_areas
 
 
 class ElectrodeError(ValueError):
@@ -149,6 +150,57 @@ class AreaPatch(AbstractElectrode):
 
     def centre(self, domain: Domain) -> np.ndarray:
         return np.asarray(self.position, float)
+
+
+@dataclass(frozen=True)
+class PolygonPatch(AbstractElectrode):
+    """An area electrode of straight sides, such as a rectangular pad of a flexible circuit: current
+    spreads into the sheet under its whole area, as under an `AreaPatch`.
+
+    | meaning                                 | shape        | unit    |
+    |-----------------------------------------|--------------|---------|
+    | outline: its shape on the flat sheet    | `Polygon`    | m       |
+    | contact: specific contact resistance    | ()           | ohm m^2 |
+
+    It may reach the rim of the sheet or run from rim to rim.  There is no closed form: the mesh must
+    resolve the transfer length along its sides where its own resistance matters.
+    """
+
+    outline: Polygon
+    contact: float = 1e-6
+
+    def __post_init__(self):
+        _contact(self.contact, "ohm m^2")
+
+    def footprint(self, segments: int) -> Footprint:
+        raise ElectrodeError(
+            f"the mesh generator cannot follow the polygon electrode {self.outline.corner_points.tolist()}; "
+            "give discretise a mesh whose edges follow it"
+        )
+
+    def elements(self, space: Space) -> np.ndarray:
+        """Triangles under the electrode."""
+        mesh = space.mesh
+        inside = np.flatnonzero(self.outline.contains(mesh.chart_centroids))
+        corners = mesh.chart[mesh.triangles[inside]]
+        covered = 0.5 * doubled_areas(corners).sum()
+        whole = abs(covered - self.outline.area) < 1e-6 * self.outline.area
+        if not (whole and self.outline.contains(corners.reshape(-1, 2)).all()):
+            raise ElectrodeError(
+                f"mesh edges cross the polygon electrode {self.outline.corner_points.tolist()}; "
+                "give a mesh whose edges follow it"
+            )
+        return inside
+
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        inside = self.elements(space)
+        return Pieces(space.dofs[inside], space.element_mass(inside))
+
+    def centre(self, domain: Domain) -> np.ndarray:
+        corners = self.outline.corner_points
+        after = np.roll(corners, -1, 0)
+        weight = cross(corners - corners[0], after - corners[0])
+        return (weight @ (corners[0] + corners + after)) / (3 * weight.sum())
 
 
 @dataclass(frozen=True)
