@@ -19,7 +19,7 @@ from .presses import dominant_pad
 
 try:  # an extra: without it everything but the figures works
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import LineCollection
+    from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.figure import Figure
 except ImportError:
     Figure = None  # type: ignore[assignment,misc]
@@ -260,8 +260,14 @@ def _sheet(axes: Any, skin: je.Skin) -> None:
 
 
 def _electrodes(axes: Any, skin: je.Skin) -> None:
-    place = skin.electrode_positions * _MM
-    axes.plot(*place.T, "o", ms=9, mfc="none", mec=_GREEN, mew=1.6, label="electrode", zorder=2)
+    """Polygons as they are, all others as circles of one size, for most are too small to see."""
+    shapes = [e.outline.corner_points * _MM for e in skin.electrodes if isinstance(e, je.PolygonPatch)]
+    round_ones = [not isinstance(e, je.PolygonPatch) for e in skin.electrodes]
+    place = skin.electrode_positions[round_ones] * _MM
+    if len(place):
+        axes.plot(*place.T, "o", ms=9, mfc="none", mec=_GREEN, mew=1.6, label="electrode", zorder=2)
+    label = None if len(place) else "electrode"
+    axes.add_collection(PolyCollection(shapes, fc="none", ec=_GREEN, lw=1.6, label=label, zorder=2))
 
 
 def _legend_below(axes: Any) -> None:

@@ -18,7 +18,7 @@ from scipy.special import ive
 
 from .domain import Domain, Polygon, cross
 from .elements import Space
-from .mesh import ArcFootprint, DiscFootprint, Footprint, PointFootprint
+from .mesh import ArcFootprint, DiscFootprint, Footprint, PointFootprint, PolygonFootprint
 from .smoothing import doubled_areas
 
 
@@ -162,8 +162,9 @@ class PolygonPatch(AbstractElectrode):
     | outline: its shape on the flat sheet    | `Polygon`    | m       |
     | contact: specific contact resistance    | ()           | ohm m^2 |
 
-    It may reach the rim of the sheet or run from rim to rim.  There is no closed form: the mesh must
-    resolve the transfer length along its sides where its own resistance matters.
+    The mesh generator needs it wholly inside the sheet; on a mesh of your own whose edges follow it, it
+    may reach the rim or run from rim to rim.  There is no closed form: the mesh must resolve the
+    transfer length along its sides where its own resistance matters.
     """
 
     outline: Polygon
@@ -172,11 +173,8 @@ class PolygonPatch(AbstractElectrode):
     def __post_init__(self):
         _contact(self.contact, "ohm m^2")
 
-    def footprint(self, segments: int) -> Footprint:
-        raise ElectrodeError(
-            f"the mesh generator cannot follow the polygon electrode {self.outline.corner_points.tolist()}; "
-            "give discretise a mesh whose edges follow it"
-        )
+    def footprint(self, segments: int) -> PolygonFootprint:
+        return PolygonFootprint(self.outline, segments)
 
     def elements(self, space: Space) -> np.ndarray:
         """Triangles under the electrode."""

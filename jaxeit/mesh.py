@@ -13,17 +13,21 @@ from enum import Enum
 from functools import partial
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from .domain import Domain, Rectangle
+from .domain import Domain, Polygon, Rectangle
 from .footprints import (
     ArcFootprint,
     DiscFootprint,
     Footprint,
     PointFootprint,
+    PolygonFootprint,
+    gap,
     polygon_radius,
     reach,
     require_placed,
+    rim_gap,
 )
 from .grading import SizeField, divide_rim, fill, narrow_places, thin
 from .smoothing import Problem, missing_edges, relax
@@ -37,6 +41,7 @@ __all__ = [
     "MeshError",
     "Pattern",
     "PointFootprint",
+    "PolygonFootprint",
     "Surface",
     "polygon_radius",
     "structured",
@@ -45,6 +50,9 @@ __all__ = [
 
 MOST_NODES = 2_000_000
 """A mesh that would be larger is taken for a mistake in units."""
+
+MOST_EDGES = 2000
+"""Around one polygon; checks of an outline compare all pairs of its sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +80,11 @@ def triangulate(
     | growth: ratio of edge lengths from one layer to the next, above 1 to 2 |  |
     | electrode_edge: edges at points and arc ends; edge_length / 4 if not given | m |
 
-    Edges at a disc are its circumference / segments; a disc gets twice, four times ... its segments
-    where edge_length or the gap to a neighbour is shorter than that.  Near anything narrow (gaps,
-    short arcs, waists of the domain) edges shrink to fit.  The rim is followed exactly where it is
-    straight, and by chords where it is round.  Nodes: the rim counter-clockwise, then the
-    footprints' in their order, then the rest.
+    Edges at a disc or polygon are its circumference / segments; a disc gets twice, four times ... its
+    segments where edge_length or the gap to a neighbour is shorter than that.  Near anything narrow
+    (gaps, short arcs, thin polygons, waists of the domain) edges shrink to fit.  The rim is followed
+    exactly where it is straight, and by chords where it is round.  Nodes: the rim counter-clockwise,
+    then the footprints' in their order, then the rest.
 
     Raises ValueError for footprints that overlap or leave the domain, naming the electrodes by
     their place in ``footprints``, and MeshError if the mesh reached does not pass `Mesh.check`.
@@ -84,7 +92,7 @@ def triangulate(
     fine = _lengths(domain, edge_length, growth, electrode_edge)
     footprints = list(footprints)
     require_placed(domain, footprints)
-    footprints = _subdivided(domain, footprints, edge_length)
+    footprints = _subdivided(domain, footprints, edge_length, growth - 1)
     rim = _rim_positions(domain, footprints)
     size = _size_field(domain, footprints, rim, edge_length, growth - 1, fine)
     problem = _problem(domain, footprints, rim, size)
@@ -122,24 +130,60 @@ def _lengths(domain: Domain, edge_length: float, growth: float, edge: float | No
     return min(fine, edge_length)
 
 
-def _subdivided(domain: Domain, footprints: list[Footprint], edge_length: float) -> list[Footprint]:
-    """The footprints, with discs given more segments where neighbours or edge_length ask for it."""
-    return [
-        _subdivide(domain, f, footprints[:index] + footprints[index + 1 :], edge_length)
-        if isinstance(f, DiscFootprint)
-        else f
-        for index, f in enumerate(footprints)
-    ]
+def _subdivided(domain: Domain, footprints: list[Footprint], edge_length: float, slope: float) -> list[Footprint]:
+    """The footprints, with discs and polygons given more edges where neighbours or edge_length ask for it."""
+    out = list(footprints)
+    for index, f in enumerate(footprints):
+        others = footprints[:index] + footprints[index + 1 :]
+        if isinstance(f, DiscFootprint):
+            out[index] = _subdivide(domain, f, others, edge_length)
+        elif isinstance(f, PolygonFootprint):
+            out[index] = _with_nodes(_Among(f.outline.vertices, domain, others), f, edge_length, slope)
+    return out
 
 
 def _subdivide(domain: Domain, disc: DiscFootprint, others: list[Footprint], edge_length: float) -> DiscFootprint:
-    position = np.asarray(disc.position, float)
-    room = [float(domain.boundary_distance(position[None])[0])]
-    room += [float(np.linalg.norm(position - f.position)) - reach(f) for f in others if not isinstance(f, ArcFootprint)]
-    gap, segments = min(room) - reach(disc), disc.segments
-    while 2 * np.pi * disc.radius / segments > 1.3 * min(edge_length, gap):
+    room, segments = min([rim_gap(domain, disc), *(gap(disc, f) for f in others)]), disc.segments
+    while 2 * np.pi * disc.radius / segments > 1.3 * min(edge_length, room):
         segments *= 2
     return DiscFootprint(disc.position, disc.radius, segments)
+
+
+@dataclass(frozen=True)
+class _Among(Polygon):
+    """A polygon whose clearance counts the rim of the domain and the other footprints too."""
+
+    domain: Domain
+    others: list[Footprint]
+
+    def clearance(self, s: ArrayLike) -> np.ndarray:
+        points = self.boundary_point(s)
+        room = [super().clearance(s), self.domain.boundary_distance(points)]
+        return np.min(room + [_distance(points, f) for f in self.others], axis=0)
+
+
+def _distance(points: np.ndarray, footprint: Footprint) -> np.ndarray:
+    """Of points (n, 2) outside a footprint from it; (n,) m, infinite for arcs, which are of the rim."""
+    if isinstance(footprint, ArcFootprint):
+        return np.full(len(points), np.inf)
+    if isinstance(footprint, PolygonFootprint):
+        return footprint.outline.boundary_distance(points)
+    return np.linalg.norm(points - footprint.position, axis=1) - reach(footprint)
+
+
+def _with_nodes(among: _Among, polygon: PolygonFootprint, edge_length: float, slope: float) -> PolygonFootprint:
+    """The polygon with a corner wherever the mesh gets a node."""
+    cap = min(edge_length, polygon.outline.perimeter / polygon.segments)
+    places, widths = narrow_places(among, cap, slope)
+    size = SizeField(places, np.zeros(len(widths)), widths, slope, cap)
+    edges = among.perimeter * np.mean(1 / size(among.boundary_point(np.linspace(0, among.perimeter, MOST_EDGES))))
+    if edges > MOST_EDGES:
+        raise MeshError(
+            f"triangulate: the polygon from {place(among.corner_points[0])} needs {edges:.0f} edges around it, above "
+            f"the limit of {MOST_EDGES}; use a longer edge_length, or make it wider and move what is near it away"
+        )
+    s = divide_rim(among, among.corners, size)
+    return PolygonFootprint(Polygon(among.boundary_point(s)), len(s))
 
 
 def _rim_positions(domain: Domain, footprints: list[Footprint]) -> np.ndarray:
@@ -188,7 +232,7 @@ def _size_field(
 
 
 def _features(domain: Domain, footprints: list[Footprint], rim: np.ndarray, cap: float, fine: float) -> list[_Feature]:
-    """One per disc, point, arc end and fixed node of the rim, with the edge length asked there."""
+    """One per disc, point, arc end and fixed node of the rim or a polygon, with the edge length asked there."""
     features = [_Feature(p, 0.0, cap) for p in domain.boundary_point(rim)]
     for f in footprints:
         if isinstance(f, DiscFootprint):
@@ -196,6 +240,8 @@ def _features(domain: Domain, footprints: list[Footprint], rim: np.ndarray, cap:
             features.append(_Feature(np.asarray(f.position, float), reach(f), min(edge, cap)))
         elif isinstance(f, PointFootprint):
             features.append(_Feature(np.asarray(f.position, float), 0.0, fine))
+        elif isinstance(f, PolygonFootprint):
+            features += [_Feature(p, 0.0, cap) for p in f.outline.corner_points]
         else:
             # Two edges or more under an arc: the current crowds at its ends.
             size = min(fine, 0.5 * (f.stop - f.start))
@@ -223,14 +269,15 @@ def _problem(domain: Domain, footprints: list[Footprint], rim: np.ndarray, size:
     around = domain.boundary_point(divide_rim(domain, rim, size))
     own = [_own_nodes(domain, f) for f in footprints]
     first = len(around) + np.cumsum([0, *map(len, own)])
-    discs = [(k, f) for k, f in zip(first, footprints, strict=False) if isinstance(f, DiscFootprint)]
+    closed = DiscFootprint | PolygonFootprint
+    rings = [_cycle(k, f.segments) for k, f in zip(first, footprints, strict=False) if isinstance(f, closed)]
     return Problem(
         domain=domain,
         size=size,
         fixed=np.concatenate([around, *own]),
         rim=_cycle(0, len(around)),
-        rings=np.concatenate([np.zeros((0, 2), int), *(_cycle(k, f.segments) for k, f in discs)]),
-        open_to=partial(_open_to, domain, [f for _, f in discs], size),
+        rings=np.concatenate([np.zeros((0, 2), int), *rings]),
+        open_to=partial(_open_to, domain, [f for f in footprints if isinstance(f, DiscFootprint)], size),
     )
 
 
@@ -244,6 +291,8 @@ def _own_nodes(domain: Domain, footprint: Footprint) -> np.ndarray:
     """Nodes (k, 2) a footprint adds to those of the rim; a disc's outermost ring comes first."""
     if isinstance(footprint, DiscFootprint):
         return _disc_nodes(footprint)
+    if isinstance(footprint, PolygonFootprint):
+        return footprint.outline.corner_points
     if isinstance(footprint, ArcFootprint):
         return np.zeros((0, 2))
     position = np.asarray([footprint.position], float)

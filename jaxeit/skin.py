@@ -4,11 +4,12 @@ import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .domain import Disc, Domain, Polygon, Rectangle
-from .electrodes import AbstractElectrode, AreaPatch, BoundaryPatch, PointElectrode
+from .electrodes import AbstractElectrode, AreaPatch, BoundaryPatch, PointElectrode, PolygonPatch
 from .protocol import Protocol, adjacent
 from .surface import AbstractSurface, Cylinder, Sphere
 from .toml import TomlError, TomlTable, parse_toml, read_text
@@ -142,10 +143,14 @@ def _surface(table: TomlTable, domain: Domain) -> AbstractSurface:
 
 
 def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ...]:
-    kind = table.choice("kind", "bolt", "point", "edge")
+    kind = table.choice("kind", "bolt", "point", "edge", "rectangle", "polygon")
     electrodes: tuple[AbstractElectrode, ...]
     if kind == "edge":
         electrodes = _edge_electrodes(table, domain)
+    elif kind == "rectangle":
+        electrodes = _rectangles(table, domain)
+    elif kind == "polygon":
+        electrodes = _polygons(table, domain)
     else:
         positions = _positions(table)
         _require_inside(table, positions, domain)
@@ -153,7 +158,7 @@ def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ..
             electrodes = tuple(PointElectrode(p) for p in positions)
         else:
             radius = table.positive("radius", "the contact radius in m")
-            contact = table.number("contact", "ohm m^2, zero or more")
+            contact = _area_contact(table)
             electrodes = tuple(AreaPatch(p, radius, contact) for p in positions)
     table.done()
     return electrodes
@@ -182,6 +187,51 @@ def _require_inside(table: TomlTable, positions: list, domain: Domain) -> None:
     if outside.any():
         number = int(np.argmax(outside))
         raise table.error("positions", f"electrode {number} at {positions[number]} m lies outside the sheet")
+
+
+def _area_contact(table: TomlTable) -> float:
+    return table.number("contact", "ohm m^2, zero or more")
+
+
+def _rectangles(table: TomlTable, domain: Domain) -> tuple[PolygonPatch, ...]:
+    positions = _positions(table)
+    size = table.vector("size", 2, "[width, height] in m")
+    if min(size) <= 0:
+        raise table.error("size", f"is {list(size)}; give a width and a height in m, above zero")
+    angle = table.number("angle", "the turn counter-clockwise in rad", 0.0, least=-math.inf)
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
+    along, across = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    turned = corners[:, :1] * along + corners[:, 1:] * across
+    return _patches(table, "positions", [Polygon(turned + p) for p in positions], domain)
+
+
+def _polygons(table: TomlTable, domain: Domain) -> tuple[PolygonPatch, ...]:
+    meaning = "[[[x, y], ...], ...], the corners of each electrode in m"
+    given = table.get("outlines", lambda v: isinstance(v, list) and v != [] and all(map(_is_outline, v)), meaning)
+    return _patches(table, "outlines", [_outline(table, number, v) for number, v in enumerate(given)], domain)
+
+
+def _is_outline(value: Any) -> bool:
+    """Whether a value of a TOML file is rows of two numbers; `Polygon` judges the numbers."""
+    rows = value if isinstance(value, list) else [None]
+    return all(isinstance(row, list) and len(row) == 2 and all(type(x) in (int, float) for x in row) for row in rows)
+
+
+def _outline(table: TomlTable, number: int, corners: list) -> Polygon:
+    try:
+        return Polygon(corners)
+    except ValueError as error:
+        raise table.error("outlines", f"electrode {number}: {error}") from None
+
+
+def _patches(table: TomlTable, key: str, outlines: list[Polygon], domain: Domain) -> tuple[PolygonPatch, ...]:
+    for number, outline in enumerate(outlines):
+        outside = ~domain.contains(outline.corner_points)
+        if outside.any():
+            corner = outline.corner_points[np.argmax(outside)].round(9).tolist()
+            raise table.error(key, f"electrode {number} has a corner at {corner} m, outside the sheet")
+    contact = _area_contact(table)
+    return tuple(PolygonPatch(outline, contact) for outline in outlines)
 
 
 def _edge_electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ...]:

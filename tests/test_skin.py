@@ -74,6 +74,72 @@ def test_edge_electrodes_and_points():
     assert je.parse_skin(points).protocol.readings == 4
 
 
+def _with_electrodes(lines):
+    return TEXT[: TEXT.index("[electrodes]")] + TEXT[TEXT.index("[protocol]") :] + f"[electrodes]\n{lines}\n"
+
+
+RECTANGLES = """kind = "rectangle"
+size = [0.02, 0.01]
+angle = 0.3
+contact = 1e-5
+positions = [[0.05, 0.05], [0.15, 0.05], [0.15, 0.15], [0.05, 0.15]]"""
+
+POLYGONS = """kind = "polygon"
+contact = 0.0
+outlines = [[[0.01, 0.01], [0.01, 0.03], [0.03, 0.01]], [[0.1, 0.1], [0.12, 0.1], [0.12, 0.12], [0.1, 0.12]],
+            [[0.15, 0.1], [0.17, 0.1], [0.17, 0.12]], [[0.15, 0.15], [0.17, 0.15], [0.17, 0.17]]]"""
+
+
+def test_rectangles_are_turned_about_their_centres():
+    skin = je.parse_skin(_with_electrodes(RECTANGLES))
+    np.testing.assert_allclose(skin.electrode_positions[3], [0.05, 0.15], rtol=1e-14)
+    first = skin.electrodes[0]
+    assert (first.outline.area, first.contact) == (pytest.approx(2e-4), 1e-5)
+    bottom = first.outline.corner_points[1] - first.outline.corner_points[0]  # counter-clockwise from the x axis
+    np.testing.assert_allclose(bottom, 0.02 * np.array([np.cos(0.3), np.sin(0.3)]), rtol=1e-12)
+    row = 'kind = "rectangle"\nsize = [0.02, 0.01]\ncontact = 0.0\n'
+    grid = je.parse_skin(_with_electrodes(row + "grid = {columns = 4, rows = 1, pitch = 0.04, origin = [0.04, 0.1]}"))
+    assert grid.electrodes[1].outline.bounds == (pytest.approx((0.07, 0.095)), pytest.approx((0.09, 0.105)))
+
+
+def test_polygons():
+    skin = je.parse_skin(_with_electrodes(POLYGONS))
+    assert [len(e.outline.corner_points) for e in skin.electrodes] == [3, 4, 3, 3]
+    np.testing.assert_allclose(skin.electrode_positions[0], [0.05 / 3, 0.05 / 3], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lines", "old", "new", "message"),
+    [
+        (
+            RECTANGLES,
+            "size = [0.02, 0.01]",
+            "size = [0.02, 0.0]",
+            r"\[electrodes\]: size: is \[0.02, 0.0\]; give a width",
+        ),
+        (RECTANGLES, "size = [0.02, 0.01]", "radius = 0.01", r"size: missing; give \[width, height\] in m"),
+        (RECTANGLES, "[0.15, 0.05]", "[0.195, 0.05]", r"positions: electrode 1 has a corner at \[0.2.* m, outside"),
+        (RECTANGLES, "angle = 0.3", "angle = '17 deg'", "angle: is '17 deg'; give the turn counter-clockwise in rad"),
+        (RECTANGLES, "contact = 1e-5", "contact = -1.0", "contact: is -1.0; give ohm m.2"),
+        (RECTANGLES, "angle = 0.3", "angel = 0.3", "angel: unknown key; did you mean 'angle'"),
+        (
+            POLYGONS,
+            "[0.01, 0.01]",
+            "[-0.01, 0.01]",
+            r"outlines: electrode 0 has a corner at \[-0.01, 0.01\] m, outside",
+        ),
+        (POLYGONS, "[0.1, 0.12]", "[0.11, 0.09]", "outlines: electrode 1: Polygon: the sides .* meet"),
+        (POLYGONS, "[0.1, 0.12]", "[nan, 0.09]", "outlines: electrode 1: Polygon: vertex 3 .* give finite metres"),
+        (POLYGONS, "[0.1, 0.12]", "[0.1, '0.12']", r"outlines: is .*; give \[\[\[x, y\], ...\], ...\]"),
+        (POLYGONS, "outlines = [[[0.01, 0.01]", "outlines = [[0.01, [0.01, 0.01]", "outlines: is .*; give"),
+    ],
+)
+def test_wrong_patches_are_refused(lines, old, new, message):
+    assert old in lines
+    with pytest.raises(je.TomlError, match=message):
+        je.parse_skin(_with_electrodes(lines.replace(old, new, 1)))
+
+
 def test_adjacent_never_senses_what_it_drives():
     pattern = je.adjacent(32)
     assert pattern.shape == (32 * 29, 4)
