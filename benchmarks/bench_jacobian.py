@@ -31,7 +31,9 @@ def ours(problem: c.Problem, pixels: bool, dtype: str = "float64") -> c.Tool:
 def pixel_matrix(problem: c.Problem) -> csr_array:
     """(elements, 900): the projection, for the tool that is given it."""
     image = je.Pixels(PIXELS).on(problem.model())
-    entries = np.asarray(image.weight), (np.asarray(image.element), np.asarray(image.coefficient))
+    weight, element = np.asarray(image.weight), np.asarray(image.element)
+    coefficient = np.broadcast_to(np.asarray(image.coefficient)[:, None], element.shape)
+    entries = weight.ravel(), (element.ravel(), coefficient.ravel())
     return csr_array(entries, shape=(len(problem.sigma), image.size))
 
 

@@ -25,7 +25,7 @@ from .effects import (
     Stream,
     fold,
 )
-from .electrodes import AreaPatch, BoundaryPatch, ElectrodeError, PointElectrode, disc_resistance
+from .electrodes import AreaPatch, BoundaryPatch, ElectrodeError, PointElectrode, PolygonPatch, disc_resistance
 from .fidelity import Fidelity, FidelityError
 from .forward import conductivity, forward, load_spread
 from .fusion import ForceMap, FusionError, PadMasks, fuse, pad_masks
@@ -47,9 +47,10 @@ from .priors import Noser, Tikhonov
 from .protocol import Protocol, adjacent, reciprocal_rows
 from .scene import Scene, read_effects
 from .skin import Pad, PressureSensor, Skin, load_skin, parse_skin, shipped_skins
-from .solvers import Dense, NestedDissection
+from .solvers import ConjugateGradient, Dense, NestedDissection, Single
 from .surface import AbstractSurface, Cylinder, Sphere
 from .toml import TomlError, TomlTable, parse_toml, read_text
+from .verbs import compiler_options
 
 __version__ = metadata.version("jaxeit")
 
@@ -65,6 +66,7 @@ __all__ = [
     "BasisMap",
     "BoundaryPatch",
     "CoatingNonUniformity",
+    "ConjugateGradient",
     "ContactGain",
     "ContactPiezoresistance",
     "Cylinder",
@@ -94,6 +96,7 @@ __all__ = [
     "Pixels",
     "PointElectrode",
     "Polygon",
+    "PolygonPatch",
     "PositiveCentroid",
     "PressureSensor",
     "Protocol",
@@ -101,6 +104,7 @@ __all__ = [
     "Reconstructor",
     "Rectangle",
     "Scene",
+    "Single",
     "Skin",
     "Sphere",
     "Stream",
@@ -109,6 +113,7 @@ __all__ = [
     "TomlTable",
     "adjacent",
     "coefficient_of_variation",
+    "compiler_options",
     "conductivity",
     "disc_resistance",
     "discretise",

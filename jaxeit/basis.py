@@ -19,18 +19,21 @@ class BasisError(ValueError):
 class BasisMap(eqx.Module):
     """A basis laid over one model: conductivity change = sparse matrix times coefficients.
 
+    The matrix is kept in lines of c entries; a coefficient has as many lines as it needs.
+
     | meaning                                               | shape       | unit |
     |-------------------------------------------------------|-------------|------|
-    | element, coefficient, weight: the matrix's entries    | (entries,)  |      |
+    | element, weight: entries of each line; weight 0: none | (lines, c)  |      |
+    | coefficient of each line                              | (lines,)    |      |
     | centres in the sheet's flat coordinates               | (basis, 2)  | m    |
     | areas on the sheet; zero for a pixel that misses it   | (basis,)    | m^2  |
     | shape: (rows, columns) of a picture, row 0 at low y   |             |      |
     | extent: x0, x1, y0, y1 of that picture                |             | m    |
     """
 
-    element: Int[Array, " entries"]
-    coefficient: Int[Array, " entries"]
-    weight: Float[Array, " entries"]
+    element: Int[Array, "lines c"]
+    weight: Float[Array, "lines c"]
+    coefficient: Int[Array, " lines"]
     centres: Float[Array, "basis 2"]
     areas: Float[Array, " basis"]
     elements: int = eqx.field(static=True)
@@ -44,8 +47,13 @@ class BasisMap(eqx.Module):
 
     def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
         """Values on the elements, from those of the coefficients."""
-        spread = self.weight * image[self.coefficient]
+        spread = self.weight * image[self.coefficient][:, None]
         return jnp.zeros(self.elements, spread.dtype).at[self.element].add(spread)
+
+    def restrict(self, values: Float[Array, " elements"]) -> Float[Array, " basis"]:
+        """The transpose of `expand`: weighted sums over the elements of each coefficient."""
+        sums = jnp.sum(self.weight * values[self.element], 1)
+        return jnp.zeros(self.size, sums.dtype).at[self.coefficient].add(sums)
 
 
 class AbstractBasis(ABC):
@@ -116,17 +124,32 @@ class Pixels(AbstractBasis):
 
 def _basis_map(model, entries, centres, areas, shape, chart) -> BasisMap:
     (x0, y0), (x1, y1) = chart.min(0).tolist(), chart.max(0).tolist()
-    element, coefficient, weight = entries
+    element, weight, coefficient = _lines(entries, len(areas))
     return BasisMap(
         element=jnp.asarray(element, jnp.int32),
-        coefficient=jnp.asarray(coefficient, jnp.int32),
         weight=jnp.asarray(weight, model.dtype),
+        coefficient=jnp.asarray(coefficient, jnp.int32),
         centres=jnp.asarray(centres, model.dtype),
         areas=jnp.asarray(areas, model.dtype),
         elements=model.areas.shape[0],
         shape=shape,
         extent=(x0, x1, y0, y1),
     )
+
+
+def _lines(entries: tuple[np.ndarray, np.ndarray, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries in lines as long as half the coefficients need, so that little is padding."""
+    element, coefficient, weight = entries
+    order = np.lexsort((element, coefficient))
+    element, coefficient, weight = element[order], coefficient[order], weight[order]
+    counts = np.bincount(coefficient, minlength=size)
+    length = int(np.clip(np.median(counts[counts > 0]), 1, 64))
+    lines = -(-counts // length)
+    rank = np.arange(len(element)) - np.repeat(np.cumsum(counts) - counts, counts)
+    line = np.repeat(np.cumsum(lines) - lines, counts) + rank // length
+    table, weights = np.zeros((lines.sum(), length), int), np.zeros((lines.sum(), length))
+    table[line, rank % length], weights[line, rank % length] = element, weight
+    return table, weights, np.repeat(np.arange(size), lines)
 
 
 def _host(array: Array) -> np.ndarray:

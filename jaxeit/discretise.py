@@ -32,6 +32,13 @@ from .scene import Scene
 from .solvers import AbstractLinearSolver, AbstractPlan, Pattern, default_solver
 
 
+class Entries(eqx.Module):
+    """Matrix entries that at most c elements contribute to: the sum of weight times sigma[element]."""
+
+    element: Int[Array, "n c"]
+    weight: Float[Array, "n c"]
+
+
 class System(eqx.Module):
     """The assembled problem with its numbers left out: which coefficient goes where.
 
@@ -41,31 +48,36 @@ class System(eqx.Module):
     | meaning                                                                 | shape           |
     |-------------------------------------------------------------------------|-----------------|
     | dofs: unknowns of each element                                          | (elements, k)   |
-    | stiffness of each element at unit conductivity                          | (elements, k, k)|
+    | slopes of each element, weighted (`elements`)                           | (elements, k, r)|
+    | sheet: the matrix at unit contact, in the order of its entries          |                 |
     | contact_dofs, contact_mass (m^2 or m): pieces under complete electrodes | (p, k), (p, k, k)|
     | contact_electrode: whose piece it is                                    | (p,)            |
-    | rim_element, rim_electrode, rim_chi: elements around an electrode and   | (r,), (r,),     |
-    |   the values of chi at their nodes                                      | (r, k)          |
+    | rim_element, rim_electrode: elements around an electrode                | (e,), (e,)      |
+    | rim_chi, rim_flux: chi at their nodes, and their stiffness times chi    | (e, k), (e, k)  |
     | measure: area (m^2) or length (m) of each electrode, 0 if tied          | (electrodes,)   |
     | under: the complete electrode over each unknown, and over the ground    | (unknowns + 1,) |
     | electrode_dof: the unknown that is each electrode's potential           | (electrodes,)   |
-    | slots: place in the matrix of every contribution (`forward.assemble`)   | (contributions,)|
+    | electrode_root: its place in the root of the plan, past it if grounded  | (electrodes,)   |
+    | slots: place in the matrix of what contacts add (`forward.assemble`)    | (contributions,)|
     | lumped: radius of discs whose contact is in closed form, else 0, m      | (electrodes,)   |
     | near_element, near_electrode, near_share: elements under those discs,   | (q,), (q,), (q,)|
     |   and their shares of each disc's area                                  |                 |
     """
 
     dofs: Int[Array, "elements k"]
-    stiffness: Float[Array, "elements k k"]
+    slopes: Float[Array, "elements k r"]
+    sheet: tuple[Entries, ...]
     contact_dofs: Int[Array, "p k"]
     contact_mass: Float[Array, "p k k"]
     contact_electrode: Int[Array, " p"]
-    rim_element: Int[Array, " r"]
-    rim_electrode: Int[Array, " r"]
-    rim_chi: Float[Array, "r k"]
+    rim_element: Int[Array, " e"]
+    rim_electrode: Int[Array, " e"]
+    rim_chi: Float[Array, "e k"]
+    rim_flux: Float[Array, "e k"]
     measure: Float[Array, " electrodes"]
     under: Int[Array, " unknowns_and_ground"]
     electrode_dof: Int[Array, " electrodes"]
+    electrode_root: Int[Array, " electrodes"]
     slots: Int[Array, " contributions"]
     lumped: Float[Array, " electrodes"]
     near_element: Int[Array, " q"]
@@ -248,30 +260,29 @@ def _system(
     under = np.full(layout.unknowns + 1, electrodes)
     under[contact_dofs[contact_mass.any(2)]] = np.repeat(contact_electrode, contact_mass.any(2).sum(1))
     rim_element, rim_electrode, rim_chi = _rims(dofs, under, electrodes)
-    rows, cols = _entries(dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, layout.electrode_dof)
-    slots, pattern_rows, pattern_cols = _slots(rows, cols, layout.unknowns)
+    stiffness = space.stiffness
+    added = _contact_places(dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, layout.electrode_dof)
+    sheet, slots, (rows, cols) = _matrix(dofs, stiffness, added, layout.unknowns)
     roots = np.unique(layout.electrode_dof)
-    pattern = Pattern(
-        layout.unknowns,
-        pattern_rows,
-        pattern_cols,
-        layout.coords,
-        roots[roots < layout.unknowns],
-    )
+    roots = roots[roots < layout.unknowns]
+    pattern = Pattern(layout.unknowns, rows, cols, layout.coords, roots)
     solver = fidelity.solver or default_solver(layout.unknowns)
     put = partial(_put, dtype=fidelity.dtype)
     system = System(
         dofs=put(dofs),
-        stiffness=put(space.stiffness),
+        slopes=put(space.slopes),
+        sheet=tuple(Entries(put(element), put(weight)) for element, weight in sheet),
         contact_dofs=put(contact_dofs),
         contact_mass=put(contact_mass),
         contact_electrode=put(contact_electrode),
         rim_element=put(rim_element),
         rim_electrode=put(rim_electrode),
         rim_chi=put(rim_chi),
+        rim_flux=put(np.einsum("eij,ej->ei", stiffness[rim_element], rim_chi)),
         measure=put(measure),
         under=put(under),
         electrode_dof=put(layout.electrode_dof),
+        electrode_root=put(np.searchsorted(roots, layout.electrode_dof)),
         slots=put(slots),
         lumped=put(layout.lumped),
         **{name: put(part) for name, part in _near(space, layout, hardware).items()},
@@ -316,7 +327,7 @@ def _rims(dofs: np.ndarray, under: np.ndarray, electrodes: int) -> tuple[np.ndar
     return pairs[partly, 0], pairs[partly, 1], chi[partly].astype(float)
 
 
-def _entries(
+def _contact_places(
     dofs: np.ndarray,
     contact_dofs: np.ndarray,
     contact_electrode: np.ndarray,
@@ -324,23 +335,56 @@ def _entries(
     rim_electrode: np.ndarray,
     electrode_dof: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of every contribution, in the order in which `forward.assemble` makes them."""
-    width = dofs.shape[1]
-    blocks = np.concatenate([dofs, contact_dofs])
+    """Row and column of every contribution of the contacts, in the order of `forward.assemble`."""
+    rows, cols = _blocks(contact_dofs)
     nodes = np.concatenate([dofs[rim_element], contact_dofs])
-    potential = electrode_dof[np.concatenate([rim_electrode, contact_electrode])]
-    rows = [np.repeat(blocks, width, 1).ravel(), nodes.ravel(), electrode_dof]
-    cols = [np.tile(blocks, (1, width)).ravel(), np.repeat(potential, width), electrode_dof]
+    potential = np.repeat(electrode_dof[np.concatenate([rim_electrode, contact_electrode])], dofs.shape[1])
     # A node and the electrode over it make one entry, which the lower triangle holds once; a block
     # makes each of its entries twice, and the upper one is dropped.
-    rows[1], cols[1] = np.maximum(rows[1], cols[1]), np.minimum(rows[1], cols[1])
-    return np.concatenate(rows), np.concatenate(cols)
+    low, high = np.sort([nodes.ravel(), potential], axis=0)
+    return np.concatenate([rows, high, electrode_dof]), np.concatenate([cols, low, electrode_dof])
 
 
-def _slots(rows: np.ndarray, cols: np.ndarray, unknowns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Number the distinct places of the lower triangle; what is dropped goes past the last."""
+def _blocks(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    width = dofs.shape[1]
+    return np.repeat(dofs, width, 1).ravel(), np.tile(dofs, (1, width)).ravel()
+
+
+def _matrix(
+    dofs: np.ndarray, stiffness: np.ndarray, added: tuple[np.ndarray, np.ndarray], unknowns: int
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """What elements contribute to each entry of the lower triangle; where the contacts contribute;
+    rows and columns of the entries.
+
+    Entries are ordered by how many elements meet in them, to the next power of two, so that those
+    alike can be summed as one table.
+    """
+    rows, cols = (np.concatenate(pair) for pair in zip(_blocks(dofs), added, strict=True))
     kept = (rows >= cols) & (rows < unknowns)
-    keys, inverse = np.unique(rows[kept] * np.int64(unknowns) + cols[kept], return_inverse=True)
-    slots = np.full(len(rows), len(keys))
-    slots[kept] = inverse
-    return slots, keys // unknowns, keys % unknowns
+    keys, entry = np.unique(rows[kept] * np.int64(unknowns) + cols[kept], return_inverse=True)
+    whole = np.full(len(rows), len(keys))
+    whole[kept] = entry
+    of_sheet, slots = np.split(whole, [stiffness.size])
+    counts = np.bincount(of_sheet, minlength=len(keys) + 1)[:-1]
+    width = np.where(counts > 1, 2 ** np.ceil(np.log2(np.maximum(counts, 1))).astype(int), counts)
+    order = np.argsort(width, kind="stable")
+    place = np.append(np.argsort(order), len(keys))
+    tables = _tables(place[of_sheet], stiffness, width[order])
+    return tables, place[slots], (keys[order] // unknowns, keys[order] % unknowns)
+
+
+def _tables(entry: np.ndarray, stiffness: np.ndarray, width: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Element and weight of each contribution to the entries of one width, for each width."""
+    used = np.flatnonzero(entry < len(width))
+    used = used[np.argsort(entry[used], kind="stable")]
+    entry = entry[used]
+    rank = np.arange(len(entry)) - np.searchsorted(entry, entry)
+    tables = []
+    for columns in np.unique(width):
+        first, end = np.searchsorted(width, [columns, columns + 1])
+        mine = (entry >= first) & (entry < end)
+        element, weight = np.zeros((end - first, columns), int), np.zeros((end - first, columns))
+        at = entry[mine] - first, rank[mine]
+        element[at], weight[at] = used[mine] // stiffness[0].size, stiffness.ravel()[used[mine]]
+        tables.append((element, weight))
+    return tables

@@ -2,12 +2,15 @@
 
 The reference triangle has corners (0,0), (1,0), (0,1) and barycentric coordinates
 ``l0 = 1 - x - y``, ``l1 = x``, ``l2 = y``.  A straight triangle with corners ``p0, p1, p2`` in the
-plane *or in space* has the 2x2 metric ``g = J^T J`` with ``J = [p1 - p0, p2 - p0]``, so that
+plane *or in space* has the metric ``[[a, b], [b, d]] = J^T J`` with ``J = [p1 - p0, p2 - p0]``.  In
+the orthonormal frame whose first axis points along the first edge, a slope (s, t) on the reference
+triangle becomes ``(s / |a|, (a t - b s) / (|a| 2 area))`` with ``|a| = sqrt(a)``.  Taken at the points
+of a quadrature rule that is exact here, and times the roots of its weights, these are the *slopes*
+of an element, of which its stiffness is the square:
 
-    integral of grad(phi_i) . grad(phi_j) dA = area * 2 * sum_ab inv(g)_ab * S_ab,ij
+    integral of grad(phi_i) . grad(phi_j) dA = sum_r slopes_ir slopes_jr.
 
-with the reference tensor ``S_ab,ij = integral of d_a phi_i d_b phi_j`` over the reference triangle
-(area 1/2).  The same line therefore serves flat and curved sheets.
+The same lines serve flat and curved sheets.
 """
 
 from dataclasses import dataclass
@@ -25,7 +28,8 @@ class Lagrange:
     | meaning                                   | shape        | unit |
     |-------------------------------------------|--------------|------|
     | order                                     | ()           | 1    |
-    | stiffness: reference tensor S             | (2, 2, k, k) | 1    |
+    | derivatives at the quadrature points      | (q, 2, k)    | 1    |
+    | weights of the points; they sum to one    | (q,)         | 1    |
     | mass: per unit area of a triangle         | (k, k)       | 1    |
     | edge_mass: per unit length of an edge     | (e, e)       | 1    |
 
@@ -34,7 +38,8 @@ class Lagrange:
     """
 
     order: int
-    stiffness: np.ndarray
+    derivatives: np.ndarray
+    weights: np.ndarray
     mass: np.ndarray
     edge_mass: np.ndarray
 
@@ -51,6 +56,8 @@ _P2: list[_Poly] = [
     {(1, 0, 1): 4.0},
 ]
 _EDGE = {1: [0, 1], 2: [0, 1, 3]}  # the functions that do not vanish on edge 01
+# Barycentric points of equal weight, exact for products of two slopes.
+_POINTS = {1: np.full((1, 3), 1 / 3), 2: np.array([[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]])}
 
 
 def _product(p: _Poly, q: _Poly) -> _Poly:
@@ -75,6 +82,10 @@ def _along(p: _Poly, axis: int) -> _Poly:
     return out
 
 
+def _value(p: _Poly, at: np.ndarray) -> float:
+    return sum(x * np.prod(at ** np.array(key)) for key, x in p.items())
+
+
 def _integral(p: _Poly) -> float:
     """Over the reference triangle: integral of l0^a l1^b l2^c = a! b! c! / (a + b + c + 2)!."""
     return sum(x * np.prod(factorial(key)) / factorial(sum(key) + 2) for key, x in p.items())
@@ -86,12 +97,13 @@ def _edge_integral(p: _Poly) -> float:
 
 
 def _lagrange(order: int, functions: list[_Poly]) -> Lagrange:
-    slopes = [[_along(p, axis) for p in functions] for axis in (0, 1)]
-    stiffness = [[[[_integral(_product(p, q)) for q in sb] for p in sa] for sb in slopes] for sa in slopes]
+    points = _POINTS[order]
+    derivatives = [[[_value(_along(p, axis), at) for p in functions] for axis in (0, 1)] for at in points]
+    weights = np.full(len(points), 1 / len(points))
     mass = [[2.0 * _integral(_product(p, q)) for q in functions] for p in functions]
     ends = [functions[i] for i in _EDGE[order]]
     edge_mass = [[_edge_integral(_product(p, q)) for q in ends] for p in ends]
-    return Lagrange(order, np.array(stiffness), np.array(mass), np.array(edge_mass))
+    return Lagrange(order, np.array(derivatives), weights, np.array(mass), np.array(edge_mass))
 
 
 P1 = _lagrange(1, _P1)
@@ -109,7 +121,7 @@ class Space:
     | chart: the same in the sheet's flat coordinates    | (dofs, 2)         | m    |
     | dofs of each triangle                              | (elements, k)     |      |
     | boundary_dofs of each boundary edge                | (boundary, e)     |      |
-    | stiffness of each triangle at unit conductivity    | (elements, k, k)  | 1    |
+    | slopes of each triangle, weighted (see above)      | (elements, k, r)  | 1    |
     """
 
     mesh: Mesh
@@ -118,7 +130,12 @@ class Space:
     chart: np.ndarray
     dofs: np.ndarray
     boundary_dofs: np.ndarray
-    stiffness: np.ndarray
+    slopes: np.ndarray
+
+    @property
+    def stiffness(self) -> np.ndarray:
+        """Stiffness of each triangle at unit conductivity, (elements, k, k)."""
+        return self.slopes @ self.slopes.transpose(0, 2, 1)
 
     def element_mass(self, elements: np.ndarray) -> np.ndarray:
         """Mass matrices of the given triangles, (len, k, k) in m^2."""
@@ -143,7 +160,7 @@ def function_space(mesh: Mesh, order: int) -> Space:
         sides = [index(dofs[:, [i, (i + 1) % 3]]) for i in range(3)]
         dofs = np.concatenate([dofs, middle[np.stack(sides, 1)]], 1)
         boundary = np.concatenate([boundary, middle[index(boundary)][:, None]], 1)
-    return Space(mesh, element, points, chart, dofs, boundary, _stiffness(mesh, element))
+    return Space(mesh, element, points, chart, dofs, boundary, _slopes(mesh, element))
 
 
 def _edge_index(edges: np.ndarray):
@@ -159,11 +176,15 @@ def _edge_index(edges: np.ndarray):
     return lookup
 
 
-def _stiffness(mesh: Mesh, element: Lagrange) -> np.ndarray:
+def _slopes(mesh: Mesh, element: Lagrange) -> np.ndarray:
     corners = mesh.nodes[mesh.triangles]
-    jacobian = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
-    (a, b), (_, d) = np.moveaxis(np.swapaxes(jacobian, 1, 2) @ jacobian, 0, -1)
-    determinant = a * d - b * b  # = (2 area)^2, positive for a mesh that passed its check
-    inverse = np.array([[d, -b], [-b, a]]) / determinant
-    scale = 2.0 * mesh.areas
-    return np.einsum("abe,abij,e->eij", inverse, element.stiffness, scale)
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length, along, twice = np.linalg.norm(first, axis=1), np.sum(first * second, 1), 2 * mesh.areas
+    to_frame = np.zeros((len(corners), 2, 2))
+    to_frame[:, 0, 0] = 1 / length
+    to_frame[:, 1, 0] = -along / (length * twice)
+    to_frame[:, 1, 1] = length / twice
+    slopes = np.einsum(
+        "ecd,qdk,eq->ekqc", to_frame, element.derivatives, np.sqrt(mesh.areas[:, None] * element.weights)
+    )
+    return slopes.reshape(*slopes.shape[:2], -1)

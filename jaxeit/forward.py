@@ -22,7 +22,8 @@ from jaxtyping import Array, Float
 
 from .discretise import Model, System
 from .effects import AbstractLoadEffect, AbstractSheetEffect, Sheet, Touch, fold
-from .solvers import solve_spd
+from .solvers import inverse_columns
+from .verbs import verb
 
 
 class Coefficients(NamedTuple):
@@ -60,13 +61,15 @@ def forward(model: Model, sigma: Float[Array, " elements"] | None = None) -> Flo
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model.
     """
+    return _forward(model, None if sigma is None else jnp.asarray(sigma))
+
+
+@verb
+def _forward(model: Model, sigma: Float[Array, " elements"] | None) -> Float[Array, " readings"]:
     return readings(model, transfer(model, coefficients(model, sigma)))
 
 
-# `forward` and `jacobian` are made of jitted parts, so that they share one compiled solver.
-
-
-@eqx.filter_jit
+@verb
 def conductivity(model: Model, pressure: Float[Array, " elements"] | None = None) -> Float[Array, " elements"]:
     """Sheet conductivity, (elements,) S, under the scene's material effects.
 
@@ -80,7 +83,7 @@ def conductivity(model: Model, pressure: Float[Array, " elements"] | None = None
     return fold(model.effects, AbstractSheetEffect, sheet).sigma
 
 
-@eqx.filter_jit
+@verb
 def load_spread(
     model: Model, centre: Float[ArrayLike, "2"], diameter: Float[ArrayLike, ""]
 ) -> Float[Array, " elements"]:
@@ -102,7 +105,6 @@ def coefficients(model: Model, sigma: Float[Array, " elements"] | None) -> Coeff
     """The conductivity given, or the scene's own, with the contact conductances."""
     if sigma is None:
         sigma = conductivity(model)
-    sigma = jnp.asarray(sigma)
     if sigma.shape != model.background.shape or sigma.dtype != model.dtype:
         raise ValueError(
             f"sigma is {sigma.dtype}{list(sigma.shape)}; this model needs "
@@ -111,13 +113,13 @@ def coefficients(model: Model, sigma: Float[Array, " elements"] | None) -> Coeff
     return Coefficients(sigma, model.contact)
 
 
-@eqx.filter_jit
 def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
     """Voltages of the protocol from the transfer matrix in ohm."""
     source, sink, plus, minus = model.pattern.T
     return model.current * (z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
 
 
+@verb
 def transfer(model: Model, theta: Coefficients) -> Float[Array, "electrodes electrodes"]:
     """The transfer matrix Z in ohm; its derivatives of first order cost no further solve."""
     return _transfer(theta, model) + jnp.diag(series_resistance(model.system, theta))
@@ -141,7 +143,11 @@ def series_resistance(system: System, theta: Coefficients) -> Float[Array, " ele
 
 @eqx.filter_custom_jvp
 def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes electrodes"]:
-    return fields(model, theta).terminal
+    system = model.system
+    values, _, _ = assemble(system, theta)
+    corner = model.solver.corner(system.plan, values)
+    grounded = jnp.pad(corner, (0, 1))
+    return grounded[system.electrode_root][:, system.electrode_root]
 
 
 @_transfer.def_jvp
@@ -160,15 +166,13 @@ def _filled(direction: Coefficients, theta: Coefficients) -> Coefficients:
     return Coefficients(*(jnp.zeros_like(t) if d is None else d for d, t in pairs))
 
 
-@eqx.filter_jit
+@verb
 def fields(model: Model, theta: Coefficients) -> Fields:
     """Fields of a unit current into each electrode; one factorisation, differentiable."""
     system = model.system
     values, share, rest = assemble(system, theta)
-    unit = jnp.zeros((system.unknowns, model.electrodes), values.dtype)
-    unit = unit.at[system.electrode_dof, jnp.arange(model.electrodes)].set(1, mode="drop")
-    x = solve_spd(model.solver, system.plan, values, unit)
-    x = jnp.concatenate([x, jnp.zeros_like(x[:1])])  # the ground
+    x = inverse_columns(model.solver, system.plan, values)
+    x = jnp.pad(x, (0, 1))[:, system.electrode_root]  # the ground: a row, and a column for who is there
     terminal = x[system.electrode_dof]
     return Fields(
         potential=x + _over(system, share[:, None] * terminal),
@@ -190,8 +194,8 @@ def assemble(
     The shares only choose the unknowns: the potentials do not depend on them, nor derivatives.
     """
     sigma, contact = theta
-    chi, element, electrode = system.rim_chi, system.rim_element, system.rim_electrode
-    around = sigma[element, None] * jnp.einsum("rij,rj->ri", system.stiffness[element], chi)
+    chi, electrode = system.rim_chi, system.rim_electrode
+    around = sigma[system.rim_element, None] * system.rim_flux
     sheet = jnp.zeros_like(contact).at[electrode].add(jnp.sum(chi * around, 1))
     touch = contact * system.measure
     total = jnp.where(touch > 0, touch + sheet, 1.0)
@@ -200,21 +204,20 @@ def assemble(
     pieces = contact[system.contact_electrode]
     load = pieces[:, None] * system.contact_mass.sum(2)
     contributions = [
-        sigma[:, None, None] * system.stiffness,
         pieces[:, None, None] * system.contact_mass,
         share[electrode, None] * around,
         -rest[system.contact_electrode, None] * load,
         share**2 * sheet + rest**2 * touch,
     ]
-    flat = jnp.concatenate([c.ravel() for c in contributions])
-    values = jnp.zeros(system.plan.rows.shape, flat.dtype).at[system.slots].add(flat, mode="drop")
-    return values, share, rest
+    values = jnp.concatenate([jnp.sum(e.weight * sigma[e.element], 1) for e in system.sheet])
+    added = jnp.concatenate([c.ravel() for c in contributions])
+    return values.at[system.slots].add(added, mode="drop"), share, rest
 
 
 def energy(system: System, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
     """``A(theta; x_a, x_b)`` for all pairs of fields, in ohm."""
-    u, d = x.potential[system.dofs], x.drop[system.contact_dofs]
-    sigma_k = theta.sigma[:, None, None] * system.stiffness
-    contact_m = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
-    sheet = jnp.einsum("eia,eib->ab", u, jnp.einsum("eij,ejb->eib", sigma_k, u))
-    return sheet + jnp.einsum("pia,pib->ab", d, jnp.einsum("pij,pjb->pib", contact_m, d))
+    slopes = jnp.einsum("ekr,eka->era", system.slopes, x.potential[system.dofs])
+    sheet = jnp.einsum("era,erb->ab", theta.sigma[:, None, None] * slopes, slopes)
+    drop = x.drop[system.contact_dofs]
+    mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
+    return sheet + jnp.einsum("pia,pij,pjb->ab", drop, mass, drop)

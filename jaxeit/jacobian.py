@@ -1,6 +1,12 @@
-"""The Jacobian of the readings with respect to an image of the conductivity."""
+"""The Jacobian of the readings with respect to an image of the conductivity.
 
-import equinox as eqx
+`forward` gives the derivative rule of the transfer matrix, ``dZ[a, b] = -A(dtheta; x_a, x_b)``: no
+further solve.  As A is a sum over elements, the derivative for one coefficient of an image is that
+sum over its few elements, ``-sum_e w_e sum_r g_era g_erb`` with the slopes g of the L fields.  All
+readings are differences of these L(L+1)/2 products, which are formed for a batch of coefficients at
+a time: nothing of the size elements times readings exists unless it is asked for.
+"""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +14,10 @@ from jaxtyping import Array, Float
 
 from .basis import AbstractBasis, BasisMap, Elements
 from .discretise import Model
-from .forward import Coefficients, Fields, coefficients, fields, series_resistance
+from .forward import Coefficients, coefficients, fields, series_resistance
+from .verbs import verb
 
-_BATCH = 64  # electrode pairs differentiated at once: bounds the memory to 64 images of the mesh
+_BATCH = 512  # elements at once: their slopes and products stay in a core's cache
 
 
 def jacobian(
@@ -20,9 +27,7 @@ def jacobian(
 ) -> Float[Array, "readings basis"]:
     """Derivative of `forward` at ``sigma`` with respect to the coefficients of ``basis``, V/S.
 
-    By automatic differentiation of the energy with the fields held fixed, which `forward` derives
-    from the implicit function theorem: one factorisation, and one gradient for each of the L(L+1)/2
-    electrode pairs that the readings are differences of.
+    One factorisation and one substitution for the L fields; the rest is products (see above).
 
     Args:
         sigma: (elements,) S; default: the untouched sheet.
@@ -34,35 +39,56 @@ def jacobian(
     """
     basis = Elements() if basis is None else basis
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
+    return _jacobian(model, None if sigma is None else jnp.asarray(sigma), image)
+
+
+@verb
+def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap) -> Float[Array, "readings basis"]:
     theta = coefficients(model, sigma)
-    return _jacobian(model, theta, fields(model, theta), image)
-
-
-@eqx.filter_jit
-def _jacobian(model: Model, theta: Coefficients, x: Fields, image: BasisMap) -> Float[Array, "readings basis"]:
     first, second = np.triu_indices(model.electrodes)
-    zero = jnp.zeros(image.size, model.dtype)
-
-    def slope(pair):
-        def resistance(coefficients):
-            change = image.expand(coefficients)
-            series = series_resistance(model.system, theta._replace(sigma=theta.sigma + change))
-            own = jnp.where(pair[0] == pair[1], series[pair[0]], 0.0)
-            return own - _pair_energy(model, change, x, pair)
-
-        return jax.grad(resistance)(zero)
-
-    pairs = jax.lax.map(slope, (jnp.asarray(first), jnp.asarray(second)), batch_size=_BATCH)
-    # dZ is symmetric: `row` finds an unordered pair among the gradients.
-    number = np.zeros((model.electrodes, model.electrodes), int)
+    slopes = -_products(model, fields(model, theta).potential, image)
+    slopes = slopes.at[:, np.flatnonzero(first == second)].add(_series_slopes(model, theta, image).T)
+    # dZ is symmetric: `pair` finds an unordered pair of electrodes among the columns.
+    number = np.zeros((model.electrodes, model.electrodes), np.int32)
     number[first, second] = number[second, first] = np.arange(len(first))
-    row = jnp.asarray(number)
+    pair = jnp.asarray(number)
+    by_pair = jax.lax.optimization_barrier(slopes.T)
     source, sink, plus, minus = model.pattern.T
-    out = pairs[row[plus, source]] - pairs[row[minus, source]]
-    return model.current * (out - pairs[row[plus, sink]] + pairs[row[minus, sink]])
+    out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
+    return model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])
 
 
-def _pair_energy(model: Model, sigma: Float[Array, " elements"], x: Fields, pair) -> Array:
-    """Sheet part of ``A(theta; x_a, x_b)`` for one pair of electrodes."""
-    a, b = (x.potential[:, index][model.system.dofs] for index in pair)
-    return jnp.einsum("e,ei,eij,ej->", sigma, a, model.system.stiffness, b)
+def _products(model: Model, potential: Float[Array, "n electrodes"], image: BasisMap) -> Float[Array, "basis pairs"]:
+    """A restricted to each coefficient, for all pairs of electrodes, batch after batch."""
+    system, electrodes = model.system, model.electrodes
+    first, second = np.triu_indices(electrodes)
+    flat = jnp.asarray(first * electrodes + second)
+    lines = max(1, _BATCH // image.element.shape[1])
+    count = -(-len(image.element) // lines)
+
+    def batch(array, i):
+        return jax.lax.dynamic_slice_in_dim(array, i * lines, lines)
+
+    tables = [_padded(a, count * lines) for a in (image.element, image.weight, image.coefficient)]
+
+    def add(i, sums):
+        element, weight, coefficient = (batch(table, i) for table in tables)
+        nodes = potential[system.dofs[element]]
+        slopes = jnp.einsum("lekr,leka->lera", system.slopes[element], nodes).reshape(lines, -1, electrodes)
+        weighted = jnp.repeat(weight, system.slopes.shape[2], 1)[..., None] * slopes
+        products = jnp.einsum("lxa,lxb->lab", weighted, slopes).reshape(lines, -1)[:, flat]
+        return sums.at[coefficient].add(products)
+
+    return jax.lax.fori_loop(0, count, add, jnp.zeros((image.size, len(first)), potential.dtype))
+
+
+def _padded(array: Array, length: int) -> Array:
+    return jnp.concatenate([array, jnp.zeros_like(array, shape=(length - len(array), *array.shape[1:]))])
+
+
+def _series_slopes(model: Model, theta: Coefficients, image: BasisMap) -> Float[Array, "electrodes basis"]:
+    """Derivative of the contact resistances in closed form, each of which knows few elements."""
+    if not model.system.near_element.size:
+        return jnp.zeros((model.electrodes, image.size), model.dtype)
+    slopes = jax.jacrev(lambda sigma: series_resistance(model.system, theta._replace(sigma=sigma)))(theta.sigma)
+    return jax.vmap(image.restrict)(slopes)

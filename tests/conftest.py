@@ -35,3 +35,17 @@ def root():
 @pytest.fixture(scope="session")
 def bundled(root):
     return sorted((root / "data" / "sessions").glob("*.h5"))
+
+
+@pytest.fixture
+def compilations():
+    """What JAX traces, lowers or compiles during a test."""
+    seen = []
+
+    def note(event, *_, **__):
+        if "/compile/" in event:
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(note)

@@ -16,8 +16,8 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "toml", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements", "electrodes",
-    "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
+    "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
+    "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
     "basis", "jacobian", "priors", "inverse", "fusion", "metrics",
 ]  # fmt: skip
 BENCH = [

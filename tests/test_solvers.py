@@ -10,16 +10,24 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from jaxeit.solvers import (
+    ConjugateGradient,
     Dense,
     NestedDissection,
     Pattern,
     PatternError,
+    Single,
     default_solver,
+    inverse_columns,
     matvec,
     solve_spd,
 )
 
-SOLVERS = [Dense(), NestedDissection(leaf_size=6)]
+SOLVERS = [
+    Dense(),
+    NestedDissection(leaf_size=6),
+    ConjugateGradient(),
+    ConjugateGradient(Single(NestedDissection(leaf_size=6))),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -248,7 +256,7 @@ TRANSFORMS = {
 
 
 @pytest.mark.parametrize("transform", TRANSFORMS)
-@pytest.mark.parametrize("solver", SOLVERS[:2], ids=str)
+@pytest.mark.parametrize("solver", SOLVERS, ids=str)
 def test_derivatives_are_those_of_dense_autodiff(solver, transform, small):
     pattern, values, rhs = small
     plan = solver.analyse(pattern)
@@ -289,7 +297,7 @@ def test_factor_survives_vmap_and_serves_many_loads(small):
     assert relative(found, jnp.stack([single, single / 2])) < 1e-13
 
 
-@pytest.mark.parametrize("solver", SOLVERS[:2], ids=str)
+@pytest.mark.parametrize("solver", SOLVERS, ids=str)
 def test_new_values_retrace_nothing(solver, small):
     pattern, values, rhs = small
     traces = []
@@ -302,6 +310,69 @@ def test_new_values_retrace_nothing(solver, small):
     for scale in (1.0, 2.0):
         run(solver.analyse(pattern), scale * values, rhs)
     assert len(traces) == 1
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=str)
+def test_root_of_the_inverse(solver):
+    matrix, coords = square_sheet(9, 1, np.ones(2))
+    root = [81, 82, 4, 40]
+    pattern, values = as_pattern(matrix, coords, root)
+    expected = np.linalg.inv(matrix.toarray())[:, root]
+    plan = solver.analyse(pattern)
+    corner = quick(solver.corner)(plan, values)
+    columns = quick(partial(inverse_columns, solver))(plan, values)
+    assert relative(corner, expected[root]) < 1e-10
+    assert relative(columns, expected) < 1e-10
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=str)
+def test_root_without_unknowns(solver):
+    matrix, coords = square_sheet(5, 1, np.ones(0))
+    pattern, values = as_pattern(matrix, coords)
+    assert quick(solver.corner)(solver.analyse(pattern), values).shape == (0, 0)
+
+
+@pytest.mark.parametrize("solver", SOLVERS[:2], ids=str)
+@pytest.mark.parametrize("transform", ["jacfwd", "reverse over reverse", "reverse over forward"])
+def test_derivatives_of_the_columns(solver, transform, small):
+    """Forward mode is exact in values; higher ones go through the factor kept for them."""
+    pattern, values, rhs = small
+    root = np.array([3, 16])
+    pattern = Pattern(pattern.n, pattern.rows, pattern.cols, pattern.coords, root)
+    plan = solver.analyse(pattern)
+    unit = jnp.zeros((pattern.n, 2)).at[root, jnp.arange(2)].set(1)
+    wrap = TRANSFORMS[transform]
+    found = quick(wrap(lambda v, b: inverse_columns(solver, plan, v) * b))(values, rhs)
+    expected = quick(wrap(lambda v, b: dense_solve(pattern, v, unit) * b))(values, rhs)
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert relative(ours, theirs) < 1e-9
+
+
+def test_wide_fronts_are_eliminated_in_halves():
+    """A solid has wide separators: the recursion meets odd widths at several depths."""
+    rng = np.random.default_rng(8)
+    n = 150
+    matrix = laplacian(np.stack(np.triu_indices(n, 1), 1), rng.uniform(0.5, 2, n * (n - 1) // 2), n)
+    pattern, values = as_pattern(matrix, rng.normal(size=(n, 2)), [7, 140])
+    rhs = rng.normal(size=(n, 3))
+    assert relative(solution(NestedDissection(), pattern, values, rhs), splu(matrix).solve(rhs)) < 1e-12
+    corner = NestedDissection().corner(NestedDissection().analyse(pattern), values)
+    assert relative(corner, np.linalg.inv(matrix.toarray())[np.ix_([7, 140], [7, 140])]) < 1e-12
+
+
+def test_iteration_that_does_not_converge_is_nan():
+    matrix, coords = square_sheet(9, 3, np.ones(2))
+    pattern, values = as_pattern(matrix, coords)
+    found = solution(ConjugateGradient(max_steps=3), pattern, values, np.ones((pattern.n, 2)))
+    assert np.isnan(found).all()
+
+
+def test_single_precision_factors_reach_double_accuracy_in_a_few_steps():
+    matrix, coords = square_sheet(20, 1, np.ones(9))
+    pattern, values = as_pattern(matrix, coords)
+    rhs = np.eye(pattern.n)[:, -9:]
+    solver = ConjugateGradient(Single(NestedDissection()), max_steps=8)
+    assert relative(solution(solver, pattern, values, rhs), splu(matrix).solve(rhs)) < 1e-10
 
 
 def test_matvec_is_the_symmetric_product():

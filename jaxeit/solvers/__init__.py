@@ -5,20 +5,25 @@ from ._base import (
     AbstractPlan,
     Pattern,
     PatternError,
+    inverse_columns,
     matvec,
     solve_spd,
 )
+from .conjugate_gradient import ConjugateGradient, Single
 from .dense import Dense
 from .nested_dissection import NestedDissection
 
 __all__ = [
     "AbstractLinearSolver",
     "AbstractPlan",
+    "ConjugateGradient",
     "Dense",
     "NestedDissection",
     "Pattern",
     "PatternError",
+    "Single",
     "default_solver",
+    "inverse_columns",
     "matvec",
     "solve_spd",
 ]

@@ -33,7 +33,8 @@ class Pattern:
     | n: number of unknowns                                            |        |      |
     | rows, cols: lower triangle, whole diagonal, each place once      | (nnz,) |      |
     | coords: place of each unknown, NaN where it has none (optional)  | (n, d) | m    |
-    | root: unknowns that every other may couple to, eliminated last   | (k,)   |      |
+    | root: unknowns that every other may couple to, eliminated last;  | (r,)   |      |
+    |   the inverse is wanted on them (`AbstractLinearSolver.corner`)  |        |      |
 
     Raises `PatternError` for an upper-triangle, repeated or out-of-range entry, or a hole in the
     diagonal.
@@ -53,11 +54,11 @@ class Pattern:
 
 
 def index_arrays(pattern: Pattern) -> dict[str, Int[Array, "..."]]:
-    """The fields that every plan has: entries, and where each diagonal one stands among them."""
+    """The fields that every plan has: entries, where each diagonal one stands among them, the root."""
     diagonal = np.empty(pattern.n, np.int32)
     places = np.flatnonzero(pattern.rows == pattern.cols)
     diagonal[pattern.rows[places]] = places
-    arrays = {"rows": pattern.rows, "cols": pattern.cols, "diagonal": diagonal}
+    arrays = {"rows": pattern.rows, "cols": pattern.cols, "diagonal": diagonal, "root": pattern.root}
     return {name: jnp.asarray(array) for name, array in arrays.items()}
 
 
@@ -91,14 +92,15 @@ class AbstractPlan(eqx.Module):
     rows: eqx.AbstractVar[Int[Array, " nnz"]]
     cols: eqx.AbstractVar[Int[Array, " nnz"]]
     diagonal: eqx.AbstractVar[Int[Array, " n"]]
+    root: eqx.AbstractVar[Int[Array, " r"]]
     n: eqx.AbstractVar[int]
 
 
 class AbstractLinearSolver(eqx.Module):
-    """A direct method: analyse once on the host, factor once per matrix, solve as often as needed.
+    """Analyse once on the host, factor once per matrix, solve as often as needed.
 
-    The factorisation of a matrix that is not positive definite is NaN throughout, in the manner of
-    `jax.lax.linalg.cholesky`; whoever lets values in checks them.
+    A matrix that is not positive definite, or an iteration that does not converge, gives NaN
+    throughout, in the manner of `jax.lax.linalg.cholesky`; whoever lets values in checks them.
     """
 
     @abstractmethod
@@ -112,6 +114,19 @@ class AbstractLinearSolver(eqx.Module):
     @abstractmethod
     def solve(self, factor: Any, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         """Solve for k right-hand sides."""
+
+    @abstractmethod
+    def columns(self, factor: Any) -> Float[Array, "n r"]:
+        """The columns of the inverse that belong to `Pattern.root`."""
+
+    @abstractmethod
+    def corner(self, plan: Any, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
+        """The inverse on `Pattern.root` alone; a direct method needs no substitution for it."""
+
+
+def unit_columns(plan: AbstractPlan, dtype: Any) -> Float[Array, "n r"]:
+    """Columns of the unit matrix that belong to the root."""
+    return jnp.zeros((plan.n, plan.root.size), dtype).at[plan.root, jnp.arange(plan.root.size)].set(1)
 
 
 def matvec(plan: AbstractPlan, values: Float[Array, " nnz"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -147,9 +162,32 @@ def solve_spd(
     of this, both with the same factor.
     """
     factor = solver.factor(plan, jax.lax.stop_gradient(values))
+    return _solved(solver, factor, plan, values, rhs)
+
+
+def inverse_columns(
+    solver: AbstractLinearSolver, plan: AbstractPlan, values: Float[Array, " nnz"]
+) -> Float[Array, "n r"]:
+    """X = A^-1 on the columns of the root, differentiable as `solve_spd` is: dX = -A^-1 dA X."""
+    factor = solver.factor(plan, jax.lax.stop_gradient(values))
+    return _columns(values, factor, plan, solver)
+
+
+@eqx.filter_custom_jvp
+def _columns(values, factor, plan, solver):
+    return solver.columns(factor)
+
+
+@_columns.def_jvp
+def _columns_jvp(primals, tangents):
+    values, factor, plan, solver = primals
+    x = _columns(values, factor, plan, solver)
+    if tangents[0] is None:
+        return x, jnp.zeros_like(x)
+    return x, _solved(solver, factor, plan, values, -matvec(plan, tangents[0], x))
+
+
+def _solved(solver, factor, plan, values, rhs):
     return jax.lax.custom_linear_solve(
-        partial(matvec, plan, values),
-        rhs,
-        lambda _, b: solver.solve(factor, b),
-        symmetric=True,
+        partial(matvec, plan, values), rhs, lambda _, b: solver.solve(factor, b), symmetric=True
     )

@@ -24,26 +24,14 @@ class Level:
     | pivots: unknown at each pivot place, n where padded                  | (m, p)      |
     | up: place of each boundary unknown in the parent's front             | (m, b)      |
     | down: place of each unknown in each child's boundary                 | (m, c, p+b) |
+    | entries: entry at each place of the panel, columns of the pivots;    | (m, p+b, p) |
+    |   nnz stands for a zero, nnz + 1 for a one                           |             |
     """
 
     pivots: np.ndarray
     up: np.ndarray
     down: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Fronts:
-    """The levels from the root down, and where the matrix entries go.
-
-    | meaning                                                                  | shape  |
-    |--------------------------------------------------------------------------|--------|
-    | slots: place of each entry in the panels (m, p+b, p), root first, flat   | (nnz,) |
-    | ones: places on the diagonal of padded pivots                            | (pad,) |
-    """
-
-    levels: tuple[Level, ...]
-    slots: np.ndarray
-    ones: np.ndarray
+    entries: np.ndarray
 
 
 class _Tree:
@@ -89,16 +77,20 @@ class _Boundaries:
         return self.rank[np.searchsorted(self.keys, fronts * self.n + unknowns)]
 
 
-def lay_out(pattern: Pattern, owner: np.ndarray, starts: tuple[int, ...]) -> Fronts:
-    """Fronts of the tree with heap numbers `owner`, its depths merged into levels at `starts`.
+def lay_out(pattern: Pattern, owner: np.ndarray, starts: tuple[int, ...]) -> tuple[Level, ...]:
+    """Levels, from the root down, of the tree with heap numbers `owner`, its depths merged at `starts`.
 
     Merging puts a separator and those right below it into one front: more arithmetic, but fewer
     levels, hence fewer kernels to compile and to launch.
     """
     tree = _Tree(owner, starts)
     bounds = _boundaries(pattern, tree)
-    levels = _levels(tree, bounds)
-    return Fronts(levels, *_slots(pattern, tree, bounds))
+    ups = [_up(tree, bounds, level) for level in range(len(bounds))]
+    entries = _entries(pattern, tree, bounds)
+    return tuple(
+        Level(tree.pivots[level], ups[level], _down(tree, bounds, ups, level), entries[level])
+        for level in range(len(bounds))
+    )
 
 
 def _boundaries(pattern: Pattern, tree: _Tree) -> list[_Boundaries]:
@@ -126,11 +118,6 @@ def _handed(tree: _Tree, bound: _Boundaries, level: int) -> np.ndarray:
         return np.zeros((2, 0), np.int64)
     shift = tree.starts[level] - tree.starts[level - 1]
     return np.stack([bound.fronts[keep] >> shift, unknowns])
-
-
-def _levels(tree: _Tree, bounds: list[_Boundaries]) -> tuple[Level, ...]:
-    ups = [_up(tree, bounds, level) for level in range(len(bounds))]
-    return tuple(Level(tree.pivots[level], ups[level], _down(tree, bounds, ups, level)) for level in range(len(bounds)))
 
 
 def _front_size(tree: _Tree, bounds: list[_Boundaries], level: int) -> int:
@@ -168,21 +155,20 @@ def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: 
     return table.reshape(fronts, -1, size)
 
 
-def _slots(pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]) -> tuple[np.ndarray, np.ndarray]:
+def _entries(pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]) -> list[np.ndarray]:
     """Each entry stands in the column of whichever of its unknowns is eliminated first."""
     first, second = _elimination_order(pattern, tree)
-    slots, ones, offset = np.zeros(first.size, np.int64), [], 0
+    nnz, tables = first.size, []
     for level, pivots in enumerate(tree.pivots):
         m, p = pivots.shape
-        q = p + bounds[level].size
+        table = np.full((m, p + bounds[level].size, p), nnz)
         mine = np.flatnonzero(tree.level[first] == level)
         front, column = tree.index[first[mine]], tree.rank[first[mine]]
-        row = _place(tree, bounds, level, front, second[mine])
-        slots[mine] = offset + (front * q + row) * p + column
+        table[front, _place(tree, bounds, level, front, second[mine]), column] = mine
         padded, place = np.nonzero(pivots == pattern.n)
-        ones.append(offset + (padded * q + place) * p + place)
-        offset += m * q * p
-    return slots, np.concatenate(ones)
+        table[padded, place, place] = nnz + 1
+        tables.append(table)
+    return tables
 
 
 def _elimination_order(pattern: Pattern, tree: _Tree) -> tuple[np.ndarray, np.ndarray]:

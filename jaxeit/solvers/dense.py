@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, cholesky
 from jaxtyping import Array, Float, Int
 
-from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale
+from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale, unit_columns
 
 
 class DensePlan(AbstractPlan):
@@ -14,6 +14,7 @@ class DensePlan(AbstractPlan):
     rows: Int[Array, " nnz"]
     cols: Int[Array, " nnz"]
     diagonal: Int[Array, " n"]
+    root: Int[Array, " r"]
     n: int = eqx.field(static=True)
 
 
@@ -22,6 +23,7 @@ class DenseFactor(eqx.Module):
 
     lower: Float[Array, "n n"]
     scale: Float[Array, " n"]
+    plan: DensePlan
 
 
 class Dense(AbstractLinearSolver):
@@ -33,8 +35,14 @@ class Dense(AbstractLinearSolver):
     def factor(self, plan: DensePlan, values: Float[Array, " nnz"]) -> DenseFactor:
         scale, scaled = jacobi_scale(plan, values)
         matrix = jnp.zeros((plan.n, plan.n), values.dtype).at[plan.rows, plan.cols].set(scaled)
-        return DenseFactor(cholesky(matrix, lower=True), scale)
+        return DenseFactor(cholesky(matrix, lower=True), scale, plan)
 
     def solve(self, factor: DenseFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         scale = factor.scale[:, None]
         return scale * cho_solve((factor.lower, True), scale * rhs)
+
+    def columns(self, factor: DenseFactor) -> Float[Array, "n r"]:
+        return self.solve(factor, unit_columns(factor.plan, factor.lower.dtype))
+
+    def corner(self, plan: DensePlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
+        return self.columns(self.factor(plan, values))[plan.root]

@@ -6,15 +6,17 @@ are one batch.  With a front F over pivots 1 and boundary 2,
 
     F11 = L L^T,    W = F21 L^-T,    update of the parent: F22 - W W^T,
 
-a level keeps the panel M = [L^-1; -W L^-1], so that a sweep of a solve is one product per level:
+a level keeps L^-1 and H = -W L^-1, so that a sweep of a solve is two products per level:
 
-    forward  [y; update] = M r1,    backward  x1 = M^T [y; x2].
+    forward  y = L^-1 r1, update = H r1,    backward  x1 = L^-T y + H^T x2.
+
+`corner`, the inverse on the unknowns of the root, needs neither sweep: the last front holds it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from math import prod
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,17 +28,21 @@ from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, ja
 from ._dissection import dissect
 from ._fronts import Level, lay_out
 
+# Pivots eliminated at once.  Beyond it LAPACK's own threads and XLA's get in each other's way (a
+# hundredfold on a busy machine); halving moves the work into matrix products, which XLA spreads.
+_WIDEST = 48
+
 
 class LevelPlan(eqx.Module):
     """One level of m fronts with p pivots and b boundary places; see `_fronts.Level`."""
 
     up: Int[Array, "m b"]
     down: Int[Array, "m c q"]
-    pivots: int = eqx.field(static=True)
+    entries: Int[Array, "m q p"]
 
     @property
-    def panel_shape(self) -> tuple[int, int, int]:
-        return self.down.shape[0], self.down.shape[2], self.pivots
+    def pivots(self) -> int:
+        return self.entries.shape[2]
 
 
 class NestedDissectionPlan(AbstractPlan):
@@ -44,7 +50,6 @@ class NestedDissectionPlan(AbstractPlan):
 
     | meaning                                                             | shape      |
     |---------------------------------------------------------------------|------------|
-    | slots: where entries, then padding ones, stand in the panels, flat  | (nnz+pad,) |
     | gather: unknown at each pivot place of all levels, n where padded   | (places,)  |
     | scatter: pivot place of each unknown                                | (n,)       |
     """
@@ -52,7 +57,7 @@ class NestedDissectionPlan(AbstractPlan):
     rows: Int[Array, " nnz"]
     cols: Int[Array, " nnz"]
     diagonal: Int[Array, " n"]
-    slots: Int[Array, " slots"]
+    root: Int[Array, " r"]
     gather: Int[Array, " places"]
     scatter: Int[Array, " n"]
     levels: tuple[LevelPlan, ...]
@@ -60,13 +65,21 @@ class NestedDissectionPlan(AbstractPlan):
 
     @property
     def panel_shapes(self) -> list[tuple[int, int, int]]:
-        return [level.panel_shape for level in self.levels]
+        """Fronts, places of a front, and pivots, of each level."""
+        return [(level.down.shape[0], level.down.shape[2], level.pivots) for level in self.levels]
+
+
+class Front(NamedTuple):
+    """What a level keeps: L^-1 and H."""
+
+    inverse: Float[Array, "m p p"]
+    below: Float[Array, "m b p"]
 
 
 class NestedDissectionFactor(eqx.Module):
-    """Panels M of the levels from the root down, the scaling D, and the plan."""
+    """The levels from the root down, the scaling D, and the plan."""
 
-    panels: tuple[Float[Array, "m q p"], ...]
+    levels: tuple[Front, ...]
     scale: Float[Array, " n"]
     plan: NestedDissectionPlan
 
@@ -83,30 +96,22 @@ class NestedDissection(AbstractLinearSolver):
 
     def analyse(self, pattern: Pattern) -> NestedDissectionPlan:
         owner, depth = dissect(pattern, self.leaf_size)
-        fronts = lay_out(pattern, owner, _level_starts(depth, self.merge))
-        gather = np.concatenate([level.pivots.ravel() for level in fronts.levels])
+        levels = lay_out(pattern, owner, _level_starts(depth, self.merge))
+        gather = np.concatenate([level.pivots.ravel() for level in levels])
         filled = np.flatnonzero(gather < pattern.n)
         scatter = np.empty(pattern.n, np.int64)
         scatter[gather[filled]] = filled
         return NestedDissectionPlan(
             **index_arrays(pattern),
-            slots=_index(np.concatenate([fronts.slots, fronts.ones])),
             gather=_index(gather),
             scatter=_index(scatter),
-            levels=tuple(_level_plan(level) for level in fronts.levels),
+            levels=tuple(_level_plan(level) for level in levels),
             n=pattern.n,
         )
 
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
         scale, scaled = jacobi_scale(plan, values)
-        panels: list[Float[Array, "m q p"]] = []
-        update = jnp.zeros((0, 1, 1), values.dtype)
-        for level, entries in _upwards(plan.levels, _assemble(plan, scaled)):
-            extended = _extended(level, update)
-            panel, lost = _eliminate(entries + extended[:, :, : level.pivots])
-            update = extended[:, level.pivots :, level.pivots :] - lost
-            panels.append(panel)
-        return NestedDissectionFactor(tuple(panels[::-1]), scale, plan)
+        return NestedDissectionFactor(_eliminated(plan, scaled), scale, plan)
 
     def solve(self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
@@ -115,13 +120,24 @@ class NestedDissection(AbstractLinearSolver):
         x = _backward(factor, _forward(factor, loads))
         return scale * x[plan.scatter]
 
+    def columns(self, factor: NestedDissectionFactor) -> Float[Array, "n r"]:
+        plan, scale = factor.plan, factor.scale[:, None]
+        y = _root_loads(plan, factor.levels[0]) * scale[plan.root].T
+        x = _backward(factor, [y, *[None] * (len(plan.levels) - 1)])
+        return scale * x[plan.scatter]
+
+    def corner(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
+        scale, scaled = jacobi_scale(plan, values)
+        y = _root_loads(plan, _eliminated(plan, scaled)[0])[0] * scale[plan.root]
+        return y.T @ y
+
 
 def _index(array: np.ndarray) -> Int[Array, "..."]:
     return jnp.asarray(array, jnp.int32)
 
 
 def _level_plan(level: Level) -> LevelPlan:
-    return LevelPlan(_index(level.up), _index(level.down), level.pivots.shape[1])
+    return LevelPlan(_index(level.up), _index(level.down), _index(level.entries))
 
 
 def _level_starts(depth: int, merge: int) -> tuple[int, ...]:
@@ -129,13 +145,68 @@ def _level_starts(depth: int, merge: int) -> tuple[int, ...]:
     return tuple(sorted({0, *range(depth, 0, -merge)}))
 
 
-def _assemble(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> list[Float[Array, "m q p"]]:
-    """The columns of the pivots in every front, from the matrix alone."""
-    shapes = plan.panel_shapes
-    ones = jnp.ones(plan.slots.size - values.size, values.dtype)
-    flat = jnp.zeros(sum(map(prod, shapes)), values.dtype)
-    flat = flat.at[plan.slots].set(jnp.concatenate([values, ones]), unique_indices=True, mode="promise_in_bounds")
-    return _split(flat, shapes)
+def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> tuple[Front, ...]:
+    """All fronts, from the leaves up; returned from the root down."""
+    padded = jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
+    update = jnp.zeros((0, 1, 1), values.dtype)
+    fronts: list[Front] = []
+    for level in reversed(plan.levels):
+        pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
+        panel = _take(padded, level.entries) + _extended(level, update, slice(None), pivots)
+        w, front = _eliminate(panel)
+        update = _extended(level, update, boundary, boundary) - jnp.einsum("mik,mjk->mij", w, w)
+        fronts.append(front)
+    return tuple(fronts[::-1])
+
+
+def _take(array: Array, places: Int[Array, "..."]) -> Array:
+    return array.at[places].get(mode="promise_in_bounds")
+
+
+def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Array | float:
+    """Sum of the children's updates, each at its places, in these rows and columns of the fronts."""
+    places, size = level.down, updates.shape[1]
+    fronts, children, _ = places.shape
+    first = jnp.arange(fronts * children, dtype=jnp.int32).reshape(fronts, children, 1) * size
+    lines = updates.reshape(-1, size)
+    # Whole rows first, then columns: both gathers walk through memory in order.
+    spread = (
+        _along(_take(lines, first[:, c] + places[:, c, rows]), places[:, c, None, columns], 2) for c in range(children)
+    )
+    return sum(spread, 0.0)
+
+
+def _along(array: Array, places: Int[Array, "..."], axis: int) -> Array:
+    return jnp.take_along_axis(array, places, axis, mode="promise_in_bounds")
+
+
+def _eliminate(panel: Float[Array, "m q p"]) -> tuple[Float[Array, "m b p"], Front]:
+    """W, and what is kept, of every front; wide ones in two halves."""
+    p = panel.shape[2]
+    if p <= _WIDEST:
+        return _eliminate_at_once(panel)
+    h = (p + 1) // 2
+    w1, first = _eliminate(panel[:, :, :h])
+    rest = panel[:, h:, h:] - jnp.einsum("mik,mjk->mij", w1, w1[:, : p - h])
+    w2, second = _eliminate(rest)
+    between, beyond = first.below[:, : p - h], first.below[:, p - h :]
+    corner = jnp.zeros_like(panel, shape=(len(panel), h, p - h))
+    inverse = _stacked([[first.inverse, corner], [second.inverse @ between, second.inverse]])
+    below = _stacked([[beyond + second.below @ between, second.below]])
+    return _stacked([[w1[:, p - h :], w2]]), Front(inverse, below)
+
+
+def _eliminate_at_once(panel: Float[Array, "m q p"]) -> tuple[Float[Array, "m b p"], Front]:
+    p = panel.shape[2]
+    lower = lax.linalg.cholesky(panel[:, :p], symmetrize_input=False)
+    eye = jnp.broadcast_to(jnp.eye(p, dtype=panel.dtype), lower.shape)
+    inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
+    w = jnp.einsum("mbp,mkp->mbk", panel[:, p:], inverse)
+    return w, Front(inverse, -(w @ inverse))
+
+
+def _stacked(blocks: list[list[Array]]) -> Array:
+    return jnp.concatenate([jnp.concatenate(row, 2) for row in blocks], 1)
 
 
 def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
@@ -145,73 +216,46 @@ def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     return [piece.reshape(*shape, *rows.shape[1:]) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
-def _extended(level: LevelPlan, updates: Float[Array, "mc bc bc"]) -> Float[Array, "m q q"]:
-    """Sum of the children's updates, each at its places in the front; zero for leaves."""
-    by_child = _by_child(level, updates)
-    spread = (_spread(by_child[:, c], level.down[:, c]) for c in range(by_child.shape[1]))
-    fronts, _, size = level.down.shape
-    return sum(spread, jnp.zeros((fronts, size, size), updates.dtype))
-
-
-def _by_child(level: LevelPlan, children: Array) -> Array:
-    return children.reshape(*level.down.shape[:2], *children.shape[1:])
-
-
-def _spread(update: Float[Array, "m b b"], places: Int[Array, "m q"]) -> Float[Array, "m q q"]:
-    front = jnp.arange(update.shape[0])[:, None, None]
-    spread = update.at[front, places[:, :, None], places[:, None, :]]
-    return spread.get(mode="promise_in_bounds")
-
-
-def _eliminate(
-    panel: Float[Array, "m q p"],
-) -> tuple[Float[Array, "m q p"], Float[Array, "m b b"]]:
-    """M of every front, and W W^T, which its F22 loses."""
-    p = panel.shape[2]
-    lower = lax.linalg.cholesky(panel[:, :p], symmetrize_input=False)
-    eye = jnp.broadcast_to(jnp.eye(p, dtype=panel.dtype), lower.shape)
-    inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
-    w = jnp.einsum("mbp,mkp->mbk", panel[:, p:], inverse)
-    below = -jnp.einsum("mbk,mkp->mbp", w, inverse)
-    return jnp.concatenate([inverse, below], 1), jnp.einsum("mip,mjp->mij", w, w)
+def _root_loads(plan: NestedDissectionPlan, front: Front) -> Float[Array, "1 p r"]:
+    """L^-1 of the unit loads on the unknowns of the root."""
+    return front.inverse[:, :, plan.scatter[plan.root]]
 
 
 def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]) -> list[Float[Array, "m p k"]]:
     """y = L^-1 r from the leaves up; every front hands what its boundary gained to its parent."""
     ys: list[Float[Array, "m p k"]] = []
     handed = jnp.zeros_like(loads[0], shape=(0, 1, loads[0].shape[2]))
-    for level, panel, load in _upwards(factor.plan.levels, factor.panels, loads):
+    for level, front, load in reversed(list(zip(factor.plan.levels, factor.levels, loads, strict=True))):
         gained, p = _gained(level, handed), level.pivots
-        out = jnp.einsum("mqp,mpk->mqk", panel, load + gained[:, :p])
-        handed = out[:, p:] + gained[:, p:]
-        ys.append(out[:, :p])
+        load = load + gained[:, :p]
+        handed = front.below @ load + gained[:, p:]
+        ys.append(front.inverse @ load)
     return ys[::-1]
 
 
-def _gained(level: LevelPlan, handed: Float[Array, "mc bc k"]) -> Float[Array, "m q k"]:
-    by_child = _by_child(level, handed)
-    places = level.down[..., None]
-    return jnp.take_along_axis(by_child, places, 2, mode="promise_in_bounds").sum(1)
+def _gained(level: LevelPlan, handed: Float[Array, "mc b k"]) -> Float[Array, "m q k"]:
+    by_child = handed.reshape(*level.down.shape[:2], *handed.shape[1:])
+    return _along(by_child, level.down[..., None], 2).sum(1)
 
 
-def _backward(factor: NestedDissectionFactor, ys: list[Float[Array, "m p k"]]) -> Float[Array, "places k"]:
-    """x = L^-T y from the root down; every front finds its boundary's x in its parent's front."""
-    front = jnp.zeros_like(ys[0], shape=(1, 1, ys[0].shape[2]))
+def _backward(factor: NestedDissectionFactor, ys: Sequence[Float[Array, "m p k"] | None]) -> Float[Array, "places k"]:
+    """x = L^-T y from the root down; every front finds its boundary's x in its parent's front.
+
+    A level without load has None for y.
+    """
+    columns = next(y.shape[2] for y in ys if y is not None)
+    whole = jnp.zeros_like(factor.scale, shape=(1, 1, columns))
     xs = []
-    for level, panel, y in zip(factor.plan.levels, factor.panels, ys, strict=True):
-        outer = _inherited(level, front)
-        x = jnp.einsum("mqp,mqk->mpk", panel, jnp.concatenate([y, outer], 1))
-        front = jnp.concatenate([x, outer], 1)
-        xs.append(x.reshape(-1, x.shape[2]))
+    for level, front, y in zip(factor.plan.levels, factor.levels, ys, strict=True):
+        outer = _inherited(level, whole)
+        x = jnp.einsum("mbp,mbk->mpk", front.below, outer)
+        if y is not None:
+            x = x + jnp.einsum("mqp,mqk->mpk", front.inverse, y)
+        whole = jnp.concatenate([x, outer], 1)
+        xs.append(x.reshape(prod(x.shape[:2]), x.shape[2]))
     return jnp.concatenate(xs)
 
 
 def _inherited(level: LevelPlan, front: Float[Array, "mp qp k"]) -> Float[Array, "m b k"]:
     by_parent = level.up.reshape(front.shape[0], -1, 1)
-    outer = jnp.take_along_axis(front, by_parent, 1, mode="promise_in_bounds")
-    return outer.reshape(*level.up.shape, -1)
-
-
-def _upwards(*columns: Sequence[Any]) -> Iterator[tuple[Any, ...]]:
-    """The levels from the leaves up."""
-    return zip(*(column[::-1] for column in columns), strict=True)
+    return _along(front, by_parent, 1).reshape(*level.up.shape, front.shape[2])
