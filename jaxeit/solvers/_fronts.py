@@ -24,8 +24,8 @@ class Level:
     | pivots: unknown at each pivot place, n where padded                  | (m, p)      |
     | up: place of each boundary unknown in the parent's front             | (m, b)      |
     | down: place of each unknown in each child's boundary                 | (m, c, p+b) |
-    | entries: entry at each place of the panel, columns of the pivots;    | (m, p+b, p) |
-    |   nnz stands for a zero, nnz + 1 for a one                           |             |
+    | entries: number, front, row and column of each entry in the columns  | (4, k)      |
+    |   of the pivots; number nnz is the one of a padded pivot             |             |
     """
 
     pivots: np.ndarray
@@ -158,16 +158,15 @@ def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: 
 def _entries(pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]) -> list[np.ndarray]:
     """Each entry stands in the column of whichever of its unknowns is eliminated first."""
     first, second = _elimination_order(pattern, tree)
-    nnz, tables = first.size, []
+    tables = []
     for level, pivots in enumerate(tree.pivots):
-        m, p = pivots.shape
-        table = np.full((m, p + bounds[level].size, p), nnz)
         mine = np.flatnonzero(tree.level[first] == level)
         front, column = tree.index[first[mine]], tree.rank[first[mine]]
-        table[front, _place(tree, bounds, level, front, second[mine]), column] = mine
+        row = _place(tree, bounds, level, front, second[mine])
         padded, place = np.nonzero(pivots == pattern.n)
-        table[padded, place, place] = nnz + 1
-        tables.append(table)
+        ones = np.stack([np.full_like(place, first.size), padded, place, place])
+        table = np.concatenate([[mine, front, row, column], ones], 1)
+        tables.append(table[:, np.lexsort(table[:0:-1])])
     return tables
 
 

@@ -30,19 +30,23 @@ from ._fronts import Level, lay_out
 
 # Pivots eliminated at once.  Beyond it LAPACK's own threads and XLA's get in each other's way (a
 # hundredfold on a busy machine); halving moves the work into matrix products, which XLA spreads.
-_WIDEST = 48
+_WIDEST = 72
 
 
 class LevelPlan(eqx.Module):
-    """One level of m fronts with p pivots and b boundary places; see `_fronts.Level`."""
+    """One level of m fronts with p pivots and b boundary places; see `_fronts.Level`.
+
+    The entries (number, front, row, column) are those among the pivots, and those below.
+    """
 
     up: Int[Array, "m b"]
     down: Int[Array, "m c q"]
-    entries: Int[Array, "m q p"]
+    among: Int[Array, "4 k"]
+    below: Int[Array, "4 l"]
 
     @property
     def pivots(self) -> int:
-        return self.entries.shape[2]
+        return self.down.shape[2] - self.up.shape[1]
 
 
 class NestedDissectionPlan(AbstractPlan):
@@ -137,7 +141,10 @@ def _index(array: np.ndarray) -> Int[Array, "..."]:
 
 
 def _level_plan(level: Level) -> LevelPlan:
-    return LevelPlan(_index(level.up), _index(level.down), _index(level.entries))
+    pivots = level.pivots.shape[1]
+    among, below = (level.entries[:, mine] for mine in (level.entries[2] < pivots, level.entries[2] >= pivots))
+    below = below - [[0], [0], [pivots], [0]]
+    return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(below))
 
 
 def _level_starts(depth: int, merge: int) -> tuple[int, ...]:
@@ -147,61 +154,75 @@ def _level_starts(depth: int, merge: int) -> tuple[int, ...]:
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> tuple[Front, ...]:
     """All fronts, from the leaves up; returned from the root down."""
-    padded = jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
+    padded = jnp.concatenate([values, jnp.ones_like(values, shape=1)])
     update = jnp.zeros((0, 1, 1), values.dtype)
     fronts: list[Front] = []
     for level in reversed(plan.levels):
         pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
-        panel = _take(padded, level.entries) + _extended(level, update, slice(None), pivots)
-        w, front = _eliminate(panel)
+        among = _with_entries(_extended(level, update, pivots, pivots), level.among, padded)
+        below = _with_entries(_extended(level, update, boundary, pivots), level.below, padded)
+        w, front = _eliminate(among, below)
         update = _extended(level, update, boundary, boundary) - jnp.einsum("mik,mjk->mij", w, w)
         fronts.append(front)
     return tuple(fronts[::-1])
+
+
+def _with_entries(block: Float[Array, "m i j"], entries: Int[Array, "4 k"], values: Array) -> Float[Array, "m i j"]:
+    number, *place = entries
+    added = block.at[tuple(place)].add(
+        _take(values, number), unique_indices=True, indices_are_sorted=True, mode="promise_in_bounds"
+    )
+    return added
 
 
 def _take(array: Array, places: Int[Array, "..."]) -> Array:
     return array.at[places].get(mode="promise_in_bounds")
 
 
-def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Array | float:
+def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Float[Array, "m i j"]:
     """Sum of the children's updates, each at its places, in these rows and columns of the fronts."""
     places, size = level.down, updates.shape[1]
     fronts, children, _ = places.shape
-    first = jnp.arange(fronts * children, dtype=jnp.int32).reshape(fronts, children, 1) * size
-    lines = updates.reshape(-1, size)
-    # Whole rows first, then columns: both gathers walk through memory in order.
+    updates = updates.reshape(fronts, children, size, size)
+    front = jnp.arange(fronts, dtype=jnp.int32)[:, None, None]
+    shape = fronts, *(len(range(places.shape[2])[part]) for part in (rows, columns))
     spread = (
-        _along(_take(lines, first[:, c] + places[:, c, rows]), places[:, c, None, columns], 2) for c in range(children)
+        updates[:, c].at[front, places[:, c, rows, None], places[:, c, None, columns]].get(mode="promise_in_bounds")
+        for c in range(children)
     )
-    return sum(spread, 0.0)
+    return sum(spread, jnp.zeros(shape, updates.dtype))
 
 
 def _along(array: Array, places: Int[Array, "..."], axis: int) -> Array:
     return jnp.take_along_axis(array, places, axis, mode="promise_in_bounds")
 
 
-def _eliminate(panel: Float[Array, "m q p"]) -> tuple[Float[Array, "m b p"], Front]:
+def _eliminate(among: Float[Array, "m p p"], below: Float[Array, "m b p"]) -> tuple[Float[Array, "m b p"], Front]:
     """W, and what is kept, of every front; wide ones in two halves."""
-    p = panel.shape[2]
+    p = among.shape[2]
     if p <= _WIDEST:
-        return _eliminate_at_once(panel)
+        return _eliminate_at_once(among, below)
     h = (p + 1) // 2
-    w1, first = _eliminate(panel[:, :, :h])
-    rest = panel[:, h:, h:] - jnp.einsum("mik,mjk->mij", w1, w1[:, : p - h])
-    w2, second = _eliminate(rest)
-    between, beyond = first.below[:, : p - h], first.below[:, p - h :]
-    corner = jnp.zeros_like(panel, shape=(len(panel), h, p - h))
+    w1, first = _eliminate(among[:, :h, :h], jnp.concatenate([among[:, h:, :h], below[:, :, :h]], 1))
+    across, beyond = w1[:, : p - h], w1[:, p - h :]
+    w2, second = _eliminate(
+        among[:, h:, h:] - jnp.einsum("mik,mjk->mij", across, across),
+        below[:, :, h:] - jnp.einsum("mik,mjk->mij", beyond, across),
+    )
+    between, under = first.below[:, : p - h], first.below[:, p - h :]
+    corner = jnp.zeros_like(among, shape=(len(among), h, p - h))
     inverse = _stacked([[first.inverse, corner], [second.inverse @ between, second.inverse]])
-    below = _stacked([[beyond + second.below @ between, second.below]])
-    return _stacked([[w1[:, p - h :], w2]]), Front(inverse, below)
+    below = _stacked([[under + second.below @ between, second.below]])
+    return _stacked([[beyond, w2]]), Front(inverse, below)
 
 
-def _eliminate_at_once(panel: Float[Array, "m q p"]) -> tuple[Float[Array, "m b p"], Front]:
-    p = panel.shape[2]
-    lower = lax.linalg.cholesky(panel[:, :p], symmetrize_input=False)
-    eye = jnp.broadcast_to(jnp.eye(p, dtype=panel.dtype), lower.shape)
+def _eliminate_at_once(
+    among: Float[Array, "m p p"], below: Float[Array, "m b p"]
+) -> tuple[Float[Array, "m b p"], Front]:
+    lower = lax.linalg.cholesky(among, symmetrize_input=False)
+    w = lax.linalg.triangular_solve(lower, below, left_side=False, lower=True, transpose_a=True)
+    eye = jnp.broadcast_to(jnp.eye(among.shape[2], dtype=among.dtype), lower.shape)
     inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
-    w = jnp.einsum("mbp,mkp->mbk", panel[:, p:], inverse)
     return w, Front(inverse, -(w @ inverse))
 
 
