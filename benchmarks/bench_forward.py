@@ -1,4 +1,4 @@
-"""Forward solves of every tool on the same work, in one run; and error against time.
+"""Forward solves of every tool on the same work, in one run.
 
 python -m benchmarks.bench_forward [--smoke] [--no-memory]
 """
@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from tests.oracles.rectangle import green
 
 from . import _common as c
 from .peers import cholmod, eidors, pyeit, superlu
@@ -36,7 +35,6 @@ PREPARE = {
     eidors.NAME: eidors.prepare,
 }
 PYEIT_LARGEST = 120
-EIDORS_QUADRATIC_LARGEST = 60  # it assembles in a loop over elements, in Octave
 PEERS = (superlu, cholmod, pyeit, eidors)
 
 
@@ -107,55 +105,6 @@ def with_limits(rows: list[dict[str, Any]], machine: dict[str, float], cells: in
     return {"nodes": rows[0]["nodes"], **work, "least_ms": round(1e3 * least, 4), "fraction_reached": reached}
 
 
-def exact(problem: c.Problem) -> np.ndarray:
-    """Voltages of the homogeneous square; along the axis in which two points lie farther apart."""
-    source, sink, plus, minus = problem.pattern.T
-    z = np.zeros((25, 25))
-    for i, j in zip(*np.triu_indices(25, 1), strict=True):
-        a, b = problem.points[i], problem.points[j]
-        flip = slice(None, None, -1 if abs(a - b)[0] > abs(a - b)[1] else 1)
-        z[i, j] = z[j, i] = green(c.SIDE, c.SIDE, a[flip], b[flip])
-    return z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink]
-
-
-def with_error(problem: c.Problem, tool: c.Tool) -> tuple[c.Tool, np.ndarray, float]:
-    """The tool, the homogeneous conductivity, and how far the tool is off there."""
-    flat, want = np.ones(len(problem.sigma)), exact(problem)
-    return tool, flat, float(np.linalg.norm(tool(flat) - want) / np.linalg.norm(want))
-
-
-def accuracy(ladder: tuple[tuple[int, ...], ...], repeats: int) -> list[dict[str, Any]]:
-    """Error against the exact voltages, and time, for the sizes of order 1 and of order 2."""
-    runs = {}
-    for order, cells in ((order, cells) for order, several in enumerate(ladder, 1) for cells in several):
-        problem = c.Problem(cells)
-        for dtype in ("float64", "float32"):
-            model = problem.model(dtype, order)
-            tool = c.as_tool(c.compiled(je.forward, model), dtype)
-            runs[order, dtype, cells] = (*with_error(problem, tool), model.system.unknowns)
-        if order == 2 and cells <= EIDORS_QUADRATIC_LARGEST and not eidors.missing():
-            tool = eidors.prepare_quadratic(problem)
-            runs[order, f"float64, {eidors.NAME}", cells] = (*with_error(problem, tool), model.system.unknowns)
-    times: dict[Any, list[float]] = {key: [] for key in runs}
-    for _ in range(repeats):
-        for key, (tool, flat, _, _) in runs.items():
-            times[key].append(c.taken(tool, flat)[0])
-    return [
-        {"order": order, "dtype": dtype, "cells": cells, "unknowns": n, "relative_error": error, **c.spread(times[key])}
-        for key, (_, _, error, n) in runs.items()
-        for order, dtype, cells in [key]
-    ]
-
-
-def accuracy_table(rows: list[dict[str, Any]]) -> str:
-    lines = ["| element | precision | unknowns | relative error | ms |", "|---|---|---|---|---|"]
-    lines += [
-        f"| P{r['order']} | {r['dtype']} | {r['unknowns']:,} | {100 * r['relative_error']:.4f} % | {c.cell(r)} |"
-        for r in rows
-    ]
-    return "\n".join(lines)
-
-
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
@@ -177,10 +126,6 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         data["work"].append(with_limits(rows, data["limits"], cells))
         save()
     print(c.table(data["rows"]), flush=True)
-    ladder = (sizes, tuple(s for s in (10, 20, 30, 60, 120) if s < sizes[-1]))
-    data["accuracy"] = accuracy(((10,), (10,)) if args.smoke else ladder, 3 if args.smoke else 9)
-    save()
-    print(accuracy_table(data["accuracy"]), flush=True)
     if not (args.smoke or args.no_memory):
         c.add_peaks(data["rows"], "bench_forward", sizes[-1])
         save()

@@ -25,7 +25,7 @@ LOOSE = {"jaxeit float32, pixels": 1e-2}
 def ours(problem: c.Problem, pixels: bool, dtype: str = "float64") -> c.Tool:
     model = problem.model(dtype)
     basis = (je.Pixels(PIXELS) if pixels else je.Elements()).on(model)
-    return c.as_tool(c.compiled(je.jacobian, model, basis), dtype)
+    return c.as_tool(c.compiled(je.jacobian, model, basis, options=je.compiler_options()), dtype)
 
 
 def pixel_matrix(problem: c.Problem) -> csr_array:
@@ -89,6 +89,19 @@ def measure(cells: int, image: str, repeats: int, budget: float) -> list[dict[st
     ]
 
 
+def work(problem: c.Problem, coefficients: int) -> dict[str, float]:
+    """Flops and bytes beyond the factorisation: one substitution, slopes and products of 25 fields
+    over every element, differences of products; fields and matrix are written once."""
+    fields, elements, nodes = 25, len(problem.sigma), len(problem.mesh.nodes)
+    factor = c.factorisation(problem)
+    products = elements * 2 * (2 * 3 * fields + fields * (fields + 1))
+    differences = 3 * coefficients * len(problem.pattern)
+    return {
+        "flops": factor["flops"] + 4 * fields * factor["entries"] + products + differences,
+        "bytes": factor["bytes"] + 8 * (factor["entries"] + 2 * fields * nodes + coefficients * len(problem.pattern)),
+    }
+
+
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
@@ -102,11 +115,15 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         c.print_peak(PREPARE[args.peak[0]], int(args.peak[1]))
         return {}
     sizes = c.SMOKE if args.smoke else tuple(s for s in c.SIZES if s <= args.largest)
-    data: dict[str, Any] = {"circumstances": c.circumstances(), "rows": []}
+    data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": c.limits(), "rows": [], "work": []}
     save = (lambda: None) if args.smoke else (lambda: c.write(args.section, c.closed(data)))
     for cells in sizes:
         for image in ("pixels", "elements"):
-            data["rows"] += measure(cells, image, repeats=3 if args.smoke else 9, budget=8.0)
+            rows = measure(cells, image, repeats=3 if args.smoke else 9, budget=8.0)
+            data["rows"] += rows
+            problem = c.Problem(cells)
+            size = PIXELS**2 if image == "pixels" else len(problem.sigma)
+            data["work"] += [c.with_limits(rows, data["limits"], work(problem, size)) | {"onto": image}] if rows else []
         save()
     print(c.table(data["rows"]), flush=True)
     if not (args.smoke or args.no_memory):

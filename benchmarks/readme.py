@@ -1,8 +1,9 @@
-"""Write the results table and the picture of the README from the bundled session.
+"""Write the tables of the README: accuracy and its picture from the bundled session, speed from results/.
 
 python benchmarks/readme.py
 """
 
+import json
 import re
 from pathlib import Path
 
@@ -13,6 +14,17 @@ from calib.runtime import set_up
 from calib.session import replacing
 
 ROOT = Path(__file__).parents[1]
+SPEED = ROOT / "benchmarks" / "results" / "2-core-x86.json"
+SHOWN = {
+    ("forward", "jaxeit float64"): "forward, jaxeit",
+    ("forward", "CHOLMOD by hand"): "forward, CHOLMOD driven by hand",
+    ("forward", "SuperLU by hand"): "forward, SuperLU driven by hand",
+    ("forward", "EIDORS"): "forward, EIDORS",
+    ("forward", "pyEIT"): "forward, pyEIT",
+    ("jacobian", "jaxeit float64, pixels"): "Jacobian onto 900 pixels, jaxeit",
+    ("jacobian", "adjoint by hand, pixels"): "Jacobian onto 900 pixels, adjoint formula by hand",
+    ("jacobian", "EIDORS, pixels"): "Jacobian onto 900 pixels, EIDORS",
+}
 PAPER = {"localisation": "6.9 mm (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
 
 
@@ -21,17 +33,32 @@ def main() -> None:
     with calib.open_session(ROOT / "data" / "sessions" / "testbed_grid.h5") as session:
         calibration = calib.calibrate([session])
     readme = ROOT / "README.md"
-    text = re.sub(
-        r"(<!-- results.*?-->\n).*?(<!-- end of results -->)",
-        lambda m: m[1] + _table(calibration.evaluation.summary()) + m[2],
-        readme.read_text(encoding="utf-8"),
-        flags=re.DOTALL,
-    )
+    text = readme.read_text(encoding="utf-8")
+    text = _replaced(text, "results", _table(calibration.evaluation.summary()))
+    text = _replaced(text, "speed", _speed(json.loads(SPEED.read_text(encoding="utf-8"))))
     with replacing(readme) as new:
         new.write_text(text, encoding="utf-8")
     (ROOT / "docs").mkdir(exist_ok=True)
     figure = sensitivity_figure(calibration.evaluation, calibration.skin, simulated=True)
     (ROOT / "docs" / "sensitivity.png").write_bytes(png(figure))
+
+
+def _replaced(text: str, mark: str, table: str) -> str:
+    pattern = rf"(<!-- {mark}:.*?-->\n).*?(<!-- end of {mark} -->)"
+    return re.sub(pattern, lambda m: m[1] + table + m[2], text, flags=re.DOTALL)
+
+
+def _speed(results: dict) -> str:
+    """Medians in ms by tool and mesh, forward solves and Jacobians onto pixels."""
+    rows = [(section, row) for section in ("forward", "jacobian") for row in results[section]["rows"]]
+    nodes = sorted({row["nodes"] for _, row in rows})
+    lines = ["| ms, median | " + " | ".join(f"{n:,} nodes" for n in nodes) + " |", "|---" * (1 + len(nodes)) + "|"]
+    for (section, tool), label in SHOWN.items():
+        found = {row["nodes"]: row["median_ms"] for kind, row in rows if (kind, row["tool"]) == (section, tool)}
+        if found:
+            cells = (f"{found[n]:,.3g}" if n in found else "" for n in nodes)
+            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def _table(s: dict[str, float]) -> str:

@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer, eval_context
+from jax.extend.core import get_opaque_trace_state
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -33,7 +35,15 @@ def verb(function: F) -> F:
 
 def _is_traced(*values: Any) -> bool:
     """Whether another transformation is at work: on these values, or on whatever is computed now."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(values), jnp.negative(0)))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+    return traced or get_opaque_trace_state() != _outside()
+
+
+@cache
+def _outside() -> Any:
+    """JAX's state outside any transformation."""
+    with eval_context():
+        return get_opaque_trace_state()
 
 
 @cache
@@ -45,7 +55,8 @@ def compiler_options() -> dict[str, Any]:
     """
     options = {"xla_cpu_use_fusion_emitters": False}
     try:
-        jax.jit(jnp.negative, compiler_options=options)(jnp.float32(1))
+        with eval_context():
+            jax.jit(jnp.negative, compiler_options=options)(jnp.float32(1))
     except jax.errors.JaxRuntimeError:
         return {}
     return options

@@ -355,9 +355,9 @@ def test_wide_fronts_are_eliminated_in_halves():
     matrix = laplacian(np.stack(np.triu_indices(n, 1), 1), rng.uniform(0.5, 2, n * (n - 1) // 2), n)
     pattern, values = as_pattern(matrix, rng.normal(size=(n, 2)), [7, 140])
     rhs = rng.normal(size=(n, 3))
-    assert relative(solution(NestedDissection(), pattern, values, rhs), splu(matrix).solve(rhs)) < 1e-12
+    assert relative(solution(NestedDissection(), pattern, values, rhs), splu(matrix).solve(rhs)) < 1e-11
     corner = NestedDissection().corner(NestedDissection().analyse(pattern), values)
-    assert relative(corner, np.linalg.inv(matrix.toarray())[np.ix_([7, 140], [7, 140])]) < 1e-12
+    assert relative(corner, np.linalg.inv(matrix.toarray())[np.ix_([7, 140], [7, 140])]) < 1e-11
 
 
 def test_iteration_that_does_not_converge_is_nan():
