@@ -16,6 +16,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
@@ -154,6 +155,40 @@ def require_agreement(outputs: Mapping[str, np.ndarray], reference: str, loose: 
         if not value <= loose.get(name, AGREE):
             raise SystemExit(f"{name} disagrees with {reference}: nothing is timed")
     return found
+
+
+def factorisation(problem: Problem) -> dict[str, float]:
+    """Least work of a multifrontal Cholesky factorisation on our (padded) fronts: panels are written
+    once, updates of the parents written and read."""
+    plan: Any = problem.model().system.plan
+    m, q, p = np.array(plan.panel_shapes, np.float64).T
+    b = q - p
+    flops, entries = m * (p**3 / 3 + b * p**2 + b**2 * p), m * q * p
+    return {
+        "flops": float(np.sum(flops)),
+        "entries": float(np.sum(entries)),
+        "bytes": float(8 * np.sum(entries + 2 * m * b**2)),
+    }
+
+
+def limits() -> dict[str, float]:
+    """What is reached here: flop/s of XLA's matrix product on all cores, byte/s of a copy; best of five."""
+    a, big = jnp.asarray(np.random.default_rng(0).random((1500, 1500))), np.ones(1 << 24)
+    product, into = jax.jit(jnp.matmul), np.ones_like(big)
+    flops = 2 * 1500**3 / min(_finished(product, a, a) for _ in range(5))
+    copied = 2 * big.nbytes / min(seconds(np.copyto, into, big)[0] for _ in range(5))
+    return {"flop_per_s": flops, "byte_per_s": copied}
+
+
+def _finished(call: Callable, *args: Any) -> float:
+    return seconds(lambda: jax.block_until_ready(call(*args)))[0]
+
+
+def with_limits(rows: list[dict[str, Any]], machine: dict[str, float], work: dict[str, float]) -> dict[str, Any]:
+    """The time that the work takes at the machine's limits, and the fraction of them that we reach."""
+    least = max(work["flops"] / machine["flop_per_s"], work["bytes"] / machine["byte_per_s"])
+    reached = {row["tool"]: round(1e3 * least / row["median_ms"], 4) for row in rows if "jaxeit" in row["tool"]}
+    return {"nodes": rows[0]["nodes"], **work, "least_ms": round(1e3 * least, 4), "fraction_reached": reached}
 
 
 def peak_megabytes() -> float:

@@ -8,7 +8,6 @@ import sys
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
@@ -18,17 +17,28 @@ from .peers import cholmod, eidors, pyeit, superlu
 
 # Single precision is no direct float64 solver: how far it is off is reported, not required to be nothing.
 LOOSE = {"jaxeit float32": 1e-2}
-UNFUSED = {"xla_cpu_use_fusion_emitters": False}
 
 
-def ours(problem: c.Problem, dtype: str = "float64", options=None) -> c.Tool:
-    return c.as_tool(c.compiled(je.forward, problem.model(dtype), options=options), dtype)
+def ours(problem: c.Problem, dtype: str = "float64") -> c.Tool:
+    return c.as_tool(c.compiled(je.forward, problem.model(dtype), options=je.compiler_options()), dtype)
+
+
+def inside(problem: c.Problem) -> c.Tool:
+    """As part of a program that was not given `je.compiler_options`."""
+    return c.as_tool(c.compiled(je.forward, problem.model()))
+
+
+def called(problem: c.Problem) -> c.Tool:
+    """As users call it: `je.forward(model, sigma)`."""
+    model = problem.model()
+    return lambda sigma: np.asarray(je.forward(model, sigma))
 
 
 PREPARE = {
     "jaxeit float64": ours,
     "jaxeit float32": lambda problem: ours(problem, "float32"),
-    "jaxeit float64, no fusion emitters": lambda problem: ours(problem, options=UNFUSED),
+    "jaxeit float64, called from Python": called,
+    "jaxeit float64, without compiler options": inside,
     superlu.NAME: superlu.prepare,
     cholmod.NAME: cholmod.prepare,
     pyeit.NAME: pyeit.prepare,
@@ -72,39 +82,6 @@ def measure(cells: int, repeats: int, budget: float) -> list[dict[str, Any]]:
     ]
 
 
-def factorisation(cells: int) -> dict[str, float]:
-    """Least work of a multifrontal Cholesky factorisation and 25 solves on our (padded) fronts."""
-    plan: Any = c.Problem(cells).model().system.plan
-    m, q, p = np.array(plan.panel_shapes, np.float64).T
-    b, solves = q - p, 25
-    factor = m * (p**3 / 3 + b * p**2 + b**2 * p)
-    entries = m * (p * (p + 1) / 2 + b * p)
-    return {
-        "flops": float(np.sum(factor + 4 * entries * solves)),
-        "bytes": float(8 * 3 * np.sum(entries)),  # written once, read by either sweep
-    }
-
-
-def limits() -> dict[str, float]:
-    """What is reached here: flop/s of XLA's matrix product on all cores, byte/s of a copy; best of five."""
-    a, big = jnp.asarray(np.random.default_rng(0).random((1500, 1500))), np.ones(1 << 24)
-    product, into = jax.jit(jnp.matmul), np.ones_like(big)
-    flops = 2 * 1500**3 / min(_finished(product, a, a) for _ in range(5))
-    copied = 2 * big.nbytes / min(c.seconds(np.copyto, into, big)[0] for _ in range(5))
-    return {"flop_per_s": flops, "byte_per_s": copied}
-
-
-def _finished(call, *args) -> float:
-    return c.seconds(lambda: jax.block_until_ready(call(*args)))[0]
-
-
-def with_limits(rows: list[dict[str, Any]], machine: dict[str, float], cells: int) -> dict[str, Any]:
-    work = factorisation(cells)
-    least = max(work["flops"] / machine["flop_per_s"], work["bytes"] / machine["byte_per_s"])
-    reached = {row["tool"]: round(1e3 * least / row["median_ms"], 4) for row in rows if "float64" in row["tool"]}
-    return {"nodes": rows[0]["nodes"], **work, "least_ms": round(1e3 * least, 4), "fraction_reached": reached}
-
-
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
@@ -118,12 +95,12 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         c.print_peak(PREPARE[args.peak[0]], int(args.peak[1]))
         return {}
     sizes = c.SMOKE if args.smoke else tuple(s for s in c.SIZES if s <= args.largest)
-    data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": limits(), "rows": [], "work": []}
+    data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": c.limits(), "rows": [], "work": []}
     save = (lambda: None) if args.smoke else (lambda: c.write(args.section, c.closed(data)))
     for cells in sizes:
         rows = measure(cells, repeats=3 if args.smoke else 15, budget=8.0)
         data["rows"] += rows
-        data["work"].append(with_limits(rows, data["limits"], cells))
+        data["work"].append(c.with_limits(rows, data["limits"], c.factorisation(c.Problem(cells))))
         save()
     print(c.table(data["rows"]), flush=True)
     if not (args.smoke or args.no_memory):

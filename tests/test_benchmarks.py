@@ -1,13 +1,14 @@
 """The benchmarks' work is what they say it is, and their smoke runs; no assertion is about time."""
 
 import json
+import os
 
 import numpy as np
 import pytest
 
 import jaxeit as je
 from benchmarks import _common as common
-from benchmarks import bench_forward, bench_jacobian
+from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_jacobian
 from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
 
 from .oracles.rectangle import four_point
@@ -35,10 +36,69 @@ def test_a_mesh_without_nodes_at_the_electrodes_is_refused():
 
 def test_exact_voltages(problem):
     """Against the oracle along one axis only, whose 4,000 terms leave an error of about 1e-4."""
-    exact = bench_forward.exact(problem)
+    exact = bench_accuracy.exact(problem)
     for row in (0, 500, 1371):
         points = [problem.points[k] for k in problem.pattern[row]]
         assert exact[row] == pytest.approx(four_point(0.2, 0.2, *points), rel=1e-3)
+
+
+def test_exact_voltages_of_the_disc_are_reciprocal():
+    pattern = je.adjacent(16)
+    exact, other = bench_accuracy.exact_disc(pattern), je.reciprocal_rows(pattern)
+    assert (other >= 0).all()
+    np.testing.assert_allclose(exact[other], exact, atol=1e-12)
+
+
+def _row(sheet, tool, order, error, ms, dtype="float64", mesh="regular"):
+    labels = {"sheet": sheet, "tool": tool, "mesh": mesh, "order": order, "dtype": dtype}
+    return labels | {"nodes": 1000, "unknowns": 999, "relative_error": error, "median_ms": ms}
+
+
+def test_the_quickest_way_is_one_that_is_accurate_on_the_rectangle():
+    rows = [
+        _row("rectangle", "jaxeit", 1, 1e-2, 1.0),
+        _row("rectangle", "jaxeit", 2, 1.5e-4, 4.0, mesh="growth 1.4"),
+        _row("rectangle", "jaxeit", 2, 1e-4, 6.0),
+        _row("disc", "jaxeit", 2, 1e-4, 2.0),
+        _row("rectangle", cholmod.NAME, 1, 2e-3, 5.0),
+    ]
+    said = bench_accuracy.verdict(rows)
+    assert "P2 float64, mesh growth 1.4, 999 unknowns, 0.015 %, 4 ms" in said
+    assert "takes 5 ms for P1 with 1,000 nodes (0.2 %)" in said
+    assert bench_accuracy.verdict(rows[:1]) == "Nothing reaches 0.02 % on the rectangle."
+
+
+def test_the_picture_has_a_curve_per_order_precision_and_grading(tmp_path):
+    ours = [
+        _row(sheet, "jaxeit", order, error, ms, dtype, f"growth {growth}")
+        for sheet in ("rectangle", "disc")
+        for order in (1, 2)
+        for dtype in ("float64", "float32")
+        for growth in bench_accuracy.GRADINGS
+        for error, ms in ((1e-2, 1.0), (1e-3, 10.0))
+    ]
+    rows = [*ours, _row("rectangle", cholmod.NAME, 1, 2e-3, 5.0), _row("rectangle", eidors.NAME, 2, 2e-4, 500.0)]
+    rectangle, disc = bench_accuracy.picture(rows).axes
+    curves = [
+        [line for line in axes.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
+        for axes in (rectangle, disc)
+    ]
+    assert [len(lines) for lines in curves] == [12, 12]
+    assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in curves[0]}) == 12
+    bench_accuracy.draw(rows, tmp_path / "docs" / "accuracy.png")
+    assert (tmp_path / "docs" / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_float32_is_run_on_the_finest():
+    assert bench_accuracy.with_precision((3, 2, 1)) == [(3, "float64"), (2, "float64"), (1, "float64"),
+                                                        (3, "float32"), (1, "float32")]  # fmt: skip
+    assert [size for size, dtype in bench_accuracy.with_precision((4, 3, 2, 1)) if dtype == "float32"] == [3, 1]
+
+
+def test_nothing_to_draw(monkeypatch, tmp_path):
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    with pytest.raises(SystemExit, match="measure first"):
+        bench_accuracy.main(["--draw-only"])
 
 
 @pytest.mark.parametrize("peer", [superlu, cholmod, pyeit, eidors])
@@ -142,3 +202,45 @@ def test_smoke(bench, capsys):
     assert {row["nodes"] for row in rows} == {961}
     assert all(row["min_ms"] <= row["median_ms"] <= row["max_ms"] for row in rows)
     assert capsys.readouterr().out.count("961 nodes |") == 1
+
+
+@pytest.mark.slow
+def test_smoke_of_accuracy(capsys):
+    rows = bench_accuracy.main(["--smoke"])["rows"]
+    ours = [row for row in rows if row["tool"] == "jaxeit"]
+    assert [(row["sheet"], row["dtype"]) for row in ours] == [
+        (sheet, dtype) for sheet in ("rectangle", "disc") for dtype in ("float64", "float32")
+    ]
+    assert all(row["relative_error"] < 0.03 for row in rows)
+    assert "on the rectangle" in capsys.readouterr().out
+
+
+def test_contacts_of_the_data_set(problem):
+    """Half as much again where a contact lies; each row is another place; all 1,681 come once."""
+    numbers = np.concatenate(list(bench_batch.pieces()))
+    assert numbers[:1681].tolist() == list(range(1681))
+    assert set(numbers[1681:]) == {1680}
+    sigma = bench_batch.contacts(problem, np.array([0, 42 * 20, 41 * 40 + 10]))
+    highest = problem.mesh.chart_centroids[np.argmax(sigma, 1)]
+    np.testing.assert_allclose(highest, [[0, 0], [0.1, 0.1], [0.05, 0.2]], atol=0.015)
+    assert 1.3 < sigma.max() <= 1.5
+    assert sigma.min() == pytest.approx(1.0)
+
+
+def test_blas_threads_are_put_back(monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    for one in (True, False):
+        with bench_batch.threads(one):
+            assert os.environ.get("OPENBLAS_NUM_THREADS") == os.environ.get("OMP_NUM_THREADS") == ("1" if one else None)
+        assert os.environ["OPENBLAS_NUM_THREADS"] == "3"
+        assert "OMP_NUM_THREADS" not in os.environ
+
+
+@pytest.mark.slow
+def test_smoke_of_batches(capsys):
+    data = bench_batch.main(["--smoke"])
+    assert [row["tool"] for row in data["rows"]] == [str(way) for way in bench_batch.SMOKE]
+    assert all(row["min_per_s"] <= row["median_per_s"] <= row["max_per_s"] for row in data["rows"])
+    assert [row["cache"] for row in data["startup"]] == list(bench_batch.CACHES)
+    assert capsys.readouterr().out.count("| second process |") == 1
