@@ -240,7 +240,8 @@ def _ground(space: Space, covered: np.ndarray, ground: int | None) -> int:
     resistance and cost a digit."""
     if ground is None:
         away = np.linalg.norm(space.chart - space.chart.mean(0), axis=1)
-        return int(np.argmin(np.where(covered, np.inf, away)))
+        # Rounded, so that skins of one shape choose alike where several nodes are equally near.
+        return int(np.argmin(np.where(covered, np.inf, np.round(away / np.ptp(space.chart), 9))))
     if not (0 <= ground < len(covered)) or covered[ground]:
         raise ElectrodeError(f"node {ground} cannot be the ground: it is under an electrode")
     return ground

@@ -17,13 +17,13 @@ from ._base import Pattern
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of m fronts; c children each, of the level below.
+    """One level of m fronts, which have two children each on the level below, the leaves none.
 
     | meaning                                                              | shape       |
     |----------------------------------------------------------------------|-------------|
     | pivots: unknown at each pivot place, n where padded                  | (m, p)      |
     | up: place of each boundary unknown in the parent's front             | (m, b)      |
-    | down: place of each unknown in each child's boundary                 | (m, c, p+b) |
+    | down: place of each unknown in each of 2 or 0 children's boundaries   | (m, c, p+b) |
     | entries: number, front, row and column of each entry in the columns  | (4, k)      |
     |   of the pivots; number nnz is the one of a padded pivot             |             |
     """
@@ -35,23 +35,21 @@ class Level:
 
 
 class _Tree:
-    """The dissection tree after merging: level and index of the front that owns each unknown."""
+    """The dissection tree: level and index of the front that owns each unknown."""
 
-    def __init__(self, owner: np.ndarray, starts: tuple[int, ...]) -> None:
-        bits = np.frexp(owner.astype(float))[1] - 1
-        self.starts = np.asarray(starts)
-        self.level = np.searchsorted(self.starts, bits, side="right") - 1
-        self.index = (owner >> (bits - self.starts[self.level])) - (1 << self.starts[self.level])
-        self.rank, self.pivots = self._ranked(owner)
+    def __init__(self, owner: np.ndarray, depth: int) -> None:
+        self.level = np.frexp(owner.astype(float))[1] - 1
+        self.index = owner - (1 << self.level)
+        self.rank, self.pivots = self._ranked(depth)
 
-    def _ranked(self, owner: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    def _ranked(self, depth: int) -> tuple[np.ndarray, list[np.ndarray]]:
         """Place of each unknown among its front's pivots, and the reverse for each level."""
-        rank, tables = np.zeros(owner.size, np.int64), []
-        for level, start in enumerate(self.starts):
+        rank, tables = np.zeros(self.level.size, np.int64), []
+        for level in range(depth + 1):
             mine = np.flatnonzero(self.level == level)
-            mine = mine[np.lexsort((mine, -owner[mine], self.index[mine]))]
-            rank[mine], size = _ranks(self.index[mine], 1 << start)
-            table = np.full((1 << start, size), owner.size)
+            mine = mine[np.argsort(self.index[mine], kind="stable")]
+            rank[mine], size = _ranks(self.index[mine], 1 << level)
+            table = np.full((1 << level, size), rank.size)
             table[self.index[mine], rank[mine]] = mine
             tables.append(table)
         return rank, tables
@@ -77,13 +75,9 @@ class _Boundaries:
         return self.rank[np.searchsorted(self.keys, fronts * self.n + unknowns)]
 
 
-def lay_out(pattern: Pattern, owner: np.ndarray, starts: tuple[int, ...]) -> tuple[Level, ...]:
-    """Levels, from the root down, of the tree with heap numbers `owner`, its depths merged at `starts`.
-
-    Merging puts a separator and those right below it into one front: more arithmetic, but fewer
-    levels, hence fewer kernels to compile and to launch.
-    """
-    tree = _Tree(owner, starts)
+def lay_out(pattern: Pattern, owner: np.ndarray, depth: int) -> tuple[Level, ...]:
+    """Levels, from the root down, of the tree of this depth with heap numbers `owner`."""
+    tree = _Tree(owner, depth)
     bounds = _boundaries(pattern, tree)
     ups = [_up(tree, bounds, level) for level in range(len(bounds))]
     entries = _entries(pattern, tree, bounds)
@@ -101,11 +95,11 @@ def _boundaries(pattern: Pattern, tree: _Tree) -> list[_Boundaries]:
     below, above = below[upward], above[upward]
     handed = np.zeros((2, 0), np.int64)
     found: list[_Boundaries] = []
-    for level in reversed(range(len(tree.starts))):
+    for level in reversed(range(len(tree.pivots))):
         mine = tree.level[below] == level
         direct = np.stack([tree.index[below[mine]], above[mine]])
         fronts, unknowns = np.concatenate([direct, handed], 1)
-        found.append(_Boundaries(fronts, unknowns, 1 << tree.starts[level], n))
+        found.append(_Boundaries(fronts, unknowns, 1 << level, n))
         handed = _handed(tree, found[-1], level)
     return found[::-1]
 
@@ -116,8 +110,7 @@ def _handed(tree: _Tree, bound: _Boundaries, level: int) -> np.ndarray:
     unknowns = bound.unknowns[keep]
     if not unknowns.size:
         return np.zeros((2, 0), np.int64)
-    shift = tree.starts[level] - tree.starts[level - 1]
-    return np.stack([bound.fronts[keep] >> shift, unknowns])
+    return np.stack([bound.fronts[keep] >> 1, unknowns])
 
 
 def _front_size(tree: _Tree, bounds: list[_Boundaries], level: int) -> int:
@@ -129,9 +122,8 @@ def _up(tree: _Tree, bounds: list[_Boundaries], level: int) -> np.ndarray:
     if level == 0:
         return np.zeros((1, bound.size), np.int64)
     last = _front_size(tree, bounds, level - 1) - 1
-    table = np.full((1 << tree.starts[level], bound.size), last)
-    parents = bound.fronts >> (tree.starts[level] - tree.starts[level - 1])
-    table[bound.fronts, bound.rank] = _place(tree, bounds, level - 1, parents, bound.unknowns)
+    table = np.full((1 << level, bound.size), last)
+    table[bound.fronts, bound.rank] = _place(tree, bounds, level - 1, bound.fronts >> 1, bound.unknowns)
     return table
 
 
@@ -146,11 +138,11 @@ def _place(tree: _Tree, bounds: list[_Boundaries], level: int, fronts: np.ndarra
 
 def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: int) -> np.ndarray:
     """The reverse of the children's `up`; what a child lacks points to its padding."""
-    fronts, size = 1 << tree.starts[level], _front_size(tree, bounds, level)
+    fronts, size = 1 << level, _front_size(tree, bounds, level)
     if level + 1 == len(bounds):
         return np.zeros((fronts, 0, size), np.int64)
     child = bounds[level + 1]
-    table = np.full((1 << tree.starts[level + 1], size), child.size - 1)
+    table = np.full((2 << level, size), child.size - 1)
     table[child.fronts, ups[level + 1][child.fronts, child.rank]] = child.rank
     return table.reshape(fronts, -1, size)
 

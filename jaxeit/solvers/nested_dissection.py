@@ -89,18 +89,13 @@ class NestedDissectionFactor(eqx.Module):
 
 
 class NestedDissection(AbstractLinearSolver):
-    """Multifrontal Cholesky on a nested dissection.
-
-    A leaf has at most about ``leaf_size`` unknowns; ``merge`` depths of the binary tree are
-    eliminated together.
-    """
+    """Multifrontal Cholesky on a nested dissection whose leaves have at most about ``leaf_size`` unknowns."""
 
     leaf_size: int = eqx.field(static=True, default=32)
-    merge: int = eqx.field(static=True, default=1)
 
     def analyse(self, pattern: Pattern) -> NestedDissectionPlan:
         owner, depth = dissect(pattern, self.leaf_size)
-        levels = lay_out(pattern, owner, _level_starts(depth, self.merge))
+        levels = lay_out(pattern, owner, depth)
         gather = np.concatenate([level.pivots.ravel() for level in levels])
         filled = np.flatnonzero(gather < pattern.n)
         scatter = np.empty(pattern.n, np.int64)
@@ -145,11 +140,6 @@ def _level_plan(level: Level) -> LevelPlan:
     among, below = (level.entries[:, mine] for mine in (level.entries[2] < pivots, level.entries[2] >= pivots))
     below = below - [[0], [0], [pivots], [0]]
     return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(below))
-
-
-def _level_starts(depth: int, merge: int) -> tuple[int, ...]:
-    """Depths at which levels begin: the leaves by themselves, the rest merged from below."""
-    return tuple(sorted({0, *range(depth, 0, -merge)}))
 
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> tuple[Front, ...]:
