@@ -360,6 +360,24 @@ def test_wide_fronts_are_eliminated_in_halves():
     assert relative(corner, np.linalg.inv(matrix.toarray())[np.ix_([7, 140], [7, 140])]) < 1e-11
 
 
+@pytest.mark.parametrize("verb", ["factor", "corner"])
+def test_no_two_triangular_solves_can_run_at_once(verb):
+    """They would wait for each other for ever (see `_eliminate_at_once`): each must need the last one."""
+    matrix, coords = square_sheet(20, 1, np.ones(2))
+    pattern, values = as_pattern(matrix, coords, [400, 401, *range(0, 400, 4)])
+    solver = NestedDissection(leaf_size=20)
+    program = jax.make_jaxpr(partial(getattr(solver, verb), solver.analyse(pattern)))(values).jaxpr
+    behind, found = {}, []  # the triangular solves that each value needs
+    for equation in program.eqns:
+        needs = set().union(*(behind.get(v, set()) for v in equation.invars if not hasattr(v, "val")))
+        if equation.primitive.name == "triangular_solve":
+            assert needs >= set(found)
+            found.append(len(found))
+            needs = needs | {found[-1]}
+        behind.update(dict.fromkeys(equation.outvars, needs))
+    assert len(found) > 4
+
+
 def test_iteration_that_does_not_converge_is_nan():
     matrix, coords = square_sheet(9, 3, np.ones(2))
     pattern, values = as_pattern(matrix, coords)

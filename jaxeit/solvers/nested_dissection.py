@@ -110,7 +110,7 @@ class NestedDissection(AbstractLinearSolver):
 
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
         scale, scaled = jacobi_scale(plan, values)
-        return NestedDissectionFactor(_eliminated(plan, scaled), scale, plan)
+        return NestedDissectionFactor(_eliminated(plan, scaled, keep=True), scale, plan)
 
     def solve(self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
@@ -127,7 +127,7 @@ class NestedDissection(AbstractLinearSolver):
 
     def corner(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
         scale, scaled = jacobi_scale(plan, values)
-        y = _root_loads(plan, _eliminated(plan, scaled)[0])[0] * scale[plan.root]
+        y = _root_loads(plan, _eliminated(plan, scaled, keep=False)[0])[0] * scale[plan.root]
         return y.T @ y
 
 
@@ -142,8 +142,8 @@ def _level_plan(level: Level) -> LevelPlan:
     return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(below))
 
 
-def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> tuple[Front, ...]:
-    """All fronts, from the leaves up; returned from the root down."""
+def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
+    """What is kept of the fronts, from the root down; of the root only, unless ``keep``."""
     padded = jnp.concatenate([values, jnp.ones_like(values, shape=1)])
     update = jnp.zeros((0, 1, 1), values.dtype)
     fronts: list[Front] = []
@@ -151,10 +151,15 @@ def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> tup
         pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
         among = _with_entries(_extended(level, update, pivots, pivots), level.among, padded)
         below = _with_entries(_extended(level, update, boundary, pivots), level.below, padded)
-        w, front = _eliminate(among, below)
-        update = _extended(level, update, boundary, boundary) - jnp.einsum("mik,mjk->mij", w, w)
-        fronts.append(front)
+        w, front = _eliminate(among, below, keep or level is plan.levels[0])
+        if front is not None:
+            fronts.append(front)
+        update = _extended(level, update, boundary, boundary) - _square(w, w)
     return tuple(fronts[::-1])
+
+
+def _square(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
+    return jnp.einsum("mki,mkj->mij", left, right)
 
 
 def _with_entries(block: Float[Array, "m i j"], entries: Int[Array, "4 k"], values: Array) -> Float[Array, "m i j"]:
@@ -187,33 +192,44 @@ def _along(array: Array, places: Int[Array, "..."], axis: int) -> Array:
     return jnp.take_along_axis(array, places, axis, mode="promise_in_bounds")
 
 
-def _eliminate(among: Float[Array, "m p p"], below: Float[Array, "m b p"]) -> tuple[Float[Array, "m b p"], Front]:
-    """W, and what is kept, of every front; wide ones in two halves."""
+def _eliminate(
+    among: Float[Array, "m p p"], below: Float[Array, "m b p"], keep: bool
+) -> tuple[Float[Array, "m p b"], Front | None]:
+    """W^T of every front, and what is kept; wide fronts in two halves."""
     p = among.shape[2]
     if p <= _WIDEST:
-        return _eliminate_at_once(among, below)
+        return _eliminate_at_once(among, below, keep)
     h = (p + 1) // 2
-    w1, first = _eliminate(among[:, :h, :h], jnp.concatenate([among[:, h:, :h], below[:, :, :h]], 1))
-    across, beyond = w1[:, : p - h], w1[:, p - h :]
-    w2, second = _eliminate(
-        among[:, h:, h:] - jnp.einsum("mik,mjk->mij", across, across),
-        below[:, :, h:] - jnp.einsum("mik,mjk->mij", beyond, across),
-    )
-    between, under = first.below[:, : p - h], first.below[:, p - h :]
-    corner = jnp.zeros_like(among, shape=(len(among), h, p - h))
+    w1, first = _eliminate(among[:, :h, :h], jnp.concatenate([among[:, h:, :h], below[:, :, :h]], 1), keep)
+    across, beyond = w1[:, :, : p - h], w1[:, :, p - h :]
+    w2, second = _eliminate(among[:, h:, h:] - _square(across, across), below[:, :, h:] - _square(beyond, across), keep)
+    w = jnp.concatenate([beyond, w2], 1)
+    return w, None if first is None or second is None else _joined(first, second)
+
+
+def _joined(first: Front, second: Front) -> Front:
+    """Both halves of a front's pivots as one."""
+    (m, h, _), size = first.inverse.shape, second.inverse.shape[1]
+    between, beyond = first.below[:, :size], first.below[:, size:]
+    corner = jnp.zeros_like(between, shape=(m, h, size))
     inverse = _stacked([[first.inverse, corner], [second.inverse @ between, second.inverse]])
-    below = _stacked([[under + second.below @ between, second.below]])
-    return _stacked([[beyond, w2]]), Front(inverse, below)
+    return Front(inverse, _stacked([[beyond + second.below @ between, second.below]]))
 
 
 def _eliminate_at_once(
-    among: Float[Array, "m p p"], below: Float[Array, "m b p"]
-) -> tuple[Float[Array, "m b p"], Front]:
+    among: Float[Array, "m p p"], below: Float[Array, "m b p"], keep: bool
+) -> tuple[Float[Array, "m p b"], Front | None]:
+    """L^-1 of F12, and of the unit matrix if kept, in one call: two batched triangular solves that run at
+    once wait for each other for ever (jaxlib 0.10.2 on two cores)."""
+    p = among.shape[2]
     lower = lax.linalg.cholesky(among, symmetrize_input=False)
-    w = lax.linalg.triangular_solve(lower, below, left_side=False, lower=True, transpose_a=True)
-    eye = jnp.broadcast_to(jnp.eye(among.shape[2], dtype=among.dtype), lower.shape)
-    inverse = lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
-    return w, Front(inverse, -(w @ inverse))
+    right = jnp.swapaxes(below, 1, 2)
+    if not keep:
+        return lax.linalg.triangular_solve(lower, right, left_side=True, lower=True), None
+    eye = jnp.broadcast_to(jnp.eye(p, dtype=among.dtype), lower.shape)
+    both = lax.linalg.triangular_solve(lower, jnp.concatenate([eye, right], 2), left_side=True, lower=True)
+    inverse, w = both[:, :, :p], both[:, :, p:]
+    return w, Front(inverse, -_square(w, inverse))
 
 
 def _stacked(blocks: list[list[Array]]) -> Array:

@@ -1,0 +1,48 @@
+"""Verbs compile themselves at the top, and become part of whatever program calls them."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxeit as je
+from jaxeit import verbs
+
+
+@verbs.verb
+def double(x):
+    return 2 * x
+
+
+@pytest.fixture
+def first_call():
+    """As in a process that has called no verb yet."""
+    verbs._outside.cache_clear()
+    verbs.compiler_options.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "around",
+    [lambda f: f, jax.jit, jax.vmap, lambda f: jax.jit(jax.vmap(f)), lambda f: lambda x: jax.jvp(f, (x,), (x,))[1]],
+    ids=["alone", "jit", "vmap", "jit of vmap", "jvp"],
+)
+def test_a_verb_is_the_same_wherever_it_is_called(around, first_call):
+    assert float(around(double)(jnp.ones(1))[0]) == 2.0
+
+
+def test_a_verb_of_constants_inside_a_program(first_call):
+    """No argument tells that a program is being made; options are for whole programs only."""
+    constant = jnp.ones(3)
+    assert float(jax.jit(lambda y: double(constant)[0] + y)(1.0)) == 3.0
+
+
+def test_options_that_xla_does_not_know_are_left_out(first_call, monkeypatch):
+    def refuse(*_, **__):
+        raise jax.errors.JaxRuntimeError("no such option")
+
+    monkeypatch.setattr(jax, "jit", refuse)
+    assert je.compiler_options() == {}
+    verbs.compiler_options.cache_clear()
+
+
+def test_options_are_asked_for_inside_a_program(first_call):
+    assert float(jax.jit(lambda x: x + len(je.compiler_options()))(1.0)) >= 1.0
