@@ -56,9 +56,13 @@ def _speed(results: dict) -> str:
     for (section, tool), label in SHOWN.items():
         found = {row["nodes"]: row["median_ms"] for kind, row in rows if (kind, row["tool"]) == (section, tool)}
         if found:
-            cells = (f"{found[n]:,.3g}" if n in found else "" for n in nodes)
+            cells = (_figures(found[n]) if n in found else "" for n in nodes)
             lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _figures(ms: float) -> str:
+    return f"{ms:,.0f}" if ms >= 100 else f"{ms:.3g}"
 
 
 def _table(s: dict[str, float]) -> str:
