@@ -1,5 +1,6 @@
 """The work that every tool gets, the clock, and where results go."""
 
+import argparse
 import json
 import os
 import platform
@@ -155,6 +156,75 @@ def require_agreement(outputs: Mapping[str, np.ndarray], reference: str, loose: 
         if not value <= loose.get(name, AGREE):
             raise SystemExit(f"{name} disagrees with {reference}: nothing is timed")
     return found
+
+
+def measured(
+    prepare: Mapping[str, Callable[[Problem], Tool]],
+    problem: Problem,
+    reference: str,
+    loose: Mapping[str, float],
+    repeats: int,
+    budget: float,
+) -> list[dict[str, Any]]:
+    """A row of results per tool: agreement with the reference first, then the clocks."""
+    nodes, readings = len(problem.mesh.nodes), len(problem.pattern)
+    prepared = {name: seconds(make, problem) for name, make in prepare.items()}
+    tools = {name: tool for name, (_, tool) in prepared.items()}
+    first = {name: taken(tool, problem.sigma) for name, tool in tools.items()}
+    found = require_agreement({name: out for name, (_, out) in first.items()}, reference, loose)
+    first_call = {name: round(spent, 3) for name, (spent, _) in first.items()}
+    del first  # Jacobians are large
+    times = interleaved(tools, problem.sigma, repeats, budget)
+    return [
+        {
+            "tool": name,
+            "nodes": nodes,
+            "readings": readings,
+            "difference": found.get(name, 0.0),
+            "prepare_s": round(prepared[name][0], 3),
+            "first_call_s": first_call[name],
+            **spread(times[name]),
+        }
+        for name in tools
+    ]
+
+
+def run(
+    argv: list[str] | None,
+    about: str | None,
+    section: str,
+    prepare: Mapping[str, Callable[[Problem], Tool]],
+    measure: Callable[[int, int, float], list[tuple[list[dict[str, Any]], dict[str, Any]]]],
+    repeats: int,
+) -> dict[str, Any]:
+    """The command of a benchmark: ``measure(cells, repeats, budget)`` at all sizes, then peak memory.
+
+    ``measure`` gives lists of rows, each with the work that they did.
+    """
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
+    parser.add_argument("--no-memory", action="store_true", help="skip each tool's peak memory at the largest size")
+    parser.add_argument("--largest", type=int, default=SIZES[-1], help="most cells a side")
+    parser.add_argument("--section", default=section, help="name of this run among the results")
+    parser.add_argument("--peak", nargs=2, metavar=("TOOL", "CELLS"), help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    if args.peak:
+        print_peak(prepare[args.peak[0]], int(args.peak[1]))
+        return {}
+    sizes = SMOKE if args.smoke else tuple(s for s in SIZES if s <= args.largest)
+    data: dict[str, Any] = {"circumstances": circumstances(), "limits": limits(), "rows": [], "work": []}
+    save = (lambda: None) if args.smoke else (lambda: write(args.section, closed(data)))
+    for cells in sizes:
+        for rows, work in measure(cells, 3 if args.smoke else repeats, 8.0):
+            data["rows"] += rows
+            data["work"].append(with_limits(rows, data["limits"], work))
+        save()
+    print(table(data["rows"]), flush=True)
+    if not (args.smoke or args.no_memory):
+        add_peaks(data["rows"], f"bench_{section}", sizes[-1])
+        save()
+    return data
 
 
 def factorisation(problem: Problem) -> dict[str, float]:

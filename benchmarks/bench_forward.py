@@ -3,11 +3,9 @@
 python -m benchmarks.bench_forward [--smoke] [--no-memory]
 """
 
-import argparse
 import sys
 from typing import Any
 
-import jax
 import numpy as np
 
 import jaxeit as je
@@ -58,55 +56,15 @@ def present(cells: int) -> dict[str, Any]:
     return {name: prepare for name, prepare in PREPARE.items() if name not in absent}
 
 
-def measure(cells: int, repeats: int, budget: float) -> list[dict[str, Any]]:
+def measure(cells: int, repeats: int, budget: float) -> list[tuple[list[dict[str, Any]], dict[str, Any]]]:
     problem = c.Problem(cells)
-    nodes, readings = len(problem.mesh.nodes), len(problem.pattern)
-    print(f"{nodes} nodes, {readings} readings; largest difference of the voltages")
-    prepared = {name: c.seconds(prepare, problem) for name, prepare in present(cells).items()}
-    tools = {name: tool for name, (_, tool) in prepared.items()}
-    first = {name: c.taken(tool, problem.sigma) for name, tool in tools.items()}
-    outputs = {name: out for name, (_, out) in first.items()}
-    found = c.require_agreement(outputs, superlu.NAME, LOOSE)
-    times = c.interleaved(tools, problem.sigma, repeats, budget)
-    return [
-        {
-            "tool": name,
-            "nodes": nodes,
-            "readings": readings,
-            "difference": found.get(name, 0.0),
-            "prepare_s": round(prepared[name][0], 3),
-            "first_call_s": round(first[name][0], 3),
-            **c.spread(times[name]),
-        }
-        for name in tools
-    ]
+    print(f"{len(problem.mesh.nodes)} nodes, {len(problem.pattern)} readings; largest difference of the voltages")
+    rows = c.measured(present(cells), problem, superlu.NAME, LOOSE, repeats, budget)
+    return [(rows, c.factorisation(problem))]
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
-    parser.add_argument("--no-memory", action="store_true", help="skip each tool's peak memory at the largest size")
-    parser.add_argument("--largest", type=int, default=c.SIZES[-1], help="most cells a side")
-    parser.add_argument("--section", default="forward", help="name of this run among the results")
-    parser.add_argument("--peak", nargs=2, metavar=("TOOL", "CELLS"), help=argparse.SUPPRESS)
-    args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
-    if args.peak:
-        c.print_peak(PREPARE[args.peak[0]], int(args.peak[1]))
-        return {}
-    sizes = c.SMOKE if args.smoke else tuple(s for s in c.SIZES if s <= args.largest)
-    data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": c.limits(), "rows": [], "work": []}
-    save = (lambda: None) if args.smoke else (lambda: c.write(args.section, c.closed(data)))
-    for cells in sizes:
-        rows = measure(cells, repeats=3 if args.smoke else 15, budget=8.0)
-        data["rows"] += rows
-        data["work"].append(c.with_limits(rows, data["limits"], c.factorisation(c.Problem(cells))))
-        save()
-    print(c.table(data["rows"]), flush=True)
-    if not (args.smoke or args.no_memory):
-        c.add_peaks(data["rows"], "bench_forward", sizes[-1])
-        save()
-    return data
+    return c.run(argv, __doc__, "forward", PREPARE, measure, repeats=15)
 
 
 if __name__ == "__main__":

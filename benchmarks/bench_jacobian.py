@@ -3,11 +3,9 @@
 python -m benchmarks.bench_jacobian [--smoke] [--no-memory]
 """
 
-import argparse
 import sys
 from typing import Any
 
-import jax
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -61,39 +59,24 @@ def present(cells: int) -> list[str]:
     return names
 
 
-def measure(cells: int, image: str, repeats: int, budget: float) -> list[dict[str, Any]]:
-    problem = c.Problem(cells)
-    nodes, readings = len(problem.mesh.nodes), len(problem.pattern)
-    names = [name for name in present(cells) if name.endswith(image)]
-    if not names:
-        return []
-    print(f"{nodes} nodes, {readings} readings, onto {image}; largest difference of the Jacobians")
-    prepared = {name: c.seconds(PREPARE[name], problem) for name in names}
-    tools = {name: tool for name, (_, tool) in prepared.items()}
-    first = {name: c.taken(tool, problem.sigma) for name, tool in tools.items()}
-    found = c.require_agreement({name: out for name, (_, out) in first.items()}, f"{adjoint.NAME}, {image}", LOOSE)
-    first_call = {name: round(taken, 3) for name, (taken, _) in first.items()}
-    del first  # the Jacobians
-    times = c.interleaved(tools, problem.sigma, repeats, budget)
-    return [
-        {
-            "tool": name,
-            "nodes": nodes,
-            "readings": readings,
-            "difference": found.get(name, 0.0),
-            "prepare_s": round(prepared[name][0], 3),
-            "first_call_s": first_call[name],
-            **c.spread(times[name]),
-        }
-        for name in names
-    ]
+def measure(cells: int, repeats: int, budget: float) -> list[tuple[list[dict[str, Any]], dict[str, Any]]]:
+    problem, names = c.Problem(cells), present(cells)
+    factor = c.factorisation(problem)
+    sizes = {"pixels": PIXELS**2, "elements": len(problem.sigma)}
+    out: list[tuple[list[dict[str, Any]], dict[str, Any]]] = []
+    for image, size in sizes.items():
+        mine = {name: PREPARE[name] for name in names if name.endswith(image)}
+        if mine:
+            print(f"{len(problem.mesh.nodes)} nodes, onto {image}; largest difference of the Jacobians")
+            rows = c.measured(mine, problem, f"{adjoint.NAME}, {image}", LOOSE, repeats, budget)
+            out.append((rows, work(problem, factor, size) | {"onto": image}))
+    return out
 
 
-def work(problem: c.Problem, coefficients: int) -> dict[str, float]:
-    """Flops and bytes beyond the factorisation: one substitution, slopes and products of 25 fields
+def work(problem: c.Problem, factor: dict[str, float], coefficients: int) -> dict[str, Any]:
+    """Flops and bytes: the factorisation, one substitution, slopes and products of 25 fields
     over every element, differences of products; fields and matrix are written once."""
     fields, elements, nodes = 25, len(problem.sigma), len(problem.mesh.nodes)
-    factor = c.factorisation(problem)
     products = elements * 2 * (2 * 3 * fields + fields * (fields + 1))
     differences = 3 * coefficients * len(problem.pattern)
     return {
@@ -103,33 +86,7 @@ def work(problem: c.Problem, coefficients: int) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
-    parser.add_argument("--no-memory", action="store_true", help="skip each tool's peak memory at the largest size")
-    parser.add_argument("--largest", type=int, default=c.SIZES[-1], help="most cells a side")
-    parser.add_argument("--section", default="jacobian", help="name of this run among the results")
-    parser.add_argument("--peak", nargs=2, metavar=("TOOL", "CELLS"), help=argparse.SUPPRESS)
-    args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
-    if args.peak:
-        c.print_peak(PREPARE[args.peak[0]], int(args.peak[1]))
-        return {}
-    sizes = c.SMOKE if args.smoke else tuple(s for s in c.SIZES if s <= args.largest)
-    data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": c.limits(), "rows": [], "work": []}
-    save = (lambda: None) if args.smoke else (lambda: c.write(args.section, c.closed(data)))
-    for cells in sizes:
-        for image in ("pixels", "elements"):
-            rows = measure(cells, image, repeats=3 if args.smoke else 9, budget=8.0)
-            data["rows"] += rows
-            problem = c.Problem(cells)
-            size = PIXELS**2 if image == "pixels" else len(problem.sigma)
-            data["work"] += [c.with_limits(rows, data["limits"], work(problem, size)) | {"onto": image}] if rows else []
-        save()
-    print(c.table(data["rows"]), flush=True)
-    if not (args.smoke or args.no_memory):
-        c.add_peaks(data["rows"], "bench_jacobian", sizes[-1])
-        save()
-    return data
+    return c.run(argv, __doc__, "jacobian", PREPARE, measure, repeats=9)
 
 
 if __name__ == "__main__":
