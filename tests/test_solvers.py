@@ -21,6 +21,7 @@ from jaxeit.solvers import (
     matvec,
     solve_spd,
 )
+from jaxeit.verbs import compiler_options
 
 SOLVERS = [
     Dense(),
@@ -78,18 +79,8 @@ def solution(solver, pattern, values, rhs):
     return np.asarray(SOLVE(solver, solver.analyse(pattern), values, jnp.asarray(rhs)))
 
 
-def _cheap_compilation():
-    """These programs run once each: what the compiler would gain it never earns back.  A compiler
-    that no longer knows these options takes longer, that is all."""
-    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-    try:
-        jax.jit(jnp.negative, compiler_options=options)(1.0)
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return options
-
-
-quick = partial(jax.jit, compiler_options=_cheap_compilation())
+# These programs run once each: what the compiler would gain it never earns back.
+quick = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0, **compiler_options()})
 SOLVE = quick(solve_spd)
 
 

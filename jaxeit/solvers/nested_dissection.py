@@ -164,14 +164,8 @@ def _square(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[
 
 def _with_entries(block: Float[Array, "m i j"], entries: Int[Array, "4 k"], values: Array) -> Float[Array, "m i j"]:
     number, *place = entries
-    added = block.at[tuple(place)].add(
-        _take(values, number), unique_indices=True, indices_are_sorted=True, mode="promise_in_bounds"
-    )
-    return added
-
-
-def _take(array: Array, places: Int[Array, "..."]) -> Array:
-    return array.at[places].get(mode="promise_in_bounds")
+    entering = values.at[number].get(mode="promise_in_bounds")
+    return block.at[tuple(place)].add(entering, unique_indices=True, indices_are_sorted=True, mode="promise_in_bounds")
 
 
 def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Float[Array, "m i j"]:
