@@ -24,8 +24,8 @@ class Level:
     | pivots: unknown at each pivot place, n where padded                  | (m, p)      |
     | up: place of each boundary unknown in the parent's front             | (m, b)      |
     | down: place of each unknown in each of 2 or 0 children's boundaries   | (m, c, p+b) |
-    | entries: number, front, row and column of each entry in the columns  | (4, k)      |
-    |   of the pivots; number nnz is the one of a padded pivot             |             |
+    | entries: number of the entry at each place in the rows of the pivots; | (m, p, p+b) |
+    |   nnz where there is none, nnz + 1 on the diagonal of padded pivots  |             |
     """
 
     pivots: np.ndarray
@@ -148,17 +148,18 @@ def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: 
 
 
 def _entries(pattern: Pattern, tree: _Tree, bounds: list[_Boundaries]) -> list[np.ndarray]:
-    """Each entry stands in the column of whichever of its unknowns is eliminated first."""
+    """Each entry stands in the row of whichever of its unknowns is eliminated first."""
     first, second = _elimination_order(pattern, tree)
     tables = []
     for level, pivots in enumerate(tree.pivots):
         mine = np.flatnonzero(tree.level[first] == level)
-        front, column = tree.index[first[mine]], tree.rank[first[mine]]
-        row = _place(tree, bounds, level, front, second[mine])
+        front, row = tree.index[first[mine]], tree.rank[first[mine]]
+        column = _place(tree, bounds, level, front, second[mine])
+        table = np.full((*pivots.shape, _front_size(tree, bounds, level)), first.size)
+        table[front, row, column] = mine
         padded, place = np.nonzero(pivots == pattern.n)
-        ones = np.stack([np.full_like(place, first.size), padded, place, place])
-        table = np.concatenate([[mine, front, row, column], ones], 1)
-        tables.append(table[:, np.lexsort(table[:0:-1])])
+        table[padded, place, place] = first.size + 1
+        tables.append(table)
     return tables
 
 

@@ -4,24 +4,27 @@ The host finds a tree of separators (George 1973, `_dissection`) and where every
 multifrontal method (Duff and Reid 1983) goes (`_fronts`).  On the device all fronts of one level
 are one batch.  With a front F over pivots 1 and boundary 2,
 
-    F11 = L L^T,    W = F21 L^-T,    update of the parent: F22 - W W^T,
+    F11 = U^T U,    W = U^-T F12,    update of the parent: F22 - W^T W,
 
-a level keeps L^-1 and H = -W L^-1, so that a sweep of a solve is two products per level:
+a level keeps U and W for the sweeps of a solve:
 
-    forward  y = L^-1 r1, update = H r1,    backward  x1 = L^-T y + H^T x2.
+    forward  y = U^-T r1, update = -W^T y,    backward  x1 = U^-1 (y - W x2).
 
 `corner`, the inverse on the unknowns of the root, needs neither sweep: the last front holds it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
-from math import prod
-from typing import NamedTuple
+from math import gcd, prod
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
 from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale
@@ -32,21 +35,28 @@ from ._fronts import Level, lay_out
 # hundredfold on a busy machine); halving moves the work into matrix products, which XLA spreads.
 _WIDEST = 72
 
+# Unknowns of a subtree whose fronts stay in a processor's cache.
+_SUBTREE = 6000
+
+# Multiplications up to which jaxlib does a stack of LAPACK calls at once.  A larger stack it spreads over
+# its threads while the caller, one of them, waits; as many such callers as threads wait for ever (0.10.2).
+_IN_PLACE = 200_000
+
 
 class LevelPlan(eqx.Module):
     """One level of m fronts with p pivots and b boundary places; see `_fronts.Level`.
 
-    The entries (number, front, row, column) are those among the pivots, and those below.
+    The entries are those among the pivots, and those beside them.
     """
 
     up: Int[Array, "m b"]
     down: Int[Array, "m c q"]
-    among: Int[Array, "4 k"]
-    below: Int[Array, "4 l"]
+    among: Int[Array, "m p p"]
+    beside: Int[Array, "m p b"]
 
     @property
     def pivots(self) -> int:
-        return self.down.shape[2] - self.up.shape[1]
+        return self.among.shape[1]
 
 
 class NestedDissectionPlan(AbstractPlan):
@@ -66,6 +76,7 @@ class NestedDissectionPlan(AbstractPlan):
     scatter: Int[Array, " n"]
     levels: tuple[LevelPlan, ...]
     n: int = eqx.field(static=True)
+    subtrees: int = eqx.field(static=True)
 
     @property
     def panel_shapes(self) -> list[tuple[int, int, int]]:
@@ -73,11 +84,14 @@ class NestedDissectionPlan(AbstractPlan):
         return [(level.down.shape[0], level.down.shape[2], level.pivots) for level in self.levels]
 
 
-class Front(NamedTuple):
-    """What a level keeps: L^-1 and H."""
+class Panel(NamedTuple):
+    """What a level keeps of up to `_WIDEST` of its pivots: U and W, of which b counts later pivots too."""
 
-    inverse: Float[Array, "m p p"]
-    below: Float[Array, "m b p"]
+    upper: Float[Array, "m p p"]
+    beside: Float[Array, "m p b"]
+
+
+Front = tuple[Panel, ...]  # the panels of a level, in the order of elimination
 
 
 class NestedDissectionFactor(eqx.Module):
@@ -106,6 +120,7 @@ class NestedDissection(AbstractLinearSolver):
             scatter=_index(scatter),
             levels=tuple(_level_plan(level) for level in levels),
             n=pattern.n,
+            subtrees=max(0, min(depth, round(np.log2(pattern.n / _SUBTREE)))),
         )
 
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
@@ -121,13 +136,13 @@ class NestedDissection(AbstractLinearSolver):
 
     def columns(self, factor: NestedDissectionFactor) -> Float[Array, "n r"]:
         plan, scale = factor.plan, factor.scale[:, None]
-        y = _root_loads(plan, factor.levels[0]) * scale[plan.root].T
-        x = _backward(factor, [y, *[None] * (len(plan.levels) - 1)])
+        ys = [y * scale[plan.root].T for y in _root_loads(plan, factor.levels[0])]
+        x = _backward(factor, [ys, *[None] * (len(plan.levels) - 1)])
         return scale * x[plan.scatter]
 
     def corner(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
         scale, scaled = jacobi_scale(plan, values)
-        y = _root_loads(plan, _eliminated(plan, scaled, keep=False)[0])[0] * scale[plan.root]
+        y = jnp.concatenate(_root_loads(plan, _eliminated(plan, scaled, keep=False)[0]), 1)[0] * scale[plan.root]
         return y.T @ y
 
 
@@ -137,35 +152,58 @@ def _index(array: np.ndarray) -> Int[Array, "..."]:
 
 def _level_plan(level: Level) -> LevelPlan:
     pivots = level.pivots.shape[1]
-    among, below = (level.entries[:, mine] for mine in (level.entries[2] < pivots, level.entries[2] >= pivots))
-    below = below - [[0], [0], [pivots], [0]]
-    return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(below))
+    among, beside = np.split(level.entries, [pivots], 2)
+    return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(beside))
 
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
     """What is kept of the fronts, from the root down; of the root only, unless ``keep``."""
-    padded = jnp.concatenate([values, jnp.ones_like(values, shape=1)])
-    update = jnp.zeros((0, 1, 1), values.dtype)
+    padded = jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
+    top = max(plan.subtrees, 1)
+    update, low = lax.platform_dependent(
+        plan.levels[top:],
+        padded,
+        cpu=partial(_in_subtrees, count=1 if keep else 1 << plan.subtrees, keep=keep),
+        default=partial(_in_subtrees, count=1, keep=keep),
+    )
+    update, middle = _swept(plan.levels[1:top], padded, update, keep)
+    _, root = _swept(plan.levels[:1], padded, update, True)
+    return root + middle + low
+
+
+def _in_subtrees(
+    levels: tuple[LevelPlan, ...], values: Array, count: int, keep: bool
+) -> tuple[Float[Array, "m b b"], tuple[Front, ...]]:
+    """`_swept` over one subtree after another, so that their fronts stay in the processor's cache."""
+    leafless = jnp.zeros((0, 1, 1), values.dtype)
+    if count == 1:
+        return _swept(levels, values, leafless, keep)
+    apart = jax.tree.map(lambda a: a.reshape(count, a.shape[0] // count, *a.shape[1:]), levels)
+    found = lax.map(lambda levels: _swept(levels, values, leafless, keep), apart)
+    return jax.tree.map(lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]), found)
+
+
+def _swept(
+    levels: tuple[LevelPlan, ...], values: Array, update: Float[Array, "mc b b"], keep: bool
+) -> tuple[Float[Array, "m b b"], tuple[Front, ...]]:
+    """Eliminate these levels, the last one first: the update of what is above, and what is kept."""
     fronts: list[Front] = []
-    for level in reversed(plan.levels):
+    for level in reversed(levels):
         pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
-        among = _with_entries(_extended(level, update, pivots, pivots), level.among, padded)
-        below = _with_entries(_extended(level, update, boundary, pivots), level.below, padded)
-        w, front = _eliminate(among, below, keep or level is plan.levels[0])
-        if front is not None:
-            fronts.append(front)
+        among = _taken(values, level.among) + _extended(level, update, pivots, pivots)
+        beside = _taken(values, level.beside) + _extended(level, update, pivots, boundary)
+        w, front = _eliminate(among, beside)
+        fronts.append(front)
         update = _extended(level, update, boundary, boundary) - _square(w, w)
-    return tuple(fronts[::-1])
+    return update, tuple(fronts[::-1]) if keep else ()
 
 
 def _square(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
     return jnp.einsum("mki,mkj->mij", left, right)
 
 
-def _with_entries(block: Float[Array, "m i j"], entries: Int[Array, "4 k"], values: Array) -> Float[Array, "m i j"]:
-    number, *place = entries
-    entering = values.at[number].get(mode="promise_in_bounds")
-    return block.at[tuple(place)].add(entering, unique_indices=True, indices_are_sorted=True, mode="promise_in_bounds")
+def _taken(values: Array, places: Int[Array, "..."]) -> Array:
+    return values.at[places].get(mode="promise_in_bounds")
 
 
 def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Float[Array, "m i j"]:
@@ -186,48 +224,85 @@ def _along(array: Array, places: Int[Array, "..."], axis: int) -> Array:
     return jnp.take_along_axis(array, places, axis, mode="promise_in_bounds")
 
 
-def _eliminate(
-    among: Float[Array, "m p p"], below: Float[Array, "m b p"], keep: bool
-) -> tuple[Float[Array, "m p b"], Front | None]:
-    """W^T of every front, and what is kept; wide fronts in two halves."""
+def _eliminate(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> tuple[Float[Array, "m p b"], Front]:
+    """W of every front, and what is to be kept; wide fronts in two halves."""
     p = among.shape[2]
     if p <= _WIDEST:
-        return _eliminate_at_once(among, below, keep)
+        panel = Panel(*_panel(among, beside))
+        return panel.beside, (panel,)
     h = (p + 1) // 2
-    w1, first = _eliminate(among[:, :h, :h], jnp.concatenate([among[:, h:, :h], below[:, :, :h]], 1), keep)
+    w1, first = _eliminate(among[:, :h, :h], jnp.concatenate([among[:, :h, h:], beside[:, :h]], 2))
     across, beyond = w1[:, :, : p - h], w1[:, :, p - h :]
-    w2, second = _eliminate(among[:, h:, h:] - _square(across, across), below[:, :, h:] - _square(beyond, across), keep)
-    w = jnp.concatenate([beyond, w2], 1)
-    return w, None if first is None or second is None else _joined(first, second)
+    w2, second = _eliminate(among[:, h:, h:] - _square(across, across), beside[:, h:] - _square(across, beyond))
+    return jnp.concatenate([beyond, w2], 1), first + second
 
 
-def _joined(first: Front, second: Front) -> Front:
-    """Both halves of a front's pivots as one."""
-    (m, h, _), size = first.inverse.shape, second.inverse.shape[1]
-    between, beyond = first.below[:, :size], first.below[:, size:]
-    corner = jnp.zeros_like(between, shape=(m, h, size))
-    inverse = _stacked([[first.inverse, corner], [second.inverse @ between, second.inverse]])
-    return Front(inverse, _stacked([[beyond + second.below @ between, second.below]]))
+def _portioned(function: Callable[..., Any]) -> Callable[..., Any]:
+    """For stacks of matrices, in portions that jaxlib does in place (`_IN_PLACE`).
+
+    The results of ``function`` take the places of its last arguments.
+    """
+
+    def in_portions(stacks, portion):
+        def step(i, stacks):
+            part = [lax.dynamic_slice_in_dim(stack, i * portion, portion) for stack in stacks]
+            done = function(*part)
+            kept, changed = stacks[: -len(done)], stacks[-len(done) :]
+            pairs = zip(changed, done, strict=True)
+            return *kept, *(lax.dynamic_update_slice_in_dim(old, new, i * portion, 0) for old, new in pairs)
+
+        return lax.fori_loop(0, stacks[0].shape[0] // portion, step, stacks)
+
+    @custom_vmap
+    def stacked(*stacks):
+        count = stacks[0].shape[0]
+        work = max(1, stacks[0].shape[1] ** 2 * max(stack.shape[2] for stack in stacks))
+        portion = gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // work))))
+        return lax.platform_dependent(
+            stacks,
+            cpu=partial(in_portions, portion=portion),
+            default=lambda stacks: in_portions(stacks, count),
+        )
+
+    @stacked.def_vmap
+    def _(size, batched, *stacks):
+        whole = [s if b else jnp.broadcast_to(s, (size, *s.shape)) for s, b in zip(stacks, batched, strict=True)]
+        out = stacked(*(s.reshape(-1, *s.shape[2:]) for s in whole))
+        apart = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), out)
+        return apart, jax.tree.map(lambda _: True, apart)
+
+    return stacked
 
 
-def _eliminate_at_once(
-    among: Float[Array, "m p p"], below: Float[Array, "m b p"], keep: bool
-) -> tuple[Float[Array, "m p b"], Front | None]:
-    """L^-1 of F12, and of the unit matrix if kept, in one call: two batched triangular solves that run at
-    once wait for each other for ever (jaxlib 0.10.2 on two cores)."""
-    p = among.shape[2]
-    lower = lax.linalg.cholesky(among, symmetrize_input=False)
-    right = jnp.swapaxes(below, 1, 2)
-    if not keep:
-        return lax.linalg.triangular_solve(lower, right, left_side=True, lower=True), None
-    eye = jnp.broadcast_to(jnp.eye(p, dtype=among.dtype), lower.shape)
-    both = lax.linalg.triangular_solve(lower, jnp.concatenate([eye, right], 2), left_side=True, lower=True)
-    inverse, w = both[:, :, :p], both[:, :, p:]
-    return w, Front(inverse, -_square(w, inverse))
+# LAPACK takes a matrix by columns, XLA by rows: what is lower to the one is upper to the other, so that
+# nothing is copied between them.  The barriers keep XLA from moving the transposition elsewhere.
 
 
-def _stacked(blocks: list[list[Array]]) -> Array:
-    return jnp.concatenate([jnp.concatenate(row, 2) for row in blocks], 1)
+@_portioned
+def _panel(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> Panel:
+    """U, and W = U^-T F12; of ``among`` the upper triangle is read."""
+    among, beside = lax.optimization_barrier((among, beside))
+    lower = lax.linalg.cholesky(_transposed(among), symmetrize_input=False)
+    w = lax.linalg.triangular_solve(lower, _transposed(beside), left_side=False, lower=True, transpose_a=True)
+    return Panel(*lax.optimization_barrier((_transposed(lower), _transposed(w))))
+
+
+@_portioned
+def _descended(upper: Float[Array, "m p p"], rhs: Float[Array, "m p k"]) -> tuple[Float[Array, "m p k"]]:
+    """U^-T r."""
+    lower, rhs = _transposed(upper), _transposed(rhs)
+    return (_transposed(lax.linalg.triangular_solve(lower, rhs, left_side=False, lower=True, transpose_a=True)),)
+
+
+@_portioned
+def _ascended(upper: Float[Array, "m p p"], rhs: Float[Array, "m p k"]) -> tuple[Float[Array, "m p k"]]:
+    """U^-1 r."""
+    lower, rhs = _transposed(upper), _transposed(rhs)
+    return (_transposed(lax.linalg.triangular_solve(lower, rhs, left_side=False, lower=True)),)
+
+
+def _transposed(array: Float[Array, "m i j"]) -> Float[Array, "m j i"]:
+    return jnp.swapaxes(array, 1, 2)
 
 
 def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
@@ -237,20 +312,32 @@ def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     return [piece.reshape(*shape, *rows.shape[1:]) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
-def _root_loads(plan: NestedDissectionPlan, front: Front) -> Float[Array, "1 p r"]:
-    """L^-1 of the unit loads on the unknowns of the root."""
-    return front.inverse[:, :, plan.scatter[plan.root]]
+def _root_loads(plan: NestedDissectionPlan, front: Front) -> list[Float[Array, "1 p r"]]:
+    """U^-T of the unit loads on the unknowns of the root, panel by panel."""
+    size = sum(panel.upper.shape[1] for panel in front) + front[-1].beside.shape[2]
+    unit = jnp.arange(size)[:, None] == plan.scatter[plan.root]
+    return _through(front, unit[None].astype(front[0].upper.dtype))[0]
 
 
-def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]) -> list[Float[Array, "m p k"]]:
-    """y = L^-1 r from the leaves up; every front hands what its boundary gained to its parent."""
-    ys: list[Float[Array, "m p k"]] = []
+def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Array, "m p k"]], Float[Array, "m b k"]]:
+    """y = U^-T r of every panel, and what is left for the boundary."""
+    ys = []
+    for panel in front:
+        p = panel.upper.shape[1]
+        _, y = _descended(panel.upper, load[:, :p])
+        load = load[:, p:] - _square(panel.beside, y)
+        ys.append(y)
+    return ys, load
+
+
+def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]) -> list[list[Float[Array, "m p k"]]]:
+    """y = U^-T r from the leaves up; every front hands what its boundary gained to its parent."""
+    ys = []
     handed = jnp.zeros_like(loads[0], shape=(0, 1, loads[0].shape[2]))
     for level, front, load in reversed(list(zip(factor.plan.levels, factor.levels, loads, strict=True))):
-        gained, p = _gained(level, handed), level.pivots
-        load = load + gained[:, :p]
-        handed = front.below @ load + gained[:, p:]
-        ys.append(front.inverse @ load)
+        padded = jnp.pad(load, [(0, 0), (0, level.up.shape[1]), (0, 0)])
+        y, handed = _through(front, padded + _gained(level, handed))
+        ys.append(y)
     return ys[::-1]
 
 
@@ -259,21 +346,24 @@ def _gained(level: LevelPlan, handed: Float[Array, "mc b k"]) -> Float[Array, "m
     return _along(by_child, level.down[..., None], 2).sum(1)
 
 
-def _backward(factor: NestedDissectionFactor, ys: Sequence[Float[Array, "m p k"] | None]) -> Float[Array, "places k"]:
-    """x = L^-T y from the root down; every front finds its boundary's x in its parent's front.
+def _backward(
+    factor: NestedDissectionFactor, ys: Sequence[list[Float[Array, "m p k"]] | None]
+) -> Float[Array, "places k"]:
+    """x = U^-1 y from the root down; every front finds its boundary's x in its parent's front.
 
     A level without load has None for y.
     """
-    columns = next(y.shape[2] for y in ys if y is not None)
-    whole = jnp.zeros_like(factor.scale, shape=(1, 1, columns))
+    columns = next(y[0].shape[2] for y in ys if y is not None)
+    x = jnp.zeros_like(factor.scale, shape=(1, 1, columns))
     xs = []
     for level, front, y in zip(factor.plan.levels, factor.levels, ys, strict=True):
-        outer = _inherited(level, whole)
-        x = jnp.einsum("mbp,mbk->mpk", front.below, outer)
-        if y is not None:
-            x = x + jnp.einsum("mqp,mqk->mpk", front.inverse, y)
-        whole = jnp.concatenate([x, outer], 1)
-        xs.append(x.reshape(prod(x.shape[:2]), x.shape[2]))
+        x = _inherited(level, x)
+        for k in reversed(range(len(front))):
+            rest = front[k].beside @ x
+            _, own = _ascended(front[k].upper, rest if y is None else rest - y[k])
+            x = jnp.concatenate([-own, x], 1)
+        own = x[:, : level.pivots]
+        xs.append(own.reshape(prod(own.shape[:2]), columns))
     return jnp.concatenate(xs)
 
 
