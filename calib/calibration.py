@@ -280,11 +280,8 @@ def _to_archive(cal: Calibration) -> tuple[dict, dict]:
     }
     recon, masks, curves = cal.recon, cal.masks, cal.curves
     arrays = {
-        "image/matrix": (recon.matrix, "S/V", "image per voltage change"),
-        "image/centres": (recon.centres, "m", "centres of the pixels"),
-        "image/areas": (recon.areas, "m2", "areas of the pixels on the sheet"),
+        **{f"image/{name}": (array, *je.NUMBERS[name][1:]) for name, array in je.to_numbers(recon).items()},
         "image/extent": (recon.extent, "m", "x0, x1, y0, y1 of the picture"),
-        "image/channels": (recon.channels, "1", "readings that are used"),
         "image/masks": (masks.weights, "1", "share of each pad in each pixel"),
     }
     for name, meaning in _CURVE_FIELDS.items():
@@ -329,14 +326,9 @@ def load_calibration(path: str | Path) -> Calibration:
 def _from_archive(archive: Archive) -> Calibration:
     attrs, arrays = archive.attrs, archive.arrays
     skin = je.parse_skin(str(attrs["skin_toml"]), "calibration: skin_toml")
-    recon = je.Reconstructor(
-        matrix=jnp.asarray(arrays["image/matrix"]),
-        centres=jnp.asarray(arrays["image/centres"]),
-        areas=jnp.asarray(arrays["image/areas"]),
-        channels=jnp.asarray(arrays["image/channels"], bool),
-        shape=(int(attrs["image_rows"]), int(attrs["image_columns"])),
-        extent=tuple(map(float, arrays["image/extent"])),  # type: ignore[arg-type]
-    )
+    numbers = {k.removeprefix("image/"): v for k, v in arrays.items() if k.startswith("image/")}
+    shape = int(attrs["image_rows"]), int(attrs["image_columns"])
+    recon = je.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])))
     provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
     curve = CURVES[provenance["curve"]]()
     if "pads/reference" in arrays:

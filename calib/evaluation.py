@@ -134,7 +134,7 @@ def evaluate_presses(
     notes: tuple[str, ...] = (),
 ) -> Evaluation:
     """Image every press and say where it is."""
-    image = recon(jnp.asarray(dv, recon.matrix.dtype))
+    image = recon(jnp.asarray(dv, recon.factor.dtype))
     (x0, y0), (x1, y1) = skin.domain.bounds
     return Evaluation(
         position=position,

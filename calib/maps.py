@@ -51,7 +51,7 @@ def force_map(calibration: Calibration, frames, pressures, *, gate: float = 0.6)
         ValueError: if the shapes do not fit the calibration.
     """
     frames, pressures = np.atleast_2d(frames), np.atleast_2d(pressures)
-    readings, pads = calibration.recon.matrix.shape[1], len(calibration.skin.pads)
+    readings, pads = calibration.recon.readings, len(calibration.skin.pads)
     if frames.shape[1] != readings or pressures.shape != (len(frames), pads):
         raise ValueError(
             f"frames {frames.shape} and pressures {pressures.shape} do not fit this calibration: "

@@ -8,12 +8,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
 
 from .discretise import Model
 
 
 class BasisError(ValueError):
     """A basis that cannot be laid over the model."""
+
+
+class Picture(eqx.Module):
+    """Where the coefficients of an image lie.
+
+    | meaning                                               | shape       | unit |
+    |-------------------------------------------------------|-------------|------|
+    | centres in the sheet's flat coordinates               | (basis, 2)  | m    |
+    | areas on the sheet; zero for a pixel that misses it   | (basis,)    | m^2  |
+    | edges: pairs of neighbours, each once                 | (edges, 2)  |      |
+    | edge_length: of the border that neighbours share      | (edges,)    | m    |
+    | shape: (rows, columns) of a picture, row 0 at low y   |             |      |
+    | extent: x0, x1, y0, y1 of that picture                |             | m    |
+    """
+
+    centres: Float[Array, "basis 2"]
+    areas: Float[Array, " basis"]
+    edges: Int[Array, "edges 2"]
+    edge_length: Float[Array, " edges"]
+    shape: tuple[int, ...] = eqx.field(static=True)
+    extent: tuple[float, float, float, float] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.areas.shape[0]
 
 
 class BasisMap(eqx.Module):
@@ -25,25 +52,39 @@ class BasisMap(eqx.Module):
     |-------------------------------------------------------|-------------|------|
     | element, weight: entries of each line; weight 0: none | (lines, c)  |      |
     | coefficient of each line                              | (lines,)    |      |
-    | centres in the sheet's flat coordinates               | (basis, 2)  | m    |
-    | areas on the sheet; zero for a pixel that misses it   | (basis,)    | m^2  |
-    | shape: (rows, columns) of a picture, row 0 at low y   |             |      |
-    | extent: x0, x1, y0, y1 of that picture                |             | m    |
+    | picture: where the coefficients lie                   |             |      |
     """
 
     element: Int[Array, "lines c"]
     weight: Float[Array, "lines c"]
     coefficient: Int[Array, " lines"]
-    centres: Float[Array, "basis 2"]
-    areas: Float[Array, " basis"]
+    picture: Picture
     elements: int = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    extent: tuple[float, float, float, float] = eqx.field(static=True)
 
     @property
     def size(self) -> int:
         """Number of coefficients."""
-        return self.areas.shape[0]
+        return self.picture.size
+
+    @property
+    def centres(self) -> Float[Array, "basis 2"]:
+        """See `Picture`."""
+        return self.picture.centres
+
+    @property
+    def areas(self) -> Float[Array, " basis"]:
+        """See `Picture`."""
+        return self.picture.areas
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """See `Picture`."""
+        return self.picture.shape
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """See `Picture`."""
+        return self.picture.extent
 
     def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
         """Values on the elements, from those of the coefficients."""
@@ -77,7 +118,10 @@ class Elements(AbstractBasis):
         every = np.arange(len(areas))
         chart = _host(model.chart)
         weight = np.ones(len(areas))
-        return _basis_map(model, (every, every, weight), _host(model.centroids), areas, (len(areas),), chart)
+        neighbours = _across_sides(_host(model.triangles), chart)
+        return _basis_map(
+            model, (every, every, weight), _host(model.centroids), areas, neighbours, (len(areas),), chart
+        )
 
 
 @dataclass(frozen=True)
@@ -119,21 +163,92 @@ class Pixels(AbstractBasis):
         x, y = np.meshgrid(np.arange(self.columns) + 0.5, np.arange(rows) + 0.5)
         centres = low + np.stack([x.ravel(), y.ravel()], 1) * pixel
         shape = (rows, self.columns)
-        return _basis_map(model, (element, number, weight), centres, areas, shape, chart)
+        neighbours = _grid_neighbours(areas.reshape(shape) > 0, pixel)
+        return _basis_map(model, (element, number, weight), centres, areas, neighbours, shape, chart)
 
 
-def _basis_map(model, entries, centres, areas, shape, chart) -> BasisMap:
-    (x0, y0), (x1, y1) = chart.min(0).tolist(), chart.max(0).tolist()
+@dataclass(frozen=True)
+class Bumps(AbstractBasis):
+    """Overlapping Gaussian bumps on a regular grid: what a round contact does to the sheet (physics of a soft tip).
+
+    The paper samples 41 x 41 of them and calls the response J: its second reading.  A coefficient is the height of its
+    bump; a bump is cut at four widths.
+
+    | meaning                                                  | default | unit |
+    |----------------------------------------------------------|---------|------|
+    | columns, rows: centres from rim to rim; rows None: square | 41      |      |
+    | width: standard deviation of a bump                      | 0.012   | m    |
+    """
+
+    columns: int = 41
+    rows: int | None = None
+    width: float = 0.012
+
+    def __post_init__(self):
+        for name, count in (("columns", self.columns), ("rows", self.rows)):
+            if count is not None and not 2 <= count <= 500:
+                raise BasisError(f"{name} is {count}; give 2 to 500 bumps")
+        if not (np.isfinite(self.width) and self.width > 0):
+            raise BasisError(f"the width is {self.width} m; give a positive number")
+
+    def on(self, model: Model) -> BasisMap:
+        chart, places = _host(model.chart), _host(model.centroids)
+        low, high = chart.min(0), chart.max(0)
+        rows = self.rows or max(2, round((self.columns - 1) * (high[1] - low[1]) / (high[0] - low[0])) + 1)
+        counts = np.array([self.columns, rows])
+        pitch = (high - low) / (counts - 1)
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(rows))
+        centres = low + np.stack([x.ravel(), y.ravel()], 1) * pitch
+        near = cKDTree(places).query_ball_point(centres, 4 * self.width)
+        number = np.repeat(np.arange(len(centres)), [len(some) for some in near])
+        element = np.concatenate([np.asarray(some, int) for some in near])
+        square = np.sum((places[element] - centres[number]) ** 2, 1)
+        weight = np.exp(-0.5 * square / self.width**2)
+        areas = np.bincount(number, weight * _host(model.areas)[element], minlength=len(centres))
+        neighbours = _grid_neighbours(areas.reshape(rows, self.columns) > 0, pitch)
+        return _basis_map(
+            model, (element, number, weight), centres, areas, neighbours, (rows, self.columns), chart, pitch / 2
+        )
+
+
+def _grid_neighbours(inside: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of pixels of the picture that share a side, both on the sheet, and the length of the side."""
+    number = np.arange(inside.size).reshape(inside.shape)
+    beside = (number[:, :-1], number[:, 1:]), (number[:-1], number[1:])
+    pairs = [np.stack([a.ravel(), b.ravel()], 1) for a, b in beside]
+    length = np.repeat(pixel[::-1], [len(some) for some in pairs])
+    edges = np.concatenate(pairs)
+    kept = inside.ravel()[edges].all(1)
+    return edges[kept], length[kept]
+
+
+def _across_sides(triangles: np.ndarray, chart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of triangles that share a side, and its length."""
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    order = np.lexsort(sides.T)
+    same = (np.diff(sides[order], axis=0) == 0).all(1)
+    first, second = order[:-1][same], order[1:][same]
+    ends = chart[sides[first]]
+    return np.stack([owner[first], owner[second]], 1), np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+
+
+def _basis_map(model, entries, centres, areas, neighbours, shape, chart, margin=(0.0, 0.0)) -> BasisMap:
+    (x0, y0), (x1, y1) = (chart.min(0) - margin).tolist(), (chart.max(0) + margin).tolist()
     element, weight, coefficient = _lines(entries, len(areas))
     return BasisMap(
         element=jnp.asarray(element, jnp.int32),
         weight=jnp.asarray(weight, model.dtype),
         coefficient=jnp.asarray(coefficient, jnp.int32),
-        centres=jnp.asarray(centres, model.dtype),
-        areas=jnp.asarray(areas, model.dtype),
+        picture=Picture(
+            centres=jnp.asarray(centres, model.dtype),
+            areas=jnp.asarray(areas, model.dtype),
+            edges=jnp.asarray(neighbours[0], jnp.int32),
+            edge_length=jnp.asarray(neighbours[1], model.dtype),
+            shape=shape,
+            extent=(x0, x1, y0, y1),
+        ),
         elements=model.areas.shape[0],
-        shape=shape,
-        extent=(x0, x1, y0, y1),
     )
 
 

@@ -1,161 +1,401 @@
 """Reconstruction: from a difference of frames to an image of the conductivity change."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
+from functools import partial
+from importlib import metadata
+from typing import overload
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_factor, cho_solve
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
+from scipy.linalg import solve_triangular as solve_lower
 
-from .basis import AbstractBasis, BasisMap, Pixels
+from .basis import AbstractBasis, BasisMap, Picture, Pixels
 from .discretise import Model
-from .jacobian import jacobian
+from .hyperparameter import AbstractHyperparameter, spectrum
+from .jacobian import pair_jacobian
+from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
 from .priors import AbstractPrior, Noser
+from .whitening import Whitened, Whitening, whitened
 
 
 class InverseError(ValueError):
     """Settings from which no reconstruction can be made."""
 
 
-class Reconstructor(eqx.Module):
-    """A linear reconstruction, ready for use without mesh or solver: ``image = Q dv``.
+class Provenance(dict[str, str]):
+    """What a reconstructor was made from.  All are equal to JAX: another date compiles nothing anew."""
 
-    | meaning                                              | shape             | unit |
-    |------------------------------------------------------|-------------------|------|
-    | matrix Q                                             | (basis, readings) | S/V  |
-    | centres in the sheet's flat coordinates              | (basis, 2)        | m    |
-    | areas of the pixels on the sheet                     | (basis,)          | m^2  |
-    | channels: readings that are used                     | (readings,)       |      |
-    | shape, extent: of the picture, as in `BasisMap`      |                   | m    |
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Provenance)
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(Provenance)
+
+
+class AbstractReconstructor(eqx.Module):
+    """Frames to images, without mesh or solver.
+
+    | meaning                                                                        | shape     | unit |
+    |--------------------------------------------------------------------------------|-----------|------|
+    | whitening: what is used of a frame                                             |           |      |
+    | predict: pair sums of the one-step image, from those of the readings           | (k, k)    | S V  |
+    | picture: where the image lies                                                  |           |      |
+    | provenance                                                                     |           |      |
     """
 
-    matrix: Float[Array, "basis readings"]
-    centres: Float[Array, "basis 2"]
-    areas: Float[Array, " basis"]
-    channels: Bool[Array, " readings"]
-    shape: tuple[int, ...] = eqx.field(static=True)
-    extent: tuple[float, float, float, float] = eqx.field(static=True)
+    whitening: eqx.AbstractVar[Whitening]
+    predict: eqx.AbstractVar[Float[Array, "k k"]]
+    picture: eqx.AbstractVar[Picture]
+    provenance: eqx.AbstractVar[Provenance]
+
+    @abstractmethod
+    def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
+        """The image, from ``P^T W dv``."""
 
     @eqx.filter_jit
     def __call__(self, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
         """The image, S, of a difference of frames, V; any leading axes are batches.
 
-        Readings that `prepare` was told to leave out are not looked at, whatever they hold.
+        Readings that `prepare` was told to leave out are not looked at, whatever they hold.  Any other that is not
+        finite is replaced by what the one-step image of the other readings predicts for it, at the cost of one small
+        solve: the image of `OneStep` is exactly that of a reconstructor which never had the reading (prior and
+        strength as they were).
         """
-        dv = jnp.where(self.channels, jnp.asarray(dv, self.matrix.dtype), 0)
-        return dv @ self.matrix.T
+        dv = jnp.asarray(dv, self.predict.dtype)
+        if dv.shape[-1:] != self.whitening.channels.shape:
+            raise InverseError(f"dv has shape {dv.shape}; its last axis must hold {self.readings} readings")
+        finite = jnp.all(jnp.isfinite(dv) | ~self.whitening.channels)
+        frames = dv.reshape(-1, dv.shape[-1])
+        sums = jax.lax.cond(
+            finite,
+            lambda frames: self.whitening.sums(frames),
+            lambda frames: jax.lax.map(lambda dv: self._mended(dv), frames),
+            frames,
+        )
+        return self._image(sums.reshape(*dv.shape[:-1], sums.shape[-1]))
+
+    def _mended(self, dv: Float[Array, " readings"]) -> Float[Array, " k"]:
+        """Sums that give the image of the readings at hand: the others are what that image predicts for them."""
+        lost = self.whitening.lost(dv)
+        return jnp.linalg.solve(jnp.eye(len(lost.sums), dtype=dv.dtype) - lost.gram @ self.predict, lost.sums)
+
+    @property
+    def readings(self) -> int:
+        """Number of readings of a frame."""
+        return self.whitening.channels.shape[0]
+
+    @property
+    def channels(self) -> Bool[Array, " readings"]:
+        """Readings that are used."""
+        return self.whitening.channels
+
+    @property
+    def centres(self) -> Float[Array, "basis 2"]:
+        """See `Picture`."""
+        return self.picture.centres
+
+    @property
+    def areas(self) -> Float[Array, " basis"]:
+        """See `Picture`."""
+        return self.picture.areas
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """See `Picture`."""
+        return self.picture.shape
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """See `Picture`."""
+        return self.picture.extent
 
 
-class AbstractMethod(eqx.Module):
-    """How data and prior are weighed against each other."""
+class Reconstructor(AbstractReconstructor):
+    """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `whitening`).
 
-    @abstractmethod
-    def matrix(
-        self,
-        jacobian: Float[Array, "readings basis"],
-        prior: Float[Array, " basis"],
-        hyperparameter: Float[Array, ""],
-    ) -> Float[Array, "basis readings"]:
-        """Q for whitened readings."""
-
-
-class OneStep(AbstractMethod):
-    """One regularised Gauss-Newton step, ``Q = (J^T J + l^2 R)^-1 J^T``  (the paper's equation 2).
-
-    Solved by Cholesky in the smaller of the two spaces; with R diagonal they agree to rounding:
-    ``Q = R^-1 J^T (J R^-1 J^T + l^2 I)^-1``.  The scale ``l^2 = hyperparameter^2 tr(J R^-1 J^T) / m``
-    makes the hyperparameter a number without unit that means the same on every skin.
+    | meaning                                                                          | shape      | unit |
+    |----------------------------------------------------------------------------------|------------|------|
+    | factor: image per pair sum                                                       | (basis, k) | S V  |
+    | variance left to each coefficient by readings and prior; infinite where not known | (basis,)  | S^2  |
+    | the rest: `AbstractReconstructor`                                                |            |      |
     """
 
-    def matrix(self, jacobian, prior, hyperparameter):
-        root = jnp.sqrt(prior)
-        b = jacobian / root  # J R^-1/2
-        readings, basis = b.shape
-        square = hyperparameter**2 * jnp.sum(b**2) / readings
-        if readings <= basis:
-            small = b @ b.T + square * jnp.eye(readings, dtype=b.dtype)
-            return (b.T / root[:, None]) @ cho_solve(cho_factor(small), jnp.eye(readings, dtype=b.dtype))
-        small = b.T @ b + square * jnp.eye(basis, dtype=b.dtype)
-        return cho_solve(cho_factor(small), b.T) / root[:, None]
+    factor: Float[Array, "basis k"]
+    variance: Float[Array, " basis"]
+    predict: Float[Array, "k k"]
+    whitening: Whitening
+    picture: Picture
+    provenance: Provenance = eqx.field(static=True)
+
+    def _image(self, sums):
+        return sums @ self.factor.T
+
+    @property
+    def matrix(self) -> Float[Array, "basis readings"]:
+        """Q as one matrix, S/V; applying a reconstruction does not need it."""
+        return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
+
+    def astype(self, dtype: str) -> "Reconstructor":
+        """The same in another precision: built in float64, a matrix may be applied in float32."""
+        return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
+
+    def without(self, channels: Bool[Array, " readings"]) -> "Reconstructor":
+        """The reconstruction that never had these readings, (readings,) true to leave out, by an update of its rank.
+
+        Prior and strength stay as they were.
+
+        Raises:
+            InverseError: if the shape does not fit, or no reading would be left.
+        """
+        used = np.asarray(self.channels) & ~_flags(channels, self.readings)
+        return _without(self, jnp.asarray(_some(used)))
+
+
+@eqx.filter_jit
+def _without(recon: Reconstructor, used: Bool[Array, " readings"]) -> Reconstructor:
+    found, gram = recon.whitening.without(used)
+    mend = jnp.eye(len(gram), dtype=gram.dtype) - gram @ recon.predict
+    factor, predict = (jnp.linalg.solve(mend.T, m.T).T for m in (recon.factor, recon.predict))
+    return Reconstructor(
+        factor=factor,
+        variance=recon.variance + jnp.sum((factor @ gram) * recon.factor, 1),
+        predict=predict,
+        whitening=found,
+        picture=recon.picture,
+        provenance=recon.provenance,
+    )
+
+
+class IterativeReconstructor(AbstractReconstructor):
+    """A method that works on each frame anew.
+
+    | meaning                                     | shape  | unit |
+    |---------------------------------------------|--------|------|
+    | compress: whitened readings, from the sums  | (r, k) | ohm  |
+    | problem, method                             |        |      |
+    | the rest: `AbstractReconstructor`           |        |      |
+    """
+
+    compress: Float[Array, "r k"]
+    problem: Problem
+    method: AbstractIterativeMethod
+    predict: Float[Array, "k k"]
+    whitening: Whitening
+    picture: Picture
+    provenance: Provenance = eqx.field(static=True)
+
+    def _image(self, sums):
+        frames = (sums @ self.compress.T).reshape(-1, sums.shape[-1])
+        images = jax.lax.map(lambda y: self.method.image(self.problem, y), frames)
+        return images.reshape(*sums.shape[:-1], images.shape[-1])
+
+
+@overload
+def prepare(
+    model: Model,
+    prior: AbstractPrior | None = None,
+    method: AbstractLinearMethod | None = None,
+    basis: AbstractBasis | BasisMap | None = None,
+    noise: Float[ArrayLike, "..."] | None = None,
+    hyperparameter: float | AbstractHyperparameter = 0.1,
+    *,
+    sigma: Float[Array, " elements"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> Reconstructor: ...
+
+
+@overload
+def prepare(
+    model: Model,
+    prior: AbstractPrior | None,
+    method: AbstractIterativeMethod,
+    basis: AbstractBasis | BasisMap | None = None,
+    noise: Float[ArrayLike, "..."] | None = None,
+    hyperparameter: float | AbstractHyperparameter = 0.1,
+    *,
+    sigma: Float[Array, " elements"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> IterativeReconstructor: ...
 
 
 def prepare(
     model: Model,
     prior: AbstractPrior | None = None,
-    method: AbstractMethod | None = None,
+    method: AbstractLinearMethod | AbstractIterativeMethod | None = None,
     basis: AbstractBasis | BasisMap | None = None,
-    noise: Float[Array, " readings"] | None = None,
-    hyperparameter: float = 0.1,
+    noise: Float[ArrayLike, "..."] | None = None,
+    hyperparameter: float | AbstractHyperparameter = 0.1,
     *,
     sigma: Float[Array, " elements"] | None = None,
-    channels: Bool[Array, " readings"] | None = None,
-) -> Reconstructor:
+    channels: Bool[ArrayLike, " readings"] | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> Reconstructor | IterativeReconstructor:
     """Everything that does not depend on the frame, done once.
 
     Args:
         prior: default `Noser`.
-        method: default `OneStep`.
+        method: default `OneStep`.  A linear method gives a `Reconstructor`, another an `IterativeReconstructor`.
         basis: default `Pixels`, 40 along x.
-        noise: standard deviation of each reading, (readings,) V; default: the same for all.
-        hyperparameter: weight of the prior, without unit; 0.1 suits a signal-to-noise ratio of
-            60 dB and 0.3 to 1 one of 40 dB.
+        noise: standard deviation of each reading, (readings,) V, or their covariance, (readings, readings) V^2, as
+            measured without contact; default: the same for all, of unknown size.
+        hyperparameter: weight of the prior, without unit (see `methods`); 0.1 suits a signal-to-noise ratio of
+            60 dB and 0.3 to 1 one of 40 dB.  Or a way to choose it (see `hyperparameter`).
         sigma: conductivity to linearise at, (elements,) S; default: the untouched sheet.
         channels: readings to use; a dead one is left out, never taken for zero.
+        provenance: what to write down beside the numbers.
 
     Raises:
         InverseError: if a value is out of range or no channel is left, or the result is not finite.
     """
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
+    method, prior = method or OneStep(), prior or Noser()
     readings = model.pattern.shape[0]
-    used = _channels(channels, readings)
-    std = _noise(noise, readings, used)
-    if not (np.isfinite(hyperparameter) and hyperparameter > 0):
-        raise InverseError(f"the hyperparameter is {hyperparameter}; give a number above zero")
-    j = jacobian(model, sigma, image)
-    matrix = _build(
-        j,
-        image.areas,
-        jnp.asarray(np.where(used, 1 / std, 0.0), model.dtype),
-        jnp.asarray(hyperparameter, model.dtype),
-        Noser() if prior is None else prior,
-        OneStep() if method is None else method,
+    used = _some(np.ones(readings, bool) if channels is None else _flags(channels, readings))
+    weight = _weight(noise, readings, used)
+    found = whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
+    slopes = pair_jacobian(model, sigma, image, jnp.asarray(found.electrodes))
+    factor, compress = (jnp.asarray(array, model.dtype) for array in (found.factor, found.compress))
+    problem = Problem(
+        jacobian=factor @ slopes,
+        readings=jnp.asarray(used.sum(), model.dtype),
+        hyperparameter=jnp.asarray(jnp.nan, model.dtype),
+        prior=prior,
+        picture=image.picture,
     )
-    if not bool(jnp.isfinite(matrix).all()):
+    chosen = _chosen(hyperparameter, problem, found, noise is not None)
+    problem = eqx.tree_at(lambda p: p.hyperparameter, problem, jnp.asarray(chosen, model.dtype))
+    settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
+    about = Provenance({"jaxeit": metadata.version("jaxeit"), **settings, **(provenance or {})})
+    linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
+    recon = _build(problem, linear, compress, slopes, found.whitening, about)
+    if not bool(jnp.isfinite(recon.factor).all()):
         raise InverseError(
             "the reconstruction matrix is not finite: the conductivity must be positive, and in "
             "float32 the hyperparameter not below 1e-3"
         )
-    return Reconstructor(matrix, image.centres, image.areas, jnp.asarray(used), image.shape, image.extent)
+    if isinstance(method, AbstractIterativeMethod):
+        return IterativeReconstructor(
+            compress=compress,
+            problem=problem,
+            method=method,
+            predict=recon.predict,
+            whitening=recon.whitening,
+            picture=recon.picture,
+            provenance=about,
+        )
+    return recon if noise is not None else eqx.tree_at(lambda r: r.variance, recon, recon.variance + jnp.inf)
 
 
 @eqx.filter_jit
-def _build(j, areas, whitening, hyperparameter, prior, method):
-    scale = jnp.max(whitening)  # keeps the numbers near those of the Jacobian
-    weight = whitening / scale
-    white = weight[:, None] * j
-    return method.matrix(white, prior.diagonal(white, areas), hyperparameter) * weight
+def _build(problem, method, compress, slopes, found, about) -> Reconstructor:
+    q = method.matrix(problem)
+    return Reconstructor(
+        factor=q @ compress,
+        variance=method.variance(problem, q),
+        predict=slopes @ (OneStep().matrix(problem) @ compress),
+        whitening=found,
+        picture=problem.picture,
+        provenance=about,
+    )
 
 
-def _channels(channels, readings: int) -> np.ndarray:
-    used = np.ones(readings, bool) if channels is None else np.asarray(channels, bool)
-    if used.shape != (readings,):
-        raise InverseError(f"channels has shape {used.shape}; this model has {readings} readings")
+def _chosen(hyperparameter, problem: Problem, found: Whitened, noise_is_known: bool) -> float:
+    if isinstance(hyperparameter, AbstractHyperparameter):
+        if hyperparameter.needs_noise and not noise_is_known:
+            raise InverseError(f"{type(hyperparameter).__name__} compares with the noise; give prepare(..., noise=...)")
+        return hyperparameter.choose(spectrum(problem), partial(_whiten, found, problem.jacobian.dtype))
+    if not (np.isfinite(hyperparameter) and hyperparameter > 0):
+        raise InverseError(f"the hyperparameter is {hyperparameter}; give a number above zero")
+    return float(hyperparameter)
+
+
+def _whiten(found: Whitened, dtype: np.dtype, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... r"]:
+    return found.whitening.sums(jnp.asarray(dv, dtype)) @ jnp.asarray(found.compress, dtype).T
+
+
+def _flags(channels, readings: int) -> np.ndarray:
+    flags = np.asarray(channels, bool)
+    if flags.shape != (readings,):
+        raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
+    return flags
+
+
+def _some(used: np.ndarray) -> np.ndarray:
     if not used.any():
         raise InverseError("every channel is left out: there is nothing to reconstruct from")
     return used
 
 
-def _noise(noise, readings: int, channels: np.ndarray) -> np.ndarray:
+def _weight(noise, readings: int, channels: np.ndarray) -> np.ndarray:
+    """Inverse of the noise on the channels that are used, zero elsewhere: variances or a covariance."""
     if noise is None:
-        return np.ones(readings)
-    std = np.array(noise, float)
-    if std.shape != (readings,):
-        raise InverseError(f"noise has shape {std.shape}; this model has {readings} readings")
-    bad = channels & ~(np.isfinite(std) & (std > 0))
+        return channels.astype(float)
+    noise = np.asarray(noise, float)
+    if noise.shape not in ((readings,), (readings, readings)):
+        raise InverseError(f"noise has shape {noise.shape}; this model has {readings} readings")
+    if noise.ndim == 2:
+        return _inverse_covariance(noise, channels)
+    bad = channels & ~(np.isfinite(noise) & (noise > 0))
     if bad.any():
         raise InverseError(
-            f"the noise of reading {int(np.argmax(bad))} is {std[bad][0]} V; give a positive "
+            f"the noise of reading {int(np.argmax(bad))} is {noise[bad][0]} V; give a positive "
             "number, or leave the channel out with channels=..."
         )
-    return np.where(channels, std, 1.0)
+    return np.where(channels, np.where(channels, noise, 1.0) ** -2.0, 0.0)
+
+
+def _inverse_covariance(noise: np.ndarray, channels: np.ndarray) -> np.ndarray:
+    used = np.flatnonzero(channels)
+    part = noise[np.ix_(used, used)]
+    try:
+        lower = np.linalg.cholesky(part)
+    except np.linalg.LinAlgError:
+        lower = np.full_like(part, np.nan)
+    weight = np.zeros_like(noise)
+    half = solve_lower(lower, np.eye(len(used)), lower=True, check_finite=False)
+    weight[np.ix_(used, used)] = half.T @ half
+    if not np.isfinite(weight).all() or not np.allclose(part, part.T, rtol=1e-6, atol=0):
+        raise InverseError(
+            "the covariance of the noise is not symmetric positive definite; a recording of fewer frames than readings "
+            "gives such a one: give standard deviations instead, or shrink it towards its diagonal "
+            "(jaxeit.noise_covariance does)"
+        )
+    return weight
+
+
+def noise_covariance(blank: Float[ArrayLike, "frames readings"]) -> np.ndarray:
+    """Covariance of the readings of a blank recording, shrunk towards its diagonal so that it can be inverted.
+
+    The weight of the diagonal is that of Schaefer and Strimmer (2005): the variance of the off-diagonal entries, as
+    the frames tell it, over their squares; 1 where the frames tell of no correlation.
+
+    Args:
+        blank: readings without contact, (frames, readings) V; at least four frames, finite.
+
+    Returns:
+        (readings, readings) V^2.
+
+    Raises:
+        InverseError: for fewer frames, or readings that are not finite or do not change at all.
+    """
+    blank = np.asarray(blank, float)
+    if blank.ndim != 2 or len(blank) < 4 or not np.isfinite(blank).all():
+        raise InverseError(f"the blank recording has shape {blank.shape}; give four or more frames of finite readings")
+    n, centred = len(blank), blank - blank.mean(0)
+    std = centred.std(0, ddof=1)
+    if (std == 0).any():
+        raise InverseError(f"reading {int(np.argmax(std == 0))} does not change at all; leave it out as a dead channel")
+    z = centred / std
+    mean = z.T @ z / n
+    spread = (z**2).T @ z**2 / n - mean**2
+    off = ~np.eye(len(std), dtype=bool)
+    correlation = mean * n / (n - 1)
+    shrink = np.clip(spread[off].sum() * n / (n - 1) ** 3 * n / max((correlation[off] ** 2).sum(), 1e-300), 0, 1)
+    return np.where(off, (1 - shrink) * correlation, 1.0) * np.outer(std, std)

@@ -10,7 +10,7 @@ a time: nothing of the size elements times readings exists unless it is asked fo
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .basis import AbstractBasis, BasisMap, Elements
 from .discretise import Model
@@ -44,18 +44,33 @@ def jacobian(
 
 @verb
 def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap) -> Float[Array, "readings basis"]:
-    theta = coefficients(model, sigma)
     first, second = np.triu_indices(model.electrodes)
-    slopes = -_products(model, fields(model, theta).potential, image)
-    slopes = slopes.at[:, np.flatnonzero(first == second)].add(_series_slopes(model, theta, image).T)
     # dZ is symmetric: `pair` finds an unordered pair of electrodes among the columns.
     number = np.zeros((model.electrodes, model.electrodes), np.int32)
     number[first, second] = number[second, first] = np.arange(len(first))
     pair = jnp.asarray(number)
-    by_pair = jax.lax.optimization_barrier(slopes.T)
+    by_pair = jax.lax.optimization_barrier(_pair_slopes(model, sigma, image).T)
     source, sink, plus, minus = model.pattern.T
     out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
     return model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])
+
+
+@verb
+def pair_jacobian(
+    model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap, electrodes: Int[Array, "k 2"]
+) -> Float[Array, "k basis"]:
+    """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S; see `whitening`."""
+    small, large = electrodes[:, 0], electrodes[:, 1]
+    column = small * model.electrodes - small * (small + 1) // 2 + large
+    return _pair_slopes(model, sigma, image).T[column]
+
+
+def _pair_slopes(model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap) -> Float[Array, "basis pairs"]:
+    """dZ for the pairs (a, b), a <= b, row by row."""
+    theta = coefficients(model, sigma)
+    first, second = np.triu_indices(model.electrodes)
+    slopes = -_products(model, fields(model, theta).potential, image)
+    return slopes.at[:, np.flatnonzero(first == second)].add(_series_slopes(model, theta, image).T)
 
 
 def _products(model: Model, potential: Float[Array, "n electrodes"], image: BasisMap) -> Float[Array, "basis pairs"]:

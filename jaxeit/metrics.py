@@ -1,20 +1,45 @@
-"""Figures of merit: where a contact is said to be, and how even the sensitivity is."""
+"""Figures of merit: where a contact is said to be, how true its image is, and how even the sensitivity is."""
 
 from abc import abstractmethod
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .inverse import Reconstructor
+from .verbs import verb
+
+
+class MetricError(ValueError):
+    """Images that cannot be compared, or a setting without meaning."""
+
+
+class Pictured(Protocol):
+    """Whatever says where the pixels of an image lie: a reconstructor, a basis map or a picture.
+
+    | meaning                                              | shape       | unit |
+    |------------------------------------------------------|-------------|------|
+    | centres in the sheet's flat coordinates              | (pixels, 2) | m    |
+    | areas on the sheet; zero for a pixel that misses it  | (pixels,)   | m^2  |
+    | shape: (rows, columns) of a picture                  |             |      |
+    """
+
+    @property
+    def centres(self) -> Float[Array, "pixels 2"]: ...
+
+    @property
+    def areas(self) -> Float[Array, " pixels"]: ...
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
 
 
 class AbstractEstimator(eqx.Module):
     """Where an image says that the contact is."""
 
     @abstractmethod
-    def __call__(self, image: Float[Array, "... pixels"], recon: Reconstructor) -> Float[Array, "... 2"]:
+    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         """Position, (..., 2) m; NaN where the image is nowhere positive."""
 
 
@@ -63,7 +88,13 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
 
 def localisation_error(estimated: Float[ArrayLike, "... 2"], true: Float[ArrayLike, "... 2"]) -> Float[Array, "..."]:
     """Distance between estimated and true positions, m."""
-    return jnp.linalg.norm(jnp.asarray(estimated) - jnp.asarray(true), axis=-1)
+    return _length(jnp.asarray(estimated) - jnp.asarray(true))
+
+
+def _length(vector):
+    """Euclidean, with a gradient of zero (not NaN) at zero."""
+    square = jnp.sum(vector**2, -1)
+    return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
 
 
 def inward_bias(
@@ -85,3 +116,272 @@ def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) ->
     """Standard deviation over mean along the last axis; ``ddof`` is 0 or 1, and must be said."""
     values = jnp.asarray(values)
     return jnp.std(values, -1, ddof=ddof) / jnp.mean(values, -1)
+
+
+# --- GREIT figures of merit ------------------------------------------------------------------------------------------
+
+
+class GreitFigures(eqx.Module):
+    """Figures of merit of the image of a single small contact; see `greit_figures`.
+
+    | meaning                                                        | shape | unit  | best  |
+    |----------------------------------------------------------------|-------|-------|-------|
+    | amplitude AR: integral of the image                            | (...) | S m^2 | even  |
+    | position_error PE: inward shift, negative if outward           | (...) | m     | 0     |
+    | resolution RES: root of the share of the sheet that lights up  | (...) |       | small |
+    | shape_deformation SD: share of it outside its circle           | (...) |       | 0     |
+    | ringing RNG: negative part over the sum of what lights up      | (...) |       | 0     |
+    """
+
+    amplitude: Float[Array, "..."]
+    position_error: Float[Array, "..."]
+    resolution: Float[Array, "..."]
+    shape_deformation: Float[Array, "..."]
+    ringing: Float[Array, "..."]
+
+
+def greit_figures(
+    image: Float[ArrayLike, "... pixels"],
+    recon: Pictured,
+    target: Float[ArrayLike, "... 2"],
+    centre: Float[ArrayLike, "2"],
+) -> GreitFigures:
+    """The GREIT figures of merit, with every sum over pixels weighted by their areas A on the sheet.
+
+    With q = {pixels of at least a quarter of the largest value x}, r_q the centroid of q (each
+    pixel by its area, whatever its value), and C the circle about r_q that has the area of q:
+
+        AR  = sum(A x)                                  RES = sqrt(A_q / A_sheet)
+        PE  = |target - centre| - |r_q - centre|        SD  = A_(q outside C) / A_q
+        RNG = -sum(A x over negative x) / sum(A x over q)
+
+    A pixel is in C if its centre is. These are the definitions of EIDORS
+    (``eval_GREIT_fig_merit``), with the origin at ``centre``; there AR is divided by its mean over
+    targets near the centre when there are more than ten images, here that is left to the caller.
+    The text of the paper sums the ringing outside and inside C in place of q.
+
+    PE is radial: an error along the circle about ``centre`` does not show. `localisation_error`
+    has all of it. Negative contacts are seen after a change of the image's sign.
+
+    Args:
+        image: (..., pixels) S; pixels that miss the sheet are not looked at.
+        recon: whose centres and areas the image has.
+        target: true position, (..., 2) m.
+        centre: of the sheet, (2,) m.
+
+    Returns:
+        Everything but the amplitude is NaN where the image is nowhere positive, and only there.
+
+    Source: Adler et al. 2009, Physiol. Meas. 30 S35, section 2.2.
+    """
+    dtype = recon.areas.dtype
+    where = jnp.asarray(target, dtype), jnp.asarray(centre, dtype)
+    return _greit_figures(jnp.asarray(image), recon.centres, recon.areas, *where)
+
+
+@verb
+def _greit_figures(image, centres, areas, target, centre):
+    image = jnp.where(areas > 0, image, 0)
+    top = jnp.max(image, -1, keepdims=True)
+    seen = top[..., 0] > 0
+    lit = jnp.where(image >= top / 4, areas, 0)
+    area = jnp.where(seen, lit.sum(-1), 1)
+    middle = lit @ centres / area[..., None]
+    outside = jnp.sum((centres - middle[..., None, :]) ** 2, -1) >= area[..., None] / jnp.pi
+    negative = jnp.minimum(image, 0) @ areas
+    positive = jnp.where(seen, jnp.sum(lit * image, -1), 1)
+    return GreitFigures(
+        amplitude=image @ areas,
+        position_error=jnp.where(seen, inward_bias(middle, target, centre), jnp.nan),
+        resolution=jnp.where(seen, jnp.sqrt(area / areas.sum()), jnp.nan),
+        shape_deformation=jnp.where(seen, jnp.sum(lit * outside, -1) / area, jnp.nan),
+        ringing=jnp.where(seen, -negative / positive, jnp.nan),
+    )
+
+
+# --- likeness of two images ------------------------------------------------------------------------------------------
+
+
+def image_correlation(
+    image: Float[ArrayLike, "... pixels"], truth: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " pixels"]
+) -> Float[Array, "..."]:
+    """Pearson's correlation of two images over the sheet, each pixel weighted by its area; -1 to 1.
+
+    0 where either image is constant: it then says nothing about the other, and a mean over many
+    frames stays finite. Pixels without area are not looked at.
+    """
+    return _image_correlation(jnp.asarray(image), jnp.asarray(truth), jnp.asarray(areas))
+
+
+@verb
+def _image_correlation(image, truth, areas):
+    weight = areas / areas.sum()
+    a, b = _contrast(image, weight), _contrast(truth, weight)
+    square = jnp.sum(weight * a**2, -1) * jnp.sum(weight * b**2, -1)
+    known = square > 0
+    return jnp.where(known, jnp.sum(weight * a * b, -1) / jnp.sqrt(jnp.where(known, square, 1)), 0)
+
+
+def _contrast(image, weight):
+    """The image less its mean, in units of its span; exactly zero for a constant one."""
+    there = jnp.argmax(weight)
+    rise = jnp.where(weight > 0, image - image[..., there, None], 0)
+    span = jnp.max(jnp.abs(rise), -1, keepdims=True)
+    rise = rise / jnp.where(span > 0, span, 1)
+    return rise - jnp.sum(weight * rise, -1, keepdims=True)
+
+
+def structural_similarity(
+    image: Float[ArrayLike, "... rows columns"],
+    truth: Float[ArrayLike, "... rows columns"],
+    *,
+    width: float = 80.0,
+    c1: float = 1e-4,
+    c2: float = 9e-4,
+) -> Float[Array, "..."]:
+    """Mean structural similarity (SSIM) of two pictures, as the Kuopio Tomography Challenge 2023 computes it.
+
+        SSIM = (2 m_a m_b + c1) (2 s_ab + c2) / ((m_a^2 + m_b^2 + c1) (s_aa + s_bb + c2)),
+
+    with m and s the local means and (co)variances, s_ab = mean(a b) - m_a m_b, under a Gaussian
+    window, and the mean taken over all pixels. The window is cut to the square of ceil(2 ``width``)
+    pixels to each side; at the rim the part of it that lies on the picture is scaled up to a sum
+    of one (neither zeros nor reflections are assumed beyond the rim). 1 for equal pictures.
+
+    Args:
+        image, truth: (..., rows, columns), of a range of about one, such as 0 and 1.
+        width: standard deviation of the window, pixels.
+        c1, c2: keep the quotient steady where both pictures are empty, or flat.
+
+    Raises:
+        MetricError: if the shapes differ, there is no picture, or a setting is not above zero.
+    """
+    a, b = _pictures(image, truth)
+    if not (width > 0 and c1 > 0 and c2 > 0):
+        raise MetricError(f"width, c1 and c2 are {width}, {c1} and {c2}; give numbers above zero")
+    return _structural_similarity(a, b, *(jnp.asarray(number, a.dtype) for number in (width, c1, c2)))
+
+
+@verb
+def _structural_similarity(a, b, width, c1, c2):
+    rows, columns = (_window(size, width) for size in a.shape[-2:])
+
+    def mean(picture):
+        return rows @ picture @ columns.T  # the window is a product of one along each side, rim included
+
+    m_a, m_b = mean(a), mean(b)
+    s_aa, s_bb, s_ab = mean(a * a) - m_a**2, mean(b * b) - m_b**2, mean(a * b) - m_a * m_b
+    like = (2 * m_a * m_b + c1) * (2 * s_ab + c2) / ((m_a**2 + m_b**2 + c1) * (s_aa + s_bb + c2))
+    return jnp.mean(like, (-2, -1))
+
+
+def _window(size, width):
+    """Weights of the local mean along one side, (size, size); every row sums to one."""
+    apart = jnp.arange(size)[:, None] - jnp.arange(size)
+    weight = jnp.where(jnp.abs(apart) <= jnp.ceil(2 * width), jnp.exp(-0.5 * (apart / width) ** 2), 0)
+    return weight / weight.sum(1, keepdims=True)
+
+
+def ktc_score(
+    labels: Int[ArrayLike, "... rows columns"], truth: Int[ArrayLike, "... rows columns"]
+) -> Float[Array, "..."]:
+    """Score of a segmented picture in the Kuopio Tomography Challenge 2023 (Räsänen et al.); 1 is best.
+
+    The mean of the `structural_similarity` of two masks: where the pictures say 1 (resistive) and
+    where they say 2 (conductive); anything else is water. A class that is in neither picture
+    counts as found. The challenge's pictures are 256 x 256, and its window of 80 pixels is for
+    that size.
+
+    Raises:
+        MetricError: if the shapes differ or there is no picture.
+    """
+    a, b = _pictures(labels, truth)
+    return (structural_similarity(a == 1, b == 1) + structural_similarity(a == 2, b == 2)) / 2
+
+
+def _pictures(image, truth):
+    image, truth = jnp.asarray(image), jnp.asarray(truth)
+    if image.shape != truth.shape or image.ndim < 2 or not image.size:
+        raise MetricError(
+            f"pictures of shapes {image.shape} and {truth.shape}; give two of one shape (..., rows, columns)"
+        )
+    dtype = jnp.result_type(image, truth, float)
+    return image.astype(dtype), truth.astype(dtype)
+
+
+# --- segmentation ----------------------------------------------------------------------------------------------------
+
+
+def otsu_thresholds(
+    values: Float[ArrayLike, "..."],
+    classes: int = 3,
+    *,
+    bins: int = 256,
+    weights: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, " classes-1"]:
+    """Thresholds that part the values into classes of the largest variance between them (Otsu 1979).
+
+    Exact for the histogram of ``bins`` equal bins from the least value to the largest: every choice
+    of bin edges is looked at, by dynamic programming. Of edges that part the values alike, the
+    threshold is the middle. Class numbers are ``jnp.searchsorted(thresholds, values, side="right")``.
+    If the values fill fewer bins than there are classes, some class is empty; all thresholds of
+    values that are all the same are that value.
+
+    Args:
+        values: of any shape; those that are not finite are left out.
+        classes: 2 or more.
+        weights: of each value, such as the area of its pixel; default: the same for all.
+
+    Returns:
+        Ascending, in the unit of the values; NaN if no value is finite and has weight.
+
+    Raises:
+        MetricError: if there are fewer than two classes, fewer bins than classes, no values, or
+            weights of another shape.
+    """
+    values = jnp.asarray(values)
+    weights = jnp.ones(values.shape) if weights is None else jnp.asarray(weights)
+    if not 2 <= classes <= bins:
+        raise MetricError(f"{classes} classes from {bins} bins; give at least 2, and no more than there are bins")
+    if weights.shape != values.shape or not values.size:
+        raise MetricError(f"values of shape {values.shape} with weights of shape {weights.shape}; give one for each")
+    dtype = jnp.result_type(values, float)
+    return _otsu_thresholds(values.ravel().astype(dtype), weights.ravel().astype(dtype), classes, bins)
+
+
+@verb
+def _otsu_thresholds(values, weights, classes, bins):
+    edges, count = _histogram(values, jnp.where(jnp.isfinite(values), weights, 0), bins)
+    mass, moment = _sums(count), _sums(count * jnp.linspace(-1, 1, bins, dtype=count.dtype))
+    inside, first = mass - mass[:, None], moment - moment[:, None]  # of the class from edge i to edge j
+    gain = jnp.where(inside > 0, first**2 / jnp.where(inside > 0, inside, 1), 0)
+    cuts = _best_cuts(jnp.where(jnp.tri(bins + 1, k=-1, dtype=bool), -jnp.inf, gain), classes)
+    filled = _sums(count > 0)  # bins with something in them below each edge
+    alike = filled == filled[cuts][:, None]
+    return jnp.sum(alike * edges, 1) / jnp.sum(alike, 1)
+
+
+def _histogram(values, weights, bins):
+    low = jnp.min(jnp.where(weights > 0, values, jnp.inf))
+    high = jnp.max(jnp.where(weights > 0, values, -jnp.inf))
+    part = jnp.where(weights > 0, values - low, 0) / jnp.where(high > low, high - low, 1)
+    place = jnp.clip((part * bins).astype(int), 0, bins - 1)
+    edges = low + (high - low) * jnp.linspace(0, 1, bins + 1, dtype=values.dtype)
+    return edges, jnp.zeros(bins, weights.dtype).at[place].add(weights)
+
+
+def _sums(values):
+    """Sums of all values before each edge, (bins + 1,)."""
+    return jnp.concatenate([jnp.zeros_like(jnp.cumsum(values[:1])), jnp.cumsum(values)])
+
+
+def _best_cuts(gain, classes):
+    """The path over edges from first to last, in ``classes`` steps, of the largest sum of gains."""
+    best, before = gain[0], list[Any]()
+    for _ in range(classes - 2):
+        total = best[:, None] + gain
+        best, before = total.max(0), [*before, total.argmax(0)]
+    cuts = [jnp.argmax(best + gain[:, -1])]
+    for step in reversed(before):
+        cuts.insert(0, step[cuts[0]])
+    return jnp.stack(cuts)

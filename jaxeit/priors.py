@@ -1,20 +1,119 @@
-"""Priors: what an image is expected to look like before the data are seen."""
+"""Priors: what an image is expected to look like before the data are seen.
+
+A prior is a quadratic penalty ``x^T R x``; its *precision* R comes in three forms, each of which says what the methods
+ask for in its own cheapest way.  The overall scale of R does not matter: the hyperparameter has no unit (`inverse`).
+"""
 
 from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from jaxtyping import Array, Float
+
+from .basis import Picture
+
+
+class AbstractPrecision(eqx.Module):
+    """R, symmetric positive definite."""
+
+    @abstractmethod
+    def matrix(self) -> Float[Array, "basis basis"]:
+        """R itself."""
+
+    @abstractmethod
+    def times(self, x: Float[Array, "basis k"]) -> Float[Array, "basis k"]:
+        """``R x``."""
+
+    @abstractmethod
+    def solve(self, x: Float[Array, "basis k"]) -> Float[Array, "basis k"]:
+        """``R^-1 x``."""
+
+    @abstractmethod
+    def variance(self) -> Float[Array, " basis"]:
+        """The diagonal of ``R^-1``."""
+
+    @abstractmethod
+    def residual(self, x: Float[Array, " basis"]) -> Float[Array, " rows"]:
+        """``Gamma x``, whose sum of squares is ``x^T R x``: a block for any least-squares method."""
+
+
+class Diagonal(AbstractPrecision):
+    """R = diag(values), (basis,) above zero."""
+
+    values: Float[Array, " basis"]
+
+    def matrix(self):
+        return jnp.diag(self.values)
+
+    def times(self, x):
+        return (self.values * x.T).T
+
+    def solve(self, x):
+        return (x.T / self.values).T
+
+    def variance(self):
+        return 1 / self.values
+
+    def residual(self, x):
+        return jnp.sqrt(self.values) * x
+
+
+class Precision(AbstractPrecision):
+    """R as a matrix, (basis, basis)."""
+
+    values: Float[Array, "basis basis"]
+
+    def matrix(self):
+        return self.values
+
+    def times(self, x):
+        return self.values @ x
+
+    def solve(self, x):
+        return cho_solve(cho_factor(self.values), x)
+
+    def variance(self):
+        return jnp.diagonal(self.solve(jnp.eye(len(self.values), dtype=self.values.dtype)))
+
+    def residual(self, x):
+        return cholesky(self.values) @ x
+
+
+class Covariance(AbstractPrecision):
+    """R as its inverse, the covariance of the image, (basis, basis)."""
+
+    values: Float[Array, "basis basis"]
+
+    def matrix(self):
+        return self.times(jnp.eye(len(self.values), dtype=self.values.dtype))
+
+    def times(self, x):
+        return cho_solve(cho_factor(self.values), x)
+
+    def solve(self, x):
+        return self.values @ x
+
+    def variance(self):
+        return jnp.diagonal(self.values)
+
+    def residual(self, x):
+        return solve_triangular(cholesky(self.values, lower=True), x, lower=True)
 
 
 class AbstractPrior(eqx.Module):
-    """A quadratic penalty ``x^T R x`` with a diagonal R."""
+    """A choice of R; one class, one export and one row in the tests make a new one."""
 
     @abstractmethod
-    def diagonal(
-        self, jacobian: Float[Array, "readings basis"], areas: Float[Array, " basis"]
-    ) -> Float[Array, " basis"]:
-        """The diagonal of R = Gamma^T Gamma, positive; its overall scale does not matter."""
+    def precision(
+        self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None
+    ) -> AbstractPrecision:
+        """R for images that lie like this.
+
+        Args:
+            jacobian: of whitened readings; of it only sums over the readings may be used, ``J^T J``.
+            at: the image so far, for a prior that is not quadratic (`TotalVariation`); default: none yet.
+        """
 
 
 class Noser(AbstractPrior):
@@ -32,13 +131,86 @@ class Noser(AbstractPrior):
     exponent: float = 0.5
     floor: float = 1e-3
 
-    def diagonal(self, jacobian, areas):
+    def precision(self, jacobian, picture, at=None):
         power = jnp.sum(jacobian**2, 0) ** self.exponent
-        return jnp.maximum(power, self.floor * jnp.max(power))
+        return Diagonal(jnp.maximum(power, self.floor * jnp.max(power)))
 
 
 class Tikhonov(AbstractPrior):
     """``R = diag(area)``: the same penalty per unit of area everywhere, whatever the mesh."""
 
-    def diagonal(self, jacobian, areas):
-        return jnp.maximum(areas, 1e-3 * jnp.max(areas))
+    def precision(self, jacobian, picture, at=None):
+        return Diagonal(_areas(picture))
+
+
+class Laplace(AbstractPrior):
+    """``R = D^T D`` with the differences D between neighbours: smooth images, of any level.
+
+    A constant costs nothing in D; ``floor`` of the mean diagonal is added so that R stays definite (the prior of
+    EIDORS' `prior_laplace`, whose R is the graph Laplacian as here).
+    """
+
+    floor: float = 1e-3
+
+    def precision(self, jacobian, picture, at=None):
+        return Precision(_laplacian(picture, jnp.ones(len(picture.edges), picture.areas.dtype), self.floor))
+
+
+class GaussianSmooth(AbstractPrior):
+    """The image is a Gaussian random field: ``(R^-1)_ij = s_i s_j exp(-|r_i - r_j|^2 / (2 length^2))``.
+
+    The covariance form of EIDORS' Gaussian high-pass prior.  With ``noser`` the standard deviations are those of
+    `Noser` (exponent 0.5), so that the rim and the electrodes are treated alike; else s = 1.
+
+    | meaning                                                     | default | unit |
+    |-------------------------------------------------------------|---------|------|
+    | length over which the image is alike                        | 0.01    | m    |
+    | nugget: variance of each pixel's own, of that of the field  | 1e-3    |      |
+    | noser                                                       | False   |      |
+    """
+
+    length: float = 0.01
+    nugget: float = 1e-3
+    noser: bool = eqx.field(static=True, default=False)
+
+    def precision(self, jacobian, picture, at=None):
+        square = jnp.sum((picture.centres[:, None] - picture.centres) ** 2, -1)
+        field = jnp.exp(-0.5 * square / self.length**2) + self.nugget * jnp.eye(len(square), dtype=square.dtype)
+        if not self.noser:
+            return Covariance(field)
+        std = 1 / jnp.sqrt(Noser().precision(jacobian, picture).values)
+        return Covariance(std[:, None] * field * std)
+
+
+class TotalVariation(AbstractPrior):
+    """``sum over edges of length * sqrt((x_i - x_j)^2 + beta^2)``: few jumps, anywhere; flat between.
+
+    Taken by iteratively reweighted least squares: at an image x, ``R = D^T diag(length / sqrt((D x)^2 + beta^2)) D``
+    (Vogel and Oman 1996).  ``beta``, as a fraction of the largest value of the image, keeps it smooth where x is flat.
+    """
+
+    beta: float = 1e-2
+    floor: float = 1e-3
+
+    def precision(self, jacobian, picture, at=None):
+        if at is None:
+            return Precision(_laplacian(picture, picture.edge_length, self.floor))
+        first, second = picture.edges.T
+        step, top = at[first] - at[second], jnp.max(jnp.abs(at))
+        top = jnp.where(top > 0, top, 1)
+        weight = picture.edge_length / jnp.sqrt((step / top) ** 2 + self.beta**2)
+        return Precision(_laplacian(picture, weight, self.floor))
+
+
+def _areas(picture: Picture) -> Float[Array, " basis"]:
+    return jnp.maximum(picture.areas, 1e-3 * jnp.max(picture.areas))
+
+
+def _laplacian(picture: Picture, weight: Float[Array, " edges"], floor: float) -> Float[Array, "basis basis"]:
+    """``D^T diag(weight) D``, with ``floor`` of its mean diagonal added."""
+    first, second = picture.edges.T
+    r = jnp.zeros((picture.size, picture.size), weight.dtype)
+    r = r.at[first, first].add(weight).at[second, second].add(weight)
+    r = r.at[first, second].add(-weight).at[second, first].add(-weight)
+    mean = jnp.trace(r) / picture.size
+    return r + floor * jnp.where(mean > 0, mean, 1) * jnp.eye(picture.size, dtype=weight.dtype)

@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
-    "basis", "jacobian", "priors", "inverse", "fusion", "metrics",
+    "basis", "jacobian", "whitening", "priors", "methods", "hyperparameter", "inverse", "store", "contacts",
+    "fusion", "metrics", "regions",
 ]  # fmt: skip
 BENCH = [
     "session", "units", "corrections", "presses", "curves", "fit", "response", "measured", "evaluation",

@@ -64,14 +64,20 @@ def fitted_curves(pads):
 
 @pytest.fixture(scope="module")
 def calibration(skin):
-    recon = je.Reconstructor(
-        matrix=jnp.zeros((4, 3)),
-        centres=jnp.asarray([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15]]),
-        areas=jnp.full(4, 0.01),
-        channels=jnp.ones(3, bool),
-        shape=(2, 2),
-        extent=(0.0, 0.2, 0.0, 0.2),
-    )
+    numbers = {
+        "factor": np.zeros((4, 6)),
+        "variance": np.full(4, np.inf),
+        "predict": np.zeros((6, 6)),
+        "pairs": np.tile([0, 1, 2, 3], (3, 1)),
+        "current": np.array(1.0),
+        "weight": np.ones(3),
+        "channels": np.ones(3, bool),
+        "centres": np.array([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15]]),
+        "areas": np.full(4, 0.01),
+        "edges": np.array([[0, 1], [2, 3]]),
+        "edge_length": np.full(2, 0.1),
+    }
+    recon = je.from_numbers(numbers, (2, 2), (0.0, 0.2, 0.0, 0.2))
     return Calibration(
         skin=skin,
         recon=recon,

@@ -1,0 +1,173 @@
+"""Ways to choose the hyperparameter: how much noise there is, against how much image.
+
+Each looks at one-step images over a range of hyperparameters, through the eigenvectors U and eigenvalues w of
+``J R^-1 J^T`` (`methods` has the symbols): ``x = R^-1 J^T U (w + l^2)^-1 U^T y``.
+"""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .methods import Problem
+
+_RANGE = np.logspace(-4, 2, 241)
+
+
+class HyperparameterError(ValueError):
+    """A hyperparameter that cannot be chosen so; the message says why."""
+
+
+class Spectrum(eqx.Module):
+    """A problem in its own coordinates.
+
+    | meaning                                             | shape      |
+    |-----------------------------------------------------|------------|
+    | squares: w over the scale of ``l^2``                | (k,)       |
+    | vectors: U                                          | (k, k)     |
+    | gained: ``R^-1 J^T U`` over that scale              | (basis, k) |
+    | problem                                             |            |
+    """
+
+    squares: Float[Array, " k"]
+    vectors: Float[Array, "k k"]
+    gained: Float[Array, "basis k"]
+    problem: Problem
+
+    def filters(self) -> tuple[np.ndarray, Float[Array, "h k"]]:
+        """The hyperparameters tried, and ``1 / (w + l^2)`` for each."""
+        return _RANGE, 1 / (self.squares + jnp.asarray(_RANGE, self.squares.dtype)[:, None] ** 2)
+
+
+@eqx.filter_jit
+def spectrum(problem: Problem) -> Spectrum:
+    """The eigenvectors that all choices share."""
+    gained = problem.precision().solve(problem.jacobian.T)
+    scale = jnp.sum(problem.jacobian.T * gained) / problem.readings
+    squares, vectors = jnp.linalg.eigh(problem.jacobian @ gained / scale)
+    return Spectrum(jnp.maximum(squares, 0), vectors, gained @ vectors / scale, problem)
+
+
+class AbstractHyperparameter(eqx.Module):
+    """A way to choose; given to `prepare` instead of a number."""
+
+    needs_noise: ClassVar[bool] = False
+
+    @abstractmethod
+    def choose(self, spectrum: Spectrum, whiten) -> float:
+        """The hyperparameter.
+
+        Args:
+            whiten: takes frames, (..., readings) V, to whitened ones, (..., k).
+
+        Raises:
+            HyperparameterError: if none in 1e-4 to 100 will do.
+        """
+
+
+class GeneralisedCrossValidation(AbstractHyperparameter):
+    """The least ``m |y - J x|^2 / tr(I - J Q)^2``: the readings are best told from each other (Golub et al. 1979).
+
+    m counts the independent numbers in a frame, here and below.
+
+    | meaning                                      | shape         | unit |
+    |----------------------------------------------|---------------|------|
+    | frames: differences, at least one of a touch | (..., readings) | V  |
+    """
+
+    frames: Float[Array, "... readings"]
+
+    def choose(self, spectrum, whiten):
+        tried, filters = spectrum.filters()
+        residual = _residuals(spectrum, filters, whiten(self.frames))
+        m = len(spectrum.squares)
+        freedom = m - jnp.sum(spectrum.squares * filters, 1)
+        return float(tried[int(jnp.argmin(m * residual / freedom**2))])
+
+
+class LCurve(AbstractHyperparameter):
+    """The corner of log |y - J x| against log x^T R x: where its curvature is largest (Hansen 1992).
+
+    | meaning                                      | shape         | unit |
+    |----------------------------------------------|---------------|------|
+    | frames: differences, at least one of a touch | (..., readings) | V  |
+    """
+
+    frames: Float[Array, "... readings"]
+
+    def choose(self, spectrum, whiten):
+        tried, filters = spectrum.filters()
+        y = whiten(self.frames) @ spectrum.vectors
+        size = jnp.einsum("hk,...k->h", spectrum.squares * filters**2, y**2)
+        x, z = (np.log(np.asarray(v)) for v in (_residuals(spectrum, filters, whiten(self.frames)), size))
+        (x1, z1), (x2, z2) = _slopes(x, z), _slopes(*_slopes(x, z))
+        curvature = (x1 * z2 - x2 * z1) / np.maximum(x1**2 + z1**2, 1e-30) ** 1.5
+        inner = slice(4, -4)  # the ends of the range have one-sided slopes
+        return float(tried[inner][int(np.argmax(curvature[inner]))])
+
+
+def _slopes(*curves: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(np.gradient(curve, np.log(_RANGE)) for curve in curves)
+
+
+class Discrepancy(AbstractHyperparameter):
+    """The largest with ``|y - J x|^2 <= factor^2 m``: no closer to the readings than their noise (Morozov 1966).
+
+    Needs ``noise`` in `prepare`.
+
+    | meaning                                      | shape           | unit | default |
+    |----------------------------------------------|-----------------|------|---------|
+    | frames: differences, at least one of a touch | (..., readings) | V    |         |
+    | factor                                       | ()              |      | 1       |
+    """
+
+    needs_noise: ClassVar[bool] = True
+    frames: Float[Array, "... readings"]
+    factor: float = 1.0
+
+    def choose(self, spectrum, whiten):
+        tried, filters = spectrum.filters()
+        y = whiten(self.frames)
+        frames = y.size // y.shape[-1]
+        residual = _residuals(spectrum, filters, y) / (frames * len(spectrum.squares))
+        within = np.flatnonzero(np.asarray(residual) <= self.factor**2)
+        if not within.size:
+            raise HyperparameterError(
+                f"discrepancy: the readings stay {float(residual[0]) ** 0.5:.3g} standard deviations from any image; "
+                "the noise given is too small, or the model does not fit"
+            )
+        return float(tried[within[-1]])
+
+
+class NoiseFigure(AbstractHyperparameter):
+    """The smallest whose noise figure is at most ``target``, for a small contact in the middle of the sheet.
+
+    Signal to noise of the readings over that of the image, root mean squares over readings and area:
+    ``NF = (|y| / sqrt(m)) / (|x|_A / sqrt(E |Q e|_A^2))`` with e white.  (0.5 is EIDORS' usual target; there it is
+    defined by means of absolute values, Adler and Guardo 1996.)
+    """
+
+    target: float = 0.5
+
+    def choose(self, spectrum, whiten):
+        tried, filters = spectrum.filters()
+        picture, areas = spectrum.problem.picture, spectrum.problem.picture.areas
+        middle = jnp.sum(picture.centres * areas[:, None], 0) / jnp.sum(areas)
+        y = spectrum.problem.jacobian[:, jnp.argmin(jnp.sum((picture.centres - middle) ** 2, 1))]
+        image = spectrum.gained @ (filters * (y @ spectrum.vectors)).T
+        noise = jnp.sqrt(filters**2 @ (areas @ spectrum.gained**2))
+        signal = jnp.sqrt(areas @ image**2)
+        figure = np.asarray(jnp.sqrt(jnp.sum(y**2) / spectrum.problem.readings) * noise / signal)
+        within = np.flatnonzero(figure <= self.target)
+        if not within.size:
+            raise HyperparameterError(f"noise figure: none as low as {self.target}; the least is {figure.min():.3g}")
+        return float(tried[within[0]])
+
+
+def _residuals(spectrum: Spectrum, filters, y) -> Float[Array, " h"]:
+    """``|y - J x|^2`` summed over the frames, for each hyperparameter tried."""
+    left = 1 - spectrum.squares * filters
+    return jnp.einsum("hk,...k->h", left**2, (y @ spectrum.vectors) ** 2)

@@ -1,0 +1,147 @@
+"""A reconstructor as numbers, so that a robot applies it without mesh or solver.
+
+Numbers, not a compiled program: those fail, or worse load and differ, under another version of JAX.
+"""
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from .basis import Picture
+from .inverse import Provenance, Reconstructor
+from .whitening import Whitening, lines_of
+
+FORMAT = "jaxeit reconstructor 1"
+
+# Name: dimensions, unit, meaning.
+NUMBERS = {
+    "factor": ("basis k", "S V", "image per pair sum"),
+    "variance": ("basis", "S2", "variance left to each coefficient"),
+    "predict": ("k k", "ohm S V", "pair sums of the one-step image, from those of the readings"),
+    "pairs": ("readings 4", "1", "the four pair sums of each reading"),
+    "current": ("", "A", "amplitude of the stimulation"),
+    "weight": ("readings *", "1/V2", "inverse of the noise: variances, or a covariance matrix"),
+    "channels": ("readings", "1", "readings that are used"),
+    "centres": ("basis 2", "m", "centres of the pixels"),
+    "areas": ("basis", "m2", "areas of the pixels on the sheet"),
+    "edges": ("edges 2", "1", "pairs of neighbouring pixels"),
+    "edge_length": ("edges", "m", "length of the border that neighbours share"),
+}
+
+
+class StoreError(ValueError):
+    """A file or numbers that are no reconstructor; the message says what is wrong, and where."""
+
+
+def to_numbers(recon: Reconstructor) -> dict[str, np.ndarray]:
+    """The arrays of a reconstructor under the names of `NUMBERS`."""
+    parts = (recon, recon.whitening, recon.picture)
+    return {name: np.asarray(next(vars(p)[name] for p in parts if name in vars(p))) for name in NUMBERS}
+
+
+def from_numbers(
+    numbers: Mapping[str, np.ndarray],
+    shape: tuple[int, ...],
+    extent: tuple[float, ...],
+    provenance: Mapping[str, str] | None = None,
+) -> Reconstructor:
+    """The reconstructor with these arrays; the reverse of `to_numbers`.
+
+    Raises:
+        StoreError: if an array is missing, or they do not fit each other.
+    """
+    missing = [name for name in NUMBERS if name not in numbers]
+    if missing:
+        raise StoreError(f"{missing[0]}: missing")
+    sizes = _sizes(numbers)
+    if len(extent) != 4 or int(np.prod(shape)) != sizes["basis"]:
+        raise StoreError(f"a picture of shape {shape} and extent {extent} does not hold {sizes['basis']} coefficients")
+    if not 0 <= int(numbers["pairs"].min()) <= int(numbers["pairs"].max()) < sizes["k"]:
+        raise StoreError(f"pairs: must count the {sizes['k']} pair sums from 0")
+    factor = jnp.asarray(numbers["factor"])
+    lines, sign = lines_of(np.asarray(numbers["pairs"]), sizes["k"])
+    return Reconstructor(
+        factor=factor,
+        variance=jnp.asarray(numbers["variance"]),
+        predict=jnp.asarray(numbers["predict"]),
+        whitening=Whitening(
+            pairs=jnp.asarray(numbers["pairs"], jnp.int32),
+            lines=jnp.asarray(lines, jnp.int32),
+            sign=jnp.asarray(sign, factor.dtype),
+            current=jnp.asarray(numbers["current"]),
+            weight=jnp.asarray(numbers["weight"]),
+            channels=jnp.asarray(numbers["channels"], bool),
+        ),
+        picture=Picture(
+            centres=jnp.asarray(numbers["centres"]),
+            areas=jnp.asarray(numbers["areas"]),
+            edges=jnp.asarray(numbers["edges"], jnp.int32),
+            edge_length=jnp.asarray(numbers["edge_length"]),
+            shape=tuple(shape),
+            extent=(extent[0], extent[1], extent[2], extent[3]),
+        ),
+        provenance=Provenance(provenance or {}),
+    )
+
+
+def _sizes(numbers: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """The size of each dimension in `NUMBERS`; they must agree, and the numbers be finite."""
+    sizes: dict[str, int] = {}
+    for name, (dimensions, _, _) in NUMBERS.items():
+        array = np.asarray(numbers[name])
+        words = dimensions.replace("*", "readings" if array.ndim == 2 else "").split()
+        if len(words) != array.ndim:
+            raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)})")
+        expected = tuple(
+            int(word) if word.isdigit() else sizes.setdefault(word, n)
+            for word, n in zip(words, array.shape, strict=True)
+        )
+        if array.shape != expected:
+            raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)}), here {expected}")
+        if not np.isfinite(array).all() and name != "variance":
+            raise StoreError(f"{name}: holds values that are not finite")
+    return sizes
+
+
+def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
+    """Write numbers and provenance to ``path`` (a NumPy .npz), whole or not at all."""
+    about = {"format": FORMAT, "shape": recon.shape, "extent": recon.extent, "provenance": recon.provenance}
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **to_numbers(recon))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def load_reconstructor(path: str | Path) -> Reconstructor:
+    """Read what `save_reconstructor` wrote.
+
+    Raises:
+        StoreError: if the file cannot be read, is damaged or of another kind.
+    """
+    name = Path(path).name
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            numbers = {key: file[key] for key in file.files}
+        about = json.loads(str(numbers.pop("about")))
+        if about["format"] != FORMAT:
+            raise StoreError(f"is a {about['format']!r}; this version reads {FORMAT!r}")
+        return from_numbers(numbers, tuple(about["shape"]), tuple(about["extent"]), about["provenance"])
+    except StoreError as error:
+        raise StoreError(f"{name}: {error}") from None
+    except OSError as error:
+        raise StoreError(f"{name}: {error.strerror or 'is no reconstructor'}") from None
+    except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise StoreError(f"{name}: is damaged or no reconstructor ({error}); prepare and save it again") from None
