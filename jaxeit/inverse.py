@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from importlib import metadata
 from typing import overload
@@ -28,7 +29,10 @@ class InverseError(ValueError):
 
 
 class Provenance(dict[str, str]):
-    """What a reconstructor was made from.  All are equal to JAX: another date compiles nothing anew."""
+    """What a reconstructor was made from.  All are equal to JAX: another date compiles nothing anew.
+
+    (So what a compiled function returns has the provenance of its first call: attach it outside.)
+    """
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Provenance)
@@ -153,7 +157,7 @@ class Reconstructor(AbstractReconstructor):
             InverseError: if the shape does not fit, or no reading would be left.
         """
         used = np.asarray(self.channels) & ~_flags(channels, self.readings)
-        return _without(self, jnp.asarray(_some(used)))
+        return replace(_without(self, jnp.asarray(_some(used))), provenance=self.provenance)
 
 
 @eqx.filter_jit
@@ -167,7 +171,7 @@ def _without(recon: Reconstructor, used: Bool[Array, " readings"]) -> Reconstruc
         predict=predict,
         whitening=found,
         picture=recon.picture,
-        provenance=recon.provenance,
+        provenance=Provenance(),
     )
 
 
@@ -190,7 +194,7 @@ class IterativeReconstructor(AbstractReconstructor):
     provenance: Provenance = eqx.field(static=True)
 
     def _image(self, sums):
-        frames = (sums @ self.compress.T).reshape(-1, sums.shape[-1])
+        frames = sums.reshape(-1, sums.shape[-1]) @ self.compress.T
         images = jax.lax.map(lambda y: self.method.image(self.problem, y), frames)
         return images.reshape(*sums.shape[:-1], images.shape[-1])
 
@@ -274,13 +278,16 @@ def prepare(
     settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
     about = Provenance({"jaxeit": metadata.version("jaxeit"), **settings, **(provenance or {})})
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
-    recon = _build(problem, linear, compress, slopes, found.whitening, about)
+    recon = replace(_build(problem, linear, compress, slopes, found.whitening), provenance=about)
     if not bool(jnp.isfinite(recon.factor).all()):
         raise InverseError(
             "the reconstruction matrix is not finite: the conductivity must be positive, and in "
             "float32 the hyperparameter not below 1e-3"
         )
     if isinstance(method, AbstractIterativeMethod):
+        eqx.filter_eval_shape(
+            method.image, problem, compress[:, 0]
+        )  # what does not fit is refused here, not at a frame
         return IterativeReconstructor(
             compress=compress,
             problem=problem,
@@ -294,7 +301,7 @@ def prepare(
 
 
 @eqx.filter_jit
-def _build(problem, method, compress, slopes, found, about) -> Reconstructor:
+def _build(problem, method, compress, slopes, found) -> Reconstructor:
     q = method.matrix(problem)
     return Reconstructor(
         factor=q @ compress,
@@ -302,7 +309,7 @@ def _build(problem, method, compress, slopes, found, about) -> Reconstructor:
         predict=slopes @ (OneStep().matrix(problem) @ compress),
         whitening=found,
         picture=problem.picture,
-        provenance=about,
+        provenance=Provenance(),
     )
 
 

@@ -133,7 +133,7 @@ def load_reconstructor(path: str | Path) -> Reconstructor:
     """
     name = Path(path).name
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             numbers = {key: file[key] for key in file.files}
         about = json.loads(str(numbers.pop("about")))
         if about["format"] != FORMAT:
