@@ -64,6 +64,19 @@ def test_images_are_linear_and_batched(recon):
     np.testing.assert_allclose(recon(2 * dv), 2 * recon(dv), rtol=1e-12)
 
 
+def test_the_compiled_function_is_the_same_map(recon):
+    dv = np.asarray(jax.random.normal(jax.random.key(0), (3, recon.readings)))
+    apply = recon.compiled()
+    np.testing.assert_allclose(apply(dv), recon(dv), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(apply(dv[0]), recon(dv[0]), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 549), (550, 2)])
+def test_frames_of_another_protocol_are_refused(recon, shape):
+    with pytest.raises(je.InverseError, match="must hold 550 readings"):
+        recon(np.zeros(shape))
+
+
 def test_a_dead_channel_is_left_out_and_may_hold_anything(model, pixels):
     channels = np.ones(550, bool)
     channels[[3, 77]] = False
