@@ -19,7 +19,7 @@ from .basis import AbstractBasis, BasisMap, Picture, Pixels
 from .discretise import Model
 from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
-from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
+from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, predicted
 from .priors import AbstractPrior, Noser
 from .whitening import Whitened, Whitening, whitened
 
@@ -47,7 +47,7 @@ class AbstractReconstructor(eqx.Module):
     | meaning                                                                        | shape     | unit |
     |--------------------------------------------------------------------------------|-----------|------|
     | whitening: what is used of a frame                                             |           |      |
-    | predict: pair sums of the one-step image, from those of the readings           | (k, k)    | S V  |
+    | predict: pair sums of the one-step image, from the sums ``P^T W dv``           | (k, k)    | ohm2 |
     | picture: where the image lies                                                  |           |      |
     | provenance                                                                     |           |      |
     """
@@ -291,7 +291,7 @@ def prepare(
     settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
     about = Provenance({"jaxeit": metadata.version("jaxeit"), **settings, **(provenance or {})})
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
-    recon = replace(_build(problem, linear, compress, slopes, found.whitening), provenance=about)
+    recon = replace(_build(problem, linear, compress, found.whitening), provenance=about)
     if not bool(jnp.isfinite(recon.factor).all()):
         raise InverseError(
             "the reconstruction matrix is not finite: the conductivity must be positive, and in "
@@ -314,12 +314,12 @@ def prepare(
 
 
 @eqx.filter_jit
-def _build(problem, method, compress, slopes, found) -> Reconstructor:
+def _build(problem, method, compress, found) -> Reconstructor:
     q = method.matrix(problem)
     return Reconstructor(
         factor=q @ compress,
         variance=method.variance(problem, q),
-        predict=slopes @ (OneStep().matrix(problem) @ compress),
+        predict=compress.T @ predicted(problem) @ compress,
         whitening=found,
         picture=problem.picture,
         provenance=Provenance(),

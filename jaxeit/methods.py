@@ -98,6 +98,13 @@ def _one_step(problem: Problem, precision: AbstractPrecision) -> Float[Array, "b
     return cho_solve(cho_factor(small), gained.T).T
 
 
+def predicted(problem: Problem) -> Float[Array, "k k"]:
+    """``J Q`` of `OneStep`: what its image predicts for each whitened reading, from all of them."""
+    gained = problem.precision().solve(problem.jacobian.T)
+    a = problem.jacobian @ gained
+    return cho_solve(cho_factor(a + problem.strength(gained) * jnp.eye(len(a), dtype=a.dtype)), a)
+
+
 class TruncatedSvd(AbstractLinearMethod):
     """The pseudo-inverse on the singular values of ``J R^-1/2`` above l, the others left out.
 

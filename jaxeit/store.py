@@ -23,7 +23,7 @@ FORMAT = "jaxeit reconstructor 1"
 NUMBERS = {
     "factor": ("basis k", "S V", "image per pair sum"),
     "variance": ("basis", "S2", "variance left to each coefficient"),
-    "predict": ("k k", "ohm S V", "pair sums of the one-step image, from those of the readings"),
+    "predict": ("k k", "ohm2", "pair sums of the one-step image, from weighted ones of the readings"),
     "pairs": ("readings 4", "1", "the four pair sums of each reading"),
     "current": ("", "A", "amplitude of the stimulation"),
     "weight": ("readings *", "1/V2", "inverse of the noise: variances, or a covariance matrix"),

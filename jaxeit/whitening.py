@@ -19,6 +19,8 @@ import numpy as np
 import scipy.sparse as sp
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int
+from scipy.linalg import cho_factor as cho_factor_host
+from scipy.linalg import cho_solve as cho_solve_host
 from scipy.linalg.lapack import dpstrf
 
 
@@ -98,8 +100,10 @@ def whitened(
 ) -> "Whitened":
     """The pair sums of a protocol, from its pattern (readings, 4); on the host."""
     source, sink, plus, minus = pattern.T
-    ends = np.sort([[plus, source], [minus, source], [plus, sink], [minus, sink]], 1)  # (4, 2, readings)
-    electrodes, number = np.unique(np.swapaxes(ends, 1, 2).reshape(-1, 2), axis=0, return_inverse=True)
+    ends = np.sort([[plus, source], [minus, source], [plus, sink], [minus, sink]], 1).astype(np.int64)
+    count = 1 + ends.max()
+    keys, number = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
+    electrodes = np.stack(np.divmod(keys, count), 1)
     pairs = number.reshape(4, -1).T
     lines, sign = lines_of(pairs, len(electrodes))
     found = Whitening(
@@ -111,7 +115,7 @@ def whitened(
         channels=jnp.asarray(channels),
     )
     factor = _factor(pairs, current, weight)
-    return Whitened(found, electrodes, factor, np.linalg.solve(factor @ factor.T, factor))
+    return Whitened(found, electrodes, factor, cho_solve_host(cho_factor_host(factor @ factor.T), factor))
 
 
 class Whitened(NamedTuple):

@@ -37,13 +37,26 @@ function restrict_cache ()
   end
 end
 
+% The prior of an inverse asks for the Jacobian again: EIDORS keeps it, from one call to the next it must not.
+function forget ()
+  eidors_cache ("on", "jacobian");
+  for name = {"jacobian", "calc_RtR_prior", "calc_jacobian_bkgnd"}
+    eidors_cache ("clear_name", name{1});
+  end
+end
+
 % One way of doing the work, or two: a Jacobian onto pixels through EIDORS's coarse2fine, or over elements times
 % the matrix, which is quicker on small meshes and takes gigabytes on large ones.
 function ways = ways_of (work)
   img = mk_image (forward_model (work), 1);
-  ways = struct ("img", img, "verb", work.verb, "matrix", 1);
+  ways = struct ("img", img, "verb", work.verb, "matrix", 1, "hyperparameter", 0);
+  if (isfield (work, "hyperparameter"))
+    ways.hyperparameter = work.hyperparameter;
+  end
   if (isfield (work, "coarse2fine"))
-    ways(2) = struct ("img", img, "verb", "product", "matrix", work.coarse2fine);
+    ways(2) = ways;
+    ways(2).verb = [work.verb " by product"];
+    ways(2).matrix = work.coarse2fine;
     ways(1).img.fwd_model.coarse2fine = work.coarse2fine;
     ways = ways(1:1 + (rows (work.elems) < 2e4));
   end
@@ -59,16 +72,42 @@ function way = quickest (ways)
 end
 
 function [result, seconds] = answer (way)
+  if (strncmp (way.verb, "inverse", 7))
+    forget ();
+  end
   start = tic;
   switch (way.verb)
     case "forward"
       result = fwd_solve (way.img).meas;
     case "jacobian"
       result = calc_jacobian (way.img);
-    case "product"
+    case "jacobian by product"
       result = calc_jacobian (way.img) * way.matrix;
+    case "inverse"
+      result = one_step (way.img, way.hyperparameter);
+    case "inverse by product"
+      result = one_step_of (calc_jacobian (way.img) * way.matrix, way.hyperparameter);
   end
   seconds = toc (start);
+end
+
+% What get_RM in inv_solve_diff_GN_one_step.m does, which cannot be called from outside.
+function RM = one_step (img, hyperparameter)
+  imdl = eidors_obj ("inv_model", "bench", "fwd_model", img.fwd_model);
+  imdl.jacobian_bkgnd.elem_data = img.elem_data;
+  imdl.hyperparameter.value = hyperparameter;
+  imdl.RtR_prior = "prior_noser";
+  J = calc_jacobian (calc_jacobian_bkgnd (imdl));
+  RtR = calc_RtR_prior (imdl);
+  W = calc_meas_icov (imdl);
+  hp = calc_hyperparameter (imdl);
+  RM = left_divide (J'*W*J + hp^2*RtR, J'*W);
+end
+
+% The same of a Jacobian at hand.
+function RM = one_step_of (J, hp)
+  RtR = spdiags (sqrt (sum (J.^2, 1))', 0, columns (J), columns (J));
+  RM = left_divide (J'*J + hp^2*RtR, J');
 end
 
 function values = read (name)

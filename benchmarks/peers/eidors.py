@@ -1,6 +1,7 @@
 """EIDORS (GPL: a peer to measure against, never a dependency) in GNU Octave, as its users call it.
 
-`fwd_solve` and `calc_jacobian` on the same mesh, electrode nodes and pairs.  Octave is a process of its own and
+`fwd_solve`, `calc_jacobian` and the matrix of `inv_solve_diff_GN_one_step` on the same mesh, electrode nodes and pairs.
+Octave is a process of its own and
 reads the clock itself: its start and the files that carry conductivity and readings do not count.
 """
 
@@ -34,10 +35,12 @@ def missing() -> str | None:
 class Eidors:
     """A tool that has Octave at work; `last_seconds` is what Octave measured around its last call."""
 
-    def __init__(self, problem, verb: str, order: int = 1, pixels=None) -> None:
+    def __init__(self, problem, verb: str, order: int = 1, pixels=None, **extra: float) -> None:
         folder = tempfile.TemporaryDirectory(prefix="eidors-")
-        self.folder, self.readings, self.last_seconds = Path(folder.name), len(problem.pattern), float("nan")
-        savemat(self.folder / "work.mat", _work(problem, pixels) | {"verb": verb, "order": order})
+        self.folder, self.last_seconds = Path(folder.name), float("nan")
+        image = problem.mesh.triangles if pixels is None else pixels.T
+        self.rows = (image if verb == "inverse" else problem.pattern).shape[0]
+        savemat(self.folder / "work.mat", _work(problem, pixels) | {"verb": verb, "order": order} | extra)
         self.process: Any = subprocess.Popen(
             ["octave-cli", "--norc", "--quiet", SCRIPT, self.folder],
             env=os.environ | {"EIDORS": str(Path(os.environ["EIDORS"]).resolve())},
@@ -56,7 +59,7 @@ class Eidors:
         np.asarray(sigma, np.float64).tofile(self.folder / "sigma")
         self._say("go")
         self.last_seconds = float(self._wait("seconds"))
-        return np.fromfile(self.folder / "result").reshape(-1, self.readings).T.squeeze()
+        return np.fromfile(self.folder / "result").reshape(-1, self.rows).T.squeeze()
 
     def peaks(self) -> dict[str, int]:
         """Most memory Octave has used, in all and beyond its start; nothing where the system does not say."""
@@ -123,3 +126,8 @@ def prepare_quadratic(problem) -> Eidors:
 def prepare_jacobian(problem, pixels=None) -> Eidors:
     """Onto elements, or onto ``pixels`` (elements, basis): the quicker of EIDORS's `coarse2fine` and a product."""
     return Eidors(problem, "jacobian", pixels=pixels)
+
+
+def prepare_inverse(problem, hyperparameter: float, pixels=None) -> Eidors:
+    """The matrix of `inv_solve_diff_GN_one_step` with `prior_noser`, (basis, readings), its Jacobian included."""
+    return Eidors(problem, "inverse", pixels=pixels, hyperparameter=hyperparameter)
