@@ -230,7 +230,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     for name, settings in methods.items():
         data["rows"].append({"method": name} | by_image(model, simulated, settings))
         print(name, flush=True)
-    if hasattr(je,"prepare_contacts"): data["rows"].append({"method": "contacts, fitted"} | by_fit(model, simulated))
+    if hasattr(je, "prepare_contacts"):
+        data["rows"].append({"method": "contacts, fitted"} | by_fit(model, simulated))
     print(table(data["rows"]), flush=True)
     if not args.smoke:
         c.write("images", c.closed(data))

@@ -58,6 +58,7 @@ from .metrics import (
     otsu_thresholds,
     structural_similarity,
 )
+from .nonlinear import IsotropicVariation, LogConductivity, Quadratic, gauss_newton
 from .pneumatics import pad_response
 from .priors import GaussianSmooth, Laplace, Noser, Tikhonov, TotalVariation
 from .protocol import Protocol, adjacent, reciprocal_rows
@@ -106,11 +107,13 @@ __all__ = [
     "GreitFigures",
     "HyperparameterError",
     "InverseError",
+    "IsotropicVariation",
     "IterativeReconstructor",
     "LCurve",
     "Laplace",
     "LevelCentroid",
     "LoadSpreading",
+    "LogConductivity",
     "Mesh",
     "MeshError",
     "MetricError",
@@ -135,6 +138,7 @@ __all__ = [
     "PositiveCentroid",
     "PressureSensor",
     "Protocol",
+    "Quadratic",
     "Quantisation",
     "Reconstructor",
     "Rectangle",
@@ -164,6 +168,7 @@ __all__ = [
     "forward",
     "from_numbers",
     "fuse",
+    "gauss_newton",
     "greit_figures",
     "image_correlation",
     "image_sum",

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
-    "basis", "jacobian", "whitening", "priors", "methods", "hyperparameter", "inverse", "store", "contacts",
+    "basis", "jacobian", "whitening", "priors", "methods", "hyperparameter", "inverse", "store", "contacts", "nonlinear",
     "fusion", "metrics", "regions",
 ]  # fmt: skip
 BENCH = [

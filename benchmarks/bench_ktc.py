@@ -1,0 +1,400 @@
+"""Kuopio Tomography Challenge 2023: untrained methods on its four training frames, with electrodes taken away.
+
+python -m benchmarks.bench_ktc --data FOLDER     # --smoke: one frame at two levels, nothing written
+
+A water tank of 0.115 m radius with 32 electrodes around it, plastic and metal pieces in it (Räsänen et al. 2023). The
+challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, with every reading that uses one. Its
+evaluation frames are not used here; the levels are made by leaving those readings of the training frames out.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from scipy.io import loadmat
+from scipy.ndimage import distance_transform_edt, label, map_coordinates
+from scipy.optimize import minimize_scalar
+
+import jaxeit as je
+from calib.figures import png
+from calib.session import replacing
+
+from . import _common as c
+
+PICTURE = c.ROOT / "docs" / "ktc.png"
+RADIUS, ELECTRODES, GRID = 0.115, 32, 256
+LEVELS, SMOKE_LEVELS = tuple(range(1, 8)), (1, 7)
+OTHER_SECTORS, OTHER_LEVELS = (8, 16, 24), (4, 7)  # where else electrodes are taken away; not looked at while tuning
+WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
+PUBLISHED = {"linear baseline": 10.30, "winners (trained networks), about": 15.0}
+
+
+def half_height(image: np.ndarray, floor: float, least: int) -> np.ndarray:
+    """Labels of a picture that is zero in water: each region beyond ``floor``, cut at half of its own peak.
+
+    A blurred edge lies at half the height, however high. Regions of fewer than ``least`` pixels are left out.
+    """
+    labels = np.full(image.shape, WATER)
+    for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):
+        regions, count = label(sign * image > floor)
+        for region in (regions == number for number in range(1, count + 1)):
+            cut = max(floor, 0.5 * np.max(sign * image[region]))
+            if region.sum() >= least:
+                labels[region & (sign * image > cut)] = kind
+    return labels
+
+
+def otsu_labels(image: np.ndarray) -> np.ndarray:
+    """The challenge's own segmentation: three classes by Otsu's thresholds, the largest taken for water; what lies
+    below it is resistive, what lies above conductive."""
+    classes = np.digitize(image, np.asarray(je.otsu_thresholds(image)))
+    water = np.bincount(classes.ravel()).argmax()
+    return np.where(classes < water, RESISTIVE, np.where(classes > water, CONDUCTIVE, WATER))
+
+
+# --- the challenge ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """The training set.
+
+    | meaning                                               | shape         | unit |
+    |-------------------------------------------------------|---------------|------|
+    | pattern: drive+, drive-, sense+, sense-               | (2356, 4)     |      |
+    | current of each reading, as the file tells it         | (2356,)       | mA   |
+    | reference: water only                                 | (2356,)       | V    |
+    | frames                                                | (4, 2356)     | V    |
+    | truth: 0 water, 1 resistive, 2 conductive; row 0 = +y | (4, 256, 256) |      |
+    """
+
+    pattern: np.ndarray
+    current: np.ndarray
+    reference: np.ndarray
+    frames: np.ndarray
+    truth: np.ndarray
+
+    @property
+    def channel(self) -> np.ndarray:
+        """Pair of sensing electrodes of each reading."""
+        return np.unique(self.pattern[:, 2:], axis=0, return_inverse=True)[1].ravel()
+
+
+def load(folder: Path) -> Data:
+    """The training set from the challenge's MATLAB files."""
+    reference = loadmat(folder / "training" / "ref.mat")
+    drive, sense = reference["Injref"], reference["Mpat"].astype(float)
+    drives, senses = (np.stack([p.argmax(0), p.argmin(0)], 1) for p in (drive, sense))
+    count = len(senses)
+    frames = [loadmat(folder / "training" / f"data{k}.mat")["Uel"].ravel() for k in range(1, 5)]
+    truth = [loadmat(folder / "groundtruth_training" / f"true{k}.mat")["truth"] for k in range(1, 5)]
+    pattern = np.concatenate([np.repeat(drives, count, 0), np.tile(senses, (len(drives), 1))], 1)
+    current = np.repeat(drive.max(0), count)
+    return Data(pattern, current, reference["Uelref"].ravel(), np.array(frames), np.array(truth))
+
+
+def tank(data: Data, edge_length: float = 0.03) -> je.Model:
+    """Our own mesh of the tank: electrode 0 at +y, counter-clockwise, half of the rim covered; 1 S and mA."""
+    disc = je.Disc(RADIUS)
+    middles = disc.perimeter * (0.25 + np.arange(ELECTRODES) / ELECTRODES)
+    width = disc.perimeter / (2 * ELECTRODES)
+    starts = (middles - width / 2) % disc.perimeter
+    patches = tuple(je.BoundaryPatch(float(s), float(s + width), 1e-4) for s in starts)
+    protocol = je.Protocol(data.pattern, float(data.current.mean()))
+    return je.discretise(je.Scene(je.Skin("ktc", disc, 1.0, patches, protocol)), je.Fidelity(edge_length=edge_length))
+
+
+class Water(NamedTuple):
+    """Water and contacts as `ref.mat` tells them.
+
+    | meaning                                                 | shape       | unit       |
+    |---------------------------------------------------------|-------------|------------|
+    | sigma                                                   | ()          | mS         |
+    | contact                                                 | ()          | kilohm m   |
+    | missed: reading less model (and offset)                 | (readings,) | V          |
+    | residual: norm of it, relative to that of the readings  | ()          |            |
+    """
+
+    sigma: float
+    contact: float
+    missed: np.ndarray
+    residual: float
+
+
+LEAST_CONTACT, MOST_CONTACT = 1e-6, 1.0  # contact resistance times conductivity, m; below, the mesh sees none
+
+
+def homogeneous(model: je.Model, readings: np.ndarray, channel: np.ndarray | None = None) -> Water:
+    """Fit of one conductivity and one contact resistance; with ``channel`` also of an offset of each sensing pair.
+
+    As ``voltages(sigma, contact) = voltages(1, contact sigma) / sigma``, all but the product of the two is linear.
+    """
+
+    def less_offsets(values):
+        if channel is None:
+            return values
+        return values - (np.bincount(channel, values) / np.bincount(channel))[channel]
+
+    def fitted(ratio):
+        unit = less_offsets(np.asarray(_even(model, jnp.asarray(ratio))))
+        resistance = (unit @ readings) / (unit @ unit)
+        return 1 / resistance, less_offsets(readings) - resistance * unit
+
+    ends = np.log([LEAST_CONTACT, MOST_CONTACT])
+    best = minimize_scalar(lambda log: np.linalg.norm(fitted(np.exp(log))[1]), bounds=ends, method="bounded")
+    sigma, missed = fitted(np.exp(best.x))
+    return Water(sigma, np.exp(best.x) / sigma, missed, float(np.linalg.norm(missed) / np.linalg.norm(readings)))
+
+
+@eqx.filter_jit
+def _even(model, ratio):
+    """Readings of even water of unit conductivity."""
+    contact = jnp.full_like(model.contact, 1 / ratio)
+    return je.forward(eqx.tree_at(lambda m: m.contact, model, contact), jnp.ones_like(model.background))
+
+
+def fits(model: je.Model, data: Data) -> dict[str, Water]:
+    """Relative residuals of even water in `ref.mat`, the currents and offsets taken in three ways.
+
+    Pairs that were driven in both directions agree in size to 0.7 % on average if all currents are taken alike, to
+    2.6 % if they are those of the file. Most of what is then left (7.3 % to 4.1 %) is a fixed offset of each sensing
+    pair, which differences of frames do not see.
+    """
+    as_told = data.reference * data.current.mean() / data.current
+    return {
+        "currents of the file": homogeneous(model, as_told),
+        "equal currents": homogeneous(model, data.reference),
+        "equal currents, offsets": homogeneous(model, data.reference, data.channel),
+    }
+
+
+def with_level(data: Data, level: int, first: int = 0) -> Data:
+    """Frames with NaN where a reading uses one of the 2 (level - 1) electrodes from ``first`` on."""
+    gone = (first + np.arange(2 * (level - 1))) % ELECTRODES
+    lost = np.isin(data.pattern, gone).any(1)
+    frames = np.where(lost, np.nan, data.frames)
+    return replace(data, reference=np.where(lost, np.nan, data.reference), frames=frames)
+
+
+def on_grid(values: np.ndarray, picture: Any) -> np.ndarray:
+    """The challenge's 256 x 256 pixels, row 0 at +y, from those of an image by bilinear interpolation."""
+    inside = (np.asarray(picture.areas) > 0).reshape(picture.shape)
+    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    filled = values.reshape(picture.shape)[tuple(nearest)]
+    line = np.linspace(-RADIUS, RADIUS, GRID)
+    x, y = np.meshgrid(line, -line)
+    (rows, columns), (x0, x1, y0, y1) = picture.shape, picture.extent
+    places = [(y - y0) / (y1 - y0) * rows - 0.5, (x - x0) / (x1 - x0) * columns - 0.5]
+    return np.where(np.hypot(x, y) <= RADIUS, map_coordinates(filled, places, order=1, mode="nearest"), 0.0)
+
+
+Method = Callable[[Data], list[tuple[np.ndarray, np.ndarray]]]  # frames to (image, labels) of each
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The recipe of old: one step from even water with `Noser`, then Otsu."""
+
+    model: je.Model
+    image: je.BasisMap
+    water: Water
+    hyperparameter: float = 0.1
+
+    def __call__(self, data: Data) -> list[tuple[np.ndarray, np.ndarray]]:
+        sigma = jnp.full_like(self.model.background, self.water.sigma)
+        used = np.isfinite(data.reference)
+        recon = je.prepare(
+            self.model, basis=self.image, hyperparameter=self.hyperparameter, sigma=sigma, channels=jnp.asarray(used)
+        )
+        images = np.asarray(recon(jnp.asarray(data.frames - data.reference)))
+        pictures = [on_grid(image, recon) for image in images]
+        return [(picture, otsu_labels(picture)) for picture in pictures]
+
+
+@dataclass(frozen=True, eq=False)
+class Variation:
+    """Gauss-Newton on log conductivity with total variation, each region cut at half its height.
+
+    The model is asked for the change only: ``voltages(0) + frame - reference``. It misses the change by ``relative`` of
+    it, ``absolute`` of the largest, and in the measure in which it missed the reference.
+    """
+
+    model: je.Model
+    image: je.BasisMap
+    water: Water
+    prior: je.IsotropicVariation = field(default_factory=je.IsotropicVariation)
+    relative: float = 0.05
+    absolute: float = 0.01
+    floor: float = 0.5
+    least: int = 150
+
+    def __call__(self, data: Data) -> list[tuple[np.ndarray, np.ndarray]]:
+        contact = jnp.full_like(self.model.contact, 1 / self.water.contact)
+        model = eqx.tree_at(lambda m: m.contact, self.model, contact)
+        physics = je.LogConductivity(model, self.image, jnp.asarray(self.water.sigma))
+        rest = np.asarray(_rest(physics))
+        pictures = [self._picture(physics, rest, frame, data.reference) for frame in data.frames]
+        return [(picture, half_height(picture, self.floor, self.least)) for picture in pictures]
+
+    def _picture(self, physics, rest, frame, reference):
+        change = frame - reference
+        share = np.sqrt(np.nansum(change**2) / np.nansum(reference**2))
+        largest = np.nanmax(np.abs(change))
+        std = self.relative * np.abs(change) + self.absolute * largest + share * np.abs(self.water.missed)
+        found = je.gauss_newton(physics, self.prior, jnp.asarray(rest + change), jnp.asarray(std))
+        return on_grid(np.asarray(found), self.image.picture)
+
+
+@eqx.filter_jit
+def _rest(physics):
+    return physics.voltages(jnp.zeros(physics.image.size, physics.model.dtype))
+
+
+def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method]:
+    image = je.Pixels(pixels).on(model)
+    return {"linear": Linear(model, image, water), "variation": Variation(model, image, water)}
+
+
+# --- results ---------------------------------------------------------------------------------------------------------
+
+Row = dict[str, Any]
+
+
+def measure(
+    data: Data, ways: dict[str, Method], levels: Iterable[int], first: int = 0
+) -> tuple[list[Row], dict[tuple[int, str], list[np.ndarray]]]:
+    """Scores of every method at every level, and the labels behind them."""
+    rows, found = [], {}
+    for level in levels:
+        for name, way in ways.items():
+            spent, out = c.seconds(way, with_level(data, level, first))
+            found[level, name] = [labels for _, labels in out]
+            scores = [float(je.ktc_score(a, b)) for a, b in zip(found[level, name], data.truth, strict=True)]
+            row = {"level": level, "first": first, "method": name, "seconds": round(spent, 2)}
+            rows.append(row | {"scores": [round(s, 3) for s in scores], "mean": round(float(np.mean(scores)), 3)})
+            print(rows[-1], flush=True)
+    return rows, found
+
+
+def totals(rows: list[Row]) -> dict[str, float]:
+    """Mean over levels, of the 21 points of the challenge (three frames at each of seven levels)."""
+    names = dict.fromkeys(row["method"] for row in rows)
+    return {name: round(21 * float(np.mean([r["mean"] for r in rows if r["method"] == name])), 2) for name in names}
+
+
+def means(rows: list[Row]) -> dict[str, dict[str, float]]:
+    """Mean score by level and method."""
+    keys = dict.fromkeys((row["level"], row["method"]) for row in rows)
+    found: dict[str, dict[str, float]] = {}
+    for level, name in keys:
+        scores = [row["mean"] for row in rows if (row["level"], row["method"]) == (level, name)]
+        found.setdefault(name, {})[f"level {level}"] = round(float(np.mean(scores)), 3)
+    return found
+
+
+def table(rows: list[Row]) -> str:
+    levels = sorted({row["level"] for row in rows})
+    lines = ["| method | " + " | ".join(f"level {n}" for n in levels) + " | of 21 |", "|---" * (2 + len(levels)) + "|"]
+    for name, total in totals(rows).items():
+        means = {row["level"]: row["mean"] for row in rows if row["method"] == name}
+        lines.append(f"| {name} | " + " | ".join(f"{means[n]:.3f}" for n in levels) + f" | {total:.2f} |")
+    return "\n".join(lines)
+
+
+RIM = "#333333"
+COLOURS = ListedColormap(["#dfeaf2", "#c2571a", "#1f4e79"])
+SHOWN = {"linear": "linear", "variation": "total variation"}
+
+
+def picture(data: Data, found: dict[tuple[int, str], list[np.ndarray]]) -> Figure:
+    """Truth beside what each method makes of it, at the first and the last level found."""
+    ends = sorted({level for level, _ in found})
+    ends = [ends[0], ends[-1]]
+    columns = [(level, name) for level in ends for name in SHOWN]
+    figure = Figure(figsize=(2.1 * (1 + len(columns)), 2.3 * len(data.truth)), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(data.truth), 1 + len(columns), squeeze=False)
+    for number, (line, truth) in enumerate(zip(grid, data.truth, strict=True)):
+        _panel(line[0], truth, 1)
+        line[0].set_ylabel(f"frame {number + 1}", fontsize=10)
+        for axes, key in zip(line[1:], columns, strict=True):
+            labels = found[key][number]
+            _panel(axes, labels, key[0])
+            axes.set_xlabel(f"score {float(je.ktc_score(labels, truth)):.2f}", fontsize=9)
+    grid[0, 0].set_title("truth", fontsize=10)
+    for axes, (level, name) in zip(grid[0, 1:], columns, strict=True):
+        axes.set_title(f"{SHOWN[name]}\nlevel {level}", fontsize=10)
+    kinds = [Patch(color=COLOURS(kind), label=name) for kind, name in enumerate(("water", "resistive", "conductive"))]
+    rim = Line2D([], [], color=RIM, linewidth=2, label="electrodes in use")
+    figure.legend(handles=[*kinds, rim], loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
+    return figure
+
+
+def _panel(axes: Any, labels: np.ndarray, level: int) -> None:
+    """Labels in the tank, with the electrodes that are left."""
+    line = np.linspace(-RADIUS, RADIUS, GRID)
+    inside = np.hypot(*np.meshgrid(line, line)) <= RADIUS
+    extent = (-RADIUS, RADIUS, -RADIUS, RADIUS)
+    shown = np.ma.masked_where(~inside, labels)
+    axes.imshow(shown, cmap=COLOURS, vmin=0, vmax=2, extent=extent, interpolation="nearest")
+    for electrode in range(2 * (level - 1), ELECTRODES):
+        angle = np.pi / 2 + 2 * np.pi * electrode / ELECTRODES + np.linspace(-1, 1, 5) * np.pi / ELECTRODES / 2
+        axes.plot(1.03 * RADIUS * np.cos(angle), 1.03 * RADIUS * np.sin(angle), color=RIM, linewidth=2)
+    axes.set(xlim=(-1.1 * RADIUS, 1.1 * RADIUS), ylim=(-1.1 * RADIUS, 1.1 * RADIUS), xticks=[], yticks=[])
+    axes.set_frame_on(False)
+
+
+def draw(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path) as new:
+        new.write_bytes(png(figure))
+
+
+def main(argv: list[str] | None = None) -> Row:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="folder with training/ and groundtruth_training/")
+    parser.add_argument("--smoke", action="store_true", help="one frame at two levels, nothing written")
+    args = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    data = load(args.data)
+    model = tank(data)
+    water = fits(model, data)
+    residuals = {name: round(fit.residual, 4) for name, fit in water.items()}
+    print("relative residual of even water:", residuals, flush=True)
+    run = partial(measure, ways=methods(model, water["equal currents, offsets"]))
+    if args.smoke:
+        rows, _ = run(replace(data, frames=data.frames[:1], truth=data.truth[:1]), levels=SMOKE_LEVELS)
+        return {"residuals": residuals, "rows": rows}
+    circumstances = c.circumstances()
+    rows, found = run(data, levels=LEVELS)
+    print(table(rows), flush=True)
+    others = [row for first in OTHER_SECTORS for row in run(data, levels=OTHER_LEVELS, first=first)[0]]
+    results: Row = {
+        "circumstances": circumstances,
+        "residuals": residuals,
+        "published_of_21": PUBLISHED,
+        "of_21": totals(rows),
+        "means_other_sectors": means(others),
+        "rows": rows,
+        "other_sectors": others,
+    }
+    c.write("ktc", c.closed(results))
+    draw(picture(data, found), PICTURE)
+    return results
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

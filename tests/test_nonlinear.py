@@ -1,0 +1,85 @@
+"""Gauss-Newton through the full forward map."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+
+PENALTIES = {
+    "variation": lambda picture: je.IsotropicVariation(),
+    "Laplace": lambda picture: je.Quadratic(je.Laplace().precision(jnp.ones((1, picture.size)), picture), 3.0),
+}
+
+
+@pytest.fixture(scope="module")
+def coarse(model):
+    return je.Pixels(12).on(model)
+
+
+@pytest.fixture(scope="module")
+def physics(model, coarse):
+    return je.LogConductivity(model, coarse, model.background[0])
+
+
+def block(places):
+    """A square twice as conductive as the sheet."""
+    return 2.0 ** np.all(np.abs(np.asarray(places) - [0.08, 0.12]) < 0.03, -1)
+
+
+@pytest.fixture(scope="module")
+def readings(skin):
+    """Of the block, on a finer mesh than the one that images it."""
+    fine = je.discretise(je.Scene(skin), je.Fidelity.draft(edge_length=0.04))
+    return np.asarray(je.forward(fine, fine.background * block(fine.centroids)))
+
+
+def test_slopes_are_those_of_the_voltages(physics):
+    rng = np.random.default_rng(0)
+    x, step = (jnp.asarray(rng.normal(size=144)) for _ in range(2))
+    _, along = jax.jvp(physics.voltages, (x,), (step,))
+    np.testing.assert_allclose(physics.slopes(x) @ step, along, atol=1e-9 * np.abs(along).max())
+
+
+@pytest.mark.parametrize("name", PENALTIES)
+def test_the_matrix_gives_the_gradient_of_the_penalty(coarse, name):
+    penalty = PENALTIES[name](coarse.picture)
+    x = jnp.asarray(np.random.default_rng(1).normal(size=144))
+    slope = jax.grad(lambda x: penalty.value(coarse.picture, x))(x)
+    np.testing.assert_allclose(penalty.matrix(coarse.picture, x) @ x, slope, rtol=1e-8, atol=1e-9)
+
+
+def test_variation_does_not_ask_which_way_an_edge_runs(coarse):
+    """A straight edge costs its height times its length, on end or aslant."""
+    picture = coarse.picture
+    cost = {}
+    for angle in (0.0, 0.5, np.pi / 4, np.pi / 2):
+        along = (picture.centres - 0.1) @ jnp.array([np.cos(angle), np.sin(angle)])
+        ramp = jnp.clip(along / 0.06, -1, 1)
+        cost[angle] = float(je.IsotropicVariation(1.0, 1e-6, 0.0).value(picture, ramp))
+    length = [0.2, 0.2 / np.cos(0.5), 0.2 * np.sqrt(2), 0.2]
+    np.testing.assert_allclose(list(cost.values()), 2 * np.array(length), rtol=0.2)
+
+
+@pytest.mark.parametrize("missing", [0, 60])
+def test_a_block_is_found_in_absolute_readings(physics, coarse, readings, missing):
+    """Twice the conductivity is far from linear: its height comes out right, which one linear step misses."""
+    readings = readings.copy()
+    readings[np.random.default_rng(2).permutation(550)[:missing]] = np.nan
+    std = np.full(550, 3e-3 * np.nanstd(readings))
+    found = np.exp(
+        je.gauss_newton(physics, je.IsotropicVariation(weight=40.0), jnp.asarray(readings), jnp.asarray(std))
+    )
+    truth = block(coarse.centres)
+    assert np.isfinite(found).all()
+    assert (found > 0).all()
+    assert np.corrcoef(found, truth)[0, 1] > 0.85
+    assert found[truth > 1].mean() == pytest.approx(2, abs=0.3)
+    assert found[truth == 1].mean() == pytest.approx(1, abs=0.05)
+
+
+def test_what_fits_already_is_left_alone(physics):
+    readings = physics.voltages(jnp.zeros(144))
+    found = je.gauss_newton(physics, je.IsotropicVariation(), readings, jnp.full(550, 1e-6))
+    assert np.abs(found).max() < 1e-6
