@@ -2,12 +2,12 @@
 
 python -m benchmarks.bench_images [--smoke] [--seeds 6]
 
-For each seed the sheet is coated anew (CoatingNonUniformity 0.15, ContactGain 0.12), pressed to 20 N by a 20 mm tip on
-the 15 x 15 grid, and pressed at two places at once; noise is 60 dB below the readings.  Columns: localisation by each
-estimator and inward bias (mean over the grid, mm), CV of the image's sum (ddof 0), false second contacts on single
-presses, pairs of which both are found and nothing else (within half their distance, at most 15 mm), milliseconds a frame
-(one at a time, from Python) and to prepare.  Image methods find contacts by `find_regions`, whose ``level`` is chosen so
-that on the singles of the first seed at most 5 % show a second one.
+For each seed the sheet is coated anew (CoatingNonUniformity 0.15, ContactGain 0.12), pressed to 20 N by a
+20 mm tip on the 15 x 15 grid, and pressed at two places at once; noise is 60 dB below the readings.  Columns:
+localisation by each estimator and inward bias (mean over the grid, mm), CV of the image's sum (ddof 0), false
+second contacts on single presses, pairs of which both are found and nothing else (within half their distance, at
+most 15 mm), milliseconds a frame (one at a time, from Python) and to prepare.  Image methods find contacts by
+`find_regions`, whose ``level`` is chosen so that on the singles of the first seed at most 5 % show a second one.
 """
 
 import argparse
@@ -230,8 +230,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     for name, settings in methods.items():
         data["rows"].append({"method": name} | by_image(model, simulated, settings))
         print(name, flush=True)
-    if hasattr(je, "prepare_contacts"):
-        data["rows"].append({"method": "contacts, fitted"} | by_fit(model, simulated))
+    data["rows"].append({"method": "contacts, fitted"} | by_fit(model, simulated))
     print(table(data["rows"]), flush=True)
     if not args.smoke:
         c.write("images", c.closed(data))

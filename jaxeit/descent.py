@@ -8,7 +8,8 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 _ENOUGH = 1e-3  # fall of the square, in units of the noise, that is not worth another step
-_STEPS = 16  # at most
+_STEPS = 20  # at most
+_TRIAL = 6  # steps after which a descent must have shown that it leads somewhere
 
 
 class Fit(NamedTuple):
@@ -42,16 +43,17 @@ def ridge(like):
     return 1e3 * jnp.finfo(like.dtype).eps
 
 
-def descend(linear, y, flat, low, high) -> Fit:
+def descend(linear, y, flat, low, high, hope=jnp.inf) -> Fit:
     """Levenberg-Marquardt within the bounds; a parameter pushed against its bound rests there.
 
     Args:
         linear: parameters to readings and their slopes.
+        hope: given up when the square is still above this after a few steps.
     """
 
     def going(state):
         step, fit = state
-        return (step < _STEPS) & ~fit.done
+        return (step < _STEPS) & ~fit.done & ((step < _TRIAL) | (fit.square < hope))
 
     def again(state):
         step, fit = state

@@ -8,7 +8,7 @@ import pytest
 
 import jaxeit as je
 from benchmarks import _common as common
-from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_jacobian
+from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_inverse, bench_jacobian
 from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
 
 from .oracles.rectangle import four_point
@@ -126,6 +126,20 @@ def test_jacobians_agree(problem):
         assert common.difference(pyeit.prepare_jacobian(problem)(problem.sigma), by_hand) < 1e-9
 
 
+@pytest.mark.parametrize("pixels", [False, True])
+def test_reconstruction_matrices_agree(problem, pixels):
+    by_hand = bench_inverse.by_hand(problem, pixels)(problem.sigma)
+    others = {
+        "image space": bench_inverse.by_hand(problem, pixels, bench_inverse.in_image_space),
+        "ours": bench_inverse.Ours(problem, pixels),
+    }
+    if not (pixels or pyeit.missing()):
+        others["pyEIT"] = pyeit.prepare_inverse(problem, bench_inverse.strength(problem, pixels))
+    for name, tool in others.items():
+        assert common.difference(tool(problem.sigma), by_hand) < 1e-9, name
+    assert others["ours"].last_seconds > 0
+
+
 with_eidors = pytest.mark.skipif(bool(eidors.missing()), reason=str(eidors.missing()))
 
 
@@ -136,6 +150,17 @@ def test_jacobian_of_eidors(problem, pixels):
     tool = eidors.prepare_jacobian(problem, matrix)
     assert common.difference(tool(problem.sigma), adjoint.prepare(problem, matrix)(problem.sigma)) < 1e-11
     assert tool.last_seconds > 0
+    tool.close()
+
+
+@with_eidors
+@pytest.mark.parametrize("pixels", [False, True])
+def test_reconstruction_matrix_of_eidors(problem, pixels):
+    tool = bench_inverse.by_eidors(problem, pixels)
+    by_hand = bench_inverse.by_hand(problem, pixels)
+    first = tool(problem.sigma)
+    assert common.difference(first, by_hand(problem.sigma)) < 1e-9
+    assert common.difference(tool(2 * problem.sigma), first) > 1e-2  # nothing is kept of the first
     tool.close()
 
 
@@ -202,6 +227,42 @@ def test_smoke(bench, capsys):
     assert {row["nodes"] for row in rows} == {961}
     assert all(row["min_ms"] <= row["median_ms"] <= row["max_ms"] for row in rows)
     assert capsys.readouterr().out.count("961 nodes |") == 1
+
+
+def test_a_slow_way_of_application_stops_after_its_budget():
+    ways = {name: bench_inverse.Way(lambda: np.ones(1), np.ones(1), 8, frames=2) for name in ("one", "other")}
+    taken = bench_inverse.latencies(ways, calls=30, block=10, budget=60.0)
+    assert [len(times) for times in taken.values()] == [30, 30]
+    rows = bench_inverse.application_rows(ways, taken, byte_per_s=1e3)
+    assert [row["least_ms"] for row in rows] == [4.0, 4.0]
+    assert all(row["min_ms"] <= row["p50_ms"] <= row["p99_ms"] <= row["max_ms"] for row in rows)
+    assert not any(len(times) for times in bench_inverse.latencies(ways, 30, 10, budget=0.0).values())
+
+
+def test_goals_are_judged_by_what_was_measured():
+    def tools(nodes, ours):
+        names = ("jaxeit float64, pixels", ours), (f"{eidors.NAME}, pixels", 100.0)
+        return [{"tool": tool, "nodes": nodes, "median_ms": ms} for tool, ms in names]
+
+    def way(name, most, frames=1):
+        times = {"p50_ms": 0.02, "p99_ms": 0.03, "max_ms": most, "least_ms": 0.01}
+        return {"way": name, "frames": frames} | times
+
+    single = [way("jaxeit, a", 0.09), way("jaxeit, b", 0.2), way("jaxeit, loop", 0.2, 100), way("NumPy", 0.2)]
+    said = bench_inverse.verdict({"rows": tools(900, 11.0) + tools(400, 9.0), "application": {"single": single}})
+    about = ["400 nodes onto 900 pixels", "900 nodes onto 900 pixels", "jaxeit, a", "jaxeit, b"]
+    assert [line.split(":")[0] for line in said] == about
+    assert [": met" in line for line in said] == [True, False, True, False]
+
+
+@pytest.mark.slow
+def test_smoke_of_inverse(capsys):
+    data = bench_inverse.main(["--smoke"])
+    assert {row["nodes"] for row in data["rows"]} == {961}
+    assert all(row["min_ms"] <= row["median_ms"] <= row["max_ms"] for row in data["rows"])
+    for rows in data["application"].values():
+        assert all(row["difference"] < (1e-4 if "float32" in row["way"] else 1e-9) for row in rows)
+    assert "goal" in capsys.readouterr().out
 
 
 @pytest.mark.slow

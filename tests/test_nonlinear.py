@@ -58,8 +58,8 @@ def test_variation_does_not_ask_which_way_an_edge_runs(coarse):
         along = (picture.centres - 0.1) @ jnp.array([np.cos(angle), np.sin(angle)])
         ramp = jnp.clip(along / 0.06, -1, 1)
         cost[angle] = float(je.IsotropicVariation(1.0, 1e-6, 0.0).value(picture, ramp))
-    length = [0.2, 0.2 / np.cos(0.5), 0.2 * np.sqrt(2), 0.2]
-    np.testing.assert_allclose(list(cost.values()), 2 * np.array(length), rtol=0.2)
+    length = [0.2, 0.2 / np.cos(0.5), 0.2 * np.sqrt(2) - 0.06, 0.2]  # mean over the ramp's width: corners cut it
+    np.testing.assert_allclose(list(cost.values()), 2 * np.array(length), rtol=0.07)
 
 
 @pytest.mark.parametrize("missing", [0, 60])

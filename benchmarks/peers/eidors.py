@@ -1,8 +1,8 @@
 """EIDORS (GPL: a peer to measure against, never a dependency) in GNU Octave, as its users call it.
 
 `fwd_solve`, `calc_jacobian` and the matrix of `inv_solve_diff_GN_one_step` on the same mesh, electrode nodes and pairs.
-Octave is a process of its own and
-reads the clock itself: its start and the files that carry conductivity and readings do not count.
+Octave is a process of its own and reads the clock itself: its start and the files that carry conductivity and results
+do not count.
 """
 
 import os
