@@ -22,7 +22,7 @@ needs_data = pytest.mark.skipif(
 def disc():
     """The unit disc with eight electrodes, even, on 10 x 10 pixels; conductivity 2."""
     model = disc_model(0.1, 0.15, electrodes=8, pattern=je.adjacent(8))
-    return ktc.LogConductivity(model, je.Pixels(10).on(model), jnp.asarray(2.0))
+    return je.LogConductivity(model, je.Pixels(10).on(model), jnp.asarray(2.0))
 
 
 def _bump(physics, x, y, height):
@@ -30,28 +30,12 @@ def _bump(physics, x, y, height):
     return jnp.asarray(height * (square < 0.3**2) * (np.asarray(physics.image.areas) > 0))
 
 
-def test_slopes_are_those_of_the_voltages(disc):
-    x, direction = _bump(disc, 0.3, 0.2, 1.0), _bump(disc, 0.0, -0.4, 1.0)
-    step = 1e-5
-    numeric = (disc.voltages(x + step * direction) - disc.voltages(x - step * direction)) / (2 * step)
-    np.testing.assert_allclose(disc.slopes(x) @ direction, numeric, atol=1e-8 * float(jnp.abs(numeric).max()))
-
-
-def test_matrix_of_the_variation_is_its_slope(disc):
-    prior = ktc.IsotropicVariation(weight=3.0, beta=0.2)
-    x = jnp.asarray(np.random.default_rng(0).normal(size=disc.image.size))
-    v = jnp.asarray(np.random.default_rng(1).normal(size=disc.image.size))
-    value = lambda t: float(prior.value(disc.image.picture, x + t * v))  # noqa: E731
-    numeric = (value(1e-5) - value(-1e-5)) / 2e-5
-    assert float(v @ prior.matrix(disc.image.picture, x) @ x) == pytest.approx(numeric, rel=1e-7)
-
-
 def test_gauss_newton_finds_both_kinds_without_some_readings(disc):
     """Readings of a conductive and a resistive piece; a NaN is left out."""
     truth = _bump(disc, 0.45, 0.0, 2.0) + _bump(disc, -0.45, 0.0, -2.0)
     readings = disc.voltages(truth).at[jnp.array([3, 17])].set(jnp.nan)
     std = jnp.full(len(readings), 1e-3 * float(jnp.nanmax(jnp.abs(readings))))
-    found = np.asarray(ktc.gauss_newton(disc, ktc.IsotropicVariation(weight=1.0), readings, std))
+    found = np.asarray(je.gauss_newton(disc, je.IsotropicVariation(weight=1.0), readings, std))
     assert np.isfinite(found).all()
     assert np.corrcoef(found, truth)[0, 1] > 0.8
     assert np.std(found[np.asarray(disc.image.areas) == 0]) == 0
