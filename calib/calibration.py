@@ -321,6 +321,8 @@ def load_calibration(path: str | Path) -> Calibration:
         raise SessionError(
             f"{Path(path).name}: {error.args[0]}: missing from the calibration; calibrate again"
         ) from None
+    except je.StoreError as error:
+        raise SessionError(f"{Path(path).name}: image/{error}; calibrate again") from None
 
 
 def _from_archive(archive: Archive) -> Calibration:

@@ -1,0 +1,384 @@
+"""One-step reconstruction (NOSER) of every tool on the same work, in one run: preparation and application.
+
+python -m benchmarks.bench_inverse [--smoke] [--no-memory]
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import cho_factor, cho_solve
+
+import jaxeit as je
+
+from . import _common as c
+from . import bench_jacobian
+from .peers import adjoint, eidors, pyeit
+
+PIXELS = bench_jacobian.PIXELS
+HYPERPARAMETER = 0.1
+PRIOR = je.Noser(floor=1e-12)  # the others know no floor; ours would lift the pixels in the corners
+ELEMENTS_LARGEST = 60  # beyond, EIDORS and pyEIT take minutes for the dense system elements x elements
+IN_DATA, IN_IMAGE = "by hand in data space", "by hand in image space"
+EIDORS_AGREE = 1e-7
+FLOAT32, FLOAT32_IMAGES = 1e-2, 1e-4  # of matrices built in it; of images by matrices built in float64
+
+CALLS, BLOCK, BUDGET = 2000, 100, 12.0  # calls whose times are taken, in turns of a block; s for a slow one
+BATCH, LOOP = 1000, 100
+GOAL_MS, GOAL_TIMES = 0.1, 10
+DTYPES = ("float64", "float32")
+
+
+# Preparation: from conductivity to what turns frames into images.
+
+
+def basis_map(model: je.Model, pixels: bool) -> je.BasisMap:
+    return (je.Pixels(PIXELS) if pixels else je.Elements()).on(model)
+
+
+class Ours:
+    """`prepare`, whose clock stops when the reconstructor is there; Q is written out for comparison only."""
+
+    def __init__(self, problem: c.Problem, pixels: bool, dtype: str = "float64") -> None:
+        self.before, self.dtype = c.peak_megabytes(), dtype
+        self.model = problem.model(dtype)
+        self.basis = basis_map(self.model, pixels)
+
+    def __call__(self, sigma: np.ndarray) -> np.ndarray:
+        self.last_seconds, recon = c.seconds(self.reconstructor, sigma)
+        self.peak = c.peak_megabytes()
+        return np.asarray(recon.matrix)
+
+    def reconstructor(self, sigma: np.ndarray) -> je.Reconstructor:
+        here = jnp.asarray(sigma, self.dtype)
+        recon = je.prepare(self.model, PRIOR, basis=self.basis, hyperparameter=HYPERPARAMETER, sigma=here)
+        return jax.block_until_ready(recon)
+
+    def peaks(self) -> dict[str, int]:
+        return {"peak_mb": round(self.peak), "beyond_imports_mb": round(self.peak - self.before)}
+
+
+def projection(problem: c.Problem, pixels: bool) -> sp.csr_array | None:
+    return bench_jacobian.pixel_matrix(problem) if pixels else None
+
+
+def noser(j: np.ndarray) -> tuple[np.ndarray, float]:
+    """R = diag(J^T J)^0.5, and l^2 = hyperparameter^2 tr(J R^-1 J^T) / readings, of which the trace is that of R."""
+    prior = np.sqrt(np.einsum("ij,ij->j", j, j))
+    return prior, HYPERPARAMETER**2 * prior.sum() / len(j)
+
+
+def in_data_space(j: np.ndarray) -> np.ndarray:
+    """``R^-1 J^T (J R^-1 J^T + l^2 I)^-1``."""
+    prior, square = noser(j)
+    gained = j / prior
+    small = gained @ j.T
+    np.einsum("ii->i", small)[:] += square
+    return cho_solve(cho_factor(small, overwrite_a=True), gained).T
+
+
+def in_image_space(j: np.ndarray) -> np.ndarray:
+    """``(J^T J + l^2 R)^-1 J^T``."""
+    prior, square = noser(j)
+    small = j.T @ j
+    np.einsum("ii->i", small)[:] += square * prior
+    return cho_solve(cho_factor(small, overwrite_a=True), j.T)
+
+
+def by_hand(problem: c.Problem, pixels: bool, solve: Callable[[np.ndarray], np.ndarray] = in_data_space) -> c.Tool:
+    jacobian = adjoint.prepare(problem, projection(problem, pixels))
+    return lambda sigma: solve(jacobian(sigma))
+
+
+def strength(problem: c.Problem, pixels: bool) -> float:
+    """l^2, which the others are given as a number."""
+    return noser(adjoint.prepare(problem, projection(problem, pixels))(problem.sigma))[1]
+
+
+def by_eidors(problem: c.Problem, pixels: bool) -> eidors.Eidors:
+    return eidors.prepare_inverse(problem, strength(problem, pixels) ** 0.5, projection(problem, pixels))
+
+
+PREPARE: dict[str, Callable[[c.Problem], c.Tool]] = {
+    "jaxeit float64, pixels": lambda problem: Ours(problem, True),
+    "jaxeit float32, pixels": lambda problem: Ours(problem, True, "float32"),
+    f"{IN_DATA}, pixels": lambda problem: by_hand(problem, True),
+    f"{IN_IMAGE}, pixels": lambda problem: by_hand(problem, True, in_image_space),
+    f"{eidors.NAME}, pixels": lambda problem: by_eidors(problem, True),
+    "jaxeit float64, elements": lambda problem: Ours(problem, False),
+    f"{IN_DATA}, elements": lambda problem: by_hand(problem, False),
+    f"{eidors.NAME}, elements": lambda problem: by_eidors(problem, False),
+    f"{pyeit.NAME}, elements": lambda problem: pyeit.prepare_inverse(problem, strength(problem, False)),
+}
+LOOSE = {name: FLOAT32 if "float32" in name else EIDORS_AGREE for name in PREPARE}
+
+
+def present(cells: int) -> list[str]:
+    """Tools to run at this size."""
+    absent = {peer.NAME: peer.missing() for peer in (eidors, pyeit) if peer.missing()}
+    for name, reason in absent.items():
+        print(f"{name} left out: {reason}")
+    small = [name for name in PREPARE if "elements" not in name or cells <= ELEMENTS_LARGEST]
+    return [name for name in small if not name.startswith(tuple(absent))]
+
+
+def measure(cells: int, repeats: int, budget: float) -> list[tuple[list[dict[str, Any]], dict[str, Any]]]:
+    problem, names = c.Problem(cells), present(cells)
+    factor = c.factorisation(problem)
+    sizes = {"pixels": PIXELS**2, "elements": len(problem.sigma)}
+    out: list[tuple[list[dict[str, Any]], dict[str, Any]]] = []
+    for image, size in sizes.items():
+        mine = {name: PREPARE[name] for name in names if name.endswith(image)}
+        if mine:
+            print(f"{len(problem.mesh.nodes)} nodes, onto {image}; largest difference of the reconstruction matrices")
+            rows = c.measured(mine, problem, f"{IN_DATA}, {image}", LOOSE, repeats, budget)
+            out.append((rows, work(problem, factor, size) | {"onto": image}))
+    return out
+
+
+def work(problem: c.Problem, factor: dict[str, float], coefficients: int) -> dict[str, Any]:
+    """That of the Jacobian, and of a symmetric product, a Cholesky factor and two triangular solves for 300 numbers."""
+    of_jacobian, k = bench_jacobian.work(problem, factor, coefficients), 300
+    return {
+        "flops": of_jacobian["flops"] + 3 * k**2 * coefficients + k**3 / 3,
+        "bytes": of_jacobian["bytes"] + 8 * 2 * k * coefficients,
+    }
+
+
+# Application: from a frame to its image.
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A way to apply a reconstruction: a call, and the images it must give.
+
+    ``bytes`` are what it cannot but touch, ``passes`` times in a call of so many ``frames``.
+    """
+
+    call: Callable[[], np.ndarray | jax.Array]
+    expected: np.ndarray
+    bytes: int
+    frames: int = 1
+    passes: int = 1
+
+
+def touched(recon: je.Reconstructor) -> int:
+    """Bytes of what one image needs of a reconstructor, the frame and the image."""
+    w = recon.whitening
+    tables = (recon.factor, w.lines, w.sign, w.weight, w.channels)
+    return sum(a.nbytes for a in tables) + recon.factor.dtype.itemsize * (recon.readings + len(recon.factor))
+
+
+def pair_sums(recon: je.Reconstructor) -> sp.csr_array:
+    """(pair sums, readings): ``P^T W`` as a sparse matrix."""
+    readings = jnp.eye(recon.readings, dtype=recon.factor.dtype)
+    return sp.csr_array(np.asarray(recon.whitening.sums(readings)).T)
+
+
+def in_a_loop(recon: je.Reconstructor) -> Callable[[jax.Array], jax.Array]:
+    """One frame after the other inside a compiled program: what an image costs without the call."""
+    leaves, rest = eqx.partition(recon, eqx.is_array)
+    run = jax.jit(lambda leaves, frames: jax.lax.map(eqx.combine(leaves, rest), frames))
+    return lambda frames: jax.block_until_ready(run(leaves, frames))
+
+
+def single_ways(recon: je.Reconstructor, frame: np.ndarray) -> dict[str, Way]:
+    """Ways to apply a reconstructor built in float64 to one frame, in both precisions."""
+    exact = np.asarray(recon.matrix) @ frame
+    broken = np.where(np.arange(len(frame)) == len(frame) // 2, np.nan, frame)
+    mended = np.asarray(recon.without(jnp.isnan(broken)).matrix) @ frame
+    return {
+        f"{name} {dtype}": way
+        for dtype in DTYPES
+        for name, way in _single_ways(recon.astype(dtype), frame.astype(dtype), exact, broken, mended).items()
+    }
+
+
+def _single_ways(recon, frame, exact, broken, mended) -> dict[str, Way]:
+    on_device, many = jnp.asarray(frame), jnp.tile(frame, (LOOP, 1))
+    broken, wait, compiled, looped = (
+        broken.astype(frame.dtype),
+        jax.block_until_ready,
+        recon.compiled(),
+        in_a_loop(recon),
+    )
+    matrix, factor, sparse = np.asarray(recon.matrix), np.asarray(recon.factor), pair_sums(recon)
+    ends = frame.nbytes + len(matrix) * frame.itemsize
+    ours, dense = touched(recon), matrix.nbytes + ends
+    compressed = factor.nbytes + sparse.data.nbytes + sparse.indices.nbytes + ends
+    return {
+        "jaxeit, NumPy in and out,": Way(lambda: np.asarray(recon(frame)), exact, ours),
+        "jaxeit, JAX array,": Way(lambda: wait(recon(on_device)), exact, ours),
+        "jaxeit, compiled(), NumPy in and out,": Way(lambda: np.asarray(compiled(frame)), exact, ours),
+        "jaxeit, compiled(), JAX array,": Way(lambda: wait(compiled(on_device)), exact, ours),
+        "jaxeit, in a compiled loop,": Way(lambda: looped(many), np.tile(exact, (LOOP, 1)), ours, LOOP, passes=LOOP),
+        "jaxeit, one reading is NaN,": Way(lambda: np.asarray(recon(broken)), mended, ours),
+        "NumPy, Q dv,": Way(lambda: matrix @ frame, exact, dense),
+        "NumPy and SciPy, through pair sums,": Way(lambda: factor @ (sparse @ frame), exact, compressed),
+    }
+
+
+def batch_ways(recon: je.Reconstructor, frames: np.ndarray) -> dict[str, Way]:
+    """Ways to apply it to a batch of frames, (frames, readings)."""
+    exact, broken, lost, last = frames @ np.asarray(recon.matrix).T, frames.copy(), 7, len(frames) - 1
+    broken[last, lost], mended = np.nan, exact.copy()
+    mended[last] = np.asarray(recon.without(jnp.arange(recon.readings) == lost).matrix) @ frames[last]
+    return {
+        f"{name} {dtype}": way
+        for dtype in DTYPES
+        for name, way in _batch_ways(
+            recon.astype(dtype), frames.astype(dtype), exact, broken.astype(dtype), mended
+        ).items()
+    }
+
+
+def _batch_ways(recon, frames, exact, broken, mended) -> dict[str, Way]:
+    matrix, factor, sparse = np.asarray(recon.matrix), np.asarray(recon.factor), pair_sums(recon)
+    n, ends = len(frames), frames.nbytes + exact.size * frames.itemsize
+    ours, dense = touched(recon) + ends, matrix.nbytes + ends
+    return {
+        "jaxeit, NumPy in and out,": Way(lambda: np.asarray(recon(frames)), exact, ours, n),
+        "jaxeit, one reading of one frame is NaN,": Way(lambda: np.asarray(recon(broken)), mended, ours, n),
+        "NumPy, Q dv,": Way(lambda: frames @ matrix.T, exact, dense, n),
+        "NumPy and SciPy, through pair sums,": Way(lambda: (sparse @ frames.T).T @ factor.T, exact, ours, n),
+    }
+
+
+def require_images(ways: dict[str, Way]) -> dict[str, float]:
+    """First calls, which compile: how far the images are from Q dv; stops where they are others."""
+    found: dict[str, float] = {}
+    for name, way in ways.items():
+        outputs = {name: np.asarray(way.call()), "Q dv": way.expected}
+        found |= c.require_agreement(outputs, "Q dv", {name: FLOAT32_IMAGES} if "float32" in name else {})
+    return found
+
+
+def latencies(ways: dict[str, Way], calls: int, block: int, budget: float) -> dict[str, np.ndarray]:
+    """Seconds per frame of each call: all ways in turn, a block of calls each; a slow one stops after its budget."""
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(calls // block):
+        for name, way in ways.items():
+            times[name] += _block(way.call, block, budget - sum(times[name]))
+    return {name: np.array(taken) / ways[name].frames for name, taken in times.items()}
+
+
+def _block(call: Callable[[], Any], calls: int, left: float) -> list[float]:
+    taken: list[float] = []
+    while len(taken) < calls and sum(taken) < left:
+        taken.append(c.seconds(call)[0])
+    return taken
+
+
+def copy_seconds(count: int) -> float:
+    """Least time in which so many bytes are touched by a copy, half read and half written; small ones stay in cache."""
+    source = np.ones(max(count // 2, 1), np.uint8)
+    into = np.empty_like(source)
+    return min(c.seconds(np.copyto, into, source)[0] for _ in range(50))
+
+
+def application_rows(ways: dict[str, Way], times: dict[str, np.ndarray], byte_per_s: float) -> list[dict[str, Any]]:
+    """ms per frame; the least times are those of a copy of as many bytes, from memory and as they lie in the caches."""
+    found = {name: [1e3 * float(f(taken)) for f in STATISTICS.values()] for name, taken in times.items()}
+    return [
+        {
+            "way": name,
+            "frames": way.frames,
+            "calls": len(times[name]),
+            **{f"{key}_ms": round(value, 5) for key, value in zip(STATISTICS, found[name], strict=True)},
+            "frames_per_s": round(1e3 / found[name][0], 1),
+            "bytes": way.bytes,
+            "least_ms": round(1e3 * way.bytes / byte_per_s * way.passes / way.frames, 5),
+            "least_cached_ms": round(1e3 * copy_seconds(way.bytes) * way.passes / way.frames, 5),
+        }
+        for name, way in ways.items()
+    ]
+
+
+STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
+    "p50": np.median,
+    "p99": lambda times: np.quantile(times, 0.99),
+    "min": np.min,
+    "max": np.max,
+}
+
+
+def application(cells: int, smoke: bool, byte_per_s: float) -> dict[str, list[dict[str, Any]]]:
+    """Single frames and a batch, with a reconstructor from any mesh: its size does not depend on it."""
+    problem, rng = c.Problem(cells), np.random.default_rng(0)
+    recon = Ours(problem, True).reconstructor(problem.sigma)
+    frames = rng.normal(size=(60 if smoke else BATCH, recon.readings))
+    print("application; largest difference of the images")
+    out = {}
+    plan = {"single": (single_ways(recon, frames[0]), CALLS // 10 if smoke else CALLS, BLOCK)}
+    plan["batch"] = (batch_ways(recon, frames), 3 if smoke else 20, 1)
+    for kind, (ways, calls, block) in plan.items():
+        found = require_images(ways)
+        rows = application_rows(ways, latencies(ways, calls, block, 1.0 if smoke else BUDGET), byte_per_s)
+        out[kind] = [row | {"difference": found[row["way"]]} for row in rows]
+    return out
+
+
+def application_table(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| ms per frame | p50 | p99 | min | max | copy from memory, from cache | frames per s | calls |",
+        "|---" * 8 + "|",
+    ]
+    lines += [
+        f"| {r['way']} | {r['p50_ms']:.4f} | {r['p99_ms']:.4f} | {r['min_ms']:.4f} | {r['max_ms']:.4f} "
+        f"| {r['least_ms']:.4f}, {r['least_cached_ms']:.4f} | {r['frames_per_s']:,.0f} | {r['calls']} |"
+        for r in rows
+    ]
+    return "\n".join(lines)
+
+
+def verdict(data: dict[str, Any]) -> list[str]:
+    """What the goals ask for, and what was measured."""
+    lines = []
+    for nodes in sorted({row["nodes"] for row in data["rows"]}):
+        took = {row["tool"]: row["median_ms"] for row in data["rows"] if row["nodes"] == nodes}
+        theirs, ours = (took.get(f"{tool}, pixels") for tool in (eidors.NAME, "jaxeit float64"))
+        if theirs and ours:
+            lines.append(
+                f"{nodes:,} nodes onto {PIXELS**2} pixels: {theirs / ours:.1f} times as fast as EIDORS "
+                f"(goal {GOAL_TIMES}: {_met(theirs >= GOAL_TIMES * ours)})"
+            )
+    for row in data["application"]["single"]:
+        if row["way"].startswith("jaxeit") and row["frames"] == 1:
+            lines.append(
+                f"{row['way']}: p50 {row['p50_ms']:.3f}, p99 {row['p99_ms']:.3f}, most {row['max_ms']:.3f} ms (goal "
+                f"{GOAL_MS}: {_met(row['max_ms'] <= GOAL_MS)}; {row['p50_ms'] / row['least_ms']:.1f} times the limit)"
+            )
+    return lines
+
+
+def _met(goal: bool) -> str:
+    return "met" if goal else "missed"
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    data = c.run(argv, __doc__, "inverse", PREPARE, measure, repeats=7)
+    if not data:
+        return data
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--smoke", action="store_true")
+    own.add_argument("--section", default="inverse")
+    args, _ = own.parse_known_args(argv)
+    data["application"] = application(c.SMOKE[0], args.smoke, data["limits"]["byte_per_s"])
+    data["verdict"] = verdict(data)
+    for rows in data["application"].values():
+        print(application_table(rows), flush=True)
+    print("\n".join(data["verdict"]))
+    if not args.smoke:
+        c.write(args.section, c.closed(data))
+    return data
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
