@@ -7,6 +7,7 @@ not in the scene is not in the program.
 from importlib import metadata
 
 from .basis import BasisMap, Bumps, Elements, Picture, Pixels
+from .contacts import ContactFinder, ContactResult, Contacts, prepare_contacts, refine_contacts, strongest
 from .discretise import Model, discretise, make_mesh
 from .domain import Disc, Polygon, Rectangle
 from .effects import (
@@ -89,8 +90,11 @@ __all__ = [
     "Bumps",
     "CoatingNonUniformity",
     "ConjugateGradient",
+    "ContactFinder",
     "ContactGain",
     "ContactPiezoresistance",
+    "ContactResult",
+    "Contacts",
     "Cylinder",
     "Dense",
     "Disc",
@@ -187,11 +191,14 @@ __all__ = [
     "parse_skin",
     "parse_toml",
     "prepare",
+    "prepare_contacts",
     "read_effects",
     "read_text",
     "reciprocal_rows",
+    "refine_contacts",
     "save_reconstructor",
     "shipped_skins",
+    "strongest",
     "structural_similarity",
     "structured",
     "to_numbers",

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
-from typing import overload
+from typing import Any, overload
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular as solve_lower
+from scipy.sparse import csr_array
 
 from .basis import AbstractBasis, BasisMap, Picture, Pixels
 from .discretise import Model
@@ -21,7 +22,10 @@ from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, predicted
 from .priors import AbstractPrior, Noser
+from .verbs import compiler_options
 from .whitening import Whitened, Whitening, whitened
+
+_FEW = 16  # readings missing from a frame, up to which they are mended one by one
 
 
 class InverseError(ValueError):
@@ -78,7 +82,7 @@ class AbstractReconstructor(eqx.Module):
 
     def compiled(self) -> Callable[[Float[ArrayLike, "... readings"]], Float[Array, "... basis"]]:
         """The same as one function of the frame, its numbers built in: a call has a fraction of the overhead."""
-        return jax.jit(lambda dv: self(dv))
+        return jax.jit(lambda dv: self(dv), compiler_options=compiler_options())
 
     def _sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
         finite = jnp.all(jnp.isfinite(dv) | ~self.channels)
@@ -93,6 +97,22 @@ class AbstractReconstructor(eqx.Module):
 
     def _mended(self, dv: Float[Array, " readings"]) -> Float[Array, " k"]:
         """Sums that give the image of the readings at hand: the others are what that image predicts for them."""
+        missing = self.channels & ~jnp.isfinite(dv)
+        few = jnp.sum(missing) <= (_FEW if self.whitening.weight.ndim == 1 else 0)
+        return jax.lax.cond(few, lambda *a: self._few(*a), lambda *a: self._many(*a), dv, missing)
+
+    def _few(self, dv, missing):
+        """Through the missing readings themselves: ``y = P T (t + P^T W y)`` on their rows of P."""
+        rows = jnp.flatnonzero(missing, size=_FEW, fill_value=0)
+        there = (jnp.arange(_FEW) < jnp.sum(missing)).astype(dv.dtype)
+        p = self.whitening.rows(rows) * there[:, None]
+        weighted = p * self.whitening.weight[rows, None] if self.whitening.weight.ndim == 1 else p
+        sums, through = self.whitening.sums(jnp.where(missing, 0, dv)), p @ self.predict
+        y = jnp.linalg.solve(jnp.eye(_FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
+        return sums + weighted.T @ y
+
+    def _many(self, dv, missing):
+        """Through all pair sums: ``t = sums + G_lost T t``."""
         lost = self.whitening.lost(dv)
         return jnp.linalg.solve(jnp.eye(len(lost.sums), dtype=dv.dtype) - lost.gram @ self.predict, lost.sums)
 
@@ -157,6 +177,28 @@ class Reconstructor(AbstractReconstructor):
         """Q as one matrix, S/V; applying a reconstruction does not need it."""
         return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
 
+    def on_host(self) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
+        """The same in NumPy: for one frame at a time JAX's call alone takes longer than the image.
+
+        Frames with readings that are not finite go through JAX.
+        """
+        dtype = np.dtype(self.factor.dtype)
+        sums = self.whitening.sums(jnp.eye(self.readings, dtype=dtype)).T
+        weigh: Any = csr_array(sums) if self.whitening.weight.ndim == 1 else np.asarray(sums)
+        factor = np.asarray(self.factor)
+
+        def apply(dv):
+            dv = np.asarray(dv, dtype)
+            if dv.shape[-1:] != (self.readings,):
+                raise InverseError(f"dv has shape {dv.shape}; its last axis must hold {self.readings} readings")
+            t = weigh @ dv.reshape(-1, self.readings).T if dv.ndim != 1 else weigh @ dv
+            if not np.isfinite(t).all():
+                return np.asarray(self(dv))
+            image = factor @ t
+            return image if dv.ndim == 1 else image.T.reshape(*dv.shape[:-1], len(factor))
+
+        return apply
+
     def astype(self, dtype: str) -> "Reconstructor":
         """The same in another precision: built in float64, a matrix may be applied in float32."""
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
@@ -169,8 +211,8 @@ class Reconstructor(AbstractReconstructor):
         Raises:
             InverseError: if the shape does not fit, or no reading would be left.
         """
-        used = np.asarray(self.channels) & ~_flags(channels, self.readings)
-        return replace(_without(self, jnp.asarray(_some(used))), provenance=self.provenance)
+        used = np.asarray(self.channels) & ~as_flags(channels, self.readings)
+        return replace(_without(self, jnp.asarray(require_some(used))), provenance=self.provenance)
 
 
 @eqx.filter_jit
@@ -274,8 +316,8 @@ def prepare(
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
     method, prior = method or OneStep(), prior or Noser()
     readings = model.pattern.shape[0]
-    used = _some(np.ones(readings, bool) if channels is None else _flags(channels, readings))
-    weight = _weight(noise, readings, used)
+    used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
+    weight = noise_weight(noise, readings, used)
     found = whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
     slopes = pair_jacobian(model, sigma, image, jnp.asarray(found.electrodes))
     factor, compress = (jnp.asarray(array, model.dtype) for array in (found.factor, found.compress))
@@ -291,7 +333,7 @@ def prepare(
     settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
     about = Provenance({"jaxeit": metadata.version("jaxeit"), **settings, **(provenance or {})})
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
-    recon = replace(_build(problem, linear, compress, found.whitening), provenance=about)
+    recon = replace(_build(problem, linear, compress, found.whitening, noise is not None), provenance=about)
     if not bool(jnp.isfinite(recon.factor).all()):
         raise InverseError(
             "the reconstruction matrix is not finite: the conductivity must be positive, and in "
@@ -310,15 +352,15 @@ def prepare(
             picture=recon.picture,
             provenance=about,
         )
-    return recon if noise is not None else eqx.tree_at(lambda r: r.variance, recon, recon.variance + jnp.inf)
+    return recon
 
 
 @eqx.filter_jit
-def _build(problem, method, compress, found) -> Reconstructor:
+def _build(problem, method, compress, found, noise_is_known) -> Reconstructor:
     q = method.matrix(problem)
     return Reconstructor(
         factor=q @ compress,
-        variance=method.variance(problem, q),
+        variance=method.variance(problem, q) if noise_is_known else jnp.full(len(q), jnp.inf, q.dtype),
         predict=compress.T @ predicted(problem) @ compress,
         whitening=found,
         picture=problem.picture,
@@ -340,20 +382,20 @@ def _whiten(found: Whitened, dtype: np.dtype, dv: Float[ArrayLike, "... readings
     return found.whitening.sums(jnp.asarray(dv, dtype)) @ jnp.asarray(found.compress, dtype).T
 
 
-def _flags(channels, readings: int) -> np.ndarray:
+def as_flags(channels, readings: int) -> np.ndarray:
     flags = np.asarray(channels, bool)
     if flags.shape != (readings,):
         raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
     return flags
 
 
-def _some(used: np.ndarray) -> np.ndarray:
+def require_some(used: np.ndarray) -> np.ndarray:
     if not used.any():
         raise InverseError("every channel is left out: there is nothing to reconstruct from")
     return used
 
 
-def _weight(noise, readings: int, channels: np.ndarray) -> np.ndarray:
+def noise_weight(noise, readings: int, channels: np.ndarray) -> np.ndarray:
     """Inverse of the noise on the channels that are used, zero elsewhere: variances or a covariance."""
     if noise is None:
         return channels.astype(float)

@@ -62,6 +62,13 @@ class Whitening(eqx.Module):
         first, second, third, fourth = (z[column] for column in self.pairs.T)
         return self.current * (first - second - third + fourth)
 
+    def rows(self, number: Int[Array, " n"]) -> Float[Array, "n k"]:
+        """Rows of P."""
+        place = self.pairs[number]
+        row = jnp.zeros((len(number), self.lines.shape[0]), self.sign.dtype)
+        signs = self.current * jnp.asarray(_SIGNS, self.sign.dtype)
+        return row.at[jnp.arange(len(number))[:, None], place].add(signs)
+
     def lost(self, dv: Float[Array, " readings"]) -> Lost:
         """What a frame lacks whose readings are not all finite: their rows and columns leave the covariance.
 

@@ -71,6 +71,18 @@ def test_the_compiled_function_is_the_same_map(recon):
     np.testing.assert_allclose(apply(dv[0]), recon(dv[0]), rtol=1e-9, atol=1e-12)
 
 
+def test_numpy_gives_the_same_image(recon):
+    dv = np.array(jax.random.normal(jax.random.key(0), (2, 3, recon.readings)))
+    dv[1, 2, 5] = np.nan
+    apply = recon.on_host()
+    for frames in (dv, dv[0], dv[0, 0], dv[1, 2]):
+        found, expected = apply(frames), np.asarray(recon(frames))
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+    with pytest.raises(je.InverseError, match="must hold 550"):
+        apply(np.zeros(3))
+
+
 @pytest.mark.parametrize("shape", [(), (3,), (2, 549), (550, 2)])
 def test_frames_of_another_protocol_are_refused(recon, shape):
     with pytest.raises(je.InverseError, match="must hold 550 readings"):

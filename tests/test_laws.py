@@ -18,8 +18,8 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
-    "basis", "jacobian", "whitening", "priors", "methods", "hyperparameter", "inverse", "store", "descent", "contacts",
-    "nonlinear", "fusion", "metrics", "regions",
+    "basis", "jacobian", "whitening", "priors", "methods", "hyperparameter", "inverse", "store", "responses",
+    "descent", "contacts", "nonlinear", "fusion", "metrics", "regions",
 ]  # fmt: skip
 BENCH = [
     "session", "units", "corrections", "presses", "curves", "fit", "response", "measured", "evaluation",
