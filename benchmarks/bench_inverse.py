@@ -28,7 +28,9 @@ PRIOR = je.Noser(floor=1e-12)  # the others know no floor; ours would lift the p
 ELEMENTS_LARGEST = 60  # beyond, EIDORS and pyEIT take minutes for the dense system elements x elements
 IN_DATA, IN_IMAGE = "by hand in data space", "by hand in image space"
 EIDORS_AGREE = 1e-7
-FLOAT32, FLOAT32_IMAGES = 1e-2, 1e-4  # of matrices built in it; of images by matrices built in float64
+FLOAT32_IMAGES = (
+    1e-4  # of images in float32 by matrices built in float64 (built in float32 they are 2 % off: not timed)
+)
 
 CALLS, BLOCK, BUDGET = 2000, 100, 12.0  # calls whose times are taken, in turns of a block; s for a slow one
 BATCH, LOOP = 1000, 100
@@ -108,7 +110,6 @@ def by_eidors(problem: c.Problem, pixels: bool) -> eidors.Eidors:
 
 PREPARE: dict[str, Callable[[c.Problem], c.Tool]] = {
     "jaxeit float64, pixels": lambda problem: Ours(problem, True),
-    "jaxeit float32, pixels": lambda problem: Ours(problem, True, "float32"),
     f"{IN_DATA}, pixels": lambda problem: by_hand(problem, True),
     f"{IN_IMAGE}, pixels": lambda problem: by_hand(problem, True, in_image_space),
     f"{eidors.NAME}, pixels": lambda problem: by_eidors(problem, True),
@@ -117,7 +118,7 @@ PREPARE: dict[str, Callable[[c.Problem], c.Tool]] = {
     f"{eidors.NAME}, elements": lambda problem: by_eidors(problem, False),
     f"{pyeit.NAME}, elements": lambda problem: pyeit.prepare_inverse(problem, strength(problem, False)),
 }
-LOOSE = {name: FLOAT32 if "float32" in name else EIDORS_AGREE for name in PREPARE}
+LOOSE = dict.fromkeys(PREPARE, EIDORS_AGREE)
 
 
 def present(cells: int) -> list[str]:
@@ -203,17 +204,14 @@ def single_ways(recon: je.Reconstructor, frame: np.ndarray) -> dict[str, Way]:
 
 def _single_ways(recon, frame, exact, broken, mended) -> dict[str, Way]:
     on_device, many = jnp.asarray(frame), jnp.tile(frame, (LOOP, 1))
-    broken, wait, compiled, looped = (
-        broken.astype(frame.dtype),
-        jax.block_until_ready,
-        recon.compiled(),
-        in_a_loop(recon),
-    )
+    broken, wait = broken.astype(frame.dtype), jax.block_until_ready
+    compiled, looped, on_host = recon.compiled(), in_a_loop(recon), recon.on_host()
     matrix, factor, sparse = np.asarray(recon.matrix), np.asarray(recon.factor), pair_sums(recon)
     ends = frame.nbytes + len(matrix) * frame.itemsize
     ours, dense = touched(recon), matrix.nbytes + ends
     compressed = factor.nbytes + sparse.data.nbytes + sparse.indices.nbytes + ends
     return {
+        "jaxeit, on_host(),": Way(lambda: on_host(frame), exact, compressed),
         "jaxeit, NumPy in and out,": Way(lambda: np.asarray(recon(frame)), exact, ours),
         "jaxeit, JAX array,": Way(lambda: wait(recon(on_device)), exact, ours),
         "jaxeit, compiled(), NumPy in and out,": Way(lambda: np.asarray(compiled(frame)), exact, ours),
