@@ -7,6 +7,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -131,17 +132,9 @@ def present(cells: int) -> list[str]:
 
 
 def measure(cells: int, repeats: int, budget: float) -> list[tuple[list[dict[str, Any]], dict[str, Any]]]:
-    problem, names = c.Problem(cells), present(cells)
-    factor = c.factorisation(problem)
-    sizes = {"pixels": PIXELS**2, "elements": len(problem.sigma)}
-    out: list[tuple[list[dict[str, Any]], dict[str, Any]]] = []
-    for image, size in sizes.items():
-        mine = {name: PREPARE[name] for name in names if name.endswith(image)}
-        if mine:
-            print(f"{len(problem.mesh.nodes)} nodes, onto {image}; largest difference of the reconstruction matrices")
-            rows = c.measured(mine, problem, f"{IN_DATA}, {image}", LOOSE, repeats, budget)
-            out.append((rows, work(problem, factor, size) | {"onto": image}))
-    return out
+    run = partial(c.measured, loose=LOOSE, repeats=repeats, budget=budget)
+    tools = {name: PREPARE[name] for name in present(cells)}
+    return bench_jacobian.onto_each(c.Problem(cells), tools, IN_DATA, "reconstruction matrices", work, run)
 
 
 def work(problem: c.Problem, factor: dict[str, float], coefficients: int) -> dict[str, Any]:

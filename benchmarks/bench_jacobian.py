@@ -4,6 +4,8 @@ python -m benchmarks.bench_jacobian [--smoke] [--no-memory]
 """
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,15 +62,21 @@ def present(cells: int) -> list[str]:
 
 
 def measure(cells: int, repeats: int, budget: float) -> list[tuple[list[dict[str, Any]], dict[str, Any]]]:
-    problem, names = c.Problem(cells), present(cells)
-    factor = c.factorisation(problem)
-    sizes = {"pixels": PIXELS**2, "elements": len(problem.sigma)}
-    out: list[tuple[list[dict[str, Any]], dict[str, Any]]] = []
-    for image, size in sizes.items():
-        mine = {name: PREPARE[name] for name in names if name.endswith(image)}
+    run = partial(c.measured, loose=LOOSE, repeats=repeats, budget=budget)
+    tools = {name: PREPARE[name] for name in present(cells)}
+    return onto_each(c.Problem(cells), tools, adjoint.NAME, "Jacobians", work, run)
+
+
+def onto_each(
+    problem: c.Problem, tools: dict[str, Any], reference: str, what: str, work: Callable, run: Callable
+) -> list[tuple[list[dict[str, Any]], dict[str, Any]]]:
+    """Rows and work onto pixels, then onto elements, of the tools so named."""
+    factor, out = c.factorisation(problem), []
+    for image, size in {"pixels": PIXELS**2, "elements": len(problem.sigma)}.items():
+        mine = {name: prepare for name, prepare in tools.items() if name.endswith(image)}
         if mine:
-            print(f"{len(problem.mesh.nodes)} nodes, onto {image}; largest difference of the Jacobians")
-            rows = c.measured(mine, problem, f"{adjoint.NAME}, {image}", LOOSE, repeats, budget)
+            print(f"{len(problem.mesh.nodes)} nodes, onto {image}; largest difference of the {what}")
+            rows = run(mine, problem, f"{reference}, {image}")
             out.append((rows, work(problem, factor, size) | {"onto": image}))
     return out
 

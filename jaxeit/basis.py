@@ -43,23 +43,10 @@ class Picture(eqx.Module):
         return self.areas.shape[0]
 
 
-class BasisMap(eqx.Module):
-    """A basis laid over one model: conductivity change = sparse matrix times coefficients.
+class AbstractPictured(eqx.Module):
+    """Whatever has coefficients that lie on a `Picture`."""
 
-    The matrix is kept in lines of c entries; a coefficient has as many lines as it needs.
-
-    | meaning                                               | shape       | unit |
-    |-------------------------------------------------------|-------------|------|
-    | element, weight: entries of each line; weight 0: none | (lines, c)  |      |
-    | coefficient of each line                              | (lines,)    |      |
-    | picture: where the coefficients lie                   |             |      |
-    """
-
-    element: Int[Array, "lines c"]
-    weight: Float[Array, "lines c"]
-    coefficient: Int[Array, " lines"]
-    picture: Picture
-    elements: int = eqx.field(static=True)
+    picture: eqx.AbstractVar[Picture]
 
     @property
     def size(self) -> int:
@@ -85,6 +72,25 @@ class BasisMap(eqx.Module):
     def extent(self) -> tuple[float, float, float, float]:
         """See `Picture`."""
         return self.picture.extent
+
+
+class BasisMap(AbstractPictured):
+    """A basis laid over one model: conductivity change = sparse matrix times coefficients.
+
+    The matrix is kept in lines of c entries; a coefficient has as many lines as it needs.
+
+    | meaning                                               | shape       | unit |
+    |-------------------------------------------------------|-------------|------|
+    | element, weight: entries of each line; weight 0: none | (lines, c)  |      |
+    | coefficient of each line                              | (lines,)    |      |
+    | picture: where the coefficients lie                   |             |      |
+    """
+
+    element: Int[Array, "lines c"]
+    weight: Float[Array, "lines c"]
+    coefficient: Int[Array, " lines"]
+    picture: Picture
+    elements: int = eqx.field(static=True)
 
     def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
         """Values on the elements, from those of the coefficients."""

@@ -21,11 +21,11 @@ from .basis import Elements
 from .descent import Fit, descend, ridge, scale_of
 from .discretise import Model
 from .forward import conductivity, forward
-from .inverse import InverseError, as_flags, noise_weight, require_some
+from .inverse import InverseError, require_frames, whitened_readings
 from .jacobian import pair_jacobian
 from .responses import Nodes, Responses, nodes_of, points_of, reached, splines, tabulate
 from .verbs import verb
-from .whitening import Whitening, whitened
+from .whitening import Whitening
 
 _LONGEST = 0.04  # half length of an oblong contact, m
 _RIPPLE = 0.1  # of the strongest contact's strength: what is less is none
@@ -138,8 +138,7 @@ class ContactFinder(eqx.Module):
         numbers, for machines wide enough to gain by it.
         """
         frames = jnp.asarray(dv, self.compress.dtype)
-        if frames.shape[-1:] != self.whitening.channels.shape:
-            raise InverseError(f"dv has shape {frames.shape}; its last axis must hold {self.readings} readings")
+        require_frames(frames, self.readings)
         return _find(self, frames)
 
     @property
@@ -384,10 +383,7 @@ def prepare_contacts(
         InverseError: if a value is out of range or no channel is left.
     """
     _check(most, widths, columns, false_alarm, model_error, ratio, separation)
-    readings = model.pattern.shape[0]
-    used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
-    weight = noise_weight(noise, readings, used)
-    found = whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
+    found = whitened_readings(model, noise, channels)
     slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(found.electrodes))
     at = np.asarray(model.background if sigma is None else sigma, float)
     background = float(np.average(at, weights=np.asarray(model.areas, float)))
@@ -506,8 +502,8 @@ def refine_contacts(
     Raises:
         InverseError: if shapes do not fit, or a reading that is used is not finite.
     """
-    readings, dv = model.pattern.shape[0], np.asarray(dv, float)
-    used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
+    found = whitened_readings(model, noise, channels)
+    readings, dv, used = model.pattern.shape[0], np.asarray(dv, float), np.asarray(found.whitening.channels)
     if dv.shape != (readings,) or contacts.present.ndim != 1:
         raise InverseError(f"dv has shape {dv.shape}; refine one frame of {readings} readings at a time")
     if not np.isfinite(dv[used]).all():
@@ -515,9 +511,6 @@ def refine_contacts(
     count = int(contacts.present.sum())
     if not count:
         return contacts
-    found = whitened(
-        np.asarray(model.pattern), float(model.current), noise_weight(noise, readings, used), used, model.dtype
-    )
     sigma = conductivity(model) if sigma is None else jnp.asarray(sigma, model.dtype)
     chart = np.asarray(model.chart, float)
     points, weights = (jnp.asarray(a, model.dtype) for a in points_of(model, widths[0] * 2))

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular as solve_lower
 from scipy.sparse import csr_array
 
-from .basis import AbstractBasis, BasisMap, Picture, Pixels
+from .basis import AbstractBasis, AbstractPictured, BasisMap, Picture, Pixels
 from .discretise import Model
 from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
@@ -45,7 +45,7 @@ class Provenance(dict[str, str]):
         return hash(Provenance)
 
 
-class AbstractReconstructor(eqx.Module):
+class AbstractReconstructor(AbstractPictured):
     """Frames to images, without mesh or solver.
 
     | meaning                                                                        | shape     | unit |
@@ -58,7 +58,6 @@ class AbstractReconstructor(eqx.Module):
 
     whitening: eqx.AbstractVar[Whitening]
     predict: eqx.AbstractVar[Float[Array, "k k"]]
-    picture: eqx.AbstractVar[Picture]
     provenance: eqx.AbstractVar[Provenance]
 
     @abstractmethod
@@ -76,8 +75,7 @@ class AbstractReconstructor(eqx.Module):
         Raises:
             InverseError: if the last axis does not hold the readings of a frame.
         """
-        if np.shape(dv)[-1:] != (self.readings,):
-            raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {self.readings} readings")
+        require_frames(dv, self.readings)
         return _imaged(self, dv)
 
     def compiled(self) -> Callable[[Float[ArrayLike, "... readings"]], Float[Array, "... basis"]]:
@@ -126,26 +124,6 @@ class AbstractReconstructor(eqx.Module):
         """Readings that are used."""
         return self.whitening.channels
 
-    @property
-    def centres(self) -> Float[Array, "basis 2"]:
-        """See `Picture`."""
-        return self.picture.centres
-
-    @property
-    def areas(self) -> Float[Array, " basis"]:
-        """See `Picture`."""
-        return self.picture.areas
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """See `Picture`."""
-        return self.picture.shape
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """See `Picture`."""
-        return self.picture.extent
-
 
 @jax.jit
 def _imaged(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
@@ -189,8 +167,7 @@ class Reconstructor(AbstractReconstructor):
 
         def apply(dv):
             dv = np.asarray(dv, dtype)
-            if dv.shape[-1:] != (self.readings,):
-                raise InverseError(f"dv has shape {dv.shape}; its last axis must hold {self.readings} readings")
+            require_frames(dv, self.readings)
             t = weigh @ dv.reshape(-1, self.readings).T if dv.ndim != 1 else weigh @ dv
             if not np.isfinite(t).all():
                 return np.asarray(self(dv))
@@ -315,15 +292,12 @@ def prepare(
     """
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
     method, prior = method or OneStep(), prior or Noser()
-    readings = model.pattern.shape[0]
-    used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
-    weight = noise_weight(noise, readings, used)
-    found = whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
+    found = whitened_readings(model, noise, channels)
     slopes = pair_jacobian(model, sigma, image, jnp.asarray(found.electrodes))
     factor, compress = (jnp.asarray(array, model.dtype) for array in (found.factor, found.compress))
     problem = Problem(
         jacobian=factor @ slopes,
-        readings=jnp.asarray(used.sum(), model.dtype),
+        readings=jnp.sum(found.whitening.channels).astype(model.dtype),
         hyperparameter=jnp.asarray(jnp.nan, model.dtype),
         prior=prior,
         picture=image.picture,
@@ -380,6 +354,20 @@ def _chosen(hyperparameter, problem: Problem, found: Whitened, noise_is_known: b
 
 def _whiten(found: Whitened, dtype: np.dtype, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... r"]:
     return found.whitening.sums(jnp.asarray(dv, dtype)) @ jnp.asarray(found.compress, dtype).T
+
+
+def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
+    """Refuse what is no frame, or frames, of so many readings."""
+    if np.shape(dv)[-1:] != (readings,):
+        raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {readings} readings")
+
+
+def whitened_readings(model: Model, noise, channels) -> Whitened:
+    """What of a frame is used, and how much it weighs; noise and channels as for `prepare`."""
+    readings = model.pattern.shape[0]
+    used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
+    weight = noise_weight(noise, readings, used)
+    return whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
 
 
 def as_flags(channels, readings: int) -> np.ndarray:

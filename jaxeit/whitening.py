@@ -81,8 +81,7 @@ class Whitening(eqx.Module):
         if self.weight.ndim == 1:
             gone = rows / jnp.where(self.weight > 0, self.weight, 1)[:, None]
         else:
-            inner = jnp.where(missing[:, None] & missing, self.weight, jnp.diag((~missing).astype(rows.dtype)))
-            gone = cho_solve(cho_factor(inner), rows)
+            gone = self._solved_among(missing, rows)
         return Lost(rows.T @ gone, self.sums(known) - gone.T @ self._weighted(known))
 
     def without(self, used: Bool[Array, " readings"]) -> tuple["Whitening", Float[Array, "k k"]]:
@@ -91,11 +90,15 @@ class Whitening(eqx.Module):
         weight = jnp.where(used, self.weight, 0)
         if self.weight.ndim == 2:
             gone = self.channels & ~used
-            inner = jnp.where(gone[:, None] & gone, self.weight, jnp.diag((~gone).astype(weight.dtype)))
             rows = jnp.where(gone[:, None], self.weight, 0)
-            weight = jnp.where(used[:, None] & used, self.weight - rows.T @ cho_solve(cho_factor(inner), rows), 0)
+            weight = jnp.where(used[:, None] & used, self.weight - rows.T @ self._solved_among(gone, rows), 0)
         changed = (weight, used & self.channels)
         return eqx.tree_at(lambda w: (w.weight, w.channels), self, changed), lost.gram
+
+    def _solved_among(self, missing: Bool[Array, " readings"], rows: Float[Array, "readings n"]) -> Array:
+        """The block of a matrix W that belongs to the missing readings, solved for rows that vanish elsewhere."""
+        inner = jnp.where(missing[:, None] & missing, self.weight, jnp.diag((~missing).astype(rows.dtype)))
+        return cho_solve(cho_factor(inner), rows)
 
     def _weighted(self, values: Float[Array, "readings ..."]) -> Float[Array, "readings ..."]:
         """``W values``."""
