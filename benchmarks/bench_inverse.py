@@ -232,9 +232,10 @@ def batch_ways(recon: je.Reconstructor, frames: np.ndarray) -> dict[str, Way]:
 
 def _batch_ways(recon, frames, exact, broken, mended) -> dict[str, Way]:
     matrix, factor, sparse = np.asarray(recon.matrix), np.asarray(recon.factor), pair_sums(recon)
-    n, ends = len(frames), frames.nbytes + exact.size * frames.itemsize
+    n, ends, on_host = len(frames), frames.nbytes + exact.size * frames.itemsize, recon.on_host()
     ours, dense = touched(recon) + ends, matrix.nbytes + ends
     return {
+        "jaxeit, on_host(),": Way(lambda: on_host(frames), exact, ours, n),
         "jaxeit, NumPy in and out,": Way(lambda: np.asarray(recon(frames)), exact, ours, n),
         "jaxeit, one reading of one frame is NaN,": Way(lambda: np.asarray(recon(broken)), mended, ours, n),
         "NumPy, Q dv,": Way(lambda: frames @ matrix.T, exact, dense, n),

@@ -18,17 +18,19 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import brentq
 
 from .basis import Elements
-from .descent import Fit, descend, ridge, scale_of
+from .descent import STEPS, Fit, descend, ridge, scale_of
 from .discretise import Model
 from .forward import conductivity, forward
-from .inverse import InverseError, require_frames, whitened_readings
+from .gaps import gap_of
+from .inverse import require_frames
 from .jacobian import pair_jacobian
-from .responses import Nodes, Responses, nodes_of, points_of, reached, splines, tabulate
+from .responses import Nodes, Responses, nodes_of, points_of, reached, responses_of, tabulate
 from .verbs import verb
-from .whitening import Whitening
+from .whitening import InverseError, Whitened, Whitening, whitened_readings
 
 _LONGEST = 0.04  # half length of an oblong contact, m
 _RIPPLE = 0.1  # of the strongest contact's strength: what is less is none
+_FIRST = 4  # steps from each start, of which only the best goes on
 _TRIALS = 512  # noise frames that set the threshold
 
 
@@ -40,7 +42,7 @@ class ContactResult(IntEnum):
     OBLONG = 2  # longer than wide: the centre is good, the width a mean over directions, the covariance a guess
     NOT_CONVERGED = 3  # do not trust it
     ABSENT = 4  # nothing more than noise and model error was left to explain
-    UNREADABLE = 5  # a reading of the frame is not finite: mend it, or prepare with channels=...
+    UNREADABLE = 5  # no reading of the frame is finite
 
 
 class Contacts(eqx.Module):
@@ -51,7 +53,7 @@ class Contacts(eqx.Module):
     | present: whether there is a contact in the slot                     | (..., K)       |       |
     | position in the sheet's flat coordinates                            | (..., K, 2)    | m     |
     | width: standard deviation of the bump                               | (..., K)       | m     |
-    | amplitude: largest change of the conductivity                       | (..., K)       | S     |
+    | amplitude: largest change, as on a sheet of mean conductivity       | (..., K)       | S     |
     | covariance of x, y, log width, amplitude; times misfit if above one | (..., K, 4, 4) | mixed |
     | misfit: chi-square of the frame over its degrees of freedom         | (...)          |       |
     | result: a `ContactResult`                                           | (..., K)       |       |
@@ -74,6 +76,15 @@ class Contacts(eqx.Module):
 def strongest(contacts: Contacts) -> Float[Array, "... 2"]:
     """Position of the strongest contact, (..., 2) m; NaN where there is none (as other estimators of `metrics`)."""
     return jnp.where(contacts.present[..., :1], contacts.position[..., 0, :], jnp.nan)
+
+
+class Frame(NamedTuple):
+    """A frame as it is searched: numbers, square of those no bump reaches, count of both, how responses are seen."""
+
+    y: Float[Array, " r"]
+    beside: Float[Array, ""]
+    numbers: Float[Array, ""]
+    root: Float[Array, "r r"]
 
 
 class Found(NamedTuple):
@@ -114,6 +125,7 @@ class ContactFinder(eqx.Module):
     | model_error: part of the signal that a bump may fail to explain           | ()           | 1     |
     | ratio: part of what a fit leaves that it must explain more than a simpler one | ()        | 1     |
     | separation: least distance of two contacts, in mean widths                | ()           | 1     |
+    | root, whole: how responses are seen (`gaps`), and whether as they are     | (r, r), ()   | 1     |
     """
 
     whitening: Whitening
@@ -129,10 +141,14 @@ class ContactFinder(eqx.Module):
     model_error: Float[Array, ""]
     ratio: Float[Array, ""]
     separation: Float[Array, ""]
+    root: Float[Array, "r r"]
+    whole: Bool[Array, ""]
     most: int = eqx.field(static=True)
 
     def __call__(self, dv: Float[ArrayLike, "... readings"]) -> Contacts:
         """The contacts in a difference of frames, V; any leading axes are batches.
+
+        A reading that is not finite is left out of its frame exactly, as if it had never been measured (`gaps`).
 
         A batch is done frame by frame, each of which stops as soon as it can; ``jax.vmap`` of a finder gives the same
         numbers, for machines wide enough to gain by it.
@@ -148,12 +164,32 @@ class ContactFinder(eqx.Module):
 
     def frame(self, dv: Float[Array, " readings"]) -> Contacts:
         """The contacts in one frame."""
-        readable = jnp.all(jnp.isfinite(dv) | ~self.whitening.channels)
-        sums = self.whitening.sums(jnp.where(readable, dv, 0))
+        there = jnp.isfinite(dv) & self.whitening.channels
+        whole = jnp.all(there == self.whitening.channels)
+        seen = jax.lax.cond(whole, lambda dv: self._as_it_is(dv), lambda dv: self._with_gaps(dv), dv)
+        finder = eqx.tree_at(lambda f: (f.root, f.whole), self, (seen.root, whole))
+        fixed, still = jax.lax.stop_gradient((seen.y, finder))  # see `_sensitive`
+        return finder._contacts(seen, still.search(fixed), jnp.any(there))
+
+    def _as_it_is(self, dv) -> "Frame":
+        sums = self.whitening.sums(dv)
         y, beside = self.compress @ sums, self.rest @ sums
-        fixed, finder = jax.lax.stop_gradient((y, self))  # see `_sensitive`
-        found = finder.search(fixed)
-        return self._contacts(y, found._replace(number=jnp.where(readable, found.number, 0)), beside @ beside, readable)
+        numbers = self.compress.shape[0] + self.rest.shape[0]
+        return Frame(y, beside @ beside, jnp.asarray(numbers, y.dtype), self.root)
+
+    def _with_gaps(self, dv) -> "Frame":
+        lost = self.whitening.lost(dv)
+        seen, every = (gap_of(matrix, lost) for matrix in (self.compress, jnp.concatenate([self.compress, self.rest])))
+        return Frame(seen.y, jnp.maximum(every.y @ every.y - seen.y @ seen.y, 0), every.rank, seen.root)
+
+    def response(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, " r"], Float[Array, "r n 4"]]:
+        """What n contacts do to the numbers that the frame holds, and its slopes."""
+        value, slopes = self.responses.contacts(theta)
+
+        def mixed(value, slopes):
+            return self.root @ value, jnp.tensordot(self.root, slopes, 1)
+
+        return jax.lax.cond(self.whole, lambda *a: a, mixed, value, slopes)
 
     def search(self, y: Float[Array, " r"]) -> Found:
         """Contacts one by one; see `prepare_contacts` for when to stop.  Empty slots hold zeros."""
@@ -209,21 +245,22 @@ class ContactFinder(eqx.Module):
 
         def fitted(fit: Fit) -> Fit:
             theta = _round(fit.flat)[: n - 1]
-            starts = self.added(y, theta)[None]
-            if n > 1:
-                starts = jnp.concatenate([starts, self._split(y, theta)[None]])
+            best = self.added(y, theta)
+            if n == 1:
+                return _padded(self.fit(y, best), self.most)
+            starts = jnp.stack([best, self._split(y, theta)])
+            tried = jax.vmap(lambda start: self.fit(y, start, steps=_FIRST))(starts)
+            best = _round(tried.flat[jnp.argmin(tried.square)])
             # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
-            hope = fit.square / (1 + (0.5 * (n - 1) * self.ratio) ** 2) if n > 1 else np.inf
-            tried = jax.vmap(lambda start: self.fit(y, start, hope))(starts)
-            best = jnp.argmin(tried.square)
-            return _padded(jax.tree.map(lambda a: a[best], tried), self.most)
+            hope = fit.square / (1 + (0.5 * (n - 1) * self.ratio) ** 2)
+            return _padded(self.fit(y, best, hope), self.most)
 
         return fitted
 
     def added(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
         """One contact more: the atom that explains most of what is left."""
-        left = y - self.responses.contacts(theta)[0] if len(theta) else y
-        gain = self.atoms @ left
+        left = y - self.response(theta)[0] if len(theta) else y
+        gain = self.atoms @ jax.lax.cond(self.whole, lambda left: left, lambda left: self.root @ left, left)
         best = jnp.argmax(gain)
         strength = jnp.maximum(gain[best], 0) / self.norms[best]
         return jnp.concatenate([theta, jnp.append(self.starts[best], strength)[None]])
@@ -241,13 +278,13 @@ class ContactFinder(eqx.Module):
             return jnp.clip(split, self.low, self.high)
 
         tried = jax.vmap(halves)(shift)
-        squares = jax.vmap(lambda t: jnp.sum((y - self.responses.contacts(t)[0]) ** 2))(tried)
+        squares = jax.vmap(lambda t: jnp.sum((y - self.response(t)[0]) ** 2))(tried)
         return tried[jnp.argmin(squares)]
 
-    def fit(self, y: Float[Array, " r"], theta: Float[Array, "n 4"], hope: float | Array = np.inf) -> Fit:
+    def fit(self, y: Float[Array, " r"], theta: Float[Array, "n 4"], hope: float | Array = np.inf, steps=STEPS) -> Fit:
         """The best n contacts near these."""
         low, high = (jnp.tile(bound, len(theta)) for bound in (self.low, self.high))
-        return descend(self._linear(_round), y, theta.ravel(), low, high, hope)
+        return descend(self._linear(_round), y, theta.ravel(), low, high, hope, steps)
 
     def oblong(self, y: Float[Array, " r"], pair: Float[Array, "2 4"]) -> Fit:
         """The best oblong contact in the place of two."""
@@ -264,17 +301,16 @@ class ContactFinder(eqx.Module):
 
         def linear(flat):
             theta = shape(flat)
-            value, slopes = self.responses.contacts(theta)
+            value, slopes = self.response(theta)
             return value, slopes.reshape(len(value), -1) @ jax.jacfwd(shape)(flat).reshape(theta.size, -1)
 
         return linear
 
-    def _contacts(self, y, found: Found, beside, readable) -> Contacts:
+    def _contacts(self, seen: Frame, found: Found, readable) -> Contacts:
         """What was found as it is handed out, the strongest first."""
         present = jnp.arange(self.most) < found.number
-        theta, covariance = self._sensitive(y, _round(found.fit.flat), present)
-        numbers = self.compress.shape[0] + self.rest.shape[0] - 4 * found.number
-        misfit = (found.fit.square + beside) / jnp.maximum(numbers, 1)
+        theta, covariance = self._sensitive(seen.y, _round(found.fit.flat), present)
+        misfit = (found.fit.square + seen.beside) / jnp.maximum(seen.numbers - 4 * found.number, 1)
         named, slopes = jax.vmap(self._named)(theta), jax.vmap(jax.jacfwd(self._named))(theta)
         own = slopes @ covariance @ slopes.swapaxes(1, 2) * jnp.maximum(misfit, 1)
         empty = jnp.where(readable, ContactResult.ABSENT, ContactResult.UNREADABLE)
@@ -303,7 +339,7 @@ class ContactFinder(eqx.Module):
 
         A Gauss-Newton step from where the search ended has next to no value, but the right derivative.
         """
-        value, slopes = self.responses.contacts(theta)
+        value, slopes = self.response(theta)
         j = jnp.where(present[:, None], slopes, 0).reshape(len(y), -1)
         scale = scale_of(jnp.sum(j**2, 0))
         used = jnp.repeat(present, 4)
@@ -376,7 +412,8 @@ def prepare_contacts(
         model_error: as above.
         ratio: as above.
         separation: as above.
-        sigma: conductivity to linearise at, (elements,) S; default: the untouched sheet.
+        sigma: conductivity to linearise at, (elements,) S, best from `fit_background`, without which the error of place
+            is more than twice as large on an uneven coat; default: the untouched sheet.
         channels: readings to use; a dead one is left out, never taken for zero.
 
     Raises:
@@ -384,38 +421,44 @@ def prepare_contacts(
     """
     _check(most, widths, columns, false_alarm, model_error, ratio, separation)
     found = whitened_readings(model, noise, channels)
-    slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(found.electrodes))
-    at = np.asarray(model.background if sigma is None else sigma, float)
-    background = float(np.average(at, weights=np.asarray(model.areas, float)))
     nodes = nodes_of(model, widths, columns)
-    values = tabulate(model, found.factor @ np.asarray(slopes, float) * background, nodes)
-    seen, beside = reached(values)
+    slopes, background = _slopes(model, found, sigma)
+    seen, beside = reached(tabulate(model, slopes, nodes.fewer(3)))
+    values = tabulate(model, seen.T @ slopes, nodes)
     put = partial(jnp.asarray, dtype=model.dtype)
-    values = np.tensordot(values, seen, ([3], [0]))
-    atoms, norms, starts = _atoms(model, values, nodes)
     finder = ContactFinder(
         whitening=found.whitening,
         compress=put(seen.T @ found.compress),
         rest=put(beside.T @ found.compress),
-        responses=Responses(
-            table=put(splines(values)),
-            origin=put([axis[0] for axis in nodes.axes]),
-            pitch=put([axis[1] - axis[0] for axis in nodes.axes]),
-            scale=put(nodes.scale),
-            background=put(background),
-        ),
-        atoms=put(atoms),
-        starts=put(starts),
-        norms=put(norms),
-        low=put([nodes.axes[1][0], nodes.axes[0][0], np.log(widths[0]), 0]),
-        high=put([nodes.axes[1][-1], nodes.axes[0][-1], np.log(widths[1]), np.inf]),
+        responses=responses_of(values, nodes, background, model.dtype),
+        **{name: put(array) for name, array in _atoms(model, values, nodes).items()},
+        **{name: put(bound) for name, bound in _bounds(nodes.axes[1], nodes.axes[0], widths).items()},
         threshold=put(0),
         model_error=put(model_error),
         ratio=put(ratio),
         separation=put(separation),
+        root=put(np.eye(seen.shape[1])),
+        whole=jnp.asarray(True),
         most=most,
     )
     return eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, false_alarm)))
+
+
+def _slopes(model: Model, found: Whitened, sigma) -> tuple[np.ndarray, float]:
+    """Whitened readings per relative change of the elements' conductivity, and its mean, S."""
+    slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(found.electrodes))
+    at = np.asarray(model.background if sigma is None else sigma, float)
+    return found.factor @ (np.asarray(slopes, float) * at), _mean(model, at)
+
+
+def _mean(model: Model, sigma: np.ndarray) -> float:
+    return float(np.average(sigma, weights=np.asarray(model.areas, float)))
+
+
+def _bounds(x, y, widths) -> dict[str, list[float]]:
+    """Of x, y, log width and strength."""
+    low, high = ([np.min(x), np.min(y), np.log(widths[0]), 0], [np.max(x), np.max(y), np.log(widths[1]), np.inf])
+    return {"low": low, "high": high}
 
 
 def _check(most, widths, columns, false_alarm, model_error, ratio, separation):
@@ -432,7 +475,7 @@ def _check(most, widths, columns, false_alarm, model_error, ratio, separation):
             raise InverseError(f"{name} is {value}; give {wanted}")
 
 
-def _atoms(model: Model, values: np.ndarray, nodes: Nodes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _atoms(model: Model, values: np.ndarray, nodes: Nodes) -> dict[str, np.ndarray]:
     """Unit responses of narrow, middling and wide bumps on the sheet, their norms, and x, y, log width of each."""
     y, x, log_width = nodes.axes
     chosen = []
@@ -445,7 +488,7 @@ def _atoms(model: Model, values: np.ndarray, nodes: Nodes) -> tuple[np.ndarray, 
     responses, starts = values[i, j, level], np.stack([x[j], y[i], log_width[level]], 1)
     norms = np.linalg.norm(responses, axis=1)
     kept = (norms > 1e-3 * norms.max()) & _on_sheet(model, starts[:, :2])
-    return responses[kept] / norms[kept, None], norms[kept], starts[kept]
+    return {"atoms": responses[kept] / norms[kept, None], "norms": norms[kept], "starts": starts[kept]}
 
 
 def _on_sheet(model: Model, places: np.ndarray) -> np.ndarray:
@@ -514,11 +557,12 @@ def refine_contacts(
     sigma = conductivity(model) if sigma is None else jnp.asarray(sigma, model.dtype)
     chart = np.asarray(model.chart, float)
     points, weights = (jnp.asarray(a, model.dtype) for a in points_of(model, widths[0] * 2))
-    problem = _Full(model, sigma, forward(model, sigma), found.whitening, jnp.asarray(found.compress), points, weights)
+    background = jnp.asarray(_mean(model, np.asarray(sigma, float)), model.dtype)
+    compress = jnp.asarray(found.compress, model.dtype)
+    problem = _Full(model, sigma, background, forward(model, sigma), found.whitening, compress, points, weights)
     named = [contacts.position, jnp.log(contacts.width)[:, None], contacts.amplitude[:, None]]
     start = jnp.concatenate(named, 1)[:count].astype(model.dtype)
-    bounds = ([*chart.min(0), np.log(widths[0]), 0], [*chart.max(0), np.log(widths[1]), np.inf])
-    low, high = (jnp.asarray(bound, model.dtype) for bound in bounds)
+    low, high = (jnp.asarray(bound, model.dtype) for bound in _bounds(chart[:, 0], chart[:, 1], widths).values())
     return _refined(problem, jnp.asarray(dv, model.dtype), contacts, start, low, high)
 
 
@@ -527,6 +571,7 @@ class _Full(eqx.Module):
 
     model: Model
     sigma: Float[Array, " elements"]
+    background: Float[Array, ""]
     untouched: Float[Array, " readings"]
     whitening: Whitening
     compress: Float[Array, "r k"]
@@ -540,8 +585,8 @@ class _Full(eqx.Module):
         """Whitened readings of contacts (x, y, log width, amplitude in S), and their slopes."""
 
         def readings(flat):
-            touched = sum(self._bump(one) for one in flat.reshape(-1, 4))
-            return self.white(forward(self.model, self.sigma + touched) - self.untouched)
+            touched = sum(self._bump(one) for one in flat.reshape(-1, 4)) / self.background
+            return self.white(forward(self.model, self.sigma * (1 + touched)) - self.untouched)
 
         value, push = jax.linearize(readings, flat)
         return value, jax.vmap(push, out_axes=1)(jnp.eye(len(flat), dtype=flat.dtype))

@@ -8,8 +8,8 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 _ENOUGH = 1e-3  # fall of the square, in units of the noise, that is not worth another step
-_STEPS = 20  # at most
-_TRIAL = 6  # steps after which a descent must have shown that it leads somewhere
+STEPS = 20  # at most
+_TRIAL = 4  # steps after which a descent must have shown that it leads somewhere
 
 
 class Fit(NamedTuple):
@@ -43,17 +43,18 @@ def ridge(like):
     return 1e3 * jnp.finfo(like.dtype).eps
 
 
-def descend(linear, y, flat, low, high, hope=jnp.inf) -> Fit:
+def descend(linear, y, flat, low, high, hope=jnp.inf, steps=STEPS) -> Fit:
     """Levenberg-Marquardt within the bounds; a parameter pushed against its bound rests there.
 
     Args:
         linear: parameters to readings and their slopes.
         hope: given up when the square is still above this after a few steps.
+        steps: at most.
     """
 
     def going(state):
         step, fit = state
-        return (step < _STEPS) & ~fit.done & ((step < _TRIAL) | (fit.square < hope))
+        return (step < steps) & ~fit.done & ((step < _TRIAL) | (fit.square < hope))
 
     def again(state):
         step, fit = state

@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
-from typing import Any, overload
+from math import isfinite
+from typing import Any, TypedDict, Unpack, overload
 
 import equinox as eqx
 import jax
@@ -13,23 +14,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from scipy.linalg import solve_triangular as solve_lower
 from scipy.sparse import csr_array
 
 from .basis import AbstractBasis, AbstractPictured, BasisMap, Picture, Pixels
 from .discretise import Model
 from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
-from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, predicted
+from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, one_step
 from .priors import AbstractPrior, Noser
 from .verbs import compiler_options
-from .whitening import Whitened, Whitening, whitened
+from .whitening import (
+    InverseError,
+    Whitened,
+    Whitening,
+    as_flags,
+    require_some,
+    whitened_readings,
+)
 
+_VERSION = metadata.version("jaxeit")
 _FEW = 16  # readings missing from a frame, up to which they are mended one by one
-
-
-class InverseError(ValueError):
-    """Settings from which no reconstruction can be made."""
 
 
 class Provenance(dict[str, str]):
@@ -83,15 +87,13 @@ class AbstractReconstructor(AbstractPictured):
         return jax.jit(lambda dv: self(dv), compiler_options=compiler_options())
 
     def _sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
-        finite = jnp.all(jnp.isfinite(dv) | ~self.channels)
-        frames = dv.reshape(-1, dv.shape[-1])
-        sums = jax.lax.cond(
-            finite,
-            lambda frames: self.whitening.sums(frames),
-            lambda frames: jax.lax.map(lambda dv: self._mended(dv), frames),
-            frames,
-        )
-        return sums.reshape(*dv.shape[:-1], sums.shape[-1])
+        sums = self.whitening.sums(dv)
+
+        def mended():
+            frames = dv.reshape(-1, self.readings)
+            return jax.lax.map(lambda dv: self._mended(dv), frames).reshape(sums.shape)
+
+        return jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, mended)
 
     def _mended(self, dv: Float[Array, " readings"]) -> Float[Array, " k"]:
         """Sums that give the image of the readings at hand: the others are what that image predicts for them."""
@@ -160,19 +162,19 @@ class Reconstructor(AbstractReconstructor):
 
         Frames with readings that are not finite go through JAX.
         """
-        dtype = np.dtype(self.factor.dtype)
-        sums = self.whitening.sums(jnp.eye(self.readings, dtype=dtype)).T
+        dtype, readings = np.dtype(self.factor.dtype), self.readings
+        sums = self.whitening.sums(jnp.eye(readings, dtype=dtype)).T
         weigh: Any = csr_array(sums) if self.whitening.weight.ndim == 1 else np.asarray(sums)
         factor = np.asarray(self.factor)
 
         def apply(dv):
             dv = np.asarray(dv, dtype)
-            require_frames(dv, self.readings)
-            t = weigh @ dv.reshape(-1, self.readings).T if dv.ndim != 1 else weigh @ dv
-            if not np.isfinite(t).all():
+            require_frames(dv, readings)
+            t = weigh @ (dv if dv.ndim == 1 else dv.reshape(-1, readings).T)
+            if not isfinite(np.vdot(t, t)):
                 return np.asarray(self(dv))
             image = factor @ t
-            return image if dv.ndim == 1 else image.T.reshape(*dv.shape[:-1], len(factor))
+            return image if dv.ndim == 1 else image.T.reshape(*dv.shape[:-1], -1)
 
         return apply
 
@@ -231,18 +233,23 @@ class IterativeReconstructor(AbstractReconstructor):
         return images.reshape(*sums.shape[:-1], images.shape[-1])
 
 
+class Settings(TypedDict, total=False):
+    """What `prepare` is told by name; see there."""
+
+    noise: Float[ArrayLike, "..."] | None
+    hyperparameter: float | AbstractHyperparameter
+    sigma: Float[Array, " elements"] | None
+    channels: Bool[ArrayLike, " readings"] | None
+    provenance: Mapping[str, str] | None
+
+
 @overload
 def prepare(
     model: Model,
     prior: AbstractPrior | None = None,
     method: AbstractLinearMethod | None = None,
     basis: AbstractBasis | BasisMap | None = None,
-    noise: Float[ArrayLike, "..."] | None = None,
-    hyperparameter: float | AbstractHyperparameter = 0.1,
-    *,
-    sigma: Float[Array, " elements"] | None = None,
-    channels: Bool[ArrayLike, " readings"] | None = None,
-    provenance: Mapping[str, str] | None = None,
+    **settings: Unpack[Settings],
 ) -> Reconstructor: ...
 
 
@@ -252,12 +259,7 @@ def prepare(
     prior: AbstractPrior | None,
     method: AbstractIterativeMethod,
     basis: AbstractBasis | BasisMap | None = None,
-    noise: Float[ArrayLike, "..."] | None = None,
-    hyperparameter: float | AbstractHyperparameter = 0.1,
-    *,
-    sigma: Float[Array, " elements"] | None = None,
-    channels: Bool[ArrayLike, " readings"] | None = None,
-    provenance: Mapping[str, str] | None = None,
+    **settings: Unpack[Settings],
 ) -> IterativeReconstructor: ...
 
 
@@ -293,32 +295,30 @@ def prepare(
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
     method, prior = method or OneStep(), prior or Noser()
     found = whitened_readings(model, noise, channels)
-    slopes = pair_jacobian(model, sigma, image, jnp.asarray(found.electrodes))
-    factor, compress = (jnp.asarray(array, model.dtype) for array in (found.factor, found.compress))
     problem = Problem(
-        jacobian=factor @ slopes,
+        jacobian=jnp.asarray(found.factor, model.dtype) @ pair_jacobian(model, sigma, image, found.electrodes),
         readings=jnp.sum(found.whitening.channels).astype(model.dtype),
         hyperparameter=jnp.asarray(jnp.nan, model.dtype),
         prior=prior,
         picture=image.picture,
     )
     chosen = _chosen(hyperparameter, problem, found, noise is not None)
-    problem = eqx.tree_at(lambda p: p.hyperparameter, problem, jnp.asarray(chosen, model.dtype))
-    settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
-    about = Provenance({"jaxeit": metadata.version("jaxeit"), **settings, **(provenance or {})})
+    problem = replace(problem, hyperparameter=jnp.asarray(chosen, model.dtype))
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
-    recon = replace(_build(problem, linear, compress, found.whitening, noise is not None), provenance=about)
-    if not bool(jnp.isfinite(recon.factor).all()):
+    recon = _build(problem, linear, found, noise is not None)
+    settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
+    about = Provenance({"jaxeit": _VERSION, **settings, **(provenance or {})})
+    if not np.isfinite(recon.factor).all():
         raise InverseError(
             "the reconstruction matrix is not finite: the conductivity must be positive, and in "
             "float32 the hyperparameter not below 1e-3"
         )
     if isinstance(method, AbstractIterativeMethod):
         eqx.filter_eval_shape(
-            method.image, problem, compress[:, 0]
+            method.image, problem, problem.jacobian[:, 0]
         )  # what does not fit is refused here, not at a frame
         return IterativeReconstructor(
-            compress=compress,
+            compress=jnp.asarray(found.compress, model.dtype),
             problem=problem,
             method=method,
             predict=recon.predict,
@@ -326,17 +326,17 @@ def prepare(
             picture=recon.picture,
             provenance=about,
         )
-    return recon
+    return replace(recon, provenance=about)
 
 
 @eqx.filter_jit
-def _build(problem, method, compress, found, noise_is_known) -> Reconstructor:
-    q = method.matrix(problem)
+def _build(problem: Problem, method: AbstractLinearMethod, found: Whitened, noise_is_known: bool) -> Reconstructor:
+    compress = jnp.asarray(found.compress, problem.jacobian.dtype)
     return Reconstructor(
-        factor=q @ compress,
-        variance=method.variance(problem, q) if noise_is_known else jnp.full(len(q), jnp.inf, q.dtype),
-        predict=compress.T @ predicted(problem) @ compress,
-        whitening=found,
+        factor=method.image(problem, compress),
+        variance=method.variance(problem) if noise_is_known else jnp.full_like(problem.picture.areas, jnp.inf),
+        predict=compress.T @ one_step(problem, problem.precision(), compress)[1],
+        whitening=found.whitening,
         picture=problem.picture,
         provenance=Provenance(),
     )
@@ -360,92 +360,3 @@ def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
     """Refuse what is no frame, or frames, of so many readings."""
     if np.shape(dv)[-1:] != (readings,):
         raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {readings} readings")
-
-
-def whitened_readings(model: Model, noise, channels) -> Whitened:
-    """What of a frame is used, and how much it weighs; noise and channels as for `prepare`."""
-    readings = model.pattern.shape[0]
-    used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
-    weight = noise_weight(noise, readings, used)
-    return whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
-
-
-def as_flags(channels, readings: int) -> np.ndarray:
-    flags = np.asarray(channels, bool)
-    if flags.shape != (readings,):
-        raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
-    return flags
-
-
-def require_some(used: np.ndarray) -> np.ndarray:
-    if not used.any():
-        raise InverseError("every channel is left out: there is nothing to reconstruct from")
-    return used
-
-
-def noise_weight(noise, readings: int, channels: np.ndarray) -> np.ndarray:
-    """Inverse of the noise on the channels that are used, zero elsewhere: variances or a covariance."""
-    if noise is None:
-        return channels.astype(float)
-    noise = np.asarray(noise, float)
-    if noise.shape not in ((readings,), (readings, readings)):
-        raise InverseError(f"noise has shape {noise.shape}; this model has {readings} readings")
-    if noise.ndim == 2:
-        return _inverse_covariance(noise, channels)
-    bad = channels & ~(np.isfinite(noise) & (noise > 0))
-    if bad.any():
-        raise InverseError(
-            f"the noise of reading {int(np.argmax(bad))} is {noise[bad][0]} V; give a positive "
-            "number, or leave the channel out with channels=..."
-        )
-    return np.where(channels, np.where(channels, noise, 1.0) ** -2.0, 0.0)
-
-
-def _inverse_covariance(noise: np.ndarray, channels: np.ndarray) -> np.ndarray:
-    used = np.flatnonzero(channels)
-    part = noise[np.ix_(used, used)]
-    try:
-        lower = np.linalg.cholesky(part)
-    except np.linalg.LinAlgError:
-        lower = np.full_like(part, np.nan)
-    weight = np.zeros_like(noise)
-    half = solve_lower(lower, np.eye(len(used)), lower=True, check_finite=False)
-    weight[np.ix_(used, used)] = half.T @ half
-    if not np.isfinite(weight).all() or not np.allclose(part, part.T, rtol=1e-6, atol=0):
-        raise InverseError(
-            "the covariance of the noise is not symmetric positive definite; a recording of fewer frames than readings "
-            "gives such a one: give standard deviations instead, or shrink it towards its diagonal "
-            "(jaxeit.noise_covariance does)"
-        )
-    return weight
-
-
-def noise_covariance(blank: Float[ArrayLike, "frames readings"]) -> np.ndarray:
-    """Covariance of the readings of a blank recording, shrunk towards its diagonal so that it can be inverted.
-
-    The weight of the diagonal is that of Schaefer and Strimmer (2005): the variance of the off-diagonal entries, as
-    the frames tell it, over their squares; 1 where the frames tell of no correlation.
-
-    Args:
-        blank: readings without contact, (frames, readings) V; at least four frames, finite.
-
-    Returns:
-        (readings, readings) V^2.
-
-    Raises:
-        InverseError: for fewer frames, or readings that are not finite or do not change at all.
-    """
-    blank = np.asarray(blank, float)
-    if blank.ndim != 2 or len(blank) < 4 or not np.isfinite(blank).all():
-        raise InverseError(f"the blank recording has shape {blank.shape}; give four or more frames of finite readings")
-    n, centred = len(blank), blank - blank.mean(0)
-    std = centred.std(0, ddof=1)
-    if (std == 0).any():
-        raise InverseError(f"reading {int(np.argmax(std == 0))} does not change at all; leave it out as a dead channel")
-    z = centred / std
-    mean = z.T @ z / n
-    spread = (z**2).T @ z**2 / n - mean**2
-    off = ~np.eye(len(std), dtype=bool)
-    correlation = mean * n / (n - 1)
-    shrink = np.clip(spread[off].sum() * n / (n - 1) ** 3 * n / max((correlation[off] ** 2).sum(), 1e-300), 0, 1)
-    return np.where(off, (1 - shrink) * correlation, 1.0) * np.outer(std, std)

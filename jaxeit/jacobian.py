@@ -10,6 +10,7 @@ a time: nothing of the size elements times readings exists unless it is asked fo
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from .basis import AbstractBasis, BasisMap, Elements
@@ -49,7 +50,8 @@ def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: Basi
     number = np.zeros((model.electrodes, model.electrodes), np.int32)
     number[first, second] = number[second, first] = np.arange(len(first))
     pair = jnp.asarray(number)
-    by_pair = jax.lax.optimization_barrier(_pair_slopes(model, sigma, image).T)
+    slopes = _pair_slopes(model, sigma, image, np.stack([first, second], 1))
+    by_pair = jax.lax.optimization_barrier(slopes.T)
     source, sink, plus, minus = model.pattern.T
     out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
     return model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])
@@ -57,27 +59,26 @@ def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: Basi
 
 @verb
 def pair_jacobian(
-    model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap, electrodes: Int[Array, "k 2"]
+    model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap, electrodes: Int[ArrayLike, "k 2"]
 ) -> Float[Array, "k basis"]:
     """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S; see `whitening`."""
-    small, large = electrodes[:, 0], electrodes[:, 1]
-    column = small * model.electrodes - small * (small + 1) // 2 + large
-    return _pair_slopes(model, sigma, image).T[column]
+    return _pair_slopes(model, sigma, image, electrodes).T
 
 
-def _pair_slopes(model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap) -> Float[Array, "basis pairs"]:
-    """dZ for the pairs (a, b), a <= b, row by row."""
-    theta = coefficients(model, sigma)
-    first, second = np.triu_indices(model.electrodes)
-    slopes = -_products(model, fields(model, theta).potential, image)
-    return slopes.at[:, np.flatnonzero(first == second)].add(_series_slopes(model, theta, image).T)
+def _pair_slopes(
+    model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap, pairs: Int[ArrayLike, "k 2"]
+) -> Float[Array, "basis k"]:
+    """dZ for these pairs of electrodes."""
+    theta, (first, second) = coefficients(model, sigma), jnp.asarray(pairs).T
+    products = _products(model, fields(model, theta).potential, image, first * model.electrodes + second)
+    return jnp.where(first == second, _series_slopes(model, theta, image).T[:, first], 0) - products
 
 
-def _products(model: Model, potential: Float[Array, "n electrodes"], image: BasisMap) -> Float[Array, "basis pairs"]:
-    """A restricted to each coefficient, for all pairs of electrodes, batch after batch."""
+def _products(
+    model: Model, potential: Float[Array, "n electrodes"], image: BasisMap, place: Int[Array, " k"]
+) -> Float[Array, "basis k"]:
+    """A restricted to each coefficient, for the pairs of electrodes at these places of a matrix; batch after batch."""
     system, electrodes = model.system, model.electrodes
-    first, second = np.triu_indices(electrodes)
-    flat = jnp.asarray(first * electrodes + second)
     lines = max(1, _BATCH // image.element.shape[1])
     count = -(-len(image.element) // lines)
 
@@ -91,10 +92,10 @@ def _products(model: Model, potential: Float[Array, "n electrodes"], image: Basi
         nodes = potential[system.dofs[element]]
         slopes = jnp.einsum("lekr,leka->lera", system.slopes[element], nodes).reshape(lines, -1, electrodes)
         weighted = jnp.repeat(weight, system.slopes.shape[2], 1)[..., None] * slopes
-        products = jnp.einsum("lxa,lxb->lab", weighted, slopes).reshape(lines, -1)[:, flat]
+        products = jnp.einsum("lxa,lxb->lab", weighted, slopes).reshape(lines, -1)[:, place]
         return sums.at[coefficient].add(products)
 
-    return jax.lax.fori_loop(0, count, add, jnp.zeros((image.size, len(first)), potential.dtype))
+    return jax.lax.fori_loop(0, count, add, jnp.zeros((image.size, len(place)), potential.dtype))
 
 
 def _padded(array: Array, length: int) -> Array:

@@ -13,7 +13,7 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
+from jax.scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from jaxtyping import Array, Float
 
 from .basis import Picture
@@ -51,15 +51,15 @@ class AbstractMethod(eqx.Module):
 
 
 class AbstractLinearMethod(AbstractMethod):
-    """A method whose image is a matrix times the readings."""
+    """A method whose image is a matrix Q times the readings."""
 
     @abstractmethod
-    def matrix(self, problem: Problem) -> Float[Array, "basis k"]:
-        """Q, from whitened readings to the image."""
+    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+        """``Q y``, the images of whitened frames: a frame a column."""
 
-    def variance(self, problem: Problem, q: Float[Array, "basis k"]) -> Float[Array, " basis"]:
+    def variance(self, problem: Problem) -> Float[Array, " basis"]:
         """What noise and prior leave uncertain in each coefficient, for noise of unit variance; infinite: not known."""
-        return jnp.full(len(q), jnp.inf, q.dtype)
+        return jnp.full_like(problem.picture.areas, jnp.inf)
 
 
 class AbstractIterativeMethod(AbstractMethod):
@@ -77,32 +77,37 @@ class OneStep(AbstractLinearMethod):
     ``Q = R^-1 J^T (J R^-1 J^T + l^2 I)^-1``.
     """
 
-    def matrix(self, problem):
-        return _one_step(problem, problem.precision())
+    def image(self, problem, y):
+        return one_step(problem, problem.precision(), y)[0]
 
-    def variance(self, problem, q):
+    def variance(self, problem):
         """The diagonal of ``(J^T J + l^2 R)^-1 = (R^-1 - Q J R^-1) / l^2``, the posterior of a Gaussian image."""
         precision = problem.precision()
-        gained = precision.solve(problem.jacobian.T)
-        return (precision.variance() - jnp.sum(q * gained, 1)) / problem.strength(gained)
+        gained, square, (upper, _) = _data_space(problem, precision)
+        known = jnp.sum(solve_triangular(upper, gained.T, trans=1) ** 2, 0)
+        return (precision.variance() - known) / square
 
 
-def _one_step(problem: Problem, precision: AbstractPrecision) -> Float[Array, "basis k"]:
+def one_step(
+    problem: Problem, precision: AbstractPrecision, y: Float[Array, "k ..."]
+) -> tuple[Float[Array, "basis ..."], Float[Array, "k ..."]]:
+    """``x = Q y`` of `OneStep`, and ``J x``, what the image predicts for the readings."""
+    j = problem.jacobian
+    if isinstance(precision, Diagonal) and len(j) > j.shape[1]:
+        small = j.T @ j + problem.strength(precision.solve(j.T)) * precision.matrix()
+        x = cho_solve(cho_factor(small), j.T @ y)
+        return x, j @ x
+    gained, square, factor = _data_space(problem, precision)
+    solved = cho_solve(factor, y)
+    return gained @ solved, y - square * solved
+
+
+def _data_space(problem: Problem, precision: AbstractPrecision):
+    """``R^-1 J^T``, ``l^2``, and the Cholesky factor of ``J R^-1 J^T + l^2 I``."""
     j = problem.jacobian
     gained = precision.solve(j.T)
     square = problem.strength(gained)
-    if isinstance(precision, Diagonal) and len(j) > j.shape[1]:
-        small = j.T @ j + square * precision.matrix()
-        return cho_solve(cho_factor(small), j.T)
-    small = j @ gained + square * jnp.eye(len(j), dtype=j.dtype)
-    return cho_solve(cho_factor(small), gained.T).T
-
-
-def predicted(problem: Problem) -> Float[Array, "k k"]:
-    """``J Q`` of `OneStep`: what its image predicts for each whitened reading, from all of them."""
-    gained = problem.precision().solve(problem.jacobian.T)
-    a = problem.jacobian @ gained
-    return cho_solve(cho_factor(a + problem.strength(gained) * jnp.eye(len(a), dtype=a.dtype)), a)
+    return gained, square, cho_factor(j @ gained + square * jnp.eye(len(j), dtype=j.dtype))
 
 
 class TruncatedSvd(AbstractLinearMethod):
@@ -111,12 +116,12 @@ class TruncatedSvd(AbstractLinearMethod):
     l as for `OneStep`, which halves what lies there.  Taken from the eigenvectors of ``J R^-1 J^T``.
     """
 
-    def matrix(self, problem):
+    def image(self, problem, y):
         gained = problem.precision().solve(problem.jacobian.T)
         squares, vectors = jnp.linalg.eigh(problem.jacobian @ gained)
         kept = squares > problem.strength(gained)
         inverse = jnp.where(kept, 1 / jnp.where(kept, squares, 1), 0)
-        return gained @ (vectors * inverse) @ vectors.T
+        return gained @ (vectors * inverse @ (vectors.T @ y))
 
 
 class BackProjection(AbstractLinearMethod):
@@ -127,9 +132,9 @@ class BackProjection(AbstractLinearMethod):
 
     floor: float = 1e-3
 
-    def matrix(self, problem):
+    def image(self, problem, y):
         power = jnp.sum(problem.jacobian**2, 0)
-        return problem.jacobian.T / (power + self.floor * jnp.max(power))[:, None]
+        return (y.T @ problem.jacobian / (power + self.floor * jnp.max(power))).T
 
 
 class Greit(AbstractLinearMethod):
@@ -151,7 +156,7 @@ class Greit(AbstractLinearMethod):
     radius: float = 0.02
     edge: float = 0.004
 
-    def matrix(self, problem):
+    def image(self, problem, y):
         areas, centres = problem.picture.areas, problem.picture.centres
         square = jnp.sum((centres[:, None] - centres) ** 2, -1)
         distance = jnp.sqrt(jnp.where(square > 0, square, 1)) * (square > 0)
@@ -159,24 +164,31 @@ class Greit(AbstractLinearMethod):
         disc = jax.nn.sigmoid((self.radius - distance) / self.edge)
         mass, whole = areas @ contacts, areas @ disc
         desired = disc * jnp.where(whole > 0, mass / jnp.where(whole > 0, whole, 1), 0)
-        y = problem.jacobian @ contacts
-        square_sum = problem.hyperparameter**2 * jnp.sum(y**2) / problem.readings
-        small = y @ y.T + square_sum * jnp.eye(len(y), dtype=y.dtype)
-        return cho_solve(cho_factor(small), y @ desired.T).T
+        trained = problem.jacobian @ contacts
+        square = problem.hyperparameter**2 * jnp.sum(trained**2) / problem.readings
+        small = trained @ trained.T + square * jnp.eye(len(trained), dtype=trained.dtype)
+        return desired @ (trained.T @ cho_solve(cho_factor(small), y))
 
 
 class NonNegative(AbstractIterativeMethod):
     """`OneStep` under the constraint x >= 0: a touch only adds conductivity.
 
-    A primal-dual interior-point method (Nocedal and Wright 2006, section 16.6) in a fixed number of steps; each
-    divides the duality gap by about ten.
+    With a diagonal prior by Newton's method in the data space: what is left of the data, ``a = y - J x``, is the
+    minimum of ``|a|^2 / 2 - y a + sum (J^T a)_+^2 / (2 l^2 R)``, and ``x = (J^T a)_+ / (l^2 R)``; pieces of a parabola,
+    so that it ends exactly, after 20 to 30 steps of which all but the first are cheap.  With another prior by a
+    primal-dual interior-point method (Nocedal and Wright 2006, section 16.6), each of whose steps divides the duality
+    gap by about ten.
+
+    ``steps`` is the number of the latter and the most of the former.
     """
 
-    steps: int = eqx.field(static=True, default=20)
+    steps: int = eqx.field(static=True, default=40)
 
     def image(self, problem, y):
         j, precision = problem.jacobian, problem.precision()
         square = problem.strength(precision.solve(j.T))
+        if isinstance(precision, Diagonal):
+            return _positive_part(j, square * precision.values, y, self.steps)
         b = j.T @ y
         hessian = j.T @ j + square * precision.matrix()
         scale = jnp.max(jnp.abs(b))
@@ -186,6 +198,51 @@ class NonNegative(AbstractIterativeMethod):
             0, self.steps, lambda _, state: _inwards(hessian, b, *state), (x, jnp.full_like(b, scale))
         )
         return x
+
+
+def _positive_part(j, weight, y, steps: int):
+    """argmin over x >= 0 of ``|J x - y|^2 + x^T diag(weight) x``; its derivative is that of the pixels above zero."""
+    fixed_j, fixed_weight, fixed_y = jax.lax.stop_gradient((j, weight, y))
+
+    def going(state):
+        step, _, above, before, length = state
+        return (step < steps) & ((length < 1) | jnp.any(above != before))
+
+    def again(state):
+        step, a, above, *_ = state
+        towards = _left(above, fixed_j, fixed_weight, fixed_y) - a
+        length = _step_length(a, towards, fixed_y, fixed_j.T @ a, fixed_j.T @ towards, fixed_weight)
+        a = a + length * towards
+        return step + 1, a, fixed_j.T @ a > 0, above, length
+
+    everywhere, none = jnp.ones(j.shape[1], bool), jnp.zeros(j.shape[1], bool)
+    start = (0, jnp.zeros_like(fixed_y), everywhere, none, jnp.ones((), y.dtype))
+    above = jax.lax.while_loop(going, again, start)[2]
+    return jnp.maximum(j.T @ _left(above, j, weight, y) / weight, 0) * above
+
+
+def _left(above, j, weight, y):
+    """``y - J x`` if x were free in these pixels and zero elsewhere; solved among the pixels if they are few."""
+    size = min(len(above), len(j) // 2)
+
+    def few(j, weight, y):
+        at, there = jnp.flatnonzero(above, size=size, fill_value=0), jnp.arange(size) < jnp.sum(above)
+        part = jnp.where(there, j[:, at], 0)
+        small = part.T @ part + jnp.diag(jnp.where(there, weight[at], 1))
+        return y - part @ cho_solve(cho_factor(small), part.T @ y)
+
+    def many(j, weight, y):
+        return cho_solve(cho_factor(jnp.eye(len(j), dtype=j.dtype) + (j * (above / weight)) @ j.T), y)
+
+    return jax.lax.cond(jnp.sum(above) <= size, few, many, j, weight, y)
+
+
+def _step_length(a, towards, y, here, ahead, weight):
+    """The best of 1, 1/2, 1/4 ... of a step, for the function of `NonNegative`."""
+    length = 0.5 ** jnp.arange(12, dtype=a.dtype)
+    moved = a + length[:, None] * towards
+    image = jnp.maximum(here + length[:, None] * ahead, 0)
+    return length[jnp.argmin(0.5 * jnp.sum(moved**2, 1) - moved @ y + 0.5 * jnp.sum(image**2 / weight, 1))]
 
 
 def _inwards(hessian, b, x, z):
@@ -207,9 +264,9 @@ class Reweighted(AbstractIterativeMethod):
 
     def image(self, problem, y):
         def again(_, x):
-            return _one_step(problem, problem.precision(x)) @ y
+            return one_step(problem, problem.precision(x), y)[0]
 
-        return jax.lax.fori_loop(0, self.steps, again, _one_step(problem, problem.precision()) @ y)
+        return jax.lax.fori_loop(0, self.steps, again, one_step(problem, problem.precision(), y)[0])
 
 
 class SparseBayes(AbstractIterativeMethod):
@@ -217,13 +274,14 @@ class SparseBayes(AbstractIterativeMethod):
 
     With ``x ~ N(0, diag g)`` and noise of variance s,
 
-        C = s I + J diag(g) J^T,    x = g J^T C^-1 y,    g_i <- x_i^2 + g_i (1 - q_i),    q_i = g_i (J^T C^-1 J)_ii,
+        C = s I + J diag(g) J^T,    x = g J^T C^-1 y,    g_i <- x_i^2 / q_i,    q_i = g_i (J^T C^-1 J)_ii,
         s <- (|y - J x|^2 + s sum(q)) / k.
 
-    The first g follows the prior (a diagonal one), the first s is hyperparameter^2 of the data's variance.
+    The first g follows the prior (a diagonal one), the first s is hyperparameter^2 of the data's variance.  The rule
+    for g is MacKay's, which Tipping takes; it needs a fraction of the steps of ``g_i <- x_i^2 + g_i (1 - q_i)``.
     """
 
-    steps: int = eqx.field(static=True, default=40)
+    steps: int = eqx.field(static=True, default=15)
 
     def image(self, problem, y):
         j, precision = problem.jacobian, problem.precision()
@@ -234,16 +292,16 @@ class SparseBayes(AbstractIterativeMethod):
         g = 1 / precision.values
         g = g * power / (jnp.sum(j**2 * g) / len(j))
 
-        def solved(g, s):
-            return cho_factor(s * jnp.eye(len(j), dtype=j.dtype) + (j * g) @ j.T)
+        def lower(g, s):
+            return cholesky(s * jnp.eye(len(j), dtype=j.dtype) + (j * g) @ j.T, lower=True)
 
         def again(_, state):
             g, s = state
-            factor = solved(g, s)
-            x = g * (j.T @ cho_solve(factor, y))
-            q = g * jnp.sum(j * cho_solve(factor, j), 0)
-            left = jnp.sum((y - j @ x) ** 2) + s * jnp.sum(q)
-            return x**2 + g * jnp.maximum(1 - q, 0), jnp.maximum(left / len(j), 1e-12 * power)
+            factor = lower(g, s)
+            half = solve_triangular(factor, j, lower=True)
+            seen, own = half.T @ solve_triangular(factor, y, lower=True), jnp.sum(half**2, 0)
+            left = jnp.sum((y - j @ (g * seen)) ** 2) + s * jnp.sum(g * own)
+            return g * seen**2 / jnp.where(own > 0, own, 1), jnp.maximum(left / len(j), 1e-12 * power)
 
         g, s = jax.lax.fori_loop(0, self.steps, again, (g, problem.hyperparameter**2 * power))
-        return g * (j.T @ cho_solve(solved(g, s), y))
+        return g * (j.T @ cho_solve((lower(g, s), True), y))

@@ -1,9 +1,10 @@
 """Whitened readings of Gaussian bumps, from a table.
 
-A contact changes the conductivity by ``a g(r - p; s)``, g a Gaussian bump of height one and standard deviation s.  To
-second order, and measured against the full forward map, the readings see K contacts as if the sheet had changed by
+A contact multiplies the conductivity by ``1 + a g(r - p; s) / mean(sigma_0)``, g a Gaussian bump of height one and
+standard deviation s: pressed together, sheet and metal conduct better in proportion to the coat.  To second order, and
+measured against the full forward map, the readings see K contacts as if the sheet had changed by sigma_0 e,
 
-    e = u - c u^2 / (1 + d u),        u = sum_k a_k g_k / sigma_0,   c = 0.8,  d = 0.7,
+    e = u - c u^2 / (1 + d u),        u = sum_k a_k g_k / mean(sigma_0),   c = 0.8,  d = 0.7,
 
 through the linear response (the field inside a conductive spot falls).  Up to +100 % this leaves out 1 to 3 % of a
 single contact's signal, where the linear response, scaled at best, leaves 4 to 11 %.  The product of two Gaussians is a
@@ -26,6 +27,7 @@ from jaxtyping import Array, Float
 from .discretise import Model
 
 _SECOND, _SATURATION = 0.8, 0.7  # c and d above
+_WIDTH_PITCH = 0.25  # of the table, in log width
 
 
 class Responses(eqx.Module):
@@ -36,7 +38,7 @@ class Responses(eqx.Module):
     | table: coefficients over y, x and log width; of bumps of unit u (s / scale)^2 | (ny, nx, nw, r)   | 1    |
     | origin, pitch of its nodes: y, x, log width                                 | (3,), (3,)          | m, 1 |
     | scale: the width of which strengths are counted                             | ()                  | m    |
-    | background: sigma_0                                                         | ()                  | S    |
+    | background: mean of sigma_0                                                 | ()                  | S    |
     """
 
     table: Float[Array, "ny nx nw r"]
@@ -100,28 +102,33 @@ class Nodes(NamedTuple):
     axes: tuple[np.ndarray, np.ndarray, np.ndarray]
     scale: float
 
+    def fewer(self, stride: int) -> "Nodes":
+        """Every so many along each axis."""
+        y, x, log_width = self.axes
+        return self._replace(axes=(y[::stride], x[::stride], log_width[::stride]))
+
 
 def nodes_of(model: Model, widths, columns: int) -> Nodes:
     chart = np.asarray(model.chart, float)
     low, high = chart.min(0), chart.max(0)
     rows = max(5, round((columns - 1) * (high[1] - low[1]) / (high[0] - low[0])) + 1)
     lowest, highest = np.log(widths[0] / np.sqrt(2)), np.log(widths[1])  # the square of a bump is narrower by sqrt(2)
-    levels = max(5, int(np.ceil((highest - lowest) / 0.25)) + 1)
+    levels = max(5, int(np.ceil((highest - lowest) / _WIDTH_PITCH)) + 1)
     x, y = np.linspace(low[0], high[0], columns), np.linspace(low[1], high[1], rows)
     return Nodes((y, x, np.linspace(lowest, highest, levels)), float(np.sqrt(widths[0] * widths[1])))
 
 
 def tabulate(model: Model, jacobian: np.ndarray, nodes: Nodes) -> np.ndarray:
     """Responses at the nodes, (ny, nx, nw, r): the Jacobian times the means of the bumps over the elements."""
-    points, weights = points_of(model, np.exp(nodes.axes[2][0]))
-    shape = [len(axis) for axis in nodes.axes[:2]]
-    out = np.empty((*shape, len(nodes.axes[2]), len(jacobian)))
+    shape = [len(axis) for axis in nodes.axes]
+    out = np.empty((*shape, len(jacobian)))
     for level, log_width in enumerate(nodes.axes[2]):
         width = np.exp(log_width)
-        along = [np.exp(-0.5 * ((points[..., 1 - k] - nodes.axes[k][:, None, None]) / width) ** 2) for k in (0, 1)]
-        for row in range(shape[0]):
-            means = np.einsum("xeq,eq->ex", along[1], along[0][row] * weights)
-            out[row, :, level] = (nodes.scale / width) ** 2 * (jacobian @ means).T
+        points, weights = points_of(model, width)
+        along = [np.exp(-0.5 * ((points[..., 1 - k, None] - nodes.axes[k]) / width) ** 2) for k in (0, 1)]
+        means = (along[0] * weights[:, None]).swapaxes(1, 2) @ along[1]  # (elements, y, x)
+        found = jacobian @ means.reshape(len(means), -1)
+        out[:, :, level] = (nodes.scale / width) ** 2 * np.moveaxis(found.reshape(-1, *shape[:2]), 0, -1)
     return out
 
 
@@ -156,6 +163,12 @@ def reached(values: np.ndarray, least: float = 0.1) -> tuple[np.ndarray, np.ndar
     squares, vectors = np.linalg.eigh(flat.T @ flat / len(flat))
     seen = squares > max(least**2, 1e-14 * squares[-1])
     return vectors[:, seen], vectors[:, ~seen]
+
+
+def responses_of(values: np.ndarray, nodes: Nodes, background: float, dtype: np.dtype) -> Responses:
+    """The splines through a table of `tabulate`."""
+    numbers = ([axis[0] for axis in nodes.axes], [axis[1] - axis[0] for axis in nodes.axes], nodes.scale, background)
+    return Responses(jnp.asarray(splines(values), dtype), *(jnp.asarray(number, dtype) for number in numbers))
 
 
 def splines(values: np.ndarray) -> np.ndarray:

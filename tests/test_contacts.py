@@ -9,7 +9,7 @@ from scipy.stats import binom
 
 import jaxeit as je
 from jaxeit.contacts import ContactResult, prepare_contacts, refine_contacts, strongest
-from jaxeit.inverse import InverseError
+from jaxeit.whitening import InverseError
 
 STD = 1e-5  # V: a signal-to-noise ratio of 60 dB
 FRAMES = 300
@@ -149,9 +149,9 @@ def test_error_bars_are_honest(finder, linear, model):
 
 @pytest.fixture(scope="module")
 def single(model):
-    """One that looks for a single contact, and without two dead channels: small, and compiled quickly."""
+    """One that looks for a single contact, and without dead channels: small, and compiled quickly."""
     channels = np.ones(550, bool)
-    channels[[3, 77]] = False
+    channels[3:60:3] = False
     return prepare_contacts(model, noise=np.full(550, STD), most=1, columns=31, channels=channels)
 
 
@@ -167,14 +167,25 @@ def test_batches_transformations_and_single_frames_agree(single, linear):
 
 def test_a_frame_that_cannot_be_read_says_so_and_harms_no_other(finder, linear):
     good = 0.02 * linear((0.05, 0.08), 0.01)
-    bad = good.copy()
-    bad[17] = np.nan
-    found, beside, alone = *_find(finder, bad, good), _find(finder, good)[0]
+    found, beside, alone = *_find(finder, np.full(550, np.nan), good), _find(finder, good)[0]
     assert not found.present.any()
     assert (np.asarray(found.result) == ContactResult.UNREADABLE).all()
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(found))
     assert np.isnan(strongest(found)).all()
     np.testing.assert_array_equal(beside.position, alone.position)
+
+
+def test_missing_readings_are_left_out_exactly(finder, single, linear, model):
+    """As by a finder that never had them, which a zero in their place is not."""
+    dv = 0.1 * linear((0.05, 0.03), 0.012) + _noise()
+    gone = ~np.asarray(single.whitening.channels)
+    mended, zeroed = _find(finder, np.where(gone, np.nan, dv), np.where(gone, 0, dv))
+    never = single(dv)
+    assert float(jnp.linalg.norm(zeroed.position[0] - never.position[0])) > 2e-4
+    np.testing.assert_allclose(mended.position[0], never.position[0], atol=2e-6)
+    np.testing.assert_allclose(mended.amplitude[0], never.amplitude[0], rtol=2e-3)
+    np.testing.assert_allclose(mended.covariance[0], never.covariance[0], rtol=2e-2, atol=1e-12)
+    np.testing.assert_allclose(mended.misfit, never.misfit, rtol=2e-2)
 
 
 def test_a_dead_channel_is_left_out(single, linear):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.whitening import whitened_readings
 
 STD = np.geomspace(2e-6, 2e-5, 550)
 
@@ -46,6 +47,18 @@ def test_readings_weigh_by_the_inverse_of_their_noise(noisy):
     recon, j, r, strength, _, weight = noisy
     expected = generalised(j, r, strength, weight)
     np.testing.assert_allclose(recon.matrix, expected, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_what_is_kept_of_a_frame_is_all_of_it_and_white(model, noise):
+    """C^T C is the inverse covariance of the pair sums, and E the least inverse of C^T."""
+    deviations, weight = NOISES[noise]
+    found = whitened_readings(model, deviations, None)
+    p = np.asarray(found.whitening.readings(jnp.eye(300)))
+    gram = p.T @ weight @ p
+    np.testing.assert_allclose(found.factor.T @ found.factor, gram, atol=1e-9 * np.abs(gram).max())
+    exact = np.linalg.pinv(found.factor.T)
+    np.testing.assert_allclose(found.compress, exact, atol=1e-9 * np.abs(exact).max())
 
 
 def remaining(noise, kept):

@@ -1,0 +1,70 @@
+"""The conductivity of an uneven sheet, found from an untouched frame."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit.background import fit_background
+from jaxeit.whitening import InverseError
+
+
+@pytest.fixture(scope="module")
+def uneven(skin):
+    """Another mesh, with an uneven coating."""
+    return je.discretise(je.Scene(skin, (je.CoatingNonUniformity(0.15, 0.03, seed=3),)), je.Fidelity(edge_length=0.04))
+
+
+@pytest.fixture(scope="module")
+def untouched(uneven):
+    return np.asarray(je.forward(uneven))
+
+
+def _log(model, sigma):
+    """Logarithm of the conductivity, less its mean."""
+    log, areas = np.log(np.asarray(sigma)), np.asarray(model.areas)
+    return log - np.average(log, weights=areas)
+
+
+def _near(places, others):
+    return np.argmin(np.linalg.norm(np.asarray(places)[:, None] - np.asarray(others), axis=-1), axis=1)
+
+
+@pytest.fixture(scope="module")
+def truth(model, uneven):
+    return _log(uneven, je.conductivity(uneven))[_near(model.centroids, uneven.centroids)]
+
+
+def test_the_field_is_found_whatever_the_gain_and_without_a_reading(model, untouched, truth):
+    untouched = np.where(np.arange(550) == 7, np.nan, untouched)
+    found = [_log(model, fit_background(model, gain * untouched, columns=15)) for gain in (1.0, 3.0)]
+    assert np.std(found[0] - truth) < 0.3 * np.std(truth)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+
+
+def test_a_touch_is_seen_through_the_field(model, uneven, untouched):
+    """The place of a faint touch: wrong by much where the sheet is taken for even."""
+    place = np.array([0.062, 0.091])
+    bump = jnp.exp(-0.5 * jnp.sum((uneven.centroids - place) ** 2, -1) / 0.012**2)
+    dv = np.asarray(je.forward(uneven, je.conductivity(uneven) * (1 + 0.1 * bump))) - untouched
+    error = {}
+    for name, sigma in (("even", None), ("known", fit_background(model, untouched, columns=15))):
+        finder = je.prepare_contacts(model, noise=np.full(550, 1e-5), sigma=sigma, most=1, columns=31)
+        error[name] = float(jnp.linalg.norm(finder(dv).position[0] - place))
+    assert error["known"] < 5e-4
+    assert error["known"] < 0.5 * error["even"]
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "message"),
+    [
+        (lambda v: v[1:], {}, "550 readings"),
+        (lambda v: v * np.nan, {}, "no reading"),
+        (lambda v: -v, {}, "polarity"),
+        (lambda v: np.abs(v), {}, "no coat explains"),
+        (lambda v: v, {"std": 0.0}, "std is 0.0"),
+    ],
+)
+def test_what_no_field_explains_is_refused(model, untouched, change, settings, message):
+    with pytest.raises(InverseError, match=message):
+        fit_background(model, change(untouched), **({"columns": 15} | settings))
