@@ -26,6 +26,8 @@ class Fidelity:
     | electrode_segments: sides of the polygon that stands for a bolt        |                  |
     | growth: largest ratio of edge lengths from one ring to the next        |                  |
     | solver: a linear solver, or None to choose by the number of unknowns   |                  |
+    | interpolation: error of simulated frames joined from few solves, over  |                  |
+    | the largest change of their press; 0: every frame is solved            |                  |
 
     ``edge_length`` is relative so that one fidelity means the same on a 60 mm tank and a 280 mm
     chest: 0.025 is 5 mm on the 200 mm testbed.
@@ -40,6 +42,7 @@ class Fidelity:
     electrode_segments: int = 16
     growth: float = 1.3
     solver: AbstractLinearSolver | None = field(default=None)
+    interpolation: float = 1e-4
 
     def __post_init__(self):
         object.__setattr__(self, "dtype", _float(self.dtype))
@@ -51,6 +54,8 @@ class Fidelity:
             raise FidelityError(f"electrode_segments is {self.electrode_segments}; give 6 or more")
         if not 1.05 <= self.growth <= 2:
             raise FidelityError(f"growth is {self.growth}; give 1.05 to 2")
+        if not 0 <= self.interpolation <= 0.1:
+            raise FidelityError(f"interpolation is {self.interpolation}; give 0 to 0.1")
 
     @classmethod
     def draft(cls, **changes: Any) -> "Fidelity":

@@ -8,10 +8,11 @@ which cancels).  With x_a the field of a unit current into electrode a, and
     Z[a, b] = A(theta; x_a, x_b),          dZ[a, b] = -A(dtheta; x_a, x_b),
 
 since A is linear in theta = (sigma, g) and the fields are stationary.  The derivative needs no
-further solve (the adjoint identity; Geselowitz 1971, Lehr 1972).
+further solve (the adjoint identity; Geselowitz 1971, Lehr 1972).  Where a metal coat touches the sheet
+(`coat`), A has its two terms as well, and all else stays.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -20,17 +21,44 @@ from jax.scipy.special import i0e, i1e
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .coat import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
 from .discretise import Model, System
-from .effects import AbstractLoadEffect, AbstractSheetEffect, Sheet, Touch, fold
-from .solvers import inverse_columns
+from .effects import (
+    AbstractContactEffect,
+    AbstractLoadEffect,
+    AbstractSheetEffect,
+    AbstractTerminalEffect,
+    Circuit,
+    Sheet,
+    Touch,
+    fold,
+)
+from .solvers import AbstractPlan, inverse_columns
 from .verbs import verb
 
 
+class CoatedSheet(NamedTuple):
+    """What current sees of a sheet pressed against a metal coat.
+
+    | meaning                                 | shape       | unit  |
+    |-----------------------------------------|-------------|-------|
+    | sigma: conductivity of the sheet itself | (elements,) | S     |
+    | metal: conductivity of the coat         | ()          | S     |
+    | coupling: conductance between the two   | (elements,) | S/m^2 |
+    """
+
+    sigma: Float[Array, " elements"]
+    metal: Float[Array, ""]
+    coupling: Float[Array, " elements"]
+
+
 class Coefficients(NamedTuple):
-    """What the physics is linear in: conductivity of the elements, S; contact conductances."""
+    """What the physics is linear in: conductivity of the elements, S; contact conductances; those of a
+    coat, where it touches the sheet."""
 
     sigma: Float[Array, " elements"]
     contact: Float[Array, " electrodes"]
+    coat: CoatCoefficients | None = None
 
 
 class Fields(NamedTuple):
@@ -41,46 +69,72 @@ class Fields(NamedTuple):
     | potential of the sheet at its unknowns         | (unknowns + 1, electrodes)  |
     | drop from sheet to electrode, where under one  | (unknowns + 1, electrodes)  |
     | terminal: potential of each electrode          | (electrodes, electrodes)    |
+    | coat: fields of the coat, if that touches      |                             |
     """
 
     potential: Float[Array, "unknowns_and_ground electrodes"]
     drop: Float[Array, "unknowns_and_ground electrodes"]
     terminal: Float[Array, "electrodes electrodes"]
+    coat: CoatFields | None
 
 
-def forward(model: Model, sigma: Float[Array, " elements"] | None = None) -> Float[Array, " readings"]:
+def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None = None) -> Float[Array, " readings"]:
     """Voltages of one frame.
 
     Args:
         model: from `discretise`.
-        sigma: sheet conductivity of each element, S; default: that of the untouched sheet.
+        sigma: sheet conductivity of each element, S, or what `conductivity` returns; default: that of
+            the untouched sheet.
 
     Returns:
         (readings,) V, in the order of the protocol.  Not finite if ``sigma`` is not positive.
 
     Raises:
-        ValueError: if ``sigma`` has another shape or precision than the model.
+        ValueError: if ``sigma`` has another shape or precision than the model, or the model no coat.
     """
-    return _forward(model, None if sigma is None else jnp.asarray(sigma))
+    return _forward(model, sigma if sigma is None or isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
 
 
 @verb
-def _forward(model: Model, sigma: Float[Array, " elements"] | None) -> Float[Array, " readings"]:
-    return readings(model, transfer(model, coefficients(model, sigma)))
+def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Float[Array, " readings"]:
+    z = transfer(model, coefficients(model, sigma))
+    circuit = Circuit(z, model.pattern, model.current)
+    return fold(model.effects, AbstractTerminalEffect, readings(model, z), circuit)
+
+
+@overload
+def conductivity(
+    model: Model, pressure: None = None, temperature: Float[ArrayLike, ""] = 0.0
+) -> Float[Array, " elements"]: ...
+
+
+@overload
+def conductivity(
+    model: Model, pressure: Float[Array, " elements"], temperature: Float[ArrayLike, ""] = 0.0
+) -> Float[Array, " elements"] | CoatedSheet: ...
 
 
 @verb
-def conductivity(model: Model, pressure: Float[Array, " elements"] | None = None) -> Float[Array, " elements"]:
+def conductivity(
+    model: Model, pressure: Float[Array, " elements"] | None = None, temperature: Float[ArrayLike, ""] = 0.0
+) -> Float[Array, " elements"] | CoatedSheet:
     """Sheet conductivity, (elements,) S, under the scene's material effects.
+
+    Where the scene has a metal coat and ``pressure`` is given, the two sheets and their contact: a
+    `CoatedSheet`.  Without pressure nothing touches the coat.
 
     Args:
         pressure: on the sheet, (elements,) Pa; default: none.
+        temperature: above that at which the skin's sheet resistance was measured, K.
     """
+    touched = pressure is not None
     if not any(isinstance(effect, AbstractSheetEffect) for effect in model.effects):
         return model.background  # nothing to compute: the program is that of the ideal sensor
     pressure = jnp.zeros_like(model.background) if pressure is None else pressure
-    sheet = Sheet(model.background, pressure, model.centroids)
-    return fold(model.effects, AbstractSheetEffect, sheet).sigma
+    warmer = jnp.asarray(temperature, model.dtype)
+    sheet = Sheet(model.background, pressure, model.centroids, jnp.sqrt(model.areas), warmer)
+    after = fold(model.effects, AbstractSheetEffect, sheet)
+    return CoatedSheet(after.sigma, after.metal, after.coupling) if touched and after.metal is not None else after.sigma
 
 
 @verb
@@ -101,16 +155,26 @@ def load_spread(
     return fold(model.effects, AbstractLoadEffect, even, touch, model.centroids)
 
 
-def coefficients(model: Model, sigma: Float[Array, " elements"] | None) -> Coefficients:
+def coefficients(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Coefficients:
     """The conductivity given, or the scene's own, with the contact conductances."""
     if sigma is None:
         sigma = conductivity(model)
-    if sigma.shape != model.background.shape or sigma.dtype != model.dtype:
+    contact = fold(model.effects, AbstractContactEffect, model.contact)
+    if not isinstance(sigma, CoatedSheet):
+        return Coefficients(_fitting(model, "sigma", sigma), contact)
+    if model.coat is None:
+        raise ValueError("this model has no metal coat; discretise a scene whose effects have one")
+    sheet, coupling = _fitting(model, "sigma", sigma.sigma), _fitting(model, "coupling", sigma.coupling)
+    return Coefficients(sheet, contact, CoatCoefficients(jnp.asarray(sigma.metal, model.dtype), coupling))
+
+
+def _fitting(model: Model, name: str, values: Float[Array, " elements"]) -> Float[Array, " elements"]:
+    if values.shape != model.background.shape or values.dtype != model.dtype:
         raise ValueError(
-            f"sigma is {sigma.dtype}{list(sigma.shape)}; this model needs "
+            f"{name} is {values.dtype}{list(values.shape)}; this model needs "
             f"{model.dtype}{list(model.background.shape)}, one value per element"
         )
-    return Coefficients(sigma, model.contact)
+    return values
 
 
 def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
@@ -143,11 +207,9 @@ def series_resistance(system: System, theta: Coefficients) -> Float[Array, " ele
 
 @eqx.filter_custom_jvp
 def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes electrodes"]:
-    system = model.system
-    values, _, _ = assemble(system, theta)
-    corner = model.solver.corner(system.plan, values)
-    grounded = jnp.pad(corner, (0, 1))
-    return grounded[system.electrode_root][:, system.electrode_root]
+    plan, values, _, _ = _matrix(model, theta)
+    grounded = jnp.pad(model.solver.corner(plan, values), (0, 1))
+    return grounded[model.system.electrode_root][:, model.system.electrode_root]
 
 
 @_transfer.def_jvp
@@ -157,28 +219,39 @@ def _transfer_jvp(primals, tangents):
     x = fields(model, theta)
     slope = jnp.zeros_like(x.terminal)
     if direction is not None:
-        slope = -energy(model.system, _filled(direction, theta), x)
+        slope = -energy(model, _filled(direction, theta), x)
     return x.terminal, slope
 
 
 def _filled(direction: Coefficients, theta: Coefficients) -> Coefficients:
-    pairs = zip(direction, theta, strict=True)
-    return Coefficients(*(jnp.zeros_like(t) if d is None else d for d, t in pairs))
+    return jax.tree.map(lambda t, d: jnp.zeros_like(t) if d is None else d, theta, direction)
 
 
 @verb
 def fields(model: Model, theta: Coefficients) -> Fields:
     """Fields of a unit current into each electrode; one factorisation, differentiable."""
     system = model.system
-    values, share, rest = assemble(system, theta)
-    x = inverse_columns(model.solver, system.plan, values)
-    x = jnp.pad(x, (0, 1))[:, system.electrode_root]  # the ground: a row, and a column for who is there
+    plan, values, share, rest = _matrix(model, theta)
+    whole = inverse_columns(model.solver, plan, values)
+    whole = jnp.pad(whole, ((0, 0), (0, 1)))[:, system.electrode_root]  # a column for who is grounded
+    x = jnp.pad(whole[: system.unknowns], ((0, 1), (0, 0)))  # the ground's row
     terminal = x[system.electrode_dof]
     return Fields(
         potential=x + _over(system, share[:, None] * terminal),
         drop=x - _over(system, rest[:, None] * terminal),
         terminal=terminal,
+        coat=coat_fields(model.coat, theta.coat, whole, share) if model.coat and theta.coat else None,
     )
+
+
+def _matrix(
+    model: Model, theta: Coefficients
+) -> tuple[AbstractPlan, Float[Array, " nnz"], Float[Array, " electrodes"], Float[Array, " electrodes"]]:
+    """The matrix of the sheet, or of both where a coat touches it; and what `assemble` gives with it."""
+    values, share, rest = assemble(model.system, theta)
+    if model.coat and theta.coat:
+        return model.coat.plan, assemble_coat(model.coat, theta.coat, values, share), share, rest
+    return model.system.plan, values, share, rest
 
 
 def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, "n k"]:
@@ -193,7 +266,7 @@ def assemble(
 
     The shares only choose the unknowns: the potentials do not depend on them, nor derivatives.
     """
-    sigma, contact = theta
+    sigma, contact = theta.sigma, theta.contact
     chi, electrode = system.rim_chi, system.rim_electrode
     around = sigma[system.rim_element, None] * system.rim_flux
     sheet = jnp.zeros_like(contact).at[electrode].add(jnp.sum(chi * around, 1))
@@ -214,10 +287,14 @@ def assemble(
     return values.at[system.slots].add(added, mode="drop"), share, rest
 
 
-def energy(system: System, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
+def energy(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
     """``A(theta; x_a, x_b)`` for all pairs of fields, in ohm."""
+    system = model.system
     slopes = jnp.einsum("ekr,eka->era", system.slopes, x.potential[system.dofs])
     sheet = jnp.einsum("era,erb->ab", theta.sigma[:, None, None] * slopes, slopes)
     drop = x.drop[system.contact_dofs]
     mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
-    return sheet + jnp.einsum("pia,pij,pjb->ab", drop, mass, drop)
+    own = sheet + jnp.einsum("pia,pij,pjb->ab", drop, mass, drop)
+    if model.coat and theta.coat and x.coat:
+        return own + coat_energy(model.coat, theta.coat, x.coat)
+    return own

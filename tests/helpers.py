@@ -1,8 +1,10 @@
 """Small skins whose answers are known."""
 
+import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
+from jaxeit.effects import Sheet
 from jaxeit.solvers import Dense
 
 
@@ -12,13 +14,13 @@ def skin_of(domain, electrodes, pattern, *, sheet_resistance=1.0, current=1.0, p
     return je.Skin("test", domain, sheet_resistance, tuple(electrodes), protocol, pads)
 
 
-def square_model(points, pattern, cells, *, order=1, dtype="float64", ground=None, solver=None):
+def square_model(points, pattern, cells, *, order=1, dtype="float64", ground=None, solver=None, effects=()):
     """The 0.2 m square with point electrodes on a structured mesh of ``cells`` a side."""
     square = je.Rectangle(0.2, 0.2)
     skin = skin_of(square, [je.PointElectrode(p) for p in points], pattern)
     mesh = je.structured(square, cells, cells)
     fidelity = je.Fidelity(order=order, dtype=dtype, solver=solver or Dense())
-    return je.discretise(je.Scene(skin), fidelity, mesh=mesh, ground=ground)
+    return je.discretise(je.Scene(skin, effects), fidelity, mesh=mesh, ground=ground)
 
 
 def disc_model(z, edge_length, *, electrodes=16, cover=0.5, order=1, pattern=None):
@@ -29,3 +31,9 @@ def disc_model(z, edge_length, *, electrodes=16, cover=0.5, order=1, pattern=Non
     pattern = [[0, 1, 0, 1]] if pattern is None else pattern
     skin = skin_of(je.Disc(1.0), patches, pattern)
     return je.discretise(je.Scene(skin), je.Fidelity(edge_length=edge_length, order=order, solver=Dense()))
+
+
+def sheet_of(sigma, places, pressure=None, temperature=0.0):
+    """A sheet of elements of 1 mm2 at ``places``."""
+    pressure = jnp.zeros_like(sigma) if pressure is None else pressure
+    return Sheet(sigma, pressure, places, jnp.full_like(sigma, 1e-3), jnp.asarray(temperature))

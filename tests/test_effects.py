@@ -8,14 +8,17 @@ import pytest
 from scipy.stats import skew
 
 import jaxeit as je
-from jaxeit.effects import AbstractLoadEffect, AbstractPadEffect, AbstractSheetEffect, Sheet
+from jaxeit import effects as fx
 
-from .helpers import square_model
+from .helpers import sheet_of, square_model
+from .histories import after
 
 SMALL = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.12)]
 EVERY = [kind() for kind in je.EFFECTS.values()]
 IDS = list(je.EFFECTS)
-NEEDS = {je.ContactGain: (je.ContactPiezoresistance(),)}  # what acts on the effect's result
+FAMILIES = [thing for name, thing in vars(fx).items() if name.startswith("Abstract") and hasattr(thing, "stage")]
+_LAW = (je.ContactPiezoresistance(),)
+NEEDS = {je.ContactGain: _LAW, je.ProtrusionGrid: _LAW}  # what acts on the effect's result
 
 
 @pytest.fixture(scope="module")
@@ -27,14 +30,35 @@ def _with(model, *effects):
     return eqx.tree_at(lambda m: m.effects, model, effects, is_leaf=lambda x: x is model.effects)
 
 
+def _scene(*effects):
+    """The bare sheet with these effects, with room for what they need."""
+    return square_model(SMALL, [[0, 1, 2, 3]], 10, effects=effects)
+
+
 def _everything(model, key):
     """One frame of a touch through every stage that reads effects."""
-    spread = je.load_spread(model, jnp.array([0.1, 0.1]), jnp.asarray(0.02))
-    voltage = je.forward(model, je.conductivity(model, 20 * spread))
+    path = fx.fold(
+        model.effects, fx.AbstractStageEffect, fx.Path(jnp.full((1, 2), 0.1), jnp.zeros(1), jnp.ones(1)), key
+    )
+    spread = je.load_spread(model, path.places[0], jnp.asarray(0.02))
+    load = _history(model, fx.AbstractMemoryEffect, jnp.array([[0.0], [20.0]]), key)
+    voltage = je.forward(model, je.conductivity(model, load[1] * spread, 1.0))
     distance = jnp.full((1, spread.size), 0.02)
-    pads = je.fold(model.effects, AbstractPadEffect, jnp.ones_like(distance), distance)
-    series = je.fold(model.effects, je.AbstractReadoutEffect, voltage[None], key, jnp.asarray(0.01))
-    return series, pads, spread
+    response = fx.fold(model.effects, fx.AbstractPadEffect, jnp.ones_like(distance), distance)
+    pads = _history(model, fx.AbstractPneumaticEffect, jnp.outer(load[:, 0], response @ spread), key)
+    when = fx.fold(model.effects, fx.AbstractScanEffect, voltage, jnp.abs(voltage))
+    frames = jnp.stack([voltage, voltage])
+    streams = [(fx.Stream.EIT, frames), (fx.Stream.PRESSURE, pads), (fx.Stream.FORCE, load)]
+    recorded = [_history(model, fx.AbstractReadoutEffect, series, key, stream) for stream, series in streams]
+    packets = fx.Packets(jnp.arange(2.0), jnp.arange(2.0), jnp.zeros(2, bool))
+    return recorded, when, path, fx.fold(model.effects, fx.AbstractClockEffect, packets, key)
+
+
+def _history(model, family, series, key, stream=None):
+    mine = fx.chosen(model.effects, family, stream)
+    pattern = model.pattern if stream is fx.Stream.EIT else model.pattern[:0]
+    line = fx.Line(key, jnp.asarray(0.01), jnp.ones(len(series)), jnp.zeros(len(series)), pattern)
+    return fx.history(mine, series, fx.history_start(mine, series[0]), line)[0]
 
 
 def _program(model):
@@ -50,7 +74,7 @@ def bare_program(bare):
 def test_an_effect_is_in_the_program_if_and_only_if_it_is_listed(bare, bare_program, effect):
     name, others = type(effect).__name__, NEEDS.get(type(effect), ())
     assert f"/{name}/" not in bare_program
-    assert f"/{name}/" in _program(_with(bare, effect, *others))
+    assert f"/{name}/" in _program(_scene(effect, *others))
 
 
 def test_no_effects_leave_no_trace(bare):
@@ -77,7 +101,7 @@ def _operations(jaxpr):
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=IDS)
-def test_a_new_parameter_retraces_nothing(bare, effect):
+def test_a_new_parameter_retraces_nothing(effect):
     traces = []
 
     @eqx.filter_jit
@@ -86,18 +110,32 @@ def test_a_new_parameter_retraces_nothing(bare, effect):
         return _everything(model, key)
 
     key = jax.random.key(0)
-    run(_with(bare, effect), key)
+    run(_scene(effect), key)
     changed = jax.tree.map(lambda leaf: leaf + 1 if eqx.is_array(leaf) else leaf, effect)
-    run(_with(bare, changed), key)
+    run(_scene(changed), key)
     assert len(traces) == 1
 
 
-def test_every_effect_documents_its_parameters():
-    for kind in je.EFFECTS.values():
+def test_every_effect_documents_its_parameters_and_is_public():
+    for name, kind in je.EFFECTS.items():
         assert "| meaning" in kind.__doc__
-        assert kind.__mro__[1] in (
-            AbstractLoadEffect, AbstractSheetEffect, AbstractPadEffect, je.AbstractReadoutEffect
-        )  # fmt: skip
+        assert kind.__mro__[1] in FAMILIES
+        assert getattr(je, name) is kind
+
+
+def test_the_cost_of_absent_effects_is_none(bare):
+    """By the compiler's own count, what a scene with one effect costs does not depend on the others' existence: the
+    bare program costs what the formulas cost."""
+    costs = [eqx.filter_jit(f).lower(bare).compile().compiled.cost_analysis()["flops"] for f in (_touched, _by_hand)]
+    assert costs[0] == costs[1] > 0
+
+
+def _touched(model):
+    return je.forward(model, je.conductivity(model, model.background))
+
+
+def _by_hand(model):
+    return je.forward(model, model.background)
 
 
 @pytest.mark.parametrize(("effects", "error"), [((), 0.1), ((je.LoadSpreading(width=0.02),), 2e-3)])
@@ -117,11 +155,11 @@ def test_coating_is_log_normal_and_the_same_on_every_mesh():
     x = np.linspace(0, 1, 200)
     places = jnp.asarray(np.stack(np.meshgrid(x, x), -1).reshape(-1, 2))
     ones = jnp.ones(len(places))
-    log = np.log(np.asarray(effect(Sheet(ones, 0 * ones, places)).sigma))
+    log = np.log(np.asarray(effect(sheet_of(ones, places)).sigma))
     assert log.mean() == pytest.approx(0, abs=0.02)
     assert log.std() == pytest.approx(0.2, rel=0.1)
     assert abs(skew(log)) < 0.3
-    subset = effect(Sheet(ones[:7], 0 * ones[:7], places[:7])).sigma
+    subset = effect(sheet_of(ones[:7], places[:7])).sigma
     np.testing.assert_allclose(np.log(subset), log[:7], rtol=1e-9)
     correlation = np.mean(log.reshape(200, 200)[:, 2:] * log.reshape(200, 200)[:, :-2]) / log.var()
     assert correlation == pytest.approx(np.exp(-0.5 * (2 / 199 / 0.01) ** 2), abs=0.1)
@@ -130,7 +168,7 @@ def test_coating_is_log_normal_and_the_same_on_every_mesh():
 def test_piezoresistance_follows_hill_and_keeps_its_slope_finite():
     effect = je.ContactPiezoresistance(amplitude=1.0, half_pressure=20e3, exponent=0.7)
     pressure = jnp.array([0.0, 20e3, 1e12])
-    sheet = Sheet(jnp.ones(3), pressure, jnp.zeros((3, 2)))
+    sheet = sheet_of(jnp.ones(3), jnp.zeros((3, 2)), pressure)
     np.testing.assert_allclose(effect(sheet).sigma, [1.0, 1.5, 2.0], atol=1e-5)
     slope = jax.grad(lambda p: effect(sheet._replace(pressure=p)).sigma.sum())(pressure)
     assert np.isfinite(np.asarray(slope)).all()
@@ -155,14 +193,20 @@ def test_pads_share_a_load_by_area(skin, model):
 
 
 def test_readout_effects():
-    key, interval = jax.random.key(0), jnp.asarray(0.01)
-    flat = jnp.ones((20000, 2))
-    noisy = np.asarray(je.Noise(std=0.1)(flat, key, interval))
+    noisy = after(je.Noise(std=0.1), np.ones((20000, 2)))
     assert noisy.std(0) == pytest.approx(0.1, rel=0.03)
-    walk = np.asarray(je.BaselineDrift(rate=0.01)(jnp.ones((1, 4000)), key, jnp.asarray(4.0)))
-    assert (walk - 1).std() == pytest.approx(0.02, rel=0.05)
-    counts = np.asarray(je.Quantisation(step=0.5, lowest=0, highest=1)(jnp.array([[-3.0, 0.3, 9.0]]), key, interval))
+    walk = after(je.BaselineDrift(rate=0.01), np.full((8, 4000), 2.0), interval=4.0, cuts=(4,))
+    assert (walk[0] - 2).std() == pytest.approx(0.04, rel=0.05)
+    assert (walk[-1] - 2).std() == pytest.approx(0.04 * 8**0.5, rel=0.05)  # the walk goes on over the blocks
+    counts = after(je.Quantisation(step=0.5, lowest=0, highest=1), np.array([[-3.0, 0.3, 9.0]]))
     np.testing.assert_array_equal(counts, [[0, 0.5, 1]])
+
+
+def test_chance_of_one_effect_does_not_depend_on_the_others():
+    key, noise, drift = jax.random.key(3), je.Noise(), je.BaselineDrift()
+    alone, first, second = fx.keys([noise], key), fx.keys([drift, noise], key), fx.keys([noise, noise], key)
+    assert alone[0] == first[1] == second[0]
+    assert second[0] != second[1]
 
 
 def test_scenes_refuse_what_is_not_an_effect(skin):
@@ -170,6 +214,10 @@ def test_scenes_refuse_what_is_not_an_effect(skin):
         je.Scene(skin, effects=("noise",))
     with pytest.raises(ValueError, match="tuple"):
         je.Scene(skin, effects=je.LoadSpreading())
+    with pytest.raises(ValueError, match="LoadSpreading and IndentationSpreading both say how a load spreads"):
+        je.Scene(skin, effects=(je.LoadSpreading(), je.IndentationSpreading()))
+    with pytest.raises(ValueError, match="ElectrodeFault: no electrode 25; the skin has 0 to 24"):
+        je.Scene(skin, effects=(je.ElectrodeFault(electrode=25),))
 
 
 @pytest.mark.parametrize(
@@ -179,8 +227,16 @@ def test_scenes_refuse_what_is_not_an_effect(skin):
         ({"type": "LoadSpreading", "widht": 1.0}, "widht: unknown key; did you mean 'width'"),
         ({"type": "Noise", "stream": "eeg"}, 'give one of "eit"'),
         ({"width": 1.0}, "type: missing"),
+        ({"type": "AdcRanges", "gains": 2.0}, "gains: is 2.0; give "),
+        ({"type": "ElectrodeFault", "electrode": 1.5}, "electrode: is 1.5; give a whole number"),
     ],
 )
 def test_effects_in_a_scene_file(table, message):
     with pytest.raises(je.TomlError, match=message):
         je.read_effects(je.TomlTable({"effects": [table]}, "scene.toml"))
+
+
+def test_effects_of_many_numbers_in_a_scene_file():
+    table = {"type": "TpuRelaxation", "shares": [0.2], "times": [3.0]}
+    (effect,) = je.read_effects(je.TomlTable({"effects": [table]}, "scene.toml"))
+    assert effect.shares.shape == effect.times.shape == (1,)

@@ -1,30 +1,14 @@
-"""A simulated bench: an indenter walks over a skin and everything is recorded, as on a real one.
+"""The plan of a simulated bench: a scene, what presses on it, and how it is recorded."""
 
-The mesh that simulates is not the mesh that `calib.calibrate` inverts with, so that neither knows
-the other's discretisation error.
-"""
-
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from importlib import resources
 from pathlib import Path
 from typing import Any
-from uuid import NAMESPACE_OID, uuid5
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import BarycentricInterpolator
 
 import jaxeit as je
-
-from .session import PressTable, SessionWriter
-
-_LEVELS = 9  # force levels solved at per press; a Chebyshev interpolant joins them
-_LARGEST = 2 << 30  # bytes of voltages that one simulated session may hold
-
-Progress = Callable[[Iterable], Iterable]
 
 
 class BenchError(ValueError):
@@ -47,20 +31,35 @@ class Timing:
         return self.rest + self.ramp + self.hold + self.release + self.recovery
 
 
+@dataclass(frozen=True)
+class Companion:
+    """A further tip beside the first: ``offset`` (2,) m from it, to ``force`` N, ``delay`` s later."""
+
+    offset: tuple[float, float]
+    force: float
+    delay: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Bench:
     """A scene, the presses made on it, and how they are recorded.
 
-    | meaning                                                     | shape      | unit |
-    |-------------------------------------------------------------|------------|------|
-    | sites: centres of the tip                                   | (sites, 2) | m    |
-    | forces: what each press goes to, repeated over the sites    | (any,)     | N    |
-    | tip_diameter                                                | ()         | m    |
-    | blank: recording without contact at the start               | ()         | s    |
-    | eit_rate, pad_rate: stored EIT frames; pressures and forces | ()         | Hz   |
+    | meaning                                                     | shape      | unit     |
+    |-------------------------------------------------------------|------------|----------|
+    | sites: centres of the tip                                   | (sites, 2) | m        |
+    | forces: what each press goes to, repeated over the sites    | (any,)     | N        |
+    | tip_diameter, of companions too                             | ()         | m        |
+    | companions: tips that press with it                         |            |          |
+    | slide: how far all tips move during the hold                | (2,)       | m        |
+    | blank: recording without contact at the start               | ()         | s        |
+    | eit_rate, pad_rate: stored EIT frames; pressures and forces | ()         | Hz       |
     | eit_step, pressure_step, force_step: of the stored counts   | ()         | V, Pa, N |
-    | seed of all noise                                           |            |      |
-    | toml: the text that describes all this                      |            |      |
+    | temperature_rate, barometer_rate: how the air changes       | ()         | K/s, Pa/s |
+    | seed of all chance                                          |            |          |
+    | toml: the text that describes all this                      |            |          |
+
+    Raises:
+        BenchError: for a tip that would leave the sheet.
     """
 
     scene: je.Scene
@@ -68,6 +67,8 @@ class Bench:
     forces: np.ndarray
     title: str = "simulated bench session"
     tip_diameter: float = 0.02
+    companions: tuple[Companion, ...] = ()
+    slide: tuple[float, float] = (0.0, 0.0)
     timing: Timing = field(default_factory=Timing)
     blank: float = 60.0
     eit_rate: float = 180.0
@@ -75,26 +76,30 @@ class Bench:
     eit_step: float = 1e-6
     pressure_step: float = 1.0
     force_step: float = 0.01
+    temperature_rate: float = 0.0
+    barometer_rate: float = 0.0
     seed: int = 0
     epoch: datetime = datetime(2026, 1, 1, tzinfo=UTC)
     toml: str = ""
 
     def __post_init__(self):
-        outside = ~self.scene.skin.domain.contains(self.sites)
-        if outside.any():
-            number = int(np.argmax(outside))
-            raise BenchError(f"site {number} at {self.sites[number]} m lies outside the sheet")
-        size = 8 * self.duration * self.eit_rate * self.scene.skin.protocol.readings
-        if size > _LARGEST:
-            raise BenchError(
-                f"{self.duration:.0f} s at {self.eit_rate:g} frames per second would hold "
-                f"{size / 2**30:.1f} GiB of voltages in memory; use fewer sites or a lower eit_rate"
-            )
+        for name, offset in (("", (0.0, 0.0)), *((" of a companion", c.offset) for c in self.companions)):
+            for way, moved in (("", (0.0, 0.0)), (", after its slide,", self.slide)):
+                places = self.sites + np.add(offset, moved)
+                outside = ~self.scene.skin.domain.contains(places)
+                if outside.any():
+                    number = int(np.argmax(outside))
+                    raise BenchError(f"site {number}{name}{way} at {places[number]} m lies outside the sheet")
+
+    @property
+    def period(self) -> float:
+        """From the start of one press to the start of the next, s."""
+        return self.timing.period + max((c.delay for c in self.companions), default=0.0)
 
     @property
     def duration(self) -> float:
         """Of the whole recording, s."""
-        return self.blank + len(self.sites) * self.timing.period
+        return self.blank + len(self.sites) * self.period
 
     @property
     def press_forces(self) -> np.ndarray:
@@ -103,13 +108,29 @@ class Bench:
 
 
 def load_bench(path: str | Path) -> Bench:
-    """A bench from a scene file (data/sessions holds two to copy).
+    """A bench from a scene file, or a shipped preset by its name (see `presets`).
 
     Raises:
         ValueError: naming the file, the key and the reason.
     """
-    text = je.read_text(Path(path))
-    return je.parse_toml(text, str(path), lambda table: _bench(table, text))
+    path = str(path)
+    if path in presets() and not Path(path).exists():
+        text = (_SCENES / f"{path}.toml").read_text(encoding="utf-8")
+    elif not path.endswith(".toml") and not Path(path).exists():
+        raise BenchError(f"{path}: no such scene file or preset; presets: {', '.join(presets())}")
+    else:
+        text = je.read_text(Path(path))
+    return je.parse_toml(text, path, lambda table: _bench(table, text))
+
+
+_SCENES = resources.files("calib") / "scenes"
+
+
+def presets() -> tuple[str, ...]:
+    """Names of the scenes that are shipped."""
+    return tuple(
+        sorted(entry.name.removesuffix(".toml") for entry in _SCENES.iterdir() if entry.name.endswith(".toml"))
+    )
 
 
 def _bench(top: je.TomlTable, text: str) -> Bench:
@@ -125,6 +146,12 @@ def _bench(top: je.TomlTable, text: str) -> Bench:
     numbers: dict[str, Any] = {n: table.positive(n, "a number") for n in names if table.has(n)}
     if table.has("tip_diameter"):
         numbers["tip_diameter"] = table.positive("tip_diameter", "a length in m")
+    if table.has("slide"):
+        numbers["slide"] = table.vector("slide", 2, "[dx, dy] in m, moved during the hold")
+    for name in ("temperature_rate", "barometer_rate"):
+        if table.has(name):
+            numbers[name] = table.number(name, "a rate per second", least=float("-inf"))
+    numbers["companions"] = tuple(_companion(entry) for entry in table.tables("companions"))
     forces = table.array("forces", None, "[N, ...], what each press goes to")
     sites = _sites(table, skin.domain)
     times = [n for n in Timing.__dataclass_fields__ if table.has(n)]
@@ -146,158 +173,8 @@ def _sites(table: je.TomlTable, domain) -> np.ndarray:
     return grid.reshape(-1, 2)
 
 
-def simulate(
-    bench: Bench,
-    path: str | Path,
-    *,
-    fidelity: je.Fidelity | None = None,
-    progress: Progress = iter,
-) -> Path:
-    """Run the bench and write its session file.
-
-    Args:
-        path: of the session; it appears only when complete.
-        fidelity: of the simulation; default: finer than that of calibration.
-        progress: wraps the iteration over presses, such as `tqdm.tqdm`.
-
-    Raises:
-        ValueError: if the scene cannot be discretised or the file not written.
-    """
-    fidelity = je.Fidelity(edge_length=0.02) if fidelity is None else fidelity
-    model = je.discretise(bench.scene, fidelity)
-    response = je.pad_response(bench.scene.skin, model)
-    frames, samples = _clock(bench.duration, bench.eit_rate), _clock(bench.duration, bench.pad_rate)
-    voltages = np.tile(np.asarray(je.forward(model)), (len(frames), 1))
-    pressures = np.zeros((len(samples), len(bench.scene.skin.pads)))
-    forces = np.zeros((len(samples), 1))
-    sites = list(zip(bench.sites, bench.press_forces, strict=True))
-    for number, (site, force) in enumerate(progress(sites)):
-        start = bench.blank + number * bench.timing.period
-        spread = je.load_spread(model, jnp.asarray(site), bench.tip_diameter)
-        at, load = _profile(frames, start, bench.timing)
-        voltages[at] = _voltages(model, spread, force, load)
-        at, load = _profile(samples, start, bench.timing)
-        forces[at, 0] = force * load
-        pressures[at] = np.outer(force * load, response @ spread)
-    streams = {"eit": voltages, "pressure": pressures, "force": forces}
-    recorded = _read_out(bench, streams, {"eit": bench.eit_rate})
-    return _write(bench, Path(path), frames, samples, recorded)
-
-
-def _clock(duration: float, rate: float) -> np.ndarray:
-    """Times of the samples, s."""
-    return np.arange(int(duration * rate)) / rate
-
-
-def _profile(times: np.ndarray, start: float, timing: Timing) -> tuple[slice, np.ndarray]:
-    """Samples of the press that starts at ``start``, and their share of the full load, 0 to 1."""
-    first, last = np.searchsorted(times, [start, start + timing.period])
-    since = times[first:last] - start - timing.rest
-    up = np.clip(since / timing.ramp, 0, 1)
-    down = np.clip((since - timing.ramp - timing.hold) / timing.release, 0, 1)
-    return slice(first, last), 0.5 * (np.cos(np.pi * down) - np.cos(np.pi * up))
-
-
-def _voltages(model: je.Model, spread, force: float, load: np.ndarray) -> np.ndarray:
-    """Frames at shares of the full load, from solves at Chebyshev points and the polynomial
-    through them: the response is analytic in the load.  At 20 N nine points leave 3e-6 of the change
-    for a load spread over 12 mm, 8e-5 over 8 mm, where the piezoresistance is nearer its limit."""
-    levels = 0.5 * (1 + np.polynomial.chebyshev.chebpts1(_LEVELS))
-    solved = np.asarray(_solve(model, spread, jnp.asarray(force * levels)))
-    return BarycentricInterpolator(levels, solved)(load)
-
-
-@eqx.filter_jit
-def _solve(model, spread, forces):
-    return jax.lax.map(lambda f: je.forward(model, je.conductivity(model, f * spread)), forces)
-
-
-def _read_out(bench: Bench, streams: dict, rates: dict) -> dict:
-    """The streams as the instruments see them, each with noise of its own."""
-    keys = jax.random.split(jax.random.key(bench.seed), len(streams))
-    out = {}
-    for key, (name, series) in zip(keys, streams.items(), strict=True):
-        interval = jnp.asarray(1 / rates.get(name, bench.pad_rate))
-        effects = [e for e in bench.scene.effects if isinstance(e, je.AbstractReadoutEffect)]
-        mine = [e for e in effects if e.stream == je.Stream(name)]
-        out[name] = np.asarray(_disturb(mine, jnp.asarray(series), key, interval))
-    return out
-
-
-def _disturb(effects, series, key, interval):
-    for number, effect in enumerate(sorted(effects, key=lambda e: e.rank)):
-        one = jax.random.fold_in(key, number)
-        series = je.fold([effect], je.AbstractReadoutEffect, series, one, interval)
-    return series
-
-
-def _write(bench: Bench, path: Path, frames, samples, recorded) -> Path:
-    skin, protocol = bench.scene.skin, bench.scene.skin.protocol
-    writer = SessionWriter(
-        path,
-        title=bench.title,
-        skin_name=skin.name,
-        skin_toml=skin.toml,
-        pattern=protocol.pattern,
-        current=protocol.current,
-        frequency=protocol.frequency,
-        offset=np.arange(protocol.readings) * protocol.reading_time,
-        epoch=bench.epoch,
-        simulated=True,
-        scene=bench.toml,
-        seed=bench.seed,
-        session_id=str(uuid5(NAMESPACE_OID, f"{bench.toml}{bench.seed}")),
-        license="Apache-2.0",
-    )
-    with writer:
-        for name, variable, units, rate, step in (
-            ("eit", "voltage", "V", bench.eit_rate, bench.eit_step),
-            ("pressure", "pressure", "Pa", bench.pad_rate, bench.pressure_step),
-            ("force", "force", "N", bench.pad_rate, bench.force_step),
-        ):
-            times = _nanoseconds(frames if name == "eit" else samples)
-            channels = recorded[name].shape[1]
-            writer.add_stream(
-                name,
-                variable,
-                units=units,
-                channels=channels,
-                rate_hz=rate,
-                dtype="i2",
-                scale_factor=step,
-                transport="simulated",
-            )
-            writer.append(name, times, recorded[name])
-        writer.set_presses(_presses(bench))
-        writer.set_truth({"contact_position": (bench.sites, "m")})
-    return path
-
-
-def _presses(bench: Bench) -> PressTable:
-    timing, count = bench.timing, len(bench.sites)
-    start = bench.blank + np.arange(count) * timing.period + timing.rest
-    after = np.cumsum([0, timing.ramp, timing.hold, timing.release])
-    press, hold0, hold1, release = (_nanoseconds(start + t) for t in after)
-    return PressTable(
-        x=bench.sites[:, 0],
-        y=bench.sites[:, 1],
-        tip_diameter=np.full(count, bench.tip_diameter),
-        target_force=bench.press_forces,
-        t_press=press,
-        t_hold0=hold0,
-        t_hold1=hold1,
-        t_release=release,
-        pad=_pad_under(bench),
-        accepted=np.ones(count, bool),
-        reason=("",) * count,
-    )
-
-
-def _pad_under(bench: Bench) -> np.ndarray:
-    pads = [je.Polygon(pad.outline).contains(bench.sites) for pad in bench.scene.skin.pads]
-    inside = np.array(pads).reshape(len(pads), len(bench.sites))
-    return np.where(inside.any(0), inside.argmax(0), -1) if len(pads) else np.full(len(inside), -1)
-
-
-def _nanoseconds(seconds: np.ndarray) -> np.ndarray:
-    return np.rint(seconds * 1e9).astype(np.int64)
+def _companion(table: je.TomlTable) -> Companion:
+    offset = table.vector("offset", 2, "[dx, dy] in m, from the first tip")
+    force, delay = table.positive("force", "N"), table.number("delay", "s", 0.0)
+    table.done()
+    return Companion((offset[0], offset[1]), force, delay)

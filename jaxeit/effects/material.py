@@ -1,12 +1,17 @@
-"""Material: from pressure and manufacture to conductivity."""
+"""Material: from load, pressure, manufacture and temperature to conductivity."""
 
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
+from jax.scipy.special import i0e, i1e
 from jaxtyping import Array, Float, Int
 
-from ._base import AbstractSheetEffect, Sheet, parameter
-from ._fields import gaussian_field
+from ._base import AbstractMemoryEffect, AbstractSheetEffect, Sheet, parameter
+from ._chance import own_field
+
+_PLAYS = 8  # steps in which a loop of hysteresis opens
+_TERMS = 8  # of a continued fraction: exact to rounding where it is used
 
 
 class CoatingNonUniformity(AbstractSheetEffect):
@@ -24,7 +29,7 @@ class CoatingNonUniformity(AbstractSheetEffect):
     seed: Int[Array, ""] = parameter(0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        field = gaussian_field(self.seed, self.length, sheet.centroids)
+        field = own_field(self, self.seed, self.length, sheet.centroids)
         return sheet._replace(sigma=sheet.sigma * jnp.exp(self.std * field))
 
 
@@ -45,7 +50,7 @@ class ContactGain(AbstractSheetEffect):
     seed: Int[Array, ""] = parameter(0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        field = gaussian_field(self.seed, self.length, sheet.centroids)
+        field = own_field(self, self.seed, self.length, sheet.centroids)
         return sheet._replace(pressure=sheet.pressure * jnp.exp(self.std * field))
 
 
@@ -61,13 +66,198 @@ class ContactPiezoresistance(AbstractSheetEffect):
     | exponent n                          | 1       | 0.6 to 1.2 | 1    | assumption: many contacts |
     """
 
+    alternative: ClassVar[str] = "how pressure makes the sheet conduct"
+
     amplitude: Float[Array, ""] = parameter(1.0)
     half_pressure: Float[Array, ""] = parameter(20e3)
     exponent: Float[Array, ""] = parameter(1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        # The power has an infinite slope at zero pressure for n < 1: keep it off that point.
-        touched = sheet.pressure > 0
-        ratio = jnp.where(touched, sheet.pressure, self.half_pressure) / self.half_pressure
-        x = jnp.where(touched, ratio**self.exponent, 0.0)
-        return sheet._replace(sigma=sheet.sigma * (1 + self.amplitude * x / (1 + x)))
+        x = _power(sheet.pressure / self.half_pressure, self.exponent)
+        return _conducting(sheet, 1 + self.amplitude * x / (1 + x))
+
+
+class HomogenisedIslands(AbstractSheetEffect):
+    """Pressed on islands of perfect metal, current takes short cuts through them: instead of `ContactPiezoresistance`.
+
+    Islands of radius a on a share f of the area touch the sheet of resistance R_s with the specific
+    resistance ``rho = rho_r (p / p_r)^-n``.  The dipole of one, from the modified Bessel equation
+    under it, put into Maxwell's mixture (1873):
+
+        ``sigma <- sigma (1 + f b) / (1 - f b)``,  ``b = I2(k) / I0(k)``,  ``k = a sqrt(R_s / rho)``,
+
+    which ends at ``(1 + f) / (1 - f)``: twice for a third.  Within 0.006 of the ratio of a resolved
+    square lattice up to f = 1/3.
+
+    | meaning                               | default | range      | unit    | source                   |
+    |---------------------------------------|---------|------------|---------|--------------------------|
+    | fraction f of islands                 | 1/3     | 0 to 0.5   | 1       | gives the paper's 100 %  |
+    | radius a of an island                 | 2       | 0.5 to 5   | mm      | assumption               |
+    | contact rho_r at pressure p_r         | 16      | 1 to 1000  | ohm mm2 | assumption               |
+    | reference p_r, over the whole area    | 64      |            | kPa     | 20 N on a 20 mm tip      |
+    | exponent n                            | 1       | 0.6 to 1.2 | 1       | assumption: many spots   |
+    """
+
+    alternative: ClassVar[str] = "how pressure makes the sheet conduct"
+    rank: ClassVar[int] = 1  # after what decides the sheet's own resistance
+
+    fraction: Float[Array, ""] = parameter(1 / 3)
+    radius: Float[Array, ""] = parameter(2e-3)
+    contact: Float[Array, ""] = parameter(1.6e-5)
+    reference: Float[Array, ""] = parameter(64e3)
+    exponent: Float[Array, ""] = parameter(1.0)
+
+    def __call__(self, sheet: Sheet) -> Sheet:
+        conductance = _power(sheet.pressure / self.reference, self.exponent) / self.contact
+        b = _island_dipole(self.radius**2 * conductance / sheet.sigma)
+        return _conducting(sheet, _mixture(self.fraction * b))
+
+
+class ProtrusionGrid(AbstractSheetEffect):
+    """Only protrusions press: squares on a square grid, each with the load of its own cell.
+
+    ``p <- p / f`` on a share of each element, ``f = (side / pitch)^2``.  The share is that of the
+    protrusions in a square of the element's area around its centroid, in closed form: it is 0 or 1
+    where elements resolve the grid, and f where they are larger than the pitch.  The law that follows
+    acts on that share and mixes the result (`_mixture`), since it is not linear in pressure.
+
+    Not resolved: how a protrusion's load spreads within it, and which elements it cuts; the load is
+    kept on the average over cells.
+
+    | meaning                             | default | range   | unit | source     |
+    |-------------------------------------|---------|---------|------|------------|
+    | pitch                               | 6       | 2 to 20 | mm   | assumption |
+    | side, at most the pitch: all of it  | 3.5     | 1 to 20 | mm   | assumption |
+    """
+
+    rank: ClassVar[int] = -1  # before the law that turns pressure into conductivity
+
+    pitch: Float[Array, ""] = parameter(6e-3)
+    side: Float[Array, ""] = parameter(3.5e-3)
+
+    def __call__(self, sheet: Sheet) -> Sheet:
+        half = sheet.size[:, None] / 2
+        inside = self._length(sheet.centroids + half) - self._length(sheet.centroids - half)
+        share = jnp.prod(inside / (2 * half), 1)
+        return sheet._replace(pressure=sheet.pressure * (self.pitch / self.side) ** 2, share=share)
+
+    def _length(self, x: Float[Array, "elements 2"]) -> Float[Array, "elements 2"]:
+        """Length of protrusions between 0 and x along an axis; cells start at 0, protrusions lie in their middle."""
+        cells = jnp.floor(x / self.pitch)
+        beyond = x - cells * self.pitch - (self.pitch - self.side) / 2
+        return cells * self.side + jnp.clip(beyond, 0, self.side)
+
+
+class SheetTemperature(AbstractSheetEffect):
+    """A warmer sheet resists more: ``sigma <- sigma / (1 + c T)``, T above where sigma was measured.
+
+    | meaning                                 | default | range        | unit | source     |
+    |-----------------------------------------|---------|--------------|------|------------|
+    | coefficient c of the sheet's resistance | 1e-3    | -5e-4 to 2e-3 | 1/K | assumption |
+    """
+
+    coefficient: Float[Array, ""] = parameter(1e-3)
+
+    def __call__(self, sheet: Sheet) -> Sheet:
+        return sheet._replace(sigma=sheet.sigma / (1 + self.coefficient * sheet.temperature))
+
+
+class Creep(AbstractMemoryEffect):
+    """A contact grows with its age: the sheet feels ``load (1 + c log10(1 + age / t0))``.
+
+    Age is the mean over the load of how long it has been there: what is added is new, what is taken
+    away had the mean age, and a contact lifted has none.  After a step this is the logarithmic creep
+    of printed force sensors; it leaves nothing behind at zero load.
+
+    | meaning                            | default | range      | unit | source                           |
+    |------------------------------------|---------|------------|------|----------------------------------|
+    | rate c per decade of time          | 0.05    | 0 to 0.1   | 1    | FSR 400 sheet: drift < 5 %       |
+    | onset t0                           | 0.1     | 1e-3 to 10 | s    | assumption                       |
+    """
+
+    rate: Float[Array, ""] = parameter(0.05)
+    onset: Float[Array, ""] = parameter(0.1)
+
+    def start(self, first):
+        return first, jnp.zeros_like(first)
+
+    def __call__(self, series, state, line):
+        def older(state, load):
+            before, age = state
+            grown = load > before
+            old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)  # share of it that was there before
+            age = jnp.where(load > 0, old * (age + line.interval.astype(age.dtype)), 0.0)
+            return (load, age), age
+
+        state, age = jax.lax.scan(older, state, series)
+        return series * (1 + self.rate * jnp.log1p(age / self.onset) / jnp.log(10.0)), state
+
+
+class Hysteresis(AbstractMemoryEffect):
+    """On its way down a load is felt more than on its way up, at any speed: a Prandtl-Ishlinskii sum.
+
+    The operators play in the logarithm of the load, so that the loop is a share of the load and
+    closes at zero load.  Each has an excess e over the way up,
+
+        ``e_i <- clip(e_i + ln(load before / load), 0, r_i)``,  ``felt = load exp(w sum of e_i)``,
+
+    with evenly spaced ``r_i`` up to ``ln(reach)`` and w such that all of them open the loop by
+    ``loop``.  A rising load is felt as it is.
+
+    | meaning                                          | default | range     | unit | source              |
+    |--------------------------------------------------|---------|-----------|------|---------------------|
+    | loop: load felt down over that felt up, less one | 0.1     | 0 to 0.24 | 1    | FSR 400 sheet: 10 % |
+    | reach: fall of the load that opens it wholly     | 4       | 2 to 100  | 1    | assumption          |
+    """
+
+    loop: Float[Array, ""] = parameter(0.1)
+    reach: Float[Array, ""] = parameter(4.0)
+
+    def start(self, first):
+        return _logarithm(first), jnp.zeros((_PLAYS, *first.shape), first.dtype)
+
+    def __call__(self, series, state, line):
+        widths = jnp.log(self.reach) * jnp.arange(1, _PLAYS + 1).astype(series.dtype)[:, None] / _PLAYS
+
+        def play(state, log):
+            before, excess = state
+            excess = jnp.clip(excess + (before - log), 0, widths)
+            return (log, excess), jnp.sum(excess, 0)
+
+        state, excess = jax.lax.scan(play, state, _logarithm(series))
+        return series * jnp.exp(jnp.log1p(self.loop) * excess / jnp.sum(widths)), state
+
+
+def _logarithm(load: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Its logarithm; no load is one too small to matter."""
+    return jnp.log(jnp.maximum(load, jnp.finfo(load.dtype).tiny))
+
+
+def _power(x: Float[Array, " elements"], exponent: Float[Array, ""]) -> Float[Array, " elements"]:
+    """``x^exponent``, and 0 without pressure, where a power below one would have an infinite slope."""
+    touched = x > 0
+    return jnp.where(touched, jnp.where(touched, x, 1.0) ** exponent, 0.0)
+
+
+def _conducting(sheet: Sheet, factor: Float[Array, " elements"]) -> Sheet:
+    """The sheet, ``factor`` times as conductive where pressure acts."""
+    if sheet.share is not None:
+        factor = _mixture(sheet.share * (factor - 1) / (factor + 1))
+    return sheet._replace(sigma=sheet.sigma * factor)
+
+
+def _mixture(dipole: Float[Array, " elements"]) -> Float[Array, " elements"]:
+    """Conductivity of a plane with inclusions, over that without (Maxwell 1873, in two dimensions), from
+    the dipole strength of the inclusions per area: ``share (ratio - 1) / (ratio + 1)`` for plain ones."""
+    return (1 + dipole) / (1 - dipole)
+
+
+def _island_dipole(square: Float[Array, " elements"]) -> Float[Array, " elements"]:
+    """``I2(k) / I0(k)`` for k^2: by Gauss's continued fraction where the difference of I0 and I1 cancels."""
+    small = square < 1
+    quarter = jnp.where(small, square, 0.0) / 4
+    tail = jnp.zeros_like(quarter)
+    for n in range(_TERMS, 1, -1):
+        tail = quarter / (n + tail)
+    k = jnp.sqrt(jnp.where(small, 1.0, square))
+    return jnp.where(small, tail / (1 + tail), 1 - 2 * i1e(k) / (k * i0e(k)))

@@ -1,9 +1,19 @@
-"""Pneumatics: from the pressure on a pad to the pressure in it."""
+"""Pneumatics: from the pressure on a pad to the pressure in it.
 
+A pad's load is shared by the gas and by the structure around it.  The series that the history effects are
+given is what an ideal pad would show: isothermal, at rest at all times, linear and sealed.  Each effect takes
+what the others describe as ideal.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ._base import AbstractPadEffect, parameter
+from ._base import AbstractPadEffect, AbstractPneumaticEffect, parameter
+from ._chance import own_normal
 
 
 class PadEdgeDip(AbstractPadEffect):
@@ -20,3 +30,199 @@ class PadEdgeDip(AbstractPadEffect):
 
     def __call__(self, response, distance):
         return response * (1 - self.depth * jnp.exp(-distance / self.width))
+
+
+class PadCrosstalk(AbstractPneumaticEffect):
+    """Pads share walls: each feels its own pressure and a fraction of the mean of the others'.
+
+    A series does not say which pads are neighbours: all others count alike, as they nearly do in a square of four.
+
+    | meaning                         | default | range    | unit | source     |
+    |---------------------------------|---------|----------|------|------------|
+    | fraction of the others' mean    | 0.02    | 0 to 0.1 | 1    | assumption |
+    """
+
+    rank: ClassVar[int] = -4  # a matter of the load on the pad, before anything in it
+
+    fraction: Float[Array, ""] = parameter(0.02)
+
+    def __call__(self, series, state, line):
+        others = (series.sum(1, keepdims=True) - series) / max(series.shape[1] - 1, 1)
+        return series + self.fraction * others, state
+
+
+class TpuRelaxation(AbstractPneumaticEffect):
+    """The structure relaxes under load and leaves more of it to the gas: pressure creeps up while a press is held.
+
+    The structure's stiffness falls as ``E(t) / E(0) = 1 - sum_i g_i (1 - exp(-t / tau_i))``: a Prony series, that
+    is Maxwell elements in parallel.  With s the gas's share of a lasting load, p the ideal pressure and P that in
+    the gas, ``p = P + (1 - s) sum_i g_i / (1 - sum g) h_i``, ``h_i' = P' - h_i / tau_i``: solved sample by sample,
+    exactly for a P that is linear between samples.
+
+    | meaning                                     | default          | range         | unit | source          |
+    |---------------------------------------------|------------------|---------------|------|-----------------|
+    | shares g_i of the stiffness at first        | 0.10, 0.08, 0.07 | sum below 1   | 1    | assumption      |
+    | times tau_i                                 | 0.1, 1, 10       | 0.01 to 1000  | s    | assumption      |
+    | gas_share s of a lasting load               | 0.5              | 0 to 1        | 1    | assumption      |
+    """
+
+    rank: ClassVar[int] = -3
+
+    shares: Float[Array, " elements"] = eqx.field(converter=jnp.asarray, default=(0.10, 0.08, 0.07))
+    times: Float[Array, " elements"] = eqx.field(converter=jnp.asarray, default=(0.1, 1.0, 10.0))
+    gas_share: Float[Array, ""] = parameter(0.5)
+
+    def start(self, first):
+        return first, jnp.zeros((self.times.size, first.size), first.dtype)
+
+    def __call__(self, series, state, line):
+        excess = (1 - self.gas_share) * self.shares / (1 - self.shares.sum())
+        weight = excess.astype(series.dtype)[:, None]
+        keep, gain = (part[:, None] for part in _relaxation(line.interval, self.times, series.dtype))
+
+        def step(state, ideal):
+            before, h = state
+            left = ideal - (weight * (keep * h - gain * before)).sum(0)
+            now = left / (1 + (weight * gain).sum())
+            return (now, keep * h + gain * (now - before)), now
+
+        after, out = jax.lax.scan(step, state, series)
+        return out, after
+
+
+class GasLaw(AbstractPneumaticEffect):
+    """The gas stiffens as it is squeezed: ``(P0 + P)(V0 - dV) = P0 V0``, at constant temperature.
+
+    The structure gives way by its compliance C under what the gas does not carry, so that the gas's share of a
+    small load is ``s = C / (C + V0 / P0)`` and the ideal pressure p makes a compression ``y = dV / V0`` with
+    ``p / P0 = s y / (1 - y) + (1 - s) y``.  Its smaller root gives ``P = P0 y / (1 - y)``, which is p for small p,
+    and for every p where the gas carries all.  `GasRelaxation` has what comes before the temperature is even.
+
+    | meaning                               | default | range       | unit   | source                       |
+    |---------------------------------------|---------|-------------|--------|------------------------------|
+    | volume V0                             | 70      | 20 to 200   | cm3    | assumption                   |
+    | compliance C of the structure         | 7e-10   | 0 to inf    | m3/Pa  | assumption: a share s of 0.5 |
+    | pressure P0 around the pad            | 101.325 | 60 to 110   | kPa    | standard atmosphere          |
+    """
+
+    rank: ClassVar[int] = -2
+
+    volume: Float[Array, ""] = parameter(70e-6)
+    compliance: Float[Array, ""] = parameter(7e-10)
+    pressure: Float[Array, ""] = parameter(101325.0)
+
+    def __call__(self, series, state, line):
+        structure = 1 / (1 + self.compliance * self.pressure / self.volume)
+        q = series / self.pressure
+        y = 2 * q / (1 + q + jnp.sqrt((1 + q) ** 2 - 4 * structure * q))
+        return self.pressure * y / (1 - y), state
+
+
+class GasRelaxation(AbstractPneumaticEffect):
+    """Squeezed quickly, the gas warms, is stiffer, and cools to its walls: adiabatic at first, isothermal in the end.
+
+    With s the gas's share of a lasting load, p the ideal pressure and P that in the gas, ``P = p + (1 - s) e``,
+    where the warmth's pressure follows ``m e' = (gamma - 1) p' - e / tau``, ``m = 1 + s (gamma - 1)``: exactly for a
+    p that is linear between samples.  An imposed volume (s = 0) shows gamma times the lasting pressure at first.
+
+    | meaning                        | default | range     | unit | source                                     |
+    |--------------------------------|---------|-----------|------|--------------------------------------------|
+    | time tau                       | 0.31    | 0.05 to 2 | s    | h2 / (pi2 alpha): air, a chamber 8 mm high |
+    | heat_ratio gamma               | 1.4     | 1 to 1.67 | 1    | air                                        |
+    | gas_share s of a lasting load  | 0.5     | 0 to 1    | 1    | assumption                                 |
+    """
+
+    rank: ClassVar[int] = -1
+
+    time: Float[Array, ""] = parameter(0.31)
+    heat_ratio: Float[Array, ""] = parameter(1.4)
+    gas_share: Float[Array, ""] = parameter(0.5)
+
+    def start(self, first):
+        return first, jnp.zeros_like(first)
+
+    def __call__(self, series, state, line):
+        stiffer = 1 + self.gas_share * (self.heat_ratio - 1)
+        warmth, state = _transient(series, state, line.interval, stiffer * self.time)
+        return series + (1 - self.gas_share) * (self.heat_ratio - 1) / stiffer * warmth, state
+
+
+class PadTemperature(AbstractPneumaticEffect):
+    """Sealed gas gains pressure as it warms, and gage pressure falls as the barometer rises: ``P + k dT - b dP_air``.
+
+    The gas is as warm as the air around.
+
+    | meaning                                         | default | range      | unit | source                        |
+    |-------------------------------------------------|---------|------------|------|-------------------------------|
+    | sensitivity k                                   | 346     | 0 to 400   | Pa/K | P0 / T0; less if a pad gives  |
+    | barometer: share b of a change of air pressure  | 1       | 0 to 1     | 1    | a rigid sealed pad            |
+    """
+
+    sensitivity: Float[Array, ""] = parameter(346.0)
+    barometer: Float[Array, ""] = parameter(1.0)
+
+    def __call__(self, series, state, line):
+        shift = self.sensitivity * line.temperature - self.barometer * line.barometer
+        return series + shift.astype(series.dtype)[:, None], state
+
+
+class PadLeak(AbstractPneumaticEffect):
+    """A pad leaks: ``P' = p' - P / tau``, for p linear between samples exactly.
+
+    What heat and barometer do to the pad leaks away as well.
+
+    | meaning   | default | range     | unit | source     |
+    |-----------|---------|-----------|------|------------|
+    | time tau  | 300     | 30 to inf | s    | assumption |
+    """
+
+    rank: ClassVar[int] = 1
+
+    time: Float[Array, ""] = parameter(300.0)
+
+    def start(self, first):
+        return first, first
+
+    def __call__(self, series, state, line):
+        return _transient(series, state, line.interval, self.time)
+
+
+class SensorError(AbstractPneumaticEffect):
+    """The sensor of each pad has an offset and an error of its span: ``a + (1 + b) P``, both normal, the same for ever.
+
+    | meaning                              | default | range        | unit | source                               |
+    |--------------------------------------|---------|--------------|------|--------------------------------------|
+    | offset: std of a                     | 86      | 0 to 345     | Pa   | HSC: 0.25 % of 34,474 Pa; 1 % in all |
+    | span: std of b                       | 0.0025  | 0 to 0.01    | 1    | HSC: 0.25 %; 1 % in all              |
+    | seed of the sensors                  | 0       |              |      |                                      |
+    """
+
+    rank: ClassVar[int] = 2
+
+    offset: Float[Array, ""] = parameter(86.0)
+    span: Float[Array, ""] = parameter(0.0025)
+    seed: Int[Array, ""] = parameter(0)
+
+    def __call__(self, series, state, line):
+        a, b = own_normal(self, self.seed, (2, series.shape[1]), series.dtype)
+        return self.offset * a + (1 + self.span * b) * series, state
+
+
+def _relaxation(interval, time, dtype):
+    """Of ``h' = x' - h / time``, x linear over an interval: what is kept of h, what is gained per change of x."""
+    steps = interval / time
+    gain = jnp.where(steps > 0, -jnp.expm1(-steps) / jnp.where(steps > 0, steps, 1), 1)  # nothing goes in endless time
+    return jnp.exp(-steps).astype(dtype), gain.astype(dtype)
+
+
+def _transient(series, state, interval, time):
+    """What is left of the changes of a series: ``h' = series' - h / time``; the state is (last sample, h)."""
+    keep, gain = _relaxation(interval, time, series.dtype)
+
+    def step(state, now):
+        before, h = state
+        h = keep * h + gain * (now - before)
+        return (now, h), h
+
+    after, out = jax.lax.scan(step, state, series)
+    return out, after

@@ -5,13 +5,109 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
-from ._base import AbstractReadoutEffect, Stream, parameter
+from ._base import AbstractReadoutEffect, AbstractScanEffect, Stream, parameter
+from ._chance import normal, own_normal
+
+_POLE_RATIO = 4.0
+_POLES = 1.08 * _POLE_RATIO ** -np.arange(12)  # rad per sample; the first is chosen for what is near half the rate
+
+
+class ScanSkew(AbstractScanEffect):
+    """The readings of a frame are taken one after the other, each at its own time: ``when + stretch nominal``.
+
+    | meaning                                        | default | range    | unit | source                            |
+    |------------------------------------------------|---------|----------|------|-----------------------------------|
+    | stretch: true times over the protocol's        | 1       | 0.5 to 2 | 1    | the skin's protocol as it is told |
+    """
+
+    stretch: Float[Array, ""] = parameter(1.0)
+
+    def __call__(self, when, nominal):
+        return when + self.stretch * nominal
+
+
+class IntermittentElectrode(AbstractReadoutEffect):
+    """A loose electrode opens and closes at random, frame by frame: a telegraph process with two rates.
+
+    While it is open, readings that drive through it see no current and are 0, and readings that sense with it see
+    an input afloat: a potential drawn anew for each frame, the same for all that sense with it, with their sign.
+    A frame is closed or open as a whole.  An electrode that is always open, and what source and amplifier then do,
+    belongs to the electrical effects.
+
+    | meaning                                | default | range        | unit | source     |
+    |----------------------------------------|---------|--------------|------|------------|
+    | electrode, counted from 0              | 0       |              |      |            |
+    | rate of opening while it is closed     | 0.1     | 0 to 10      | 1/s  | assumption |
+    | duration of a gap, its mean            | 0.2     | 0.005 to 10  | s    | assumption |
+    | floating: std of the input afloat      | 0.01    | 0 to 1       | V    | assumption |
+    """
+
+    rank: ClassVar[int] = -3  # at the skin, before all electronics
+    stream: ClassVar[Stream] = Stream.EIT  # type: ignore[misc]
+
+    electrode: Int[Array, ""] = parameter(0)
+    rate: Float[Array, ""] = parameter(0.1)
+    duration: Float[Array, ""] = parameter(0.2)
+    floating: Float[Array, ""] = parameter(0.01)
+
+    def start(self, first):
+        return jnp.zeros((), bool)
+
+    def __call__(self, series, state, line):
+        chance, afloat = jax.random.split(line.key)
+        numbers = jax.random.uniform(chance, series.shape[:1], jnp.float32)
+        # Exact for the two-state process: it tends to its mean share at the sum of both rates.
+        both = self.rate + 1 / self.duration
+        turned = -jnp.expm1(-both * line.interval) / both
+        to_open, to_stay = self.rate * turned, 1 - turned / self.duration
+
+        def step(was_open, number):
+            is_open = number < jnp.where(was_open, to_stay, to_open)
+            return is_open, is_open
+
+        state, is_open = jax.lax.scan(step, state, numbers)
+        touches = line.pattern == self.electrode
+        sign = touches[:, 2].astype(series.dtype) - touches[:, 3].astype(series.dtype)
+        lost = jnp.outer(self.floating * normal(afloat, series[:, 0]), sign)
+        lost = jnp.where(touches[:, :2].any(1), 0, lost).astype(series.dtype)
+        return jnp.where(is_open[:, None] & touches.any(1), lost, series), state
+
+
+class MuxSettling(AbstractReadoutEffect):
+    """The output has not quite left the reading before: ``v + (v_before - v) exp(-settle / time_constant)``.
+
+    The channels are in the order of the scan; the first of a frame comes after the last of the frame before.
+
+    | meaning                                     | default | range      | unit | source                        |
+    |---------------------------------------------|---------|------------|------|-------------------------------|
+    | time_constant                               | 0.5     | 0.1 to 3   | us   | assumption                    |
+    | settle: time left before the value is taken | 10      | 1 to 10    | us   | at most what a reading takes  |
+    """
+
+    rank: ClassVar[int] = -2
+
+    time_constant: Float[Array, ""] = parameter(0.5e-6)
+    settle: Float[Array, ""] = parameter(10e-6)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def start(self, first):
+        return first[-1]
+
+    def __call__(self, series, state, line):
+        # All frames at once from zero, then what each hands to the next: 550 + 1024 short steps instead of 563,200.
+        times = self.settle / self.time_constant * jnp.arange(1, series.shape[1] + 1)
+        left = jnp.exp(-times).astype(series.dtype)
+        alone = _decaying_sums(left[0], jnp.zeros_like(series[:, 0]), (1 - left[0]) * series.T).T
+        last = _decaying_sums(left[-1], state, alone[:, -1])
+        before = jnp.concatenate([state[None], last[:-1]])
+        return alone + jnp.outer(before, left), last[-1]
 
 
 class BaselineDrift(AbstractReadoutEffect):
-    """Each channel wanders as a random walk, in proportion to its own root mean square.
+    """Each channel wanders as a random walk, in proportion to its own value at rest.
 
     | meaning                            | default | range        | unit      | source     |
     |------------------------------------|---------|--------------|-----------|------------|
@@ -23,10 +119,67 @@ class BaselineDrift(AbstractReadoutEffect):
     rate: Float[Array, ""] = parameter(1e-4)
     stream: Stream = eqx.field(static=True, default=Stream.EIT)
 
-    def __call__(self, series, key, interval):
-        steps = jax.random.normal(key, series.shape, jnp.float32).astype(series.dtype)
-        size = self.rate * jnp.sqrt(interval) * _rms(series)
-        return series + jnp.cumsum(steps, 0) * size
+    def start(self, first):
+        return jnp.zeros_like(first), jnp.abs(first)
+
+    def __call__(self, series, state, line):
+        walked, size = state
+        std = (self.rate * jnp.sqrt(line.interval)).astype(series.dtype)
+        walk = _decaying_sums(1, walked, std * normal(line.key, series))
+        return series + size * walk, (walk[-1], size)
+
+
+class GainError(AbstractReadoutEffect):
+    """Each channel has an error of gain, the same for ever: ``v (1 + g)``, g normal.
+
+    | meaning                     | default | range     | unit | source               |
+    |-----------------------------|---------|-----------|------|----------------------|
+    | std of g                    | 2e-3    | 0 to 0.02 | 1    | assumption: resistors |
+    | seed of the electronics     | 0       |           |      |                      |
+    """
+
+    rank: ClassVar[int] = -1
+
+    std: Float[Array, ""] = parameter(2e-3)
+    seed: Int[Array, ""] = parameter(0)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def __call__(self, series, state, line):
+        return series * (1 + self.std * own_normal(self, self.seed, series.shape[1:], series.dtype)), state
+
+
+class LoadCellError(AbstractReadoutEffect):
+    """A load cell is bowed between its ends: ``F + 4 n F_max x (1 - |x|)``, ``x = F / F_max``, n the largest error.
+
+    | meaning                                  | default | range     | unit | source                  |
+    |------------------------------------------|---------|-----------|------|-------------------------|
+    | nonlinearity n, of the full scale        | 1e-3    | 0 to 0.01 | 1    | assumption              |
+    | full_scale F_max                         | 50      |           | N    | the paper's load cell   |
+    """
+
+    rank: ClassVar[int] = -1
+    stream: ClassVar[Stream] = Stream.FORCE  # type: ignore[misc]
+
+    nonlinearity: Float[Array, ""] = parameter(1e-3)
+    full_scale: Float[Array, ""] = parameter(50.0)
+
+    def __call__(self, series, state, line):
+        return series * (1 + 4 * self.nonlinearity * (1 - jnp.abs(series) / self.full_scale)), state
+
+
+class MultiplicativeNoise(AbstractReadoutEffect):
+    """White noise in proportion to the reading: ``v (1 + std n)``.
+
+    | meaning  | default | range     | unit | source                                |
+    |----------|---------|-----------|------|---------------------------------------|
+    | std      | 1e-3    | 0 to 0.01 | 1    | AD5933 boards: below 0.3 % in all     |
+    """
+
+    std: Float[Array, ""] = parameter(1e-3)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def __call__(self, series, state, line):
+        return series * (1 + self.std * normal(line.key, series)), state
 
 
 class Noise(AbstractReadoutEffect):
@@ -40,9 +193,38 @@ class Noise(AbstractReadoutEffect):
     std: Float[Array, ""] = parameter(1.0)
     stream: Stream = eqx.field(static=True, default=Stream.EIT)
 
-    def __call__(self, series, key, interval):
-        noise = jax.random.normal(key, series.shape, jnp.float32).astype(series.dtype)
-        return series + self.std * noise
+    def __call__(self, series, state, line):
+        return series + self.std * normal(line.key, series), state
+
+
+class PinkNoise(AbstractReadoutEffect):
+    """1/f noise: of spectral density ``amplitude^2 / f``, one-sided, whatever the rate of the stream.
+
+    White noise through twelve first-order low passes, their corners a factor of four apart (Keshner 1982): within
+    10 % of 1/f from 1e-5 of the rate to half of it.  The filters start at rest: what is slower than the recording
+    is not in it.
+
+    | meaning                                  | default | unit               | source |
+    |------------------------------------------|---------|--------------------|--------|
+    | amplitude: root of the density at 1 Hz   | 1       | that of the stream | set it |
+    """
+
+    amplitude: Float[Array, ""] = parameter(1.0)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def start(self, first):
+        return jnp.zeros((len(_POLES), first.size), first.dtype)
+
+    def __call__(self, series, state, line):
+        keep = jnp.asarray(np.exp(-_POLES), series.dtype)[:, None]
+        weight = jnp.asarray(np.log(_POLE_RATIO) * np.sqrt(_POLES / np.pi), series.dtype)[:, None]
+
+        def step(state, white):
+            state = keep * state + white
+            return state, (weight * state).sum(0)
+
+        state, pink = jax.lax.scan(step, state, normal(line.key, series))
+        return series + self.amplitude * pink, state
 
 
 class Quantisation(AbstractReadoutEffect):
@@ -61,9 +243,47 @@ class Quantisation(AbstractReadoutEffect):
     highest: Float[Array, ""] = parameter(jnp.inf)
     stream: Stream = eqx.field(static=True, default=Stream.EIT)
 
-    def __call__(self, series, key, interval):
-        return jnp.clip(jnp.round(series / self.step) * self.step, self.lowest, self.highest)
+    def __call__(self, series, state, line):
+        return jnp.clip(jnp.round(series / self.step) * self.step, self.lowest, self.highest), state
 
 
-def _rms(series: Float[Array, "time channels"]) -> Float[Array, " channels"]:
-    return jnp.sqrt(jnp.mean(series**2, 0))
+class AdcRanges(AbstractReadoutEffect):
+    """A converter behind an amplifier with a gain for each channel: rounds to ``2 full_scale / 2^bits / gain``.
+
+    The gain is the largest that has ``headroom`` times the value at rest within the range, else the smallest.  The
+    converter clips at the ends of its counts, ``-2^(bits-1)`` and ``2^(bits-1) - 1``.
+
+    | meaning                                | default          | range    | unit               | source        |
+    |----------------------------------------|------------------|----------|--------------------|---------------|
+    | bits                                   | 14               | 12 to 16 | 1                  | assumption    |
+    | full_scale: plus and minus, at gain 1  | 2.5              |          | that of the stream | assumption    |
+    | gains to choose from                   | 1, 2, 4 .. 128   |          | 1                  | assumption    |
+    | headroom                               | 2                | from 1   | 1                  | a 100 % touch |
+    """
+
+    rank: ClassVar[int] = 1
+
+    bits: Int[Array, ""] = parameter(14)
+    full_scale: Float[Array, ""] = parameter(2.5)
+    gains: Float[Array, " gains"] = eqx.field(converter=jnp.asarray, default=tuple(2.0**k for k in range(8)))
+    headroom: Float[Array, ""] = parameter(2.0)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def start(self, first):
+        fits = jnp.abs(first)[:, None] * self.headroom * self.gains <= self.full_scale
+        return jnp.where(fits, self.gains, self.gains.min()).max(1).astype(first.dtype)
+
+    def __call__(self, series, state, line):
+        half = jnp.exp2(self.bits - 1.0)
+        step = (self.full_scale / half / state).astype(series.dtype)
+        return jnp.clip(jnp.round(series / step), -half, half - 1) * step, state
+
+
+def _decaying_sums(keep, start, parts):
+    """``s = keep s + part`` for each of the parts, from ``start``."""
+
+    def step(total, part):
+        total = keep * total + part
+        return total, total
+
+    return jax.lax.scan(step, start, parts)[1]

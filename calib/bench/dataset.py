@@ -1,0 +1,108 @@
+"""The paper's data set: voltages of Gaussian contacts on a grid of places, at a range of amplitudes, as one batch."""
+
+from functools import cache, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Float
+
+import jaxeit as je
+
+from ..session import ArchiveWriter
+from .plan import BenchError
+from .recording import Progress
+
+FORMAT = "skin-dataset"
+_PIECE = 64  # contacts that each device is handed at a time
+_TOGETHER = 8  # of these, solved as one batch
+
+
+def grid(skin: je.Skin, columns: int = 41, rows: int = 41) -> Float[np.ndarray, "places 2"]:
+    """Places on a regular grid over the sheet's bounding box that lie on the sheet, m; 5 mm apart on the testbed."""
+    (x0, y0), (x1, y1) = skin.domain.bounds
+    places = np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), -1).reshape(-1, 2)
+    inward = places + 1e-9 * (np.array([[x0 + x1, y0 + y1]]) / 2 - places)
+    return places[skin.domain.contains(inward)]
+
+
+def simulate_contacts(
+    model: je.Model,
+    places: Float[np.ndarray, "places 2"],
+    amplitudes: Float[np.ndarray, " amplitudes"],
+    *,
+    width: float = 0.012,
+    progress: Progress = iter,
+) -> Float[np.ndarray, "places amplitudes readings"]:
+    """Voltages, V, for ``sigma = sigma0 (1 + amplitude exp(-|r - place|^2 / (2 width^2)))``, sigma0 the scene's sheet.
+
+    Solved in batches, the batches shared out over all devices that JAX sees.
+
+    Args:
+        width: m.
+        progress: wraps the iteration over pieces of the data set.
+    """
+    devices = Mesh(np.array(jax.devices()), ("contacts",))
+    piece = _PIECE * devices.size
+    at, size = np.repeat(np.arange(len(places)), len(amplitudes)), np.tile(amplitudes, len(places))
+    out = np.empty((len(at), len(model.pattern)), model.dtype)
+    split, whole = NamedSharding(devices, P("contacts")), NamedSharding(devices, P())
+    model, spread = jax.device_put((model, jnp.asarray(width, model.dtype)), whole)
+    sigma = je.conductivity(model)
+    for start in progress(range(0, len(at), piece)):
+        rows = np.minimum(np.arange(start, start + piece), len(at) - 1)
+        batch = np.column_stack([places[at[rows]], size[rows]]).astype(model.dtype)
+        voltages = _shared(devices)(model, sigma, spread, jax.device_put(batch, split))
+        out[start : start + piece] = np.asarray(voltages)[: len(at) - start]
+    return out.reshape(len(places), len(amplitudes), -1)
+
+
+@cache
+def _shared(devices: Mesh):
+    # Not checked: loops inside the solver start from constants, which the check takes for alike on all devices.
+    specs = (P(), P(), P(), P("contacts"))
+    solved = jax.shard_map(_solved, mesh=devices, in_specs=specs, out_specs=P("contacts"), check_vma=False)
+    return jax.jit(solved, compiler_options=je.compiler_options())
+
+
+def _solved(model: je.Model, sigma: Array, width: Array, batch: Float[Array, "n 3"]) -> Float[Array, "n readings"]:
+    def frame(contact):
+        square = jnp.sum((model.centroids - contact[:2]) ** 2, -1)
+        return je.forward(model, sigma * (1 + contact[2] * jnp.exp(-0.5 * square / width**2)))
+
+    return jax.lax.map(frame, batch, batch_size=_TOGETHER)
+
+
+def write_data_set(
+    skin: je.Skin,
+    path: str | Path,
+    *,
+    columns: int = 41,
+    rows: int = 41,
+    steps: int = 11,
+    width: float = 0.012,
+    fidelity: je.Fidelity | None = None,
+    progress: Progress = iter,
+) -> tuple[int, int]:
+    """Simulate `simulate_contacts` on `grid` with amplitudes from 0 to 1 on the ideal sensor, and write it as HDF5.
+
+    Returns:
+        How many places and amplitudes there are.
+
+    Raises:
+        BenchError: for a grid or amplitudes of less than one place or two steps.
+    """
+    if columns < 1 or rows < 1 or steps < 2:
+        raise BenchError(f"{columns} x {rows} places in {steps} steps make no data set; give one place and two steps")
+    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.02) if fidelity is None else fidelity)
+    places, amplitudes = grid(skin, columns, rows), np.linspace(0, 1, steps)
+    voltages = partial(simulate_contacts, width=width, progress=progress)(model, places, amplitudes)
+    attrs: dict[str, str | bool | float] = {"skin": skin.name, "skin_toml": skin.toml, "simulated": True, "width_m": width}
+    with ArchiveWriter(path, FORMAT, attrs) as writer:
+        writer.add("places", places, "m", "centres of the contacts")
+        writer.add("amplitudes", amplitudes, "1", "largest relative change of the conductivity")
+        writer.add("voltages", voltages, "V", "readings of the protocol, by place and amplitude")
+    return len(places), len(amplitudes)

@@ -1,0 +1,124 @@
+"""What a scene simulates, stage by stage, and what each part costs, as measured here and now."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from jaxeit import effects as fx
+
+from .motion import moments
+from .plan import Bench
+from .streams import EitRecording, Recordings, history, recordings
+
+STAGES = ("mechanics", "material", "electrical", "pneumatics", "readout")
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a simulation: its stage, its name, how often it runs in the session, and one run in s."""
+
+    stage: str
+    name: str
+    runs: int
+    seconds: float
+
+    @property
+    def total(self) -> float:
+        """In the whole session, s."""
+        return self.runs * self.seconds
+
+
+def explain(bench: Bench, fidelity: je.Fidelity | None = None) -> tuple[Part, ...]:
+    """Measure each part of a scene's simulation alone, compilation apart."""
+    made = recordings(bench, je.Fidelity(edge_length=0.02) if fidelity is None else fidelity)
+    parts = [*_of_sheet(made), *_of_histories(made)]
+    return tuple(sorted(parts, key=lambda part: STAGES.index(part.stage)))
+
+
+def render(bench: Bench, parts: tuple[Part, ...]) -> str:
+    """The table that `jaxeit simulate --explain` prints."""
+    whole = sum(part.total for part in parts)
+    width = max(len(part.name) for part in parts)
+    lines = [f"{'stage':10}  {'effect':{width}}  share of the time", "-" * (30 + width)]
+    before = ""
+    for part in parts:
+        stage = part.stage if part.stage != before else ""
+        lines.append(f"{stage:10}  {part.name:{width}}  {100 * part.total / whole:5.1f} %")
+        before = part.stage
+    lines.append(f"{'':10}  {'':{width}}  of {whole:.3g} s for {bench.duration:.0f} s of recording")
+    return "\n".join(lines)
+
+
+def _of_sheet(made: Recordings) -> Iterator[Part]:
+    """What runs once per solve."""
+    model, solves = made.eit.model, made.eit.solves_expected()
+    effects, contacts = model.effects, made.motion.forces.shape[1]
+    place, tip = jnp.asarray(made.motion.places[0, 0], model.dtype), jnp.asarray(made.bench.tip_diameter, model.dtype)
+    spread = je.load_spread(model, place, tip)
+    load = jnp.asarray(made.motion.forces[0, 0], model.dtype)
+    sheet = fx.Sheet(model.background, load * spread, model.centroids, jnp.sqrt(model.areas), jnp.zeros_like(load))
+    for effect in fx.chosen(effects, fx.AbstractLoadEffect):
+        yield _part(effect, solves * contacts, effect, spread, fx.Touch(place, tip), model.centroids)
+    for effect in fx.chosen(effects, fx.AbstractSheetEffect):
+        yield _part(effect, solves, effect, sheet)
+    bare = eqx.tree_at(lambda m: m.effects, model, (), is_leaf=lambda x: x is model.effects)
+    pressed = je.conductivity(model, sheet.pressure)  # two sheets where there is a coat of metal
+    yield Part("electrical", "the sheet itself", solves, _seconds(je.forward, bare, pressed))
+    for effect in fx.chosen(effects, fx.AbstractContactEffect):
+        yield _part(effect, solves, effect, model.contact)
+    circuit = fx.Circuit(jnp.ones((model.electrodes,) * 2, model.dtype), model.pattern, model.current)
+    for effect in fx.chosen(effects, fx.AbstractTerminalEffect):
+        yield _part(effect, solves, effect, jnp.asarray(made.eit.resting), circuit)
+
+
+def _of_histories(made: Recordings) -> Iterator[Part]:
+    """What runs once per block of samples."""
+    for name, recording in made:
+        times = recording.times(0)
+        line, rest = recording.line(0, 0), jnp.asarray(recording.resting)
+        loads = jnp.asarray(moments(made.motion, times).load)
+        series = jnp.tile(rest, (len(times), 1))
+        families: tuple[tuple[type, Any], ...] = ((fx.AbstractReadoutEffect, series),)
+        if name == "eit":
+            families = ((fx.AbstractMemoryEffect, loads), *families)
+            yield Part("readout", "frames between the solved ones", recording.blocks, _joining(made.eit))
+        if name == "pressure":
+            families = ((fx.AbstractPneumaticEffect, series), *families)
+        for family, values in families:
+            stream = recording.kind if family is fx.AbstractReadoutEffect else None
+            for effect in fx.chosen(made.bench.scene.effects, family, stream):
+                state = fx.history_start((effect,), values[0])
+                yield _part(effect, recording.blocks, history, (effect,), values, state, line)
+
+
+def _joining(eit: EitRecording) -> float:
+    """The polynomials of a block, s; their solves are counted elsewhere."""
+    state = eit.start()
+    eit.block(0, state)
+    start = time.perf_counter()
+    eit.quantity(0, eit.times(0), state[0])
+    return time.perf_counter() - start
+
+
+def _part(effect: fx.AbstractEffect, runs: int, function: Callable, *arguments: Any) -> Part:
+    stream = getattr(effect, "stream", None)
+    name = type(effect).__name__ + (f" ({stream.value})" if stream else "")
+    return Part(effect.stage, name, runs, _seconds(function, *arguments))
+
+
+def _seconds(function: Callable, *arguments: Any, repeats: int = 5) -> float:
+    """The median of some runs, the first of which compiles and does not count."""
+    compiled = function if function in (je.forward, history) else eqx.filter_jit(function)
+    taken = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(*arguments))
+        taken.append(time.perf_counter() - start)
+    return float(np.median(taken[1:]))

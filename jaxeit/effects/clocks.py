@@ -1,0 +1,54 @@
+"""Clocks and links: when a sample says it was taken, when it arrives, and whether it does."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._base import AbstractClockEffect, Stream, parameter
+
+
+class ClockError(AbstractClockEffect):
+    """The device's clock runs on its own, and what it sends arrives late.
+
+    ``device <- (1 + skew) device + offset``; ``host <- host + latency + x``, x exponential with mean ``jitter``,
+    no earlier in a block than the sample before; where ``batch`` is not 0, at the next whole multiple of it.
+
+    | meaning                                  | default | range            | unit | source                     |
+    |------------------------------------------|---------|------------------|------|----------------------------|
+    | skew                                     | 50e-6   | -50e-6 to 50e-6  | 1    | assumption                 |
+    | offset of the device's clock             | 0       |                  | s    |                            |
+    | latency, the smallest                    | 1e-3    | 0 to 0.02        | s    | assumption                 |
+    | jitter: mean of what comes on top        | 5e-4    | 0 to 0.005       | s    | assumption: TCP            |
+    | batch: period of the adapter, 0 for none | 0       | 1e-3 to 16e-3    | s    | assumption: USB serial     |
+    """
+
+    skew: Float[Array, ""] = parameter(50e-6)
+    offset: Float[Array, ""] = parameter(0.0)
+    latency: Float[Array, ""] = parameter(1e-3)
+    jitter: Float[Array, ""] = parameter(5e-4)
+    batch: Float[Array, ""] = parameter(0.0)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def __call__(self, packets, key):
+        late = jax.random.exponential(key, packets.host.shape, jnp.float32).astype(packets.host.dtype)
+        sent = jax.lax.cummax(packets.host + self.latency + self.jitter * late)
+        period = jnp.where(self.batch > 0, self.batch, 1)
+        host = jnp.where(self.batch > 0, jnp.ceil(sent / period) * period, sent)
+        return packets._replace(device=packets.device * (1 + self.skew) + self.offset, host=host)
+
+
+class DropOut(AbstractClockEffect):
+    """Samples are lost on the way, each by itself with the same probability.
+
+    | meaning       | default | range     | unit | source     |
+    |---------------|---------|-----------|------|------------|
+    | probability   | 1e-3    | 0 to 0.05 | 1    | assumption |
+    """
+
+    probability: Float[Array, ""] = parameter(1e-3)
+    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+
+    def __call__(self, packets, key):
+        lost = jax.random.uniform(key, packets.lost.shape, jnp.float32) < self.probability
+        return packets._replace(lost=packets.lost | lost)

@@ -1,0 +1,46 @@
+"""Material: a coat of metal that conducts on its own."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._base import AbstractCoatEffect, Sheet, parameter
+
+
+class ContinuousCoating(AbstractCoatEffect):
+    """The metal is one sheet, not islands: pressed places far apart are joined through it.
+
+    Sheet and metal, with potentials u and m, exchange current where they are pressed together
+    (`jaxeit.coat`):
+
+        ``-div(sigma grad u) + g (u - m) = 0``,  ``-div(grad m) / R_m + g (m - u) = 0``,
+        ``g = f / rho``,  ``rho = rho_r (p / p_r)^-n``.
+
+    Stands for `ContactPiezoresistance` and `HomogenisedIslands`, which are local: list one of the
+    three.  The metal has no contact to any electrode.
+
+    | meaning                                    | default | range      | unit    | source              |
+    |--------------------------------------------|---------|------------|---------|---------------------|
+    | resistance R_m of the metal per square     | 0.1     | 0.02 to 1  | ohm     | assumption          |
+    | contact_resistivity rho_r at pressure p_r  | 16      | 1 to 1000  | ohm mm2 | assumption          |
+    | reference_pressure p_r, over the area      | 64      |            | kPa     | 20 N on a 20 mm tip |
+    | exponent n                                 | 1       | 0.6 to 1.2 | 1       | many spots          |
+    | coverage f: share of the area that touches | 1/3     | 0 to 1     | 1       | that of the islands |
+    """
+
+    alternative: ClassVar[str] = "how pressure makes the sheet conduct"
+
+    resistance: Float[Array, ""] = parameter(0.1)
+    contact_resistivity: Float[Array, ""] = parameter(1.6e-5)
+    reference_pressure: Float[Array, ""] = parameter(64e3)
+    exponent: Float[Array, ""] = parameter(1.0)
+    coverage: Float[Array, ""] = parameter(1 / 3)
+
+    def __call__(self, sheet: Sheet) -> Sheet:
+        # The power has an infinite slope at zero pressure for n < 1: keep it off that point.
+        touched = sheet.pressure > 0
+        ratio = jnp.where(touched, sheet.pressure, self.reference_pressure) / self.reference_pressure
+        coupling = jnp.where(touched, self.coverage / self.contact_resistivity * ratio**self.exponent, 0.0)
+        bearing = coupling if sheet.share is None else sheet.share * coupling
+        return sheet._replace(metal=1 / self.resistance, coupling=bearing)

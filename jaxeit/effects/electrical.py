@@ -1,0 +1,108 @@
+"""Electrical: electrodes, source and amplifier between the sheet and the voltages."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ._base import AbstractContactEffect, AbstractTerminalEffect, Circuit, parameter
+from ._chance import own_normal
+
+
+class ContactScatter(AbstractContactEffect):
+    """No two bolts touch alike: contact conductances vary from electrode to electrode, log-normally.
+
+    ``g <- g exp(std n)``; perfect contacts stay perfect.
+
+    | meaning                    | default | range  | unit | source     |
+    |----------------------------|---------|--------|------|------------|
+    | std of log conductance     | 0.5     | 0 to 1 | 1    | assumption |
+    | seed of the electrodes     | 0       |        |      |            |
+    """
+
+    std: Float[Array, ""] = parameter(0.5)
+    seed: Int[Array, ""] = parameter(0)
+
+    def __call__(self, contact):
+        return contact * jnp.exp(self.std * own_normal(self, self.seed, contact.shape, contact.dtype))
+
+
+class ElectrodeFault(AbstractTerminalEffect):
+    """A lost electrode, as a source of finite compliance and amplifiers of finite input resistance see it.
+
+    A resistance lies between the electrode and its wire.  The drive- wire is ground; each sense wire
+    loads the sheet with an input resistance to ground; the source gives less than its current where
+    that would take more than the compliance.  The circuit of each reading is solved exactly; with no
+    resistance and infinite limits it is the ideal one.
+
+    Electrodes lost together are one effect with arrays for ``electrode`` and ``resistance``: two
+    effects would each see the other's electrode whole.
+
+    | meaning                                     | default | range       | unit | source               |
+    |---------------------------------------------|---------|-------------|------|----------------------|
+    | electrode, counted from 0                   | 0       |             |      |                      |
+    | resistance in its wire                      | 1       | 0 to inf    | Mohm | assumption: a lost one |
+    | compliance: largest voltage of the source   | 5       | 1 to inf    | V    | assumption           |
+    | input_resistance of each amplifier input    | 10      | 1 to inf    | Mohm | assumption           |
+    """
+
+    electrode: Int[Array, " lost"] | Int[Array, ""] = parameter(0)
+    resistance: Float[Array, " lost"] | Float[Array, ""] = parameter(1e6)
+    compliance: Float[Array, ""] = parameter(5.0)
+    input_resistance: Float[Array, ""] = parameter(1e7)
+
+    def __call__(self, voltage, circuit):
+        lost = self.electrode
+        wired = circuit._replace(z=circuit.z.at[lost, lost].add(self.resistance))
+        source, _, plus, minus = circuit.pattern.T
+        leak = 1 / self.input_resistance
+
+        # Inputs draw leak * potential from plus and minus.  With D their difference and M the potential of
+        # minus, per ampere:  D = d_a - leak (d_p (M + D) + d_m M),  M = m_a - leak (m_p (M + D) + m_m M).
+        # Written in differences, the lost electrode's resistance does not drown the sheet's in rounding.
+        d_a, d_p, d_m = (_difference(wired, into) for into in (source, plus, minus))
+        m_a, m_p, m_m = (_potential(wired, minus, into) for into in (source, plus, minus))
+        both, loaded = leak * (d_p + d_m), 1 + leak * (m_p + m_m)
+        difference = (d_a * loaded - both * m_a) / ((1 + leak * d_p) * loaded - leak * both * m_p)
+        at_minus = (m_a - leak * m_p * difference) / loaded
+
+        a_a, a_p, a_m = (_potential(wired, source, into) for into in (source, plus, minus))
+        path = a_a - leak * (a_p * (at_minus + difference) + a_m * at_minus)
+        excess = jnp.maximum(1.0, circuit.current * path / self.compliance)
+        return (voltage + circuit.current * (difference - _difference(circuit, source))) / excess
+
+
+class CommonMode(AbstractTerminalEffect):
+    """An amplifier lets some of what both inputs share through: ``V <- V + gain (V+ + V-) / 2``.
+
+    Potentials are above ground, to which the drive- electrode is tied, without the resistance of lost
+    electrodes.  That of the contacts is part of them; electrodes that are points of the mesh have none
+    that a finer mesh would not change.
+
+    | meaning                           | default | range     | unit | source              |
+    |-----------------------------------|---------|-----------|------|---------------------|
+    | gain for what both share          | 1e-3    | 0 to 1e-2 | 1    | assumption: 60 dB   |
+    """
+
+    rank: ClassVar[int] = -1  # before a fault of the source, which takes its share of this too
+
+    gain: Float[Array, ""] = parameter(1e-3)
+
+    def __call__(self, voltage, circuit):
+        source, _, plus, minus = circuit.pattern.T
+        mean = (_potential(circuit, plus, source) + _potential(circuit, minus, source)) / 2
+        return voltage + self.gain * circuit.current * mean
+
+
+def _potential(
+    circuit: Circuit, at: Int[Array, " readings"], into: Int[Array, " readings"]
+) -> Float[Array, " readings"]:
+    """Above drive-, per ampere into one electrode and out at drive-, in ohm."""
+    z, sink = circuit.z, circuit.pattern[:, 1]
+    return (z[at, into] - z[sink, into]) - (z[at, sink] - z[sink, sink])
+
+
+def _difference(circuit: Circuit, into: Int[Array, " readings"]) -> Float[Array, " readings"]:
+    """Of sense+ above sense-, per ampere into one electrode and out at drive-, in ohm."""
+    z, (_, sink, plus, minus) = circuit.z, circuit.pattern.T
+    return (z[plus, into] - z[minus, into]) - (z[plus, sink] - z[minus, sink])
