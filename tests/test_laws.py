@@ -17,13 +17,14 @@ import jaxeit as je
 ROOT = Path(__file__).parents[1]
 ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
-    "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "discretise", "forward", "pneumatics",
-    "basis", "jacobian", "whitening", "priors", "methods", "hyperparameter", "inverse", "store", "responses",
-    "descent", "contacts", "nonlinear", "fusion", "metrics", "regions",
+    "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise", "forward",
+    "pneumatics", "basis", "jacobian", "whitening", "gaps", "priors", "methods", "hyperparameter", "inverse", "store",
+    "responses", "descent", "contacts", "nonlinear", "background", "fusion", "metrics", "regions",
 ]  # fmt: skip
 BENCH = [
-    "session", "units", "corrections", "presses", "curves", "fit", "response", "measured", "evaluation",
-    "calibration", "maps", "bench", "check", "importers", "logs", "figures", "report", "runtime", "cli",
+    "session", "units", "corrections", "presses", "curves", "fit", "response", "location", "locators", "hybrid",
+    "online", "measured", "evaluation", "calibration", "maps", "acquisition", "bench", "check", "importers", "logs",
+    "figures", "report", "runtime", "cli",
 ]  # fmt: skip
 
 

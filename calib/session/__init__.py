@@ -12,7 +12,7 @@ from calib.session.archive import (
     read_archive,
     write_archive,
 )
-from calib.session.model import Events, PressTable, SessionError, Status
+from calib.session.model import ClockTable, Events, PressTable, SessionError, Status
 from calib.session.reader import Session, Stream, open_session
 from calib.session.storage import file_hash, replacing
 from calib.session.writer import SessionWriter
@@ -21,6 +21,7 @@ __all__ = [
     "Archive",
     "ArchiveReader",
     "ArchiveWriter",
+    "ClockTable",
     "Events",
     "PressTable",
     "Session",

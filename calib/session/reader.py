@@ -13,9 +13,11 @@ import numpy as np
 from calib.session.chunks import GuardedArray
 from calib.session.guard import Node, open_guarded, root_node, translated
 from calib.session.model import (
+    CLOCK_ATTRIBUTES,
     FORMAT,
     PRESS_COLUMNS,
     STREAM_EXTRAS,
+    ClockTable,
     Events,
     PressTable,
     SessionError,
@@ -55,8 +57,9 @@ class Session:
 
     ``pattern`` (M, 4) int: drive+, drive-, sense+, sense-, or None; ``current`` in A and
     ``frequency`` in Hz (None if not stated); ``offset`` (M,) s or None; ``streams`` by name;
-    ``presses`` and ``events`` or None; ``truth`` by name, empty unless simulated; ``complete`` is
-    False for a recording that was not finished; ``created`` and ``epoch`` are ISO texts in UTC and
+    ``presses`` and ``events`` or None; ``clocks`` by stream; ``truth`` by name, empty unless
+    simulated; ``complete`` is False for a recording that broke off and ``recovered`` says that it
+    was made whole from what a crash left; ``created`` and ``epoch`` are ISO texts in UTC and
     ``epoch_ns`` counts from 1970.
     """
 
@@ -70,6 +73,7 @@ class Session:
         self.title = root.text("title", "")
         self.creator = root.text("creator", "")
         self.complete = bool(root.number("complete"))
+        self.recovered = bool(root.number("recovered", 0))
         self.simulated = bool(root.number("simulated"))
         self.epoch = root.text("time_epoch_utc")
         self.epoch_ns = _nanoseconds(root, self.epoch)
@@ -143,6 +147,14 @@ class Session:
         if not len(time) == len(code) == len(label):
             raise node.error("columns of unequal length", "write one row per event")
         return Events(np.asarray(time), np.asarray(code), tuple(label))
+
+    @functools.cached_property
+    def clocks(self) -> Mapping[str, ClockTable]:
+        """How each device's clock was laid on the session's, by stream; empty if not stated."""
+        node = self._root.group("clocks")
+        names = node.members(MAX_STREAMS) if node is not None else []
+        groups = {name: node.group(name) for name in names} if node is not None else {}
+        return MappingProxyType({name: _clock(group) for name, group in groups.items() if group is not None})
 
     @functools.cached_property
     def truth(self) -> Mapping[str, np.ndarray]:
@@ -402,6 +414,22 @@ def _unit(node: Node, variable: str) -> Unit:
         what = f"{variable} in {name} is mislabelled"
         raise node.error(what, f"use units of {expected}, or another variable name")
     return UNITS[name]
+
+
+def _clock(node: Node) -> ClockTable:
+    """One member of /clocks."""
+    host, ticks = _column(node, "host_ns", "i8"), _column(node, "device_ticks", "u8")
+    numbers = {name: float(node.number(name, 0.0)) for name in CLOCK_ATTRIBUTES if name not in ("valid", "method")}
+    try:
+        return ClockTable(
+            host_ns=np.asarray(host),
+            device_ticks=np.asarray(ticks),
+            valid=bool(node.number("valid", 0)),
+            method=node.text("method", ""),
+            **numbers,
+        )
+    except SessionError as error:
+        raise SessionError(f"{printable(node.path.name)}: /{error}") from None
 
 
 def _column(node: Node, name: str, dtype: str) -> np.ndarray | tuple[str, ...]:

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from calib.session.model import (
+    CLOCK_ATTRIBUTES,
     FORMAT,
     PRESS_COLUMNS,
     STREAM_EXTRAS,
     VERSION,
+    ClockTable,
     Column,
     Events,
     PressTable,
@@ -76,7 +78,8 @@ class SessionWriter:
     an error nothing is left and an existing file is as it was. ``pattern`` (M, 4) holds zero-based
     electrodes drive+, drive-, sense+, sense-; ``current`` in A, ``frequency`` in Hz, ``offset``
     (M,) in s after the frame's time; ``epoch`` is a datetime with a time zone. A simulated session
-    must state ``scene`` and ``seed``. Two sessions of equal content, `session_id` and `epoch` are
+    must state ``scene`` and ``seed``. A recording that broke off is marked by ``complete=False``, one
+    made whole from what a crash left by ``recovered=True``. Two sessions of equal content, `session_id` and `epoch` are
     equal byte by byte. Raises `SessionError` for what the format cannot hold.
     """
 
@@ -98,6 +101,8 @@ class SessionWriter:
         creator: str | None = None,
         license: str = "",
         session_id: str | None = None,
+        complete: bool = True,
+        recovered: bool = False,
     ):
         self.path = Path(path)
         self._epoch = _utc(self.path, epoch)
@@ -114,7 +119,7 @@ class SessionWriter:
             "time_epoch_utc": self._epoch,
             "creator": creator or program(),
             "license": license,
-            "recovered": False,
+            "recovered": bool(recovered),
             "simulated": bool(simulated),
         }
         self._root |= {} if scene is None else {"scene": scene}
@@ -125,6 +130,8 @@ class SessionWriter:
         self._presses: PressTable | None = None
         self._truth: dict[str, tuple[np.ndarray, str]] = {}
         self._events: list[Events] = []
+        self._clocks: dict[str, ClockTable] = {}
+        self._complete = bool(complete)
         self._stack = contextlib.ExitStack()
         self._file: h5py.File | None = None
 
@@ -169,7 +176,8 @@ class SessionWriter:
         self._write_presses(file)
         self._write_events(file)
         self._write_truth(file)
-        put_attributes(file, {"complete": True})
+        self._write_clocks(file)
+        put_attributes(file, {"complete": self._complete})
 
     # --- what the session is about -------------------------------------------------------------
 
@@ -389,9 +397,26 @@ class SessionWriter:
             raise self._problem("/events", "columns of unequal length", "give one row per event")
         self._events.append(Events(times, codes, label))
 
+    def set_clock(self, name: str, table: ClockTable) -> None:
+        """How the clock of the device behind the stream `name` was laid on the session's."""
+        if name not in self._streams:
+            raise self._problem(f"/clocks/{printable(name)}", "no such stream", "add_stream first")
+        self._clocks[name] = table
+
+    def _write_clocks(self, file: h5py.File) -> None:
+        parent = make_group(file, "clocks", {"NX_class": "NXcollection"}) if self._clocks else None
+        for name, table in self._clocks.items():
+            columns = {
+                "host_ns": (Column("i8", "time", "when the device counted that"), table.host_ns),
+                "device_ticks": (Column("u8", "1", "the device's count, unwrapped"), table.device_ticks),
+            }
+            group = self._write_table(parent, name, "knot", columns)
+            about = {key: getattr(table, key) for key in CLOCK_ATTRIBUTES}
+            put_attributes(group, about)
+
     def _write_table(
-        self, file: h5py.File, name: str, row: str, columns: Mapping[str, tuple[Column, np.ndarray]]
-    ) -> None:
+        self, file: h5py.Group, name: str, row: str, columns: Mapping[str, tuple[Column, np.ndarray]]
+    ) -> h5py.Group:
         group = make_group(file, name, {"NX_class": "NXcollection"})
         rows = make_index(group, row, len(next(iter(columns.values()))[1]))
         for key, (column, values) in columns.items():
@@ -399,6 +424,7 @@ class SessionWriter:
             if column.units == "time":
                 attrs = self._time_attrs(column.meaning)
             attach(make_array(group, key, values, attrs), rows)
+        return group
 
     def _write_presses(self, file: h5py.File) -> None:
         table = self._presses

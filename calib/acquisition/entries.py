@@ -1,0 +1,93 @@
+"""What the records of a recording's journal hold: frames, events, the plan, the end."""
+
+import enum
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .wire import Frame
+
+PLAN, EVENT, END = 0xFFFF, 0xFFFE, 0xFFFD  # stream numbers of what is not a frame
+RESTARTED = 1 << 15  # beside the `Status` flags: the device's numbers began anew before this frame
+_HEAD = struct.Struct("<BxxxIQ")
+_TYPES = tuple(np.dtype(t) for t in ("<f4", "<i2", "<f8"))
+_SEQ, _TICKS, _LONG = 16, 32, 64
+
+
+class Code(enum.IntEnum):
+    """What happened to a stream."""
+
+    CONNECTED = 1
+    LOST = 2
+    CLOCK_STEP = 3
+    NOTE = 4
+
+
+def pack_frame(frame: Frame) -> bytes:
+    """A frame as a payload: its stream is the record's."""
+    kind = _TYPES.index(frame.values.dtype)
+    kind |= (_SEQ if frame.seq is not None else 0) | (_TICKS if frame.ticks is not None else 0)
+    kind |= _LONG if frame.bits == 64 else 0
+    return _HEAD.pack(kind, frame.seq or 0, frame.ticks or 0) + frame.values.tobytes()
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of one stream, all sent alike: ``seq`` (n,) u4 and ``ticks`` (n,) u8, or None where the device
+    sends none; ``bits`` of its counter; ``values`` (n, channels) as sent."""
+
+    seq: np.ndarray | None
+    ticks: np.ndarray | None
+    bits: int
+    values: np.ndarray
+
+
+def alike(payload: bytes) -> tuple[int, int]:
+    """Frames for which this is equal can be unpacked together."""
+    return payload[0], len(payload)
+
+
+def unpack_frames(payloads: Sequence[bytes]) -> Frames:
+    """What `pack_frame` was given, of payloads that are `alike`."""
+    kind, size = alike(payloads[0])
+    dtype = _TYPES[kind & 15]
+    row = np.dtype(
+        {
+            "names": ["seq", "ticks", "values"],
+            "formats": ["<u4", "<u8", (dtype, (size - _HEAD.size) // dtype.itemsize)],
+            "offsets": [4, 8, _HEAD.size],
+            "itemsize": size,
+        }
+    )
+    rows = np.frombuffer(b"".join(payloads), row)
+    return Frames(
+        rows["seq"] if kind & _SEQ else None,
+        rows["ticks"].astype(np.uint64) if kind & _TICKS else None,
+        64 if kind & _LONG else 32,
+        rows["values"].reshape(len(rows), -1),
+    )
+
+
+def pack_event(code: Code, label: str) -> bytes:
+    """An event as a payload."""
+    return json.dumps([int(code), label]).encode()
+
+
+def unpack_event(payload: bytes) -> tuple[Code, str]:
+    """What `pack_event` was given."""
+    code, label = json.loads(payload)
+    return Code(code), str(label)
+
+
+def pack_end(complete: bool, why: str) -> bytes:
+    """The end of a recording: as planned, or broken off and why."""
+    return json.dumps([bool(complete), why]).encode()
+
+
+def unpack_end(payload: bytes) -> tuple[bool, str]:
+    """What `pack_end` was given."""
+    complete, why = json.loads(payload)
+    return bool(complete), str(why)

@@ -1,0 +1,353 @@
+"""Live: frames to results as they arrive, and who is shown them."""
+
+import base64
+import http.client
+import json
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.acquisition import live as live_module
+from calib.acquisition.broadcast import Broadcaster
+from calib.acquisition.device import Device, recording, rows
+from calib.acquisition.live import Arrival, Engine, Inbox, LiveError, Resting, Show, live
+from calib.acquisition.plan import StreamPlan
+from calib.acquisition.present import present
+from calib.acquisition.recorder import Orders, record
+from calib.acquisition.setup import prepare
+from calib.acquisition.web import Page
+from calib.acquisition.wire import Frame
+from calib.bench import Bench, Timing, simulate
+
+S = 1_000_000_000
+READINGS, PADS = 6, 2
+CENTRES = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1], [0.1, 0.1]])
+
+
+def fake_force_map(calibration, frames, pressures):
+    """The change of pressure in newtons; on each pad spread over its two pixels as 1 to 3."""
+    force = np.atleast_2d(pressures).astype(float)
+    share = np.array([0.25, 0.75])
+    image = np.concatenate([force[:, :1] * share, force[:, 1:] * share], 1) + 0 * np.atleast_2d(frames).sum()
+    error = np.full_like(force, 0.1)
+    return SimpleNamespace(map=SimpleNamespace(force=image), force=force, standard_error=error, valid=force < 50)
+
+
+@pytest.fixture
+def calibration(monkeypatch, skin):
+    """What live needs of one, of two pads and four pixels, without a computation."""
+    monkeypatch.setattr(live_module, "force_map", fake_force_map)
+    channels = np.arange(READINGS) > 0
+    recon = SimpleNamespace(
+        centres=CENTRES, areas=np.ones(4), readings=READINGS, channels=channels, shape=(2, 2), factor=None
+    )
+    pads = [SimpleNamespace(name="left"), SimpleNamespace(name='<b>"right"')]
+    positions = np.array([[0.0, 0.0], [0.1, 0.1]])
+    protocol = SimpleNamespace(readings=READINGS, pattern=np.tile([0, 1, 2, 3], (READINGS, 1)), current=1.0,
+                               frequency=0.0, reading_time=1e-5)  # fmt: skip
+    hardware = SimpleNamespace(name="small", toml="", pads=pads, electrode_positions=positions, protocol=protocol)
+    weights = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
+    return SimpleNamespace(skin=hardware, recon=recon, masks=SimpleNamespace(weights=weights), simulated=True)
+
+
+def arrival(pressure, host=0, voltage=0.0):
+    return Arrival(np.full(READINGS, float(voltage)), np.asarray(pressure, float), host)
+
+
+def rested(calibration):
+    engine = Engine(calibration, rest=0.5)
+    assert engine.step(arrival([10.0, 20.0], 0)) is None
+    assert engine.step(arrival([12.0, 20.0], S)) is None
+    assert not engine.resting
+    return engine
+
+
+# --- from frames to results ----------------------------------------------------------------------
+
+
+def test_forces_are_those_above_the_resting_level(calibration):
+    result = rested(calibration).step(arrival([11.0, 24.0], time.monotonic_ns()), dropped=7)
+    np.testing.assert_allclose(result.force, [0.0, 4.0])
+    np.testing.assert_allclose(result.map.sum(), 4.0)
+    np.testing.assert_allclose(result.centre[1], [0.075, 0.1])
+    assert np.isnan(result.centre[0]).all()
+    assert (result.number, result.dropped, result.valid.tolist()) == (1, 7, [True, True])
+    assert 0 <= result.latency < 1
+
+
+def test_what_is_missing_stays_where_it_is(calibration):
+    """A dead reading is taken as unchanged; a pad without pressure has no force, the other one keeps its own."""
+    engine = rested(calibration)
+    voltage = np.full(READINGS, np.nan)
+    result = engine.step(Arrival(voltage, np.array([np.nan, 24.0]), 0))
+    np.testing.assert_array_equal(result.force, [np.nan, 4.0])
+    assert (result.missing, result.valid.tolist()) == (READINGS - 1, [False, True])
+    assert np.isfinite(result.map).all()
+    line = json.loads(result.to_json(image=True))
+    assert line["force"] == [None, 4.0]
+    image = np.frombuffer(base64.b64decode(line["map"]), "<f4")
+    np.testing.assert_allclose(image, result.map)
+
+
+def test_levels_do_not_count_what_is_missing():
+    resting = Resting(1.0)
+    for n, value in enumerate([1.0, np.nan, 3.0]):
+        resting.add(arrival([value, np.nan], n * S))
+        if n:
+            break
+    np.testing.assert_array_equal(resting.levels[1], [1.0, np.nan])
+
+
+def test_zero_may_be_set_again(calibration):
+    engine = rested(calibration)
+    engine.tare()
+    assert engine.step(arrival([50.0, 50.0], 2 * S)) is None
+    assert engine.step(arrival([50.0, 50.0], 3 * S)) is None
+    np.testing.assert_allclose(engine.step(arrival([51.0, 50.0])).force, [1.0, 0.0])
+
+
+def test_the_newest_frame_is_taken_and_the_others_are_counted():
+    inbox = Inbox(StreamPlan("eit", 2, scale=0.5), StreamPlan("pressure", 1))
+    assert inbox.take(0.0) is None
+    inbox.put(0, Frame(1, 0, 0, 32, np.array([2, 4], "<i2")), 5)
+    assert inbox.take(0.0) is None  # no pressure yet
+    for value in (1.0, 2.0, 6.0):
+        inbox.put(1, Frame(2, 0, 0, 32, np.array([value])), 0)
+    for number in range(3):
+        inbox.put(0, Frame(1, 0, 0, 32, np.array([number, 4], "<i2")), number)
+    found = inbox.take(0.0)
+    assert (found.voltage.tolist(), found.pressure.tolist(), found.host) == ([1.0, 2.0], [3.0], 2)
+    assert inbox.dropped == 3
+    assert inbox.take(0.0) is None
+    inbox.put(0, Frame(1, 0, 0, 32, np.array([1, 4], "<i2")), 9)
+    assert inbox.take(0.0).pressure.tolist() == [3.0]  # held
+
+
+# --- the whole -----------------------------------------------------------------------------------
+
+
+def small_device(rate=100):
+    """Pressure on the second pad rises by 5 N after a second."""
+    times = [n * S // rate for n in range(10**5)]
+    eit = rows(1, iter(times), (np.zeros(READINGS, "f4") for _ in times))
+    pressure = rows(2, iter(times), (np.array([0.0, 5.0 * (t > S)], "f4") for t in times))
+    return Device([eit, pressure], wait_for=1)
+
+
+def sources_of(device, calibration):
+    return prepare({"eit": device.urls[0], "pressure": device.urls[1]}, calibration.skin)
+
+
+def test_results_come_as_frames_arrive(calibration):
+    show, results = Show(), []
+    with small_device() as device:
+
+        def publish(result):
+            results.append(result)
+            if result.force[1] > 4.5:
+                show.stop.set()
+
+        count = live(calibration, *sources_of(device, calibration), publish, show, rest=0.3)
+    assert count == len(results) > 10
+    assert [r.number for r in results] == list(range(1, count + 1))
+    np.testing.assert_allclose(results[-1].force, [0.0, 5.0])
+    assert show.state == "running"
+
+
+def test_a_slow_listener_to_results_makes_nothing_late(calibration):
+    show, results = Show(), []
+    with small_device(200) as device:
+
+        def publish(result):
+            results.append(result)
+            time.sleep(0.05)
+            if len(results) == 20:
+                show.stop.set()
+
+        live(calibration, *sources_of(device, calibration), publish, show, rest=0.1)
+    assert results[-1].dropped > 50
+    assert results[-1].latency < 0.05
+
+
+def test_streams_that_do_not_fit_or_do_not_come_are_said(calibration):
+    plan, sources = prepare({"eit": "tcp://127.0.0.1:1", "pressure": "tcp://127.0.0.1:1"}, calibration.skin)
+    with pytest.raises(LiveError, match="nothing answers"):
+        live(calibration, plan, sources, lambda r: None, Show(), wait=0.2)
+    plan, sources = prepare({"eit": "tcp://h:1", "pressure": "tcp://h:1?channels=7"}, calibration.skin)
+    with pytest.raises(LiveError, match="7 pressures"):
+        live(calibration, plan, sources, lambda r: None, Show())
+
+
+# --- the page and the lines ----------------------------------------------------------------------
+
+
+def fetch(page, path, *, method="GET", headers=None):
+    host, port = page.server_address[:2]
+    link = http.client.HTTPConnection(host, port, timeout=5)
+    link.request(method, path, headers=headers or {})
+    reply = link.getresponse()
+    body = reply.read() if path != "/results" else b""
+    return link, reply, body
+
+
+def events(reply, count):
+    """Events of the page, as they are pushed."""
+    out = []
+    while len(out) < count:
+        line = reply.readline()
+        if line.startswith(b"data: "):
+            out.append(json.loads(line[6:]))
+    return out
+
+
+@pytest.fixture
+def page(calibration):
+    with Page(calibration, Show()) as found:
+        yield found
+
+
+def test_the_page_is_whole_and_asks_nothing_of_others(page):
+    link, reply, body = fetch(page, "/")
+    assert reply.status == 200
+    assert b"http://" not in body.replace(b"http://www.w3.org", b"")
+    assert b"https://" not in body
+    assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
+    link.close()
+    link, reply, body = fetch(page, "/scene")
+    scene = json.loads(body)
+    assert (scene["rows"], scene["pads"], scene["simulated"]) == (2, ["left", '<b>"right"'], True)
+    link.close()
+    link, reply, _ = fetch(page, "/../etc/passwd")
+    assert reply.status == 404
+    link.close()
+
+
+def test_a_viewer_is_given_the_newest_result_only(page, calibration):
+    engine = rested(calibration)
+    page.show.state = "running"
+    link, reply, _ = fetch(page, "/results")
+    for force in range(200):
+        page.show_result(engine.step(arrival([11.0 + force, 20.0])))
+    found = events(reply, 2)
+    assert found[-1]["state"] == "running"
+    last = [event["result"] for event in found if event["result"]][-1]
+    assert last["number"] > 100
+    assert len(base64.b64decode(last["map"])) == 16
+    link.close()
+
+
+def test_a_viewer_who_never_reads_delays_no_one(page, calibration):
+    engine = rested(calibration)
+    deaf = socket.create_connection(page.server_address[:2])
+    deaf.sendall(f"GET /results HTTP/1.1\r\nHost: 127.0.0.1:{page.server_address[1]}\r\n\r\n".encode())
+    begin = time.monotonic()
+    for force in range(2000):
+        page.show_result(engine.step(arrival([11.0 + force % 7, 20.0])))
+    assert time.monotonic() - begin < 3
+    deaf.close()
+
+
+def test_only_our_own_page_may_ask(page):
+    port = page.server_address[1]
+    others = {"Host": f"evil.example:{port}"}
+    assert fetch(page, "/", headers=others)[1].status == 403
+    assert fetch(page, "/tare", method="POST", headers={"Origin": "http://evil.example"})[1].status == 403
+    assert fetch(page, "/else", method="POST")[1].status == 403
+    assert not page.show.tare.is_set()
+    own = {"Origin": f"http://127.0.0.1:{port}"}
+    assert fetch(page, "/tare", method="POST", headers=own)[1].status == 200
+    assert page.show.tare.is_set()
+
+
+def test_everything_listens_on_this_machine_only(calibration, page):
+    assert page.server_address[0] == "127.0.0.1"
+    with Broadcaster() as lines:
+        assert lines.address[0] == "127.0.0.1"
+    with small_device() as device:
+        assert all(url.startswith("tcp://127.0.0.1:") for url in device.urls)
+
+
+def test_results_are_published_as_lines_and_a_warning_precedes_an_open_door(calibration):
+    show, told, lines = Show(), [], []
+
+    def tell(line):
+        told.append(line)
+        if line.startswith("lines"):
+            port = line.rpartition(":")[2]
+            threading.Thread(target=listen, args=("127.0.0.1", int(port)), daemon=True).start()
+
+    def listen(host, port):
+        with socket.create_connection((host, port), timeout=10) as link, link.makefile("rb") as file:
+            lines.extend(json.loads(file.readline()) for _ in range(5))
+        show.stop.set()
+
+    with small_device() as device:
+        present(
+            calibration,
+            *sources_of(device, calibration),
+            show,
+            host="0.0.0.0",
+            port=0,
+            publish=0,
+            tell=tell,
+            rest=0.1,
+        )
+    assert len(lines) == 5
+    assert "anyone who can reach this machine" in told[-1]
+    assert set(lines[0]) >= {"force", "standard_error", "valid", "centre", "latency_ms", "dropped"}
+
+
+# --- end to end ----------------------------------------------------------------------------------
+
+SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
+TIMING = Timing(rest=0.6, ramp=0.6, hold=1.2, release=0.6, recovery=0.6)
+
+
+def stage(bench):
+    """Where the indenter stands, at 20 Hz: over the site of the press of the time."""
+    times = np.arange(0, bench.duration, 0.05)
+    press = np.clip((times - bench.blank) // bench.timing.period, 0, len(bench.sites) - 1).astype(int)
+    return rows(4, (times * S).astype(int), bench.sites[press].astype("f4"))
+
+
+@pytest.mark.slow
+def test_from_a_simulated_skin_to_a_recording_a_calibration_and_live_forces(skin, tmp_path):
+    """Everything over loopback, in real time: forces stay within the calibration's own error bars."""
+    effects = (je.ContactPiezoresistance(), je.Noise(std=1e-6, stream=je.Stream.EIT),
+               je.Noise(std=2.0, stream=je.Stream.PRESSURE), je.Noise(std=0.01, stream=je.Stream.FORCE))  # fmt: skip
+    bench = Bench(je.Scene(skin, effects), SITES, np.array([20.0]), timing=TIMING, blank=2.0, eit_rate=100.0,
+                  pad_rate=200.0, toml="simulated in a test")  # fmt: skip
+    simulate(bench, tmp_path / "skin.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    names = ["eit", "pressure", "force"]
+    streams = [recording(tmp_path / "skin.h5", [name]) for name in names]
+    with Device([*streams, stage(bench)], wait_for=1) as device:
+        urls = dict(zip([*names, "stage"], device.urls, strict=True))
+        plan, sources = prepare({**urls, "stage": urls["stage"] + "?channels=2"}, skin, "end to end")
+        summary = record(plan, sources, tmp_path / "recorded.h5", seconds=bench.duration - 0.5, orders=Orders())
+    assert summary.complete
+    assert all(stream.lost == 0 for stream in summary.streams)
+    with calib.open_session(tmp_path / "recorded.h5") as session:
+        calibration = calib.calibrate([session], basis=je.Pixels(20), fidelity=je.Fidelity.draft())
+        force = session.stream("force")
+        assert calibration.evaluation.summary()["force_rmse"] < 4.0
+    show, results = Show(), []
+    with Device([recording(tmp_path / "skin.h5", [name]) for name in ("eit", "pressure")], wait_for=1) as device:
+        threading.Timer(20.0, show.stop.set).start()
+        found = prepare({"eit": device.urls[0], "pressure": device.urls[1]}, skin)
+        live(calibration, *found, results.append, show, rest=1.5)
+    assert len(results) > 200
+    total = np.array([result.force.sum() for result in results])
+    error = np.array([np.linalg.norm(result.standard_error) for result in results])
+    since = np.array([result.host - results[0].host for result in results]) / S + 1.5
+    with calib.open_session(tmp_path / "recorded.h5") as session:
+        force = session.stream("force")
+        true = np.interp(since, (force.time - force.time[0]) / S, force.read()[:, 0])
+    still = np.abs(np.gradient(true, since)) < 5
+    assert np.mean(np.abs(total - true)[still] < 2 * error[still] + 0.1) > 0.9
+    assert np.ptp(true) > 15

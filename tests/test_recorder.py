@@ -1,0 +1,697 @@
+"""Recording: the journal and what is made of it, and the recorder under every fault that could be arranged."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from itertools import count
+
+import h5py
+import numpy as np
+import pytest
+
+from calib.acquisition.device import Device
+from calib.acquisition.entries import END, EVENT, PLAN, RESTARTED, Code, pack_end, pack_event, pack_frame
+from calib.acquisition.finish import finish
+from calib.acquisition.journal import MAX_PAYLOAD, Journal, JournalError, Scan
+from calib.acquisition.plan import KINDS, Plan, PlanError, StreamPlan, plan_from_json
+from calib.acquisition.recorder import Orders, record
+from calib.acquisition.setup import prepare
+from calib.acquisition.sources import source
+from calib.acquisition.wire import Frame, encode
+from calib.cli import main
+from calib.session import SessionError, Status, open_session
+
+S = 1_000_000_000
+PATTERN = ((0, 1, 2, 3), (1, 2, 3, 4), (2, 3, 4, 5))
+PLANNED = Plan(
+    (StreamPlan("eit", 3, 100.0), StreamPlan("pressure", 2, 200.0, scale=0.5, offset=100.0)),
+    "2026-01-01T00:00:00+00:00",
+    7 * S,
+    "an id",
+    title="a test",
+    skin_name="bench",
+    pattern=PATTERN,
+    current=1e-3,
+)
+
+
+def sample(stream, number, *, late=200_000, **changes):
+    """Frame `number` of a stream of the plan: its record's stream, flags, time and payload."""
+    rate = PLANNED.streams[stream].rate
+    at = int(number * S / rate)
+    values = np.full(PLANNED.streams[stream].channels, number % 1000, "<i2" if stream else "<f4")
+    frame = Frame(stream, number, (5_000_000 + at // 1000) % 2**32, 32, values)
+    return stream, changes.pop("flags", 0), 8 * S + at + late, pack_frame(frame._replace(**changes))
+
+
+def journal(path, records, *, end=True, plan=PLANNED):
+    """A journal with a plan and `records`."""
+    with Journal(path) as out:
+        out.append(PLAN, 0, 0, plan.to_json())
+        for record in records:
+            out.append(*record)
+        if end:
+            out.append(END, 0, 0, pack_end(True, ""))
+    return path
+
+
+def both(eit=40):
+    """Frames of both streams as they come."""
+    return [sample(*where) for n in range(eit) for where in ((0, n), (1, 2 * n), (1, 2 * n + 1))]
+
+
+# --- the journal ---------------------------------------------------------------------------------
+
+
+def test_records_come_back(tmp_path):
+    records = both()
+    found = [r[1:] for r in Scan(journal(tmp_path / "j", records))]
+    assert found == [(PLAN, 0, 0, PLANNED.to_json()), *records, (END, 0, 0, pack_end(True, ""))]
+
+
+def test_a_cut_at_every_byte_leaves_an_exact_prefix(tmp_path):
+    path = journal(tmp_path / "j", both(6))
+    whole, raw = list(Scan(path)), path.read_bytes()
+    ends = []  # of each record
+    at = 20
+    for entry in whole:
+        at += 28 + len(entry.payload)
+        ends.append(at)
+    assert at == len(raw)
+    cut = tmp_path / "cut"
+    for size in range(20, len(raw) + 1):
+        cut.write_bytes(raw[:size])
+        scan = Scan(cut)
+        kept = sum(end <= size for end in ends)
+        assert list(scan) == whole[:kept]
+        assert (scan.lost, scan.damaged) == (0, 0)
+        assert scan.torn == size - (ends[kept - 1] if kept else 20)
+
+
+def test_what_is_too_short_is_refused_in_words(tmp_path):
+    raw = journal(tmp_path / "j", []).read_bytes()
+    for size in range(20):
+        (tmp_path / "cut").write_bytes(raw[:size])
+        with pytest.raises(JournalError, match="is empty" if size == 0 else "does not begin"):
+            Scan(tmp_path / "cut")
+    with pytest.raises(JournalError, match="No such file"):
+        Scan(tmp_path / "none")
+    with pytest.raises(JournalError, match="directory"):
+        Scan(tmp_path)
+
+
+def spoilt(raw, rng):
+    """A few bytes changed, a stretch overwritten by zeros or by another stretch, removed or doubled."""
+    out, at = bytearray(raw), int(rng.integers(20, len(raw)))
+    size = int(rng.integers(1, 200))
+    kind = rng.integers(5)
+    if kind == 0:
+        for _ in range(int(rng.integers(1, 4))):
+            out[int(rng.integers(20, len(raw)))] ^= int(rng.integers(1, 256))
+    elif kind == 1:
+        out[at : at + size] = bytes(min(size, len(raw) - at))
+    elif kind == 2:
+        other = int(rng.integers(0, len(raw) - size))
+        out[at : at + size] = raw[other : other + min(size, len(raw) - at)]
+    elif kind == 3:
+        del out[at : at + size]
+    else:
+        out[at:at] = raw[at - min(size, at - 20) : at]
+    return bytes(out)
+
+
+def no_invention(tmp_path, count, seed):
+    path = journal(tmp_path / "j", both(10))
+    whole, raw, rng = list(Scan(path)), path.read_bytes(), np.random.default_rng(seed)
+    known, kept = {*whole}, 0
+    for _ in range(count):
+        (tmp_path / "cut").write_bytes(spoilt(raw, rng))
+        scan = Scan(tmp_path / "cut")
+        found = list(scan)
+        assert known.issuperset(found)
+        numbers = [record.number for record in found]
+        assert numbers == sorted({*numbers})
+        assert scan.lost == (numbers[-1] + 1 - len(numbers) if numbers else 0)
+        kept += len(found)
+    return kept / count / len(whole)
+
+
+def test_damage_never_invents_a_record(tmp_path):
+    assert no_invention(tmp_path, 1500, 0) > 0.9
+
+
+@pytest.mark.slow
+def test_damage_never_invents_a_record_in_twenty_thousand_tries(tmp_path):
+    assert no_invention(tmp_path, 20_000, 1) > 0.9
+
+
+def test_records_of_another_journal_are_not_taken_up(tmp_path):
+    other = journal(tmp_path / "other", both(2)).read_bytes()
+    mine = journal(tmp_path / "mine", [sample(0, 0), (1, 0, 0, other[20:]), sample(0, 1)])
+    raw = bytearray(mine.read_bytes())
+    raw[raw.rindex(other[20:60]) - 5] ^= 1  # the record around it is damaged
+    mine.write_bytes(raw)
+    scan = Scan(mine)
+    assert [r.number for r in scan] == [0, 1, 3, 4]
+    assert scan.lost == 1
+
+
+def test_scanning_takes_bounded_memory_and_finds_markers_across_pieces(tmp_path):
+    """A hole of ten megabytes, and one record of the largest size behind it."""
+    large = os.urandom(MAX_PAYLOAD)
+    path = journal(tmp_path / "j", [(0, 0, 1, b"7" * 1000)] * 3 + [(0, 0, 2, large)], end=False)
+    raw = path.read_bytes()
+    hole = raw.index(b"7" * 1000)
+    path.write_bytes(raw[: hole - 24] + b"\xf7jx" * 3_333_333 + raw[len(raw) - MAX_PAYLOAD - 28 :])
+    scan = Scan(path)
+    assert [r.payload for r in scan] == [PLANNED.to_json(), large]
+    assert (scan.lost, scan.torn) == (3, 0)
+
+
+def test_a_journal_is_not_overwritten_nor_read_while_it_grows(tmp_path):
+    with Journal(tmp_path / "j") as out:
+        out.append(PLAN, 0, 0, b"")
+        with pytest.raises(JournalError, match="still being recorded"):
+            Scan(tmp_path / "j")
+    with pytest.raises(JournalError, match="jaxeit recover"):
+        Journal(tmp_path / "j")
+    with pytest.raises(JournalError, match="cannot be written"):
+        Journal(tmp_path / "none" / "j")
+    with Journal(tmp_path / "k") as out, pytest.raises(JournalError, match="keep below"):
+        out.append(0, 0, 0, bytes(MAX_PAYLOAD + 1))
+
+
+def test_what_is_written_is_on_the_disk_within_a_fifth_of_a_second(tmp_path, monkeypatch):
+    """Measured by the calls to the system, not by a power cut."""
+    ends = []
+    name = "fdatasync" if hasattr(os, "fdatasync") else "fsync"
+    monkeypatch.setattr(os, name, lambda file: ends.append((time.monotonic(), os.fstat(file).st_size)))
+    with Journal(tmp_path / "j") as out:
+        for _ in range(10):
+            out.append(0, 0, 0, bytes(500))
+            written, size = time.monotonic(), out.size
+            time.sleep(0.4)
+            assert any(at - written < 0.3 and end >= size for at, end in ends)
+        quiet = len(ends)
+        time.sleep(0.3)
+        assert len(ends) == quiet  # nothing to bring
+
+
+FULL = """
+import resource, signal, sys
+from calib.acquisition.journal import Journal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+try:
+    with Journal(sys.argv[1]) as out:
+        for number in range(1000):
+            out.append(0, 0, number, bytes(100))
+except ValueError as error:
+    sys.exit(f"said: {error}")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs file size limits")
+def test_a_full_disk_leaves_whole_records(tmp_path):
+    command = [sys.executable, "-c", FULL, str(tmp_path / "j")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stderr.startswith("said: j: cannot be written")
+    assert len(done.stderr.splitlines()) == 1
+    scan = Scan(tmp_path / "j")
+    assert [r.host for r in scan] == list(range((10_000 - 20) // 128))
+    assert scan.torn == 0
+
+
+# --- the plan ------------------------------------------------------------------------------------
+
+
+def test_a_plan_comes_back_from_its_text():
+    assert plan_from_json(PLANNED.to_json()) == PLANNED
+    bare = replace(PLANNED, streams=PLANNED.streams[1:], pattern=None, offset=(0.5,), simulated=True, scene="s", seed=1)
+    assert plan_from_json(bare.to_json()) == bare
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"[]", b"{}", b"\xff", b'{"format": 1, "version": 1}', b'{"format": "jaxeit-journal"}']
+)
+def test_what_is_no_plan_is_refused(text):
+    with pytest.raises(JournalError, match="journal"):
+        plan_from_json(text)
+
+
+def test_plans_must_be_sound():
+    eit = PLANNED.streams[0]
+    for streams, words in (((), "none"), ((eit, eit), "once"), ((replace(eit, channels=2),), "pattern of 3 rows")):
+        with pytest.raises(PlanError, match=words):
+            replace(PLANNED, streams=streams)
+    with pytest.raises(PlanError, match="not known"):
+        StreamPlan("smell", 1)
+    with pytest.raises(PlanError, match="above zero"):
+        replace(eit, tick=0.0)
+
+
+# --- journal to session --------------------------------------------------------------------------
+
+
+def finished(tmp_path, records, **how):
+    """The session made of some records, and what was said about it."""
+    path = journal(tmp_path / "s.h5.part", records, **how)
+    summary = finish(path, tmp_path / "s.h5", recovered=not how.get("end", True))
+    return summary, open_session(tmp_path / "s.h5")
+
+
+def test_a_session_is_made_of_the_journal(tmp_path):
+    summary, session = finished(tmp_path, both(1200))
+    with session as s:
+        assert (s.complete, s.recovered, s.title, s.skin_name) == (True, False, "a test", "bench")
+        assert s.pattern.tolist() == [list(row) for row in PATTERN]
+        eit, pressure = s.stream("eit"), s.stream("pressure")
+        np.testing.assert_array_equal(eit.read(), np.arange(1200)[:, None] % 1000 * np.ones(3))
+        np.testing.assert_array_equal(pressure.read(), np.arange(2400)[:, None] % 1000 * np.full(2, 0.5) + 100)
+        for stream in (eit, pressure):
+            true = S + np.arange(len(stream)) * int(S / stream.nominal_rate) + 200_000
+            assert np.abs(stream.time - true).max() < 2_000
+            assert stream.seq.tolist() == list(range(len(stream)))
+            np.testing.assert_array_equal(stream.time_host, true + 7 * S)
+            np.testing.assert_array_equal(stream.time_device, 5_000_000 + (true - 200_000 - S) // 1000)
+            assert not stream.status().any()
+        clock = s.clocks["eit"]
+        assert clock.valid
+        assert (clock.tick_s, abs(clock.drift_ppm) < 1, clock.residual_p95_ns < 1000) == (1e-6, True, True)
+    assert summary.complete
+    assert [(x.frames, x.lost) for x in summary.streams] == [(1200, 0), (2400, 0)]
+    assert "eit: 1,200 frames, 0 lost; clock" in summary.render()
+
+
+def test_the_same_journal_gives_the_same_bytes(tmp_path):
+    path = journal(tmp_path / "j", both())
+    for name in ("a", "b"):
+        finish(path, tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_gaps_steps_and_restarts_are_flagged(tmp_path):
+    records = [sample(0, n) for n in range(500) if n not in (100, 101)]
+    records += [sample(0, n, ticks=n * 10_000) for n in range(500, 800)]  # set back by five seconds
+    records += [sample(0, n, seq=n - 800, flags=RESTARTED) for n in range(800, 801)]
+    records += [sample(0, n, seq=n - 800) for n in range(801, 1000)]
+    records.insert(50, (EVENT, 0, 9 * S, pack_event(Code.NOTE, "hello")))
+    summary, session = finished(tmp_path, records)
+    with session as s:
+        status = s.stream("eit").status()
+        assert np.flatnonzero(status & Status.gap_before).tolist() == [100]
+        assert np.flatnonzero(status & Status.clock_step).tolist() == [498, 798]
+        true = S + np.r_[0:100, 102:1000] * (S // 100) + 200_000
+        assert np.abs(s.stream("eit").time - true).max() < 1_000_000
+        assert [*zip(s.events.code.tolist(), s.events.label, strict=True)] == [(4, "hello"), (3, "eit"), (3, "eit")]
+    assert (summary.streams[0].lost, summary.streams[0].steps) == (2, 2)
+
+
+def test_lines_without_ticks_are_timed_by_arrival(tmp_path):
+    values = np.array([1.5, np.nan])
+    flags = int(Status.unchecked)
+    records = [(*sample(1, n, seq=None, ticks=None, values=values, flags=flags)[:2], (8 + n // 2) * S, payload)
+               for n in range(20) for payload in [sample(1, n, seq=None, ticks=None, values=values)[3]]]  # fmt: skip
+    _, session = finished(tmp_path, records)
+    with session as s:
+        stream = s.stream("pressure")
+        assert (stream.seq, stream.time_device, len(s.clocks), "eit" in s.streams) == (None, None, 0, False)
+        np.testing.assert_array_equal(stream.time, [(1 + n // 2) * S + n % 2 for n in range(20)])
+        np.testing.assert_array_equal(stream.read(), np.tile([100.75, np.nan], (20, 1)))
+        assert (stream.status() == Status.unchecked | Status.nonfinite).all()
+
+
+def test_a_wrong_length_of_tick_is_said_and_times_are_those_of_arrival(tmp_path):
+    summary, session = finished(tmp_path, [sample(0, n, ticks=10 * n) for n in range(1500)])
+    assert "rather 0.001" in summary.render()
+    with session as s:
+        np.testing.assert_array_equal(s.stream("eit").time, S + np.arange(1500) * (S // 100) + 200_000)
+        assert not s.clocks
+
+
+def test_a_missing_count_is_missing(tmp_path):
+    values = np.array([-32768, 5], "<i2")
+    _, session = finished(tmp_path, [sample(1, n, values=values) for n in range(5)])
+    with session as s:
+        np.testing.assert_array_equal(s.stream("pressure").read(), np.tile([np.nan, 102.5], (5, 1)))
+        assert (s.stream("pressure").status() == Status.nonfinite).all()
+
+
+def test_what_a_crash_left_is_marked(tmp_path):
+    records = both()
+    path = journal(tmp_path / "s.h5.part", records, end=False)
+    raw = path.read_bytes()
+    path.write_bytes(raw[:-10])
+    summary = finish(path, tmp_path / "s.h5", recovered=True)
+    assert (summary.complete, summary.bytes_damaged > 0) == (False, True)
+    assert "the recorder was killed" in summary.render()
+    with open_session(tmp_path / "s.h5") as s:
+        assert (s.complete, s.recovered) == (False, True)
+        assert (len(s.stream("eit")), len(s.stream("pressure"))) == (40, 79)
+
+
+def test_damage_in_the_middle_costs_what_it_touches(tmp_path):
+    path = journal(tmp_path / "j", both(100))
+    raw = bytearray(path.read_bytes())
+    middle = raw.index(sample(0, 50)[3])
+    raw[middle : middle + 60] = bytes(60)
+    path.write_bytes(raw)
+    summary = finish(path, tmp_path / "s.h5")
+    assert (summary.complete, summary.records_lost) == (False, 2)
+    with open_session(tmp_path / "s.h5") as s:
+        assert s.stream("eit").seq.tolist() == [n for n in range(100) if n != 50]
+        assert np.flatnonzero(s.stream("eit").status() & Status.gap_before).tolist() == [50]
+        assert np.flatnonzero(s.stream("pressure").status() & Status.gap_before).tolist() == [100]
+
+
+def test_nothing_recorded_is_said(tmp_path):
+    with pytest.raises(JournalError, match="no frame was recorded"):
+        finished(tmp_path, [])
+    with Journal(tmp_path / "k") as out:
+        out.append(*sample(0, 1))
+    with pytest.raises(JournalError, match="description is damaged"):
+        finish(tmp_path / "k", tmp_path / "s.h5")
+    assert not (tmp_path / "s.h5").exists()
+
+
+# --- what the session file says of clocks --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda g: g.move("host_ns", "other"), "host_ns: missing"),
+        (lambda g: g.attrs.modify("drift_ppm", np.nan), "drift_ppm"),
+        (lambda g: g.__setitem__("host_ns", h5py.SoftLink("/device")) if g.move("host_ns", "x") is None else 0, "soft"),
+    ],
+)
+def test_unsound_clocks_are_refused(tmp_path, change, words):
+    _, session = finished(tmp_path, both())
+    session.close()
+    with h5py.File(tmp_path / "s.h5", "r+", libver=("v110", "v110")) as file:
+        change(file["clocks/eit"])
+    with open_session(tmp_path / "s.h5") as s, pytest.raises(SessionError, match=words):
+        _ = s.clocks
+
+
+# --- recording -----------------------------------------------------------------------------------
+
+RATES = {"eit": 100, "pressure": 1000}
+READINGS = 928
+POOL = np.random.default_rng(0).normal(size=(64, READINGS)).astype("<f4")
+
+
+def endless(name, rate=None):
+    """What a device sends for ever: values known from their numbers, ticks of its own clock."""
+    number, rate = KINDS[name].number, rate or RATES[name]
+    channels = READINGS if name == "eit" else 4
+    for seq in count():
+        yield int(seq * S / rate), encode(number, seq, seq * 1_000_000 // rate, POOL[seq % 64, :channels])
+
+
+def expected(name, seq):
+    return POOL[np.asarray(seq) % 64][:, : READINGS if name == "eit" else 4].astype(float)
+
+
+RECORDER = """
+import sys
+from calib.acquisition.plan import Plan
+from calib.acquisition.recorder import Orders, record
+from calib.acquisition.sources import source
+from calib.cli import _signals
+import resource, signal
+eit, pressure, output, seconds, limit = sys.argv[1:]
+if int(limit):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
+sources = [source("eit", eit, 928), source("pressure", pressure, 4)]
+pattern = tuple((0, 1, 2 + n % 9, 3 + n % 9) for n in range(928))
+plan = Plan(tuple(s.plan for s in sources), "2026-01-01T00:00:00+00:00", 0, "id", pattern=pattern)
+orders = Orders()
+told = []
+def progress(line):
+    if "eit 0" not in line and "pressure 0" not in line and not told:
+        told.append(print("recording", flush=True))
+try:
+    with _signals(orders, planned=bool(float(seconds))):
+        print(record(plan, sources, output, seconds=float(seconds) or None, orders=orders, progress=progress).render())
+except KeyboardInterrupt:
+    sys.exit(130)
+except ValueError as error:
+    print(f"jaxeit: {error}", file=sys.stderr)
+    sys.exit(2)
+sys.exit(orders.status)
+"""
+
+
+@pytest.fixture(scope="module")
+def device():
+    """A skin of 928 readings at 100 Hz, and pressures at 1 kHz."""
+    with Device([endless("eit"), endless("pressure")]) as found:
+        yield found
+
+
+def recorder(device, output, seconds=0.0, limit=0):
+    """The recorder at work in a process of its own."""
+    command = [sys.executable, "-c", RECORDER, *device.urls, str(output), str(seconds), str(limit)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() in ("recording\n", ""), process.communicate(timeout=20)
+    return process
+
+
+def sound(session):
+    """Every sample is what was sent under its number, none is missing."""
+    for name, stream in session.streams.items():
+        seq = stream.seq
+        assert (np.diff(seq.astype(np.int64)) == 1).all()
+        np.testing.assert_array_equal(stream.read(), expected(name, seq))
+        assert not stream.status().any()
+    return {name: len(stream) for name, stream in session.streams.items()}
+
+
+def killed(device, folder, number, seconds):
+    """Kill a recorder after some time; how many frames were left, and how many it had received at least."""
+    output = folder / f"{number}.h5"
+    process = recorder(device, output)
+    time.sleep(seconds)
+    process.kill()
+    process.communicate(timeout=20)
+    begin = time.monotonic_ns()
+    summary = finish(f"{output}.part", output, recovered=True)
+    with open_session(output) as session:
+        assert (session.complete, session.recovered) == (False, True)
+        frames = sound(session)
+        last = max(int(stream.time_host[-1]) for stream in session.streams.values())
+    assert summary.bytes_damaged < 8192
+    return frames, (begin - last) / 1e6
+
+
+def test_a_killed_recorder_leaves_a_session(device, tmp_path):
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        frames, age = killed(device, tmp_path, number, rng.uniform(0, 0.5))
+        assert frames["eit"] > 0
+        assert age < 2000  # what was there to the last
+
+
+@pytest.mark.slow
+def test_a_hundred_killed_recorders_leave_sessions(device, tmp_path):
+    rng = np.random.default_rng(1)
+    for number in range(100):
+        frames, _ = killed(device, tmp_path, number, rng.uniform(0, 0.3))
+        assert frames["eit"] > 0
+        for path in tmp_path.iterdir():
+            path.unlink()
+
+
+def test_what_was_received_is_on_the_disk_when_the_recorder_is_killed(device, tmp_path):
+    """At most one frame per stream: a record is written before the next frame is looked at."""
+    path = tmp_path / "j"
+    code = (
+        "import os, sys; from calib.acquisition.journal import Journal\n"
+        "out = Journal(sys.argv[1])\n"
+        "for n in range(500): out.append(0, 0, n, bytes(3700))\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(path)], timeout=60, check=False)
+    assert [r.host for r in Scan(path)] == list(range(500))
+
+
+def test_a_kill_while_the_session_is_made_costs_nothing(tmp_path):
+    """The session is whole or not there, and is made the next time."""
+    records = [sample(*where) for n in range(3000) for where in ((0, n), (1, 2 * n), (1, 2 * n + 1))]
+    part = journal(tmp_path / "s.h5.part", records)
+    code = "import sys; from calib.acquisition.finish import finish\nprint(1, flush=True); finish(*sys.argv[1:])"
+    rng, early = np.random.default_rng(0), 0
+    for number in range(3):
+        output = tmp_path / f"{number}.h5"
+        command = [sys.executable, "-c", code, str(part), str(output)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        process.stdout.readline()
+        time.sleep(rng.uniform(0, 0.3))
+        process.kill()
+        process.communicate(timeout=20)
+        early += not output.exists()
+        if not output.exists():
+            finish(part, output)
+        with open_session(output) as session:
+            assert (len(session.stream("eit")), len(session.stream("pressure"))) == (3000, 6000)
+    assert early
+
+
+@pytest.mark.parametrize(
+    ("name", "planned", "status"), [("SIGINT", False, 0), ("SIGINT", True, 130), ("SIGTERM", False, 143)]
+)
+def test_a_signal_ends_a_recording_in_order(device, tmp_path, name, planned, status):
+    output = tmp_path / "s.h5"
+    process = recorder(device, output, 60.0 if planned else 0.0)
+    process.send_signal(getattr(signal, name))
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (status, "")
+    assert ("not complete" in out) == bool(status)
+    assert os.listdir(tmp_path) == ["s.h5"]
+    with open_session(output) as session:
+        assert session.complete == (status == 0)
+        assert not session.recovered
+        assert sound(session)["eit"] > 0
+
+
+def test_two_signals_end_it_at_once_and_it_can_be_recovered(device, tmp_path):
+    process = recorder(device, tmp_path / "s.h5")
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.002)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode in (0, 130)  # it may have been quicker than the second
+    assert "Traceback" not in err
+    if process.returncode == 130:
+        assert main(["recover", str(tmp_path / "s.h5.part")]) == 0
+    with open_session(tmp_path / "s.h5") as session:
+        assert sound(session)["eit"] > 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs file size limits")
+def test_a_disk_that_fills_up_costs_nothing_recorded(device, tmp_path):
+    process = recorder(device, tmp_path / "s.h5", limit=300_000)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert len(err.splitlines()) == 1
+    assert "cannot be written (File too large)" in err
+    if "recover" in err:
+        assert main(["recover", str(tmp_path / "s.h5.part")]) == 0
+    with open_session(tmp_path / "s.h5") as session:
+        assert session.complete is False
+        assert sound(session)["eit"] > 50
+
+
+def test_a_recording_of_some_seconds_by_the_command_line(device, tmp_path, capsys):
+    output = tmp_path / "s.h5"
+    urls = [f"--pressure={device.urls[1]}?channels=4", f"--barometer={device.urls[1]}?channels=4&id=2"]
+    assert main(["record", *urls, "-o", str(output), "--seconds", "1"]) == 0
+    assert "complete" in capsys.readouterr().out
+    with open_session(output) as session:
+        assert {*sound(session)} == {"pressure", "barometer"}
+        assert len(session.stream("pressure")) >= 900
+        assert (session.complete, session.recovered) == (True, False)
+    assert main(["record", *urls, "-o", str(output), "--seconds", "1"]) == 2
+    assert "not overwritten" in capsys.readouterr().err
+
+
+def test_errors_of_the_command_line(device, tmp_path, capsys):
+    output = str(tmp_path / "s.h5")
+    cases = {
+        "which streams": [],
+        "name the skin": [f"--eit={device.urls[0]}"],
+        "add channels=": [f"--pressure={device.urls[1]}"],
+        "names no source": ["--force=ftp://x"],
+        "nothing answers": ["--force=tcp://127.0.0.1:1", "--wait=0.3"],
+        "with wrong length": [f"--force={device.urls[1]}?id=2", "--wait=0.5"],
+        "none of stream 3": [f"--force={device.urls[1]}", "--wait=0.5"],
+        "does not exist": [f"--force=replay://{tmp_path}/none.h5", "--wait=0.5"],
+    }
+    for words, arguments in cases.items():
+        assert main(["record", *arguments, "-o", output]) == 2
+        err = capsys.readouterr().err
+        assert words in err
+        assert len(err.splitlines()) == 1
+        assert os.listdir(tmp_path) == []
+
+
+def test_an_earlier_recording_is_not_lost_to_a_new_one(device, tmp_path, capsys):
+    output = tmp_path / "s.h5"
+    journal(tmp_path / "s.h5.part", both(), end=False)
+    assert main(["record", f"--pressure={device.urls[1]}?channels=4", "-o", str(output)]) == 2
+    assert "jaxeit recover" in capsys.readouterr().err
+    assert main(["recover", str(output) + ".part"]) == 0
+    assert "may then be deleted" in capsys.readouterr().out
+    assert main(["recover", str(output) + ".part"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["recover", str(output)]) == 2
+    assert "-o" in capsys.readouterr().err
+
+
+def test_streams_that_come_and_go_are_recorded_with_their_gaps(tmp_path):
+    plan, sources = prepare({"pressure": "tcp://127.0.0.1:1?channels=4"}, None)
+    orders, folder = Orders(), tmp_path / "s.h5"
+    with Device([endless("pressure", 500)]) as device:
+        sources = [source("pressure", device.urls[0], 4)]
+        plan = replace(plan, streams=(sources[0].plan,))
+
+        def disturb():
+            for _ in range(2):
+                time.sleep(0.5)
+                device.unplug()
+                time.sleep(0.2)
+                device.plug()
+            time.sleep(1.0)
+            orders.give()
+
+        thread = threading.Thread(target=disturb)
+        thread.start()
+        summary = record(plan, sources, folder, orders=orders)
+        thread.join()
+    with open_session(folder) as session:
+        stream = session.stream("pressure")
+        seq, status = stream.seq.astype(np.int64), stream.status()
+        jumps = np.flatnonzero(np.diff(seq) != 1) + 1
+        assert 1 <= len(jumps) <= 4
+        assert (status[jumps] & Status.gap_before).all()
+        assert np.isin(np.flatnonzero(status & Status.disconnected), jumps).all()
+        assert summary.streams[0].lost == (np.diff(seq) - 1).sum() > 0
+        assert not (status & Status.clock_step).any()
+        true = seq * (S // 500)
+        assert np.ptp(stream.time - true) < 20_000_000
+        assert {*session.events.code.tolist()} == {Code.CONNECTED, Code.LOST}
+
+
+def resident(process):
+    """Memory of a process, MB; 0 where the system does not tell."""
+    try:
+        with open(f"/proc/{process.pid}/statm") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:
+        return 0.0
+
+
+@pytest.mark.slow
+def test_ten_times_the_rate_for_a_minute_without_loss(tmp_path):
+    """Ten minutes of 100 frames of 928 readings and 1,000 pressures a second, in one; memory does not grow."""
+    names = {"eit": 1000, "pressure": 10_000}
+    with Device([endless(name, rate) for name, rate in names.items()]) as device:
+        process = recorder(device, tmp_path / "s.h5", 60.0)
+        used = []
+        for _ in range(10):
+            time.sleep(5)
+            used.append(resident(process))
+        out, err = process.communicate(timeout=300)
+    assert (process.returncode, err) == (0, "")
+    assert used[-1] - used[1] < 3, used
+    with open_session(tmp_path / "s.h5") as session:
+        for name, rate in names.items():
+            seq = session.stream(name).seq.astype(np.int64)
+            assert len(seq) > 30 * rate  # a busy machine may not even send as many as it should
+            assert (np.diff(seq) == 1).all(), out

@@ -1,0 +1,414 @@
+"""Links to devices, and the simulated device they are tried on."""
+
+import contextlib
+import socket
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.acquisition import sources
+from calib.acquisition.device import Device, recording, rows
+from calib.acquisition.entries import EVENT, RESTARTED, pack_frame, unpack_event
+from calib.acquisition.recorder import PATIENCE, Intake
+from calib.acquisition.sources import POLL, ReplayLink, SerialLink, SourceError, TcpLink, source
+from calib.acquisition.wire import State, decode, encode
+from calib.session import Status, open_session
+
+S = 1_000_000_000
+posix = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
+
+
+class Kept:
+    """A journal in memory."""
+
+    def __init__(self):
+        self.records, self.notes = [], []
+
+    def append(self, stream, flags, host, payload):
+        if stream == EVENT:
+            self.notes.append(unpack_event(payload))
+        else:
+            self.records.append((stream, flags, host, payload))
+
+    @property
+    def seq(self):
+        return [int.from_bytes(payload[4:8], "little") for *_, payload in self.records]
+
+    @property
+    def flags(self):
+        return np.array([flags for _, flags, *_ in self.records])
+
+
+class Running:
+    """An intake at work in a thread."""
+
+    def __init__(self, url, name="pressure", channels=4):
+        self.kept, self.stop = Kept(), threading.Event()
+        self.intake = Intake(0, source(name, url, channels), self.kept)
+        self.thread = threading.Thread(target=self.intake.run, args=(self.stop,), daemon=True)
+
+    def __enter__(self):
+        self.thread.start()
+        return self
+
+    def __exit__(self, *error):
+        self.stop.set()
+        self.thread.join(5)
+        assert not self.thread.is_alive()
+
+    @property
+    def tally(self):
+        return self.intake.tally
+
+
+def until(condition, seconds=10.0):
+    """Wait for something to come true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.005)
+
+
+def ramp(count, rate=200, channels=4, stream=2):
+    """Frames whose values are their numbers."""
+    values = (np.full(channels, n, "f4") for n in range(count))
+    return rows(stream, (n * S // rate for n in range(count)), values)
+
+
+def frames(number, count=1, **changes):
+    return b"".join(encode(2, n, n * 5000, np.full(4, n, "f4"), **changes) for n in range(number, number + count))
+
+
+class Peer:
+    """A listener that a test speaks through by hand."""
+
+    def __init__(self):
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.server.settimeout(10)
+        self.url = f"tcp://127.0.0.1:{self.server.getsockname()[1]}"
+        self.clients = []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        for client in self.clients:
+            client.close()
+        self.server.close()
+
+    def accept(self):
+        self.clients.append(self.server.accept()[0])
+        return self.clients[-1]
+
+
+# --- links ---------------------------------------------------------------------------------------
+
+
+def drained(link, count, layouts, seconds=10.0):
+    """Frames read from a link until there are `count`."""
+    state, found, end = State(), [], time.monotonic() + seconds
+    link.open()
+    try:
+        while len(found) < count:
+            assert time.monotonic() < end
+            state, new = decode(layouts, state, link.read())
+            found += new
+    finally:
+        link.close()
+    return found
+
+
+@pytest.mark.parametrize("port", [0, pytest.param(None, marks=posix)])
+def test_a_device_is_heard_over_tcp_and_over_a_terminal(port):
+    """What a terminal holds when it is opened is thrown away: that was before our time."""
+    with Device([ramp(10**6)], [port], wait_for=1) as device:
+        plan = source("pressure", device.urls[0], 4)
+        found = drained(plan.link(), 50, {2: plan.plan.layout})
+    first = found[0].seq
+    assert first == 0 or port is None
+    assert [frame.seq for frame in found] == list(range(first, first + len(found)))
+    assert all((frame.values == frame.seq).all() for frame in found)
+    assert device.sent[0] >= len(found)
+
+
+def test_pyserial_over_a_socket():
+    with Device([ramp(20)], wait_for=1) as device:
+        plan = source("pressure", device.urls[0].replace("tcp", "socket"), 4)
+        link = plan.link()
+        assert isinstance(link, SerialLink)
+        assert [f.seq for f in drained(link, 20, {2: plan.plan.layout})] == list(range(20))
+
+
+def test_a_loop_gives_back_what_is_written():
+    link = source("pressure", "loop://", 4).link()
+    link.open()
+    assert link.read() == b""
+    link.write(b"hello")
+    got = b""
+    while len(got) < 5:
+        got += link.read()
+    link.close()
+    link.close()
+    assert got == b"hello"
+
+
+def test_a_recorded_session_is_replayed(bundled):
+    path = next(p for p in bundled if "presses" in p.name)
+    with open_session(path) as session:
+        stream = session.stream("pressure")
+        values, times = stream.read(0, 400), stream.time
+    plan = source("pressure", f"replay://{path}?speed=20", values.shape[1])
+    begin = time.monotonic()
+    found = drained(plan.link(), 400, {2: plan.plan.layout})
+    assert time.monotonic() - begin > 0.9 * (times[399] - times[0]) / S / 20
+    np.testing.assert_array_equal([f.values for f in found[:400]], values.astype("f4"))
+    assert [f.ticks for f in found[:400]] == [int(t) // 1000 % 2**32 for t in times[:400]]
+
+
+def test_a_replay_ends(bundled):
+    link = source("force", f"replay://{bundled[0]}?speed=1e9", 1).link()
+    assert isinstance(link, ReplayLink)
+    link.open()
+    size = 0
+    with contextlib.suppress(EOFError):
+        while True:
+            size += len(link.read())
+    with open_session(bundled[0]) as session:
+        assert size == 18 * len(session.stream("force"))
+
+
+def test_several_streams_of_a_session_on_one_line(bundled):
+    with Device([recording(bundled[0], ["pressure", "force"])], speed=1e9, wait_for=1) as device:
+        with Running(device.urls[0], "force", 1) as run:
+            until(lambda: run.tally.frames > 2000)
+        assert run.kept.seq == list(range(run.tally.frames))
+        assert run.tally.dropped == {}
+        assert (run.intake.tally.earlier + run.tally.present).other > 0
+
+
+def test_a_session_played_twice_goes_on_counting(bundled):
+    count = sum(1 for _ in sources.packets(bundled[1], "force"))
+    state, raw = State(), b"".join(packet for _, packet in sources.packets(bundled[1], "force", rounds=2))
+    _, found = decode({3: source("force", "loop://", 1).plan.layout}, state, raw)
+    assert [frame.seq for frame in found] == list(range(2 * count))
+    ticks = np.diff([frame.ticks for frame in found])
+    assert ticks.min() > 0
+    assert ticks[count - 1] < 10 * ticks.min()
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("ftp://host", "names no source"),
+        ("host:80", "names no source"),
+        ("tcp://host", "lacks host or port"),
+        ("tcp://:80", "lacks host or port"),
+        ("tcp://host:99999", "lacks host or port"),
+        ("serial://", "names no port"),
+        ("replay://", "names no file"),
+        ("tcp://host:1?speed=x", "not a number"),
+        ("tcp://host:1?colour=red", "colour= .* there are"),
+        ("tcp://host:1?format=xml", "xml"),
+        ("serial:///dev/x?baud=0", "baud"),
+    ],
+)
+def test_urls_that_name_no_source_are_refused(url, words):
+    with pytest.raises(SourceError, match=words):
+        source("force", url, 1)
+
+
+def test_options_of_a_url():
+    found = source("force", "serial://COM3?baud=9600&rate=50&tick=1e-3&scale=2&offset=1&id=9&channels=6&format=csv", 1)
+    plan = found.plan
+    assert (plan.rate, plan.tick, plan.scale, plan.offset, plan.number, plan.channels) == (50, 1e-3, 2, 1, 9, 6)
+    assert (found.baud, found.format, plan.transport) == (9600, "csv", "serial://COM3")
+
+
+@pytest.mark.parametrize("url", ["tcp://127.0.0.1:1", "serial:///dev/nonesuch", "socket://127.0.0.1:1"])
+def test_a_device_that_is_not_there_is_an_os_error(url):
+    with pytest.raises(OSError, match=r"."):
+        source("force", url, 1).link().open()
+
+
+@posix
+def test_a_port_is_ours_alone():
+    with Device([ramp(1)], [None]) as device:
+        one, other = (source("pressure", device.urls[0], 4).link() for _ in range(2))
+        one.open()
+        with pytest.raises(OSError, match="lock"):
+            other.open()
+        one.close()
+
+
+# --- faults on the line --------------------------------------------------------------------------
+
+
+def slowest_return(rounds):
+    """Unplug and plug a device over and over: nothing is invented, the gaps are flagged; the longest wait, s."""
+    with Device([ramp(10**6, rate=500)]) as device, Running(device.urls[0]) as run:
+        slowest = 0.0
+        for _ in range(rounds):
+            count = run.tally.frames
+            until(lambda count=count: run.tally.frames > count + 20)
+            device.unplug()
+            until(lambda: not run.tally.connected)
+            device.plug()
+            begin = time.monotonic()
+            count = run.tally.frames
+            until(lambda count=count: run.tally.frames > count)
+            slowest = max(slowest, time.monotonic() - begin)
+    seq, flags = np.array(run.kept.seq), run.kept.flags
+    jumps = np.flatnonzero(np.diff(seq) != 1) + 1
+    assert (np.diff(seq) > 0).all()
+    assert run.tally.lost == (np.diff(seq) - 1).sum()
+    assert (flags[jumps] & Status.gap_before).all()
+    assert (flags & Status.disconnected).astype(bool).sum() == run.tally.connections - 1 >= rounds
+    assert len([text for _, text in run.kept.notes if "connected" in text]) == run.tally.connections
+    return slowest
+
+
+def test_a_device_that_comes_back_is_heard_within_two_seconds():
+    assert slowest_return(6) < 2
+
+
+@pytest.mark.slow
+def test_a_device_that_comes_back_fifty_times():
+    assert slowest_return(50) < 2
+
+
+@posix
+def test_a_serial_port_may_be_unplugged(tmp_path):
+    port = tmp_path / "tty"
+    with Running(f"serial://{port}") as run:
+        for number in range(3):
+            with Device([ramp(10**6, rate=500)], [None]) as device:
+                port.symlink_to(device.urls[0].removeprefix("serial://"))
+                count = run.tally.frames
+                until(lambda count=count: run.tally.frames > count + 20, 2 + number)
+            until(lambda: not run.tally.connected)
+            port.unlink()
+    assert run.tally.connections >= 3
+    assert (run.kept.flags & RESTARTED).astype(bool).sum() <= 2
+
+
+def test_a_reset_in_mid_frame_costs_that_frame():
+    with Peer() as peer, Running(peer.url) as run:
+        client = peer.accept()
+        client.sendall(frames(0, 5) + frames(5)[:9])
+        until(lambda: run.tally.frames == 5)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+        client.close()
+        peer.accept().sendall(frames(6, 3))
+        until(lambda: run.tally.frames == 8)
+    assert run.kept.seq == [0, 1, 2, 3, 4, 6, 7, 8]
+    assert run.kept.flags.tolist() == [0] * 5 + [Status.disconnected | Status.gap_before] + [0] * 2
+    assert (run.tally.lost, run.tally.dropped) == (1, {})
+
+
+def test_a_slow_drip_is_cut_off():
+    """Bytes that never become a frame: three periods (or half a second) after the last frame."""
+    with Peer() as peer, Running(peer.url + "?rate=100") as run:
+        client = peer.accept()
+        client.sendall(frames(0, 5))
+        begin = time.monotonic()
+        with contextlib.suppress(OSError):
+            while time.monotonic() - begin < 5:
+                client.sendall(b"\x42")
+                time.sleep(0.02)
+        assert PATIENCE < time.monotonic() - begin < PATIENCE + 1.5
+        peer.accept().sendall(frames(9))
+        until(lambda: run.tally.frames == 6)
+    assert any("no frame" in text for _, text in run.kept.notes)
+
+
+def test_a_slow_stream_is_waited_for():
+    slow, unknown, quick = (
+        Intake(0, source("force", f"tcp://h:1{q}", 1), Kept()) for q in ("?rate=0.1", "", "?rate=50")
+    )
+    assert (slow._patience(0.0, 0), quick._patience(0.0, 0)) == (30.0, PATIENCE)
+    assert (unknown._patience(1.0, 3), unknown._patience(40.0, 40)) == (5.0, 3.0)
+
+
+def test_a_claim_of_four_gigabytes_is_only_bytes():
+    with Peer() as peer, Running(peer.url) as run:
+        client = peer.accept()
+        client.sendall(frames(0) + b"\xff\xff\xff\xff" + b"x" * 3_000_000 + b"\0" + frames(1, 2))
+        until(lambda: run.tally.frames == 3)
+    assert run.tally.dropped == {"overlong": 1}
+    assert run.kept.flags.tolist() == [0, Status.crc_resync, 0]
+
+
+def test_repeated_and_reordered_frames_are_kept_once_in_order():
+    with Peer() as peer, Running(peer.url) as run:
+        order = [0, 1, 1, 2, 5, 4, 3, 6, 6, 6, 7, 2, 8]
+        peer.accept().sendall(b"".join(frames(n) for n in order))
+        until(lambda: run.tally.frames == 7)
+    assert run.kept.seq == [0, 1, 2, 5, 6, 7, 8]
+    assert np.flatnonzero(run.kept.flags & Status.gap_before).tolist() == [3]
+    assert (run.tally.lost, run.tally.repeated) == (2, 6)
+
+
+def test_garbage_between_frames_is_skipped_and_flagged():
+    rng = np.random.default_rng(0)
+    with Peer() as peer, Running(peer.url) as run:
+        client = peer.accept()
+        client.sendall(frames(0))
+        for n in range(1, 50):
+            client.sendall(rng.bytes(500) + b"\0" + frames(n))
+        until(lambda: run.tally.frames == 50)
+    assert run.kept.seq == list(range(50))
+    assert (run.kept.flags[1:] == Status.crc_resync).all()
+    values = [np.frombuffer(payload[16:], "<f4") for *_, payload in run.kept.records]
+    np.testing.assert_array_equal(values, np.arange(50)[:, None] * np.ones(4))
+
+
+def test_a_restarted_device_is_noticed():
+    with Peer() as peer, Running(peer.url) as run:
+        peer.accept().sendall(frames(100, 5) + frames(0, 5))
+        until(lambda: run.tally.frames == 9)
+    assert run.kept.seq == [100, 101, 102, 103, 104, 1, 2, 3, 4]
+    assert run.kept.flags[5] == RESTARTED | Status.gap_before
+
+
+def test_lines_of_text_are_flagged():
+    with Peer() as peer, Running(peer.url + "?format=csv", "force", 1) as run:
+        peer.accept().sendall(b"3\n1.5\n2.5\nhello\n3.5\n")
+        until(lambda: run.tally.frames == 3)
+    assert run.kept.flags.tolist() == [Status.unchecked] * 2 + [Status.unchecked | Status.crc_resync]
+
+
+def test_a_slow_listener_of_the_device_loses_whole_frames():
+    big = [np.full(928, n, "f4") for n in range(10)]
+    many = ((n * S // 10_000, encode(1, n, n, big[n % 10])) for n in range(2500))
+    with Device([many], wait_for=1) as device:
+        link = source("eit", device.urls[0], 928).link()
+        assert isinstance(link, TcpLink)
+        link.open()
+        assert device.done.wait(20)
+        state, found = State(), []
+        while data := link.read():
+            state, new = decode({1: source("eit", device.urls[0], 928).plan.layout}, state, data)
+            found += new
+        link.close()
+    assert 100 < len(found) < 2500
+    assert state.counts.dropped == {}
+
+
+def test_waiting_costs_no_time_of_the_processor():
+    with Peer() as peer, Running(peer.url):
+        peer.accept()
+        before = time.process_time()
+        time.sleep(1.0)
+        assert time.process_time() - before < 0.2
+    assert POLL >= 0.05
+
+
+def test_values_are_written_as_they_came():
+    frame = decode({2: source("pressure", "loop://", 4).plan.layout}, State(), frames(7))[1][0]
+    counts = replace(source("pressure", "loop://", 4).plan, scale=1e-3)
+    assert counts.layout.scale == 1e-3
+    assert pack_frame(frame)[16:] == np.full(4, 7, "<f4").tobytes()
