@@ -11,12 +11,26 @@ if TYPE_CHECKING:
     from .calibration import Calibration, calibrate, evaluate, load_calibration
     from .check import check_session
     from .corrections import LowPass, PreOnly, TwoSided
-    from .curves import Affine, Linear, PowerLaw
+    from .curves import Affine, Hysteresis, Linear, MonotonePolynomial, MonotoneSpline, Play, PowerLaw
     from .evaluation import Evaluation
     from .fit import Cauchy, FittedCurve, Huber, SoftL1, Squared, fit_curve, fit_curves
+    from .hybrid import Hybrid
     from .importers import import_csv
+    from .location import (
+        Bilinear,
+        Constant,
+        FittedField,
+        GaussianProcess,
+        PadEdge,
+        Places,
+        RadialBasis,
+        TensorSpline,
+        single_places,
+    )
+    from .locators import FittedContact, ImageCentroid, locate
     from .maps import ForceEstimate, apply, force_map
     from .measured import Measured, Processing, measure
+    from .online import RecursiveLeastSquares, SensitivityTracker, Touched, follow, follow_frames
     from .report import write_report
     from .response import cross_validate, fit_log
     from .session import (
@@ -36,12 +50,16 @@ _HOMES = {
     "calibration": "Calibration calibrate evaluate load_calibration",
     "check": "check_session",
     "corrections": "LowPass PreOnly TwoSided",
-    "curves": "Affine Linear PowerLaw",
+    "curves": "Affine Hysteresis Linear MonotonePolynomial MonotoneSpline Play PowerLaw",
     "evaluation": "Evaluation",
     "fit": "Cauchy FittedCurve Huber SoftL1 Squared fit_curve fit_curves",
+    "hybrid": "Hybrid",
+    "location": ("Bilinear Constant FittedField GaussianProcess PadEdge Places RadialBasis TensorSpline single_places"),
+    "locators": "FittedContact ImageCentroid locate",
     "maps": "ForceEstimate apply force_map",
     "importers": "import_csv",
     "measured": "Measured Processing measure",
+    "online": "RecursiveLeastSquares SensitivityTracker Touched follow follow_frames",
     "report": "write_report",
     "response": "cross_validate fit_log",
     "session": "PressTable Session SessionError SessionWriter Status Stream open_session read_archive write_archive",

@@ -1,8 +1,8 @@
 """Calibration: from recorded sessions to the numbers that turn a skin's signals into newtons."""
 
 import platform
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,14 +14,33 @@ import jaxeit as je
 
 from .curves import CURVES, AbstractCurve, Linear, curve_name
 from .evaluation import Evaluation, evaluate_presses
-from .fit import AbstractLoss, FitError, FitResult, FittedCurve, SoftL1, fit_curves, predict_pads
+from .fit import AbstractLoss, FitError, FitResult, FittedCurve, SoftL1
+from .hybrid import Hybrid, PressData, choose, fit_hybrid, folds_by_place, hold_out, thinned
+from .location import (
+    FIELDS,
+    AbstractField,
+    FittedField,
+    Geometry,
+    Places,
+    field_name,
+    geometry_of,
+    restored,
+    single_places,
+)
+from .locators import (
+    AbstractLocator,
+    AbstractLocatorChoice,
+    FittedContact,
+    locate,
+    locator_from_numbers,
+    locator_numbers,
+)
 from .measured import Measured, Processing, measure
 from .presses import dominant_pad
-from .response import cross_validate
 from .session import Archive, Session, SessionError, read_archive, write_archive
 
 FORMAT = "skin-calibration"
-STAGES = ("reading", "fitting curves", "holding out", "model and images")
+STAGES = ("reading", "model and images", "fitting", "holding out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +57,10 @@ class Calibration:
     | provenance: sessions, their hashes, versions, options, date              |
     | simulated: some session it rests on was simulated                        |
     | notes: what a person should know                                         |
+    | field: of gain over the place pressed; None: no correction by location   |
+    | locator: tells that place from a frame; None with no field               |
+    | baseline: the paper's curves, one slope a pad, for comparison            |
+    | image_gain: force over the integral of the image, N / (S m^2), likewise  |
     """
 
     skin: je.Skin
@@ -47,17 +70,33 @@ class Calibration:
     evaluation: Evaluation
     provenance: dict[str, str]
     simulated: bool
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    field: FittedField | None = None
+    locator: AbstractLocator | None = None
+    baseline: FittedCurve | None = None
+    image_gain: float = float("nan")
 
-    def pad_forces(self, pressures) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    @property
+    def hybrid(self) -> Hybrid:
+        """Curves and field together."""
+        return Hybrid(self.curves, self.field)
+
+    def pad_forces(self, pressures, places: Places | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Force on each pad, its standard error (N) and validity from pressures (n, pads) Pa.
 
-        Not valid: outside the range that was calibrated, or a pad whose fit failed.
+        With a correction by location, `places` (from `locate`) say where; left out, the gain is 1 and the standard
+        error says how much that may be wrong. Not valid: outside the range that was calibrated, or a failed fit.
         """
-        predicted = predict_pads(self.curves, jnp.asarray(pressures, self.dtype).T)
-        parts = (predicted.force, predicted.standard_error, predicted.valid)
-        force, error, valid = (np.asarray(part).T for part in parts)
-        return force, error, valid
+        return self.hybrid.pad_forces(pressures, places)
+
+    def locate(self, frames, image=None, *, single: bool = False) -> Places | None:
+        """Where difference frames (n, readings) V are touched; None without a correction by location.
+
+        `single`: each frame is known to hold one contact, as a press on a bench does.
+        """
+        if self.locator is None:
+            return None
+        return locate(self.locator.single() if single else self.locator, frames, self.recon, self.masks, image)
 
     @property
     def dtype(self):
@@ -73,7 +112,9 @@ def calibrate(
     sessions: Sequence[Session],
     skin: je.Skin | None = None,
     *,
-    curve: AbstractCurve | None = None,
+    curve: AbstractCurve | Sequence[AbstractCurve] | None = None,
+    location: AbstractField | Sequence[AbstractField | None] | None = None,
+    locator: AbstractLocatorChoice | None = None,
     basis: je.Pixels | None = None,
     prior=None,
     hyperparameter: float = 0.1,
@@ -83,12 +124,15 @@ def calibrate(
     folds: int = 5,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Calibration:
-    """Fit one pressure-force curve per pad and prepare the image reconstruction.
+    """Fit one pressure-force curve per pad, and a correction by location, and prepare the image reconstruction.
 
     Args:
         sessions: recorded on one skin, from `open_session`.
         skin: default: the one described in the first session.
-        curve: the law, such as `Linear` (the paper's, default) or `PowerLaw`.
+        curve: the law, such as `Linear` (the paper's, default) or `PowerLaw`; of several, one is chosen by
+            cross-validation over locations.
+        location: the field of gain over the place pressed, such as `PadEdge()`; default: none. Several: as for curve.
+        locator: how that place is told from a frame; default `FittedContact()`.
         basis, prior, hyperparameter, fidelity: of the reconstruction, as in `jaxeit.prepare`.
         loss: of the curve fit; default `SoftL1`.
         processing: how sessions are cut and corrected.
@@ -97,33 +141,62 @@ def calibrate(
 
     Raises:
         SessionError: a session cannot be used, or was recorded on another skin.
-        FitError: a pad was not pressed enough to fit its curve.
+        FitError: a pad was not pressed enough to fit its curve, or there are too few presses for a field.
     """
     if not sessions:
         raise SessionError("calibrate: no session given; give one or more session files")
     skin = skin or je.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
-    curve, loss = curve or Linear(), loss or SoftL1()
+    curves, fields, loss = _several(curve or Linear()), _several(location), loss or SoftL1()
     progress("reading")
     measured = [measure(session, skin, processing) for session in sessions]
-    data = _join(measured)
-    progress("fitting curves")
-    curves = _fit(curve, data, loss)
-    _require_fits(skin, curves)
-    progress("holding out")
-    held_out = _held_out(curve, data, folds, loss)
+    data, dv, position = _join(measured)
+    _require_pressed(skin, data)
     progress("model and images")
-    recon = je.prepare(
-        je.discretise(je.Scene(skin), fidelity),
-        prior,
-        basis=basis,
-        hyperparameter=hyperparameter,
-        channels=np.logical_and.reduce([m.channels for m in measured]),
+    model = je.discretise(je.Scene(skin), fidelity)
+    channels = np.logical_and.reduce([m.channels for m in measured])
+    recon = je.prepare(model, prior, basis=basis, hyperparameter=hyperparameter, channels=channels)
+    masks = je.pad_masks(skin, recon)
+    image = recon(jnp.asarray(dv, recon.factor.dtype))
+    found, places = None, None
+    if any(f is not None for f in fields):
+        noise = np.max([m.noise for m in measured], 0)
+        found = (locator or FittedContact()).prepare(model, noise, channels)
+        places = locate(found.single(), dv, recon, masks, image)
+    progress("fitting")
+    geometry = geometry_of(skin, places.position.dtype if places else None)
+    fold = folds_by_place(data.place, folds)
+    law, where, why = choose(curves, fields, data, geometry, places, loss, fold)
+    hybrid = fit_hybrid(law, where, data, geometry, places, loss)
+    _require_fits(skin, hybrid)
+    baseline = (
+        hybrid.curves if _is_papers(law, where) else fit_hybrid(Linear(), None, data, geometry, None, loss).curves
     )
+    progress("holding out")
+    trial = _Trial(data, geometry, loss, fold)
+    pad_force = trial.predict(law, where, places)
+    image_sum = np.asarray(je.image_sum(image, recon.areas), float)
+    others = {"eit": trial.image_only(image_sum)}
+    others["hybrid"] = (pad_force if _is_papers(law, where) else trial.predict(Linear(), None, None)).sum(1)
+    if where is not None and any("contact_position" in s.truth for s in sessions):
+        true = single_places(jnp.asarray(position), len(skin.pads))
+        others["true_place"] = trial.predict(law, where, true).sum(1)
     evaluation = evaluate_presses(
-        recon, skin, data.position, data.dv, data.force, data.pressure, held_out, held_out_by="location"
+        recon,
+        skin,
+        np.asarray(image),
+        position,
+        data.force,
+        data.pressure,
+        pad_force,
+        held_out_by="location",
+        others=others,
+        fitted=None if places is None else np.asarray(places.position[:, 0], float),
+        recipe=_recipe(law, where),
     )
     options = {
-        "curve": curve_name(curve),
+        "curve": curve_name(law),
+        "location": "none" if where is None else field_name(where),
+        "choice": why,
         "loss": type(loss).__name__,
         "hyperparameter": repr(float(hyperparameter)),
         "prior": repr(prior or je.Noser()),
@@ -135,13 +208,55 @@ def calibrate(
     return Calibration(
         skin=skin,
         recon=recon,
-        masks=je.pad_masks(skin, recon),
-        curves=curves,
+        masks=masks,
+        curves=hybrid.curves,
         evaluation=evaluation,
         provenance=_provenance(sessions, options),
         simulated=any(s.simulated for s in sessions),
-        notes=tuple(f"{m.session.name}: {note}" for m in measured for note in m.notes),
+        notes=(
+            *(f"{m.session.name}: {note}" for m in measured for note in m.notes),
+            *([f"chosen: {why}"] if why else []),
+        ),
+        field=hybrid.field,
+        locator=found if hybrid.field is not None else None,
+        baseline=baseline,
+        image_gain=float(data.force.sum() / image_sum.sum()),
     )
+
+
+def _several(choice) -> tuple:
+    return tuple(choice) if isinstance(choice, Sequence) else (choice,)
+
+
+def _is_papers(curve: AbstractCurve, field: AbstractField | None) -> bool:
+    return isinstance(curve, Linear) and field is None
+
+
+def _recipe(curve: AbstractCurve, field: AbstractField | None) -> str:
+    return curve_name(curve) + (f", {field_name(field)}" if field is not None else "")
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Presses, and how they are divided: predictions by fits that never saw a press's place."""
+
+    data: PressData
+    geometry: Geometry
+    loss: AbstractLoss
+    fold: np.ndarray
+
+    def predict(self, curve: AbstractCurve, field: AbstractField | None, places: Places | None) -> np.ndarray:
+        """Pad forces over the holds, (presses, pads) N."""
+        return hold_out(curve, field, self.data, self.geometry, places, self.loss, self.fold)
+
+    def image_only(self, image_sum: np.ndarray) -> np.ndarray:
+        """Total force by the integral of the image times one number, (presses,) N."""
+        out = np.empty(len(image_sum))
+        for k in np.unique(self.fold):
+            held = self.fold == k
+            gain = self.data.force[~held].sum() / image_sum[~held].sum() if (~held).any() else np.nan
+            out[held] = gain * image_sum[held]
+        return out
 
 
 def evaluate(calibration: Calibration, session: Session, processing: Processing | None = None) -> Evaluation:
@@ -157,57 +272,65 @@ def evaluate(calibration: Calibration, session: Session, processing: Processing 
             f"{session.name}: /streams/eit: channels {np.flatnonzero(lost)[:8].tolist()} hold no finite "
             "value but the calibration uses them; calibrate again with this session's channels"
         )
-    force, _, _ = calibration.pad_forces(found.pressure)
+    recon = calibration.recon
+    image = recon(jnp.asarray(found.dv, recon.factor.dtype))
+    places = calibration.locate(found.dv, image, single=True)
+    force, _, _ = calibration.pad_forces(found.pressure, places)
     return evaluate_presses(
-        calibration.recon,
+        recon,
         calibration.skin,
+        np.asarray(image),
         found.position,
-        found.dv,
         found.force,
         found.pressure,
         force,
         held_out_by="session",
         notes=found.notes,
+        others=_by_others(calibration, found, np.asarray(je.image_sum(image, recon.areas), float)),
+        fitted=None if places is None else np.asarray(places.position[:, 0], float),
+        recipe=calibration.evaluation.recipe,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Joined:
-    """Sessions one after the other: presses, and the samples of their ramps, holds and releases.
-
-    The means over the holds ride along as the last samples; no fit may use them, so that what is
-    predicted for them is predicted like any held-out sample.
-    """
-
-    position: np.ndarray
-    dv: np.ndarray
-    pressure: np.ndarray
-    force: np.ndarray
-    sample_pressure: np.ndarray  # (pads, n)
-    sample_force: np.ndarray
-    sample_place: np.ndarray
-    mask: np.ndarray  # (pads, n): samples of presses that this pad carries nearly alone
+def _by_others(calibration: Calibration, found: Measured, image_sum: np.ndarray) -> dict[str, np.ndarray]:
+    """Total force by the methods to compare with; none for a calibration of before they were kept."""
+    if calibration.baseline is None:
+        return {}
+    papers = Hybrid(calibration.baseline).pad_forces(found.pressure)[0].sum(1)
+    others = {"eit": calibration.image_gain * image_sum, "hybrid": papers}
+    if calibration.field is not None and "contact_position" in found.session.truth:
+        true = single_places(jnp.asarray(found.position), len(calibration.skin.pads))
+        others["true_place"] = calibration.pad_forces(found.pressure, true)[0].sum(1)
+    return others
 
 
-def _join(measured: Sequence[Measured]) -> _Joined:
+_PER_PRESS = 24  # means that stand for the samples of a press, near-duplicates of each other
+
+
+def _join(measured: Sequence[Measured]) -> tuple[PressData, np.ndarray, np.ndarray]:
+    """Sessions one after the other: their presses, frames (presses, readings) V and positions (presses, 2) m."""
     position = np.concatenate([m.position for m in measured])
     place = np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel()
     pressure = np.concatenate([m.pressure for m in measured])
-    force = np.concatenate([m.force for m in measured])
     owner = dominant_pad(pressure)
-    press = _press_of_samples(measured)
-    pads = np.arange(pressure.shape[1])[:, None]
-    unseen = np.zeros((len(pads), len(force)), bool)
-    return _Joined(
-        position=position,
-        dv=np.concatenate([m.dv for m in measured]),
-        pressure=pressure,
-        force=force,
-        sample_pressure=np.concatenate([*(m.samples.pressure for m in measured), pressure]).T,
-        sample_force=np.concatenate([*(m.samples.force for m in measured), force]),
-        sample_place=np.concatenate([place[press], place]),
-        mask=np.concatenate([_finite(measured) & (owner[press] == pads), unseen], 1),
+    press, sample_pressure, sample_force = thinned(
+        _press_of_samples(measured),
+        np.concatenate([m.samples.pressure for m in measured]),
+        np.concatenate([m.samples.force for m in measured]),
+        _PER_PRESS,
     )
+    finite = np.isfinite(sample_pressure).all(1) & np.isfinite(sample_force)
+    data = PressData(
+        sample_pressure=sample_pressure.T,
+        sample_force=sample_force,
+        sample_press=press,
+        mask=finite & (owner[press] == np.arange(pressure.shape[1])[:, None]),
+        pressure=pressure,
+        force=np.concatenate([m.force for m in measured]),
+        place=place,
+        reach=np.stack([position.min(0), position.max(0)]),
+    )
+    return data, np.concatenate([m.dv for m in measured]), position
 
 
 def _press_of_samples(measured: Sequence[Measured]) -> np.ndarray:
@@ -220,39 +343,26 @@ def _press_of_samples(measured: Sequence[Measured]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _finite(measured: Sequence[Measured]) -> np.ndarray:
-    return np.concatenate([np.isfinite(m.samples.pressure).all(1) & np.isfinite(m.samples.force) for m in measured])
+def _require_pressed(skin: je.Skin, data: PressData) -> None:
+    """Before the model is built: a pad without presses cannot be mended later."""
+    for number, pad in enumerate(skin.pads):
+        if not data.mask[number].any():
+            raise FitError(
+                f"pad {number} ({pad.name}): the curve could not be fitted: no press rests on it alone; press it "
+                "away from its neighbours"
+            )
 
 
-def _require_fits(skin: je.Skin, curves: FittedCurve) -> None:
+def _require_fits(skin: je.Skin, hybrid: Hybrid) -> None:
+    curves = hybrid.curves
     for number, pad in enumerate(skin.pads):
         if int(curves.result[number]) != FitResult.SUCCESS:
             raise FitError(f"pad {number} ({pad.name}): the curve could not be fitted: {curves.pad(number).message()}")
-
-
-def _fit(curve: AbstractCurve, data: _Joined, loss: AbstractLoss) -> FittedCurve:
-    return fit_curves(
-        curve,
-        data.sample_pressure,
-        data.sample_force,
-        mask=data.mask,
-        groups=data.sample_place,
-        loss=loss,
-    )
-
-
-def _held_out(curve: AbstractCurve, data: _Joined, folds: int, loss: AbstractLoss) -> np.ndarray:
-    """Pad forces over the hold of every press, (presses, pads) N, by curves that never saw its place."""
-    found = cross_validate(
-        curve,
-        data.sample_pressure,
-        data.sample_force,
-        groups=data.sample_place,
-        mask=data.mask,
-        folds=min(folds, len(np.unique(data.sample_place))),
-        loss=loss,
-    )
-    return found.predicted[:, -len(data.force) :].T
+    if hybrid.field is not None and int(hybrid.field.result) != FitResult.SUCCESS:
+        raise FitError(
+            f"location: the field could not be fitted to {float(hybrid.field.n):.3g} places that the images find: "
+            "press at more places, or calibrate without a correction by location"
+        )
 
 
 def _provenance(sessions: Sequence[Session], options: dict[str, str]) -> dict[str, str]:
@@ -268,7 +378,7 @@ def _provenance(sessions: Sequence[Session], options: dict[str, str]) -> dict[st
 
 
 def _to_archive(cal: Calibration) -> tuple[dict, dict]:
-    attrs = {
+    attrs: dict = {
         "skin": cal.skin.name,
         "skin_toml": cal.skin.toml,
         "simulated": int(cal.simulated),
@@ -286,13 +396,40 @@ def _to_archive(cal: Calibration) -> tuple[dict, dict]:
     }
     for name, meaning in _CURVE_FIELDS.items():
         arrays[f"pads/{name}"] = (getattr(curves, name), "", meaning)
-    reference = getattr(curves.curve, "reference", None)
-    if reference is not None:
-        arrays["pads/reference"] = (reference, "Pa", "reference pressure of the curve")
+    for f in fields(curves.curve):
+        arrays[f"pads/curve-{f.name}"] = (getattr(curves.curve, f.name), "Pa", "what the curve left open, as fitted")
+    if cal.baseline is not None:
+        attrs["image_gain"] = cal.image_gain
+        for name, meaning in _CURVE_FIELDS.items():
+            arrays[f"baseline/{name}"] = (getattr(cal.baseline, name), "", meaning)
+    if cal.field is not None and cal.locator is not None:
+        arrays |= _field_arrays(cal.field)
+        for name, array in locator_numbers(cal.locator).items():
+            arrays[f"locator/{name}"] = (array, "", "of the estimator of the place, as the library names it")
     for name, value in cal.evaluation.arrays().items():
         arrays[f"presses/{name}"] = value
     return attrs, {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
 
+
+def _field_arrays(found: FittedField) -> dict[str, tuple]:
+    choice = {f"choice-{f.name}": getattr(found.field, f.name) for f in fields(found.field)}
+    place = {f"geometry-{f.name}": getattr(found.geometry, f.name) for f in fields(Geometry)}
+    out: dict[str, tuple] = {f"location/{name}": (value, "", "setting of the field") for name, value in choice.items()}
+    out |= {f"location/{name}": (value, "m", "outlines of pads and rim") for name, value in place.items()}
+    return out | {f"location/{name}": (getattr(found, name), u, text) for name, (u, text) in _FIELD_FIELDS.items()}
+
+
+_FIELD_FIELDS = {
+    "coefficients": ("1", "of the centred features, in log gain"),
+    "covariance": ("1", "of the coefficients"),
+    "reach": ("m", "lowest and highest corner of the box that was pressed"),
+    "centre": ("1", "mean features of each pad's presses"),
+    "noise": ("1", "scatter of single presses about the field, in log force"),
+    "spread": ("1", "scatter of single presses about no field, in log force"),
+    "evidence": ("1", "log of the largest marginal likelihood, over that of no field"),
+    "n": ("1", "places fitted"),
+    "result": ("1", "0: success"),
+}
 
 _CURVE_FIELDS = {
     "parameters": "parameters of the pressure-force curve, in the curve's own units",
@@ -332,10 +469,11 @@ def _from_archive(archive: Archive) -> Calibration:
     shape = int(attrs["image_rows"]), int(attrs["image_columns"])
     recon = je.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])))
     provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
-    curve = CURVES[provenance["curve"]]()
-    if "pads/reference" in arrays:
-        curve = type(curve)(reference=jnp.asarray(arrays["pads/reference"]))
+    kind = CURVES[provenance["curve"]]
+    old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
+    curve = kind(**{f.name: jnp.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)})
     fitted = {name: jnp.asarray(arrays[f"pads/{name}"]) for name in _CURVE_FIELDS}
+    located = provenance.get("location", "none") != "none"
     return Calibration(
         skin=skin,
         recon=recon,
@@ -345,4 +483,27 @@ def _from_archive(archive: Archive) -> Calibration:
         provenance=provenance,
         simulated=bool(attrs["simulated"]),
         notes=tuple(filter(None, str(attrs["notes"]).split("\n"))),
+        field=_field_from(arrays, FIELDS[provenance["location"]]) if located else None,
+        locator=_locator_from(arrays, recon.factor.dtype) if located else None,
+        baseline=_baseline_from(arrays),
+        image_gain=float(attrs.get("image_gain", "nan")),
     )
+
+
+def _field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:
+    choice = {f.name: arrays[f"location/choice-{f.name}"] for f in fields(kind)}
+    geometry = {f.name: jnp.asarray(arrays[f"location/geometry-{f.name}"]) for f in fields(Geometry)}
+    numbers = {name: jnp.asarray(arrays[f"location/{name}"]) for name in _FIELD_FIELDS}
+    return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
+
+
+def _locator_from(arrays: Mapping[str, np.ndarray], dtype) -> AbstractLocator:
+    numbers = {k.removeprefix("locator/"): v for k, v in arrays.items() if k.startswith("locator/")}
+    return locator_from_numbers(numbers, dtype)
+
+
+def _baseline_from(arrays: Mapping[str, np.ndarray]) -> FittedCurve | None:
+    """None: a calibration written before the paper's recipe was kept beside it."""
+    if "baseline/parameters" not in arrays:
+        return None
+    return FittedCurve(curve=Linear(), **{name: jnp.asarray(arrays[f"baseline/{name}"]) for name in _CURVE_FIELDS})

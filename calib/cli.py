@@ -5,11 +5,13 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-_CURVE_NAMES = ("linear", "affine", "power")
+_CURVE_NAMES = ("linear", "affine", "power", "polynomial", "spline", "play", "hysteresis", "auto")
+_LOCATION_NAMES = ("none", "constant", "bilinear", "rbf", "edge", "spline", "gp", "auto")
+_STREAMS = ("eit", "pressure", "force", "stage", "temperature", "barometer")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,20 +80,68 @@ def _stages(count: int) -> Iterator[Callable[[str], None]]:
 
 
 def _simulate_args(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE.toml")
-    parser.add_argument("-o", "--output", required=True, metavar="SESSION.h5")
+    parser.add_argument("scene", metavar="SCENE.toml", help="a scene file, or a shipped scene by its name")
+    parser.add_argument("-o", "--output", metavar="SESSION.h5")
+    text = "print what the scene simulates and what each part costs, and simulate nothing"
+    parser.add_argument("--explain", action="store_true", help=text)
+    text = "then play SESSION.h5, simulated only if it is not there, as the skin would send it, at local TCP ports"
+    parser.add_argument("--serve", action="store_true", help=text)
+    text = "SCENE is a skin: Gaussian contacts on a grid over it, from 0 to 100 %%, as one data set (HDF5)"
+    parser.add_argument("--data-set", nargs="?", type=int, const=41, metavar="N", help=f"{text}; N x N places, 41")
 
 
 def _simulate(args: argparse.Namespace) -> int:
+    if bool(args.output) == args.explain:
+        raise ValueError("give either -o SESSION.h5 to simulate, or --explain")
     from .runtime import set_up
 
     set_up()
-    from .bench import load_bench, simulate
+    from .bench import explain, load_bench, render, simulate
 
-    _outputs(args.output)
+    if args.data_set:
+        return _simulate_data_set(args)
     bench = load_bench(args.scene)
-    simulate(bench, args.output, progress=_progress("presses"))
+    if args.explain:
+        print(render(bench, explain(bench)))
+        return 0
+    _outputs(args.output)
+    if args.serve and Path(args.output).exists():
+        return _serve(args.output)
+    try:
+        simulate(bench, args.output, progress=_progress("blocks"))
+    except KeyboardInterrupt:
+        print(f"jaxeit: interrupted; the same command goes on from {args.output}.part", file=sys.stderr)
+        return 130
     print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
+    return _serve(args.output) if args.serve else 0
+
+
+def _serve(path: str) -> int:
+    """Be a device until interrupted."""
+    import threading
+
+    from .acquisition.device import Device, recording
+    from .session import open_session
+
+    with open_session(path) as session:
+        names = [name for name in ("eit", "pressure", "force") if name in session.streams]
+    with Device([recording(path, [name], rounds=10**6) for name in names]) as device:
+        where = " ".join(f"--{name} {url}" for name, url in zip(names, device.urls, strict=True))
+        print(f"serving {path}, SIMULATED; in another terminal: jaxeit record {where} -o session.h5", flush=True)
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    return 0
+
+
+def _simulate_data_set(args: argparse.Namespace) -> int:
+    from .bench import write_data_set
+
+    if args.explain or args.serve:
+        raise ValueError("--explain and --serve are for scenes; leave them out")
+    _outputs(args.output)
+    skin, progress = _skin(args.scene), _progress("contacts")
+    places, steps = write_data_set(skin, args.output, columns=args.data_set, rows=args.data_set, progress=progress)
+    print(f"{args.output}: {places} places, {steps} amplitudes, SIMULATED")
     return 0
 
 
@@ -158,7 +208,10 @@ def _calibrate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", metavar="REPORT.html", help="write a page with figures")
     text = "sessions the fit does not see, to judge it on"
     parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
-    parser.add_argument("--curve", choices=_CURVE_NAMES, default="linear", help="default: linear")
+    text = "force from pressure; auto: chosen by cross-validation over locations; default: linear"
+    parser.add_argument("--curve", choices=_CURVE_NAMES, default="linear", help=text)
+    text = "correct for where a pad is pressed, as the image tells; default: none (the paper's recipe)"
+    parser.add_argument("--location", choices=_LOCATION_NAMES, default="none", help=text)
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
     _low_pass_arg(parser)
     parser.add_argument("--hyperparameter", type=float, default=0.1, help="default: 0.1")
@@ -181,6 +234,23 @@ def _processing(low_pass: float | None):
     return Processing() if low_pass is None else Processing(corrections=(LowPass(low_pass),))
 
 
+def _curves(name: str, *, logs: bool = False):
+    """The curve of a name, or all candidates for auto: on pads only those that are zero at zero and forget."""
+    from .curves import CURVES
+
+    if name != "auto":
+        return CURVES[name]()
+    return [CURVES[n]() for n in (CURVES if logs else ("linear", "power", "polynomial", "spline"))]
+
+
+def _locations(name: str):
+    from .location import default_field
+
+    if name == "auto":
+        return [None, *map(default_field, _LOCATION_NAMES[2:-1])]
+    return None if name == "none" else default_field(name)
+
+
 def _calibrate(args: argparse.Namespace) -> int:
     from .runtime import set_up
 
@@ -188,7 +258,6 @@ def _calibrate(args: argparse.Namespace) -> int:
     import jaxeit as je
 
     from .calibration import STAGES, calibrate, evaluate
-    from .curves import CURVES
     from .evaluation import render_table
     from .session import open_session
 
@@ -204,7 +273,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         calibration = calibrate(
             sessions,
             _skin(args.skin),
-            curve=CURVES[args.curve](),
+            curve=_curves(args.curve),
+            location=_locations(args.location),
             basis=je.Pixels(args.pixels),
             hyperparameter=args.hyperparameter,
             processing=processing,
@@ -233,12 +303,13 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 def _calibrate_logs(args: argparse.Namespace, sessions) -> int:
     """Sessions without EIT: one curve per log, tested on its second half."""
-    from .curves import CURVES
     from .logs import fit_session, render_log, save_logs
 
-    if args.report or args.test or args.skin:
-        raise ValueError("--report, --test and --skin need sessions with EIT; these hold none: leave them out")
-    fits = {session.name: fit_session(session, CURVES[args.curve]()) for session in sessions}
+    if args.report or args.test or args.skin or args.location != "none":
+        raise ValueError(
+            "--report, --test, --skin and --location need sessions with EIT; these hold none: leave them out"
+        )
+    fits = {session.name: fit_session(session, _curves(args.curve, logs=True)) for session in sessions}
     save_logs(fits, args.output)
     print("\n".join(render_log(name, fit) for name, fit in fits.items()))
     print(f"\nwrote {args.output}")
@@ -327,6 +398,181 @@ def _apply(args: argparse.Namespace) -> int:
     return 0
 
 
+# --- record and recover --------------------------------------------------------------------------
+
+
+def _record_args(parser: argparse.ArgumentParser) -> None:
+    text = "where the stream comes from: tcp://HOST:PORT, serial:///dev/ttyACM0?baud=115200, replay://SESSION.h5; "
+    text += "options after ? are format=csv, rate=, tick=, scale=, offset=, id=, channels= (docs/wire-format.md)"
+    streams = parser.add_argument_group("streams", text)
+    for name in _STREAMS:
+        also = ["--load-cell"] if name == "force" else []
+        streams.add_argument(f"--{name}", *also, dest=name, metavar="URL")
+    parser.add_argument("--skin", help="a shipped skin or a TOML file; says the order of the readings")
+    parser.add_argument("-o", "--output", required=True, metavar="SESSION.h5")
+    parser.add_argument("--seconds", type=_above_zero, help="how long; default: until Ctrl-C")
+    parser.add_argument("--title", default="", help="a line to know the session by")
+    parser.add_argument("--wait", type=_above_zero, default=10.0, metavar="S", help="for devices to begin; default: 10")
+
+
+def _above_zero(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: give a number above zero")
+    return value
+
+
+def _record(args: argparse.Namespace) -> int:
+    from .acquisition.recorder import Orders, part_of, record
+    from .acquisition.setup import prepare
+
+    urls = {name: getattr(args, name) for name in _STREAMS if getattr(args, name) is not None}
+    if not urls:
+        raise ValueError(f"which streams? give at least one of {', '.join('--' + n for n in _STREAMS)}")
+    _outputs(args.output)
+    plan, sources = prepare(urls, _skin(args.skin), args.title)
+    orders = Orders()
+    try:
+        with _signals(orders, planned=args.seconds is not None), _status_line() as progress:
+            summary = record(
+                plan, sources, args.output, seconds=args.seconds, wait=args.wait, orders=orders, progress=progress
+            )
+    except KeyboardInterrupt:
+        print(f"jaxeit: interrupted; the recording is kept: jaxeit recover {part_of(args.output)}", file=sys.stderr)
+        return 130
+    print(summary.render())
+    return orders.status
+
+
+@contextmanager
+def _signals(orders, planned: bool) -> Iterator[None]:
+    """The first signal ends a recording in order, a second one at once; Ctrl-C is how one without end is ended."""
+    import signal
+
+    def tell(number: int, _frame) -> None:
+        if orders.stop.is_set():
+            raise KeyboardInterrupt
+        expected = number == signal.SIGINT and not planned
+        orders.give("" if expected else f"stopped by {signal.Signals(number).name}", 0 if expected else 128 + number)
+
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]  # as nohup has it
+    before = {number: signal.signal(number, tell) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _status_line() -> Iterator[Callable[[str], None]]:
+    """A line on the terminal that is written over; nothing where nobody watches."""
+    if not sys.stderr.isatty():
+        yield lambda line: None
+        return
+    try:
+        yield lambda line: print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
+    finally:
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+def _recover_args(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("journal", metavar="SESSION.h5.part")
+    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="default: the name without .part")
+
+
+def _recover(args: argparse.Namespace) -> int:
+    from .acquisition.finish import finish
+
+    output = args.output or args.journal.removesuffix(".part")
+    if output == args.journal:
+        raise ValueError(f"{args.journal}: does not end in .part; say with -o how the session is to be called")
+    if os.path.exists(output):
+        raise ValueError(f"{output}: exists already; give another name with -o, or remove it")
+    _outputs(output)
+    with _bytes(2 * _size(args.journal), "recovering") as progress:
+        summary = finish(args.journal, output, recovered=True, progress=progress)
+    print(summary.render())
+    print(f"look at it (jaxeit check {output}); {args.journal} may then be deleted")
+    return 0
+
+
+def _live_args(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
+    parser.add_argument("--eit", required=True, metavar="URL", help="as for jaxeit record")
+    parser.add_argument("--pressure", required=True, metavar="URL")
+    parser.add_argument("--rest", type=_above_zero, default=2.0, metavar="S", help="untouched at first; default: 2")
+    parser.add_argument("--wait", type=_above_zero, default=10.0, metavar="S", help="for devices to begin; default: 10")
+    parser.add_argument("--seconds", type=_above_zero, help="how long; default: until Ctrl-C")
+    parser.add_argument("--host", default="127.0.0.1", help="to listen on; default: this machine only")
+    parser.add_argument("--port", type=int, default=8765, help="of the page; 0: any; default: 8765")
+    parser.add_argument("--publish", type=int, metavar="PORT", help="send results there as lines of JSON; 0: any")
+    parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
+
+
+def _live(args: argparse.Namespace) -> int:
+    from .runtime import set_up
+
+    set_up()
+    from threading import Timer
+
+    from .acquisition.live import Show
+    from .acquisition.present import present
+    from .acquisition.recorder import Orders
+    from .acquisition.setup import prepare
+    from .calibration import load_calibration
+
+    calibration = load_calibration(args.calibration)
+    plan, sources = prepare({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
+    orders = Orders()
+    timer = Timer(args.seconds or 0.0, orders.give)
+    timer.daemon = True
+    with _signals(orders, planned=False):
+        if args.seconds is not None:
+            timer.start()
+        count = present(
+            calibration,
+            plan,
+            sources,
+            Show(stop=orders.stop),
+            host=args.host,
+            port=args.port,
+            publish=args.publish,
+            also=[lambda result: print(result.to_json(), flush=True)] if args.json else [],
+            tell=lambda line: print(f"jaxeit: {line}", file=sys.stderr),
+            rest=args.rest,
+            wait=args.wait,
+        )
+        timer.cancel()
+    print(f"jaxeit: {count} frames", file=sys.stderr)
+    return orders.status
+
+
+def _doctor_args(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from .acquisition.doctor import examine
+
+    lines = examine()
+    print("\n".join(line.render() for line in lines))
+    return 0 if all(line.ok for line in lines) else 2
+
+
+def _size(path: str) -> int:
+    return os.path.getsize(path) if os.path.isfile(path) else 0
+
+
+@contextmanager
+def _bytes(total: int, text: str) -> Iterator[Callable[[int], object]]:
+    from tqdm import tqdm
+
+    with tqdm(total=total, desc=text, unit="B", unit_scale=True, disable=None, leave=False) as bar:
+        yield bar.update
+
+
 _COMMANDS: dict[str, tuple[Callable, Callable, str]] = {
     "simulate": (_simulate, _simulate_args, "simulate a bench session from a scene file"),
     "check": (_check, _check_args, "validate a recording; say what is wrong and where"),
@@ -334,6 +580,10 @@ _COMMANDS: dict[str, tuple[Callable, Callable, str]] = {
     "calibrate": (_calibrate, _calibrate_args, "fit a calibration to recorded sessions"),
     "evaluate": (_evaluate, _evaluate_args, "judge a calibration on other sessions"),
     "apply": (_apply, _apply_args, "write the force map of every frame of a session"),
+    "record": (_record, _record_args, "record devices into a session file; nothing that arrived is lost"),
+    "live": (_live, _live_args, "show the force map as frames arrive, on a page of its own"),
+    "doctor": (_doctor, _doctor_args, "examine this machine: versions, device, threads, cache, disk, ports"),
+    "recover": (_recover, _recover_args, "make a session of what a crash left of a recording"),
 }
 
 

@@ -1,7 +1,7 @@
 """Curves h: pad pressure (Pa, baseline removed) -> normal force on the pad (N).
 
 A curve is a choice, not a result: it holds no fitted numbers. Every curve is increasing by construction, because
-its slope and exponent are fitted as logarithms, and is handed to the solver in *free* coordinates of order one
+its slopes and exponents are fitted as logarithms, and is handed to the solver in *free* coordinates of order one
 (see `Scale`), so that float32 works and one step size suits all parameters.
 
 A new curve is one class here and one row in `CURVES`.
@@ -11,6 +11,7 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -29,12 +30,14 @@ class Scale(eqx.Module):
     | centre   | median pressure                                  | ()    | Pa   |
     | spread   | half the distance between 5 % and 95 % quantiles | ()    | Pa   |
     | force    | upper quartile of the absolute force             | ()    | N    |
+    | top      | 98 % quantile of the pressure                    | ()    | Pa   |
     """
 
     pressure: Scalar
     centre: Scalar
     spread: Scalar
     force: Scalar
+    top: Scalar
 
 
 def _positive(value: Scalar, otherwise) -> Scalar:
@@ -46,12 +49,13 @@ def scale_of(pressure: Samples, force: Samples, valid: Mask) -> Scale:
     p = jnp.where(valid, pressure, jnp.nan)
     f = jnp.where(valid, force, jnp.nan)
     size = _positive(jnp.nanquantile(jnp.abs(p), 0.75), 1.0)
-    low, centre, high = jnp.nanquantile(p, jnp.array([0.05, 0.5, 0.95], p.dtype))
+    low, centre, high, top = jnp.nanquantile(p, jnp.array([0.05, 0.5, 0.95, 0.98], p.dtype))
     return Scale(
         pressure=size,
         centre=jnp.nan_to_num(centre),
         spread=_positive((high - low) / 2, size),
         force=_positive(jnp.nanquantile(jnp.abs(f), 0.75), 1.0),
+        top=_positive(top, size),
     )
 
 
@@ -72,11 +76,13 @@ def resistant_line(x: Samples, y: Samples, valid: Mask) -> tuple[Scalar, Scalar]
 class AbstractCurve(eqx.Module):
     """h(parameters, pressure) -> force, its inverse, and the map between its parameters and free ones.
 
-    Subclasses state `names` and `units` of their parameters, in order.
+    Subclasses state `names` and `units` of their parameters, in order. A curve with a `path` gives the force at each
+    pressure of a series in the order of time, from what came before it; all others look at each pressure alone.
     """
 
     names: ClassVar[tuple[str, ...]]
     units: ClassVar[tuple[str, ...]]
+    path: ClassVar[bool] = False
 
     @property
     def size(self) -> int:
@@ -91,6 +97,14 @@ class AbstractCurve(eqx.Module):
     @abc.abstractmethod
     def __call__(self, params: Params, pressure: Float[Array, "..."]) -> Float[Array, "..."]:
         """Force in N at `pressure` in Pa; NaN pressure gives NaN force."""
+
+    def seen(self, pressure: Samples) -> Float[Array, "samples ..."]:
+        """What of a series of pressures does not depend on the parameters: made once for a fit, then `given`."""
+        return pressure
+
+    def given(self, params: Params, seen: Float[Array, "samples ..."]) -> Samples:
+        """Force in N, from what was `seen`."""
+        return self(params, seen)
 
     @abc.abstractmethod
     def inverse(self, params: Params, force: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -252,7 +266,257 @@ class PowerLaw(AbstractCurve):
         return jnp.stack([secant, exponent])
 
 
-CURVES: dict[str, type[AbstractCurve]] = {"linear": Linear, "affine": Affine, "power": PowerLaw}
+def _knots(value) -> Scalar | None:
+    return None if value is None else jnp.asarray(value)
+
+
+class _Stretch(AbstractCurve):
+    """A rising curve on the stretch from 0 to `top` (Pa), straight on beyond both ends; zero at zero.
+
+    `top` is a choice; left out, the fit takes the 98 % quantile of the pressure.
+    """
+
+    top: Scalar | None = eqx.field(converter=_knots, default=None)
+
+    units: ClassVar[tuple[str, ...]] = ()
+
+    def at(self, scale):
+        return type(self)(jnp.asarray(scale.top if self.top is None else self.top, scale.top.dtype))
+
+    def _top(self, dtype) -> Scalar:
+        if self.top is None:
+            raise ValueError(f"{type(self).__name__} has no top pressure yet; give one in Pa or fit it first.")
+        return self.top.astype(dtype)
+
+    @abc.abstractmethod
+    def _unit(self, params: Params, z: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Force at z = pressure / top between 0 and 1."""
+
+    @abc.abstractmethod
+    def _ends(self, params: Params) -> tuple[Scalar, Scalar]:
+        """Slopes at both ends, N per unit of z."""
+
+    def __call__(self, params, pressure):
+        z = pressure / self._top(params.dtype)
+        low, high = self._ends(params)
+        inside = self._unit(params, jnp.clip(z, 0, 1))
+        return inside + low * jnp.minimum(z, 0) + high * jnp.maximum(z - 1, 0)
+
+    def inverse(self, params, force):
+        low, high = self._ends(params)
+        last = self._unit(params, jnp.ones((), params.dtype))
+
+        def halve(_, bounds):
+            lower, upper = bounds
+            middle = (lower + upper) / 2
+            above = self._unit(params, middle) > force
+            return jnp.where(above, lower, middle), jnp.where(above, middle, upper)
+
+        shape = jnp.shape(force)
+        start = jnp.zeros(shape, params.dtype), jnp.ones(shape, params.dtype)
+        lower, upper = jax.lax.fori_loop(0, 60, halve, start)
+        z = (lower + upper) / 2
+        z = jnp.where(force < 0, force / low, jnp.where(force > last, 1 + (force - last) / high, z))
+        return jnp.where(jnp.isnan(force), force, z * self._top(params.dtype))
+
+
+class MonotonePolynomial(_Stretch):
+    """F = sum of c_j B_j(P / top), Bernstein polynomials of degree 3 with c_0 = 0 and c_j rising: a rising cubic.
+
+    | parameter    | meaning                                   | shape | unit | bound |
+    |--------------|-------------------------------------------|-------|------|-------|
+    | rise 1, 2, 3 | c_j - c_(j-1); equal: a straight line     | ()    | N    | > 0   |
+    """
+
+    names: ClassVar[tuple[str, ...]] = ("rise 1", "rise 2", "rise 3")
+    units: ClassVar[tuple[str, ...]] = ("N", "N", "N")
+
+    def _unit(self, params, z):
+        c1, c2, c3 = jnp.cumsum(params)
+        return 3 * c1 * z * (1 - z) ** 2 + 3 * c2 * z**2 * (1 - z) + c3 * z**3
+
+    def _ends(self, params):
+        return 3 * params[0], 3 * params[2]
+
+    def free(self, params, scale):
+        return jnp.log(params / scale.force)
+
+    def bound(self, free, scale):
+        return jnp.exp(free) * scale.force
+
+    def initial(self, pressure, force, valid, scale):
+        slope = _start_slope(pressure, force, valid, scale)
+        return jnp.broadcast_to(slope * self._top(slope.dtype) / 3, (3,))
+
+
+class MonotoneSpline(_Stretch):
+    """A curve whose slope is straight between five knots from 0 to `top`, and positive at each: a quadratic I-spline.
+
+    | parameter     | meaning                       | shape | unit | bound |
+    |---------------|-------------------------------|-------|------|-------|
+    | slope 0 .. 4  | at the knots, evenly spaced   | ()    | N/Pa | > 0   |
+    """
+
+    names: ClassVar[tuple[str, ...]] = tuple(f"slope {j}" for j in range(5))
+    units: ClassVar[tuple[str, ...]] = ("N/Pa",) * 5
+
+    def _unit(self, params, z):
+        pieces = len(params) - 1
+        slopes = params * self._top(params.dtype) / pieces
+        along = jnp.clip(z[..., None] * pieces - jnp.arange(pieces), 0, 1)  # part of each piece that lies below
+        return jnp.sum(slopes[:-1] * along + 0.5 * jnp.diff(slopes) * along**2, -1)
+
+    def _ends(self, params):
+        top = self._top(params.dtype)
+        return params[0] * top, params[-1] * top
+
+    def free(self, params, scale):
+        return jnp.log(params * (scale.pressure / scale.force))
+
+    def bound(self, free, scale):
+        return jnp.exp(free) * (scale.force / scale.pressure)
+
+    def initial(self, pressure, force, valid, scale):
+        return jnp.broadcast_to(_start_slope(pressure, force, valid, scale), (len(self.names),))
+
+
+def play(signal: Float[Array, " n"], width: Float[Array, " m"]) -> Float[Array, "n m"]:
+    """Play operators: each follows the signal at a distance of at most its width, from rest at zero.
+
+    y_k = max(u_k - r, min(u_k + r, y_(k-1))). Steps are clamps, and clamps after clamps are clamps: so the series is
+    done in log(n) parallel steps. NaN holds still.
+    """
+    u = signal[:, None]
+    hold = jnp.isnan(u)
+    low = jnp.where(hold, -jnp.inf, u - width)
+    high = jnp.where(hold, jnp.inf, u + width)
+
+    def then(first, second):
+        return tuple(jnp.clip(bound, *second) for bound in first)
+
+    low, high = jax.lax.associative_scan(then, (low, high))
+    return jnp.clip(jnp.zeros((), u.dtype), low, high)
+
+
+def _cumulative_weights(slopes: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Weights of a Prandtl-Ishlinskii operator whose curve of first loading has these slopes."""
+    return jnp.concatenate([slopes[:1], jnp.diff(slopes)])
+
+
+_WIDTHS = (0.2, 0.4, 0.8)  # of half the distance between the 5 % and 95 % quantiles of the pressure
+
+
+class _PrandtlIshlinskii(AbstractCurve):
+    """F = b + w_0 P + sum of w_i play(P; r_i), in time: hysteresis that does not depend on rate.
+
+    The slopes w_0 + ... + w_i of its curve of first loading are positive, so that it has an inverse, which is of the
+    same kind (Krejci and Kuhnen 2001): a law for force from pressure, fitted directly, *is* the inverse of one for the
+    pressure that a pad shows. `widths` r_i (Pa) are a choice; left out, 10, 20 and 40 % of the range fitted.
+    """
+
+    widths: Float[Array, " m"] | None = eqx.field(converter=_knots, default=None)
+
+    path: ClassVar[bool] = True
+
+    def at(self, scale):
+        own = jnp.asarray(_WIDTHS, scale.spread.dtype) * scale.spread
+        return type(self)(own if self.widths is None else jnp.asarray(self.widths, own.dtype))
+
+    def _widths(self, dtype):
+        if self.widths is None:
+            raise ValueError(f"{type(self).__name__} has no widths yet; give them in Pa or fit it first.")
+        return self.widths.astype(dtype)
+
+    def _split(self, params: Params) -> tuple[Float[Array, " m"], Scalar]:
+        """Weights and offset."""
+        return _cumulative_weights(params), jnp.zeros((), params.dtype)
+
+    def __call__(self, params, pressure):
+        return self.given(params, self.seen(jnp.ravel(pressure))).reshape(jnp.shape(pressure))
+
+    def seen(self, pressure):
+        return jnp.column_stack([pressure, play(pressure, self._widths(pressure.dtype))])
+
+    def given(self, params, seen):
+        weights, offset = self._split(params)
+        return seen @ weights + offset
+
+    def inverse(self, params, force):
+        weights, offset = self._split(params)
+        sums, widths = jnp.cumsum(weights), self._widths(params.dtype)
+        all_widths = jnp.concatenate([jnp.zeros(1, params.dtype), widths])
+        turned = jnp.stack([jnp.sum(weights[: i + 1] * (r - all_widths[: i + 1])) for i, r in enumerate(all_widths)])[
+            1:
+        ]
+        back = -weights[1:] / (sums[1:] * sums[:-1])
+        flat = jnp.ravel(force) - offset
+        return (flat / weights[0] + play(flat, turned) @ back).reshape(jnp.shape(force))
+
+
+_SLOPES = tuple(f"slope {j}" for j in range(len(_WIDTHS) + 1))
+
+
+class Play(_PrandtlIshlinskii):
+    """Hysteresis of a pad: force from the series of its pressures; zero as long as nothing has been pressed.
+
+    | parameter    | meaning                                                    | shape | unit | bound |
+    |--------------|------------------------------------------------------------|-------|------|-------|
+    | slope 0 .. 3 | of first loading: at once, and beyond each of the widths   | ()    | N/Pa | > 0   |
+
+    After a turn the slopes follow each other in the same order, at twice the widths.
+    """
+
+    names: ClassVar[tuple[str, ...]] = _SLOPES
+    units: ClassVar[tuple[str, ...]] = ("N/Pa",) * len(_SLOPES)
+
+    def free(self, params, scale):
+        return jnp.log(params * (scale.pressure / scale.force))
+
+    def bound(self, free, scale):
+        return jnp.exp(free) * (scale.force / scale.pressure)
+
+    def initial(self, pressure, force, valid, scale):
+        return jnp.broadcast_to(_start_slope(pressure, force, valid, scale), (len(self.names),))
+
+
+class Hysteresis(_PrandtlIshlinskii):
+    """`Play` with an offset: loading and unloading branches of a log whose zero is elsewhere.
+
+    | parameter    | meaning                                                    | shape | unit | bound |
+    |--------------|------------------------------------------------------------|-------|------|-------|
+    | slope 0 .. 3 | as of `Play`                                               | ()    | N/Pa | > 0   |
+    | offset       | added throughout                                           | ()    | N    | none  |
+    """
+
+    names: ClassVar[tuple[str, ...]] = (*_SLOPES, "offset")
+    units: ClassVar[tuple[str, ...]] = (*("N/Pa",) * len(_SLOPES), "N")
+
+    def _split(self, params):
+        return _cumulative_weights(params[:-1]), params[-1]
+
+    def free(self, params, scale):
+        middle = params[-2] * scale.centre + params[-1]
+        slopes = jnp.log(params[:-1] * (scale.spread / scale.force))
+        return jnp.append(slopes, middle / scale.force)
+
+    def bound(self, free, scale):
+        slopes = jnp.exp(free[:-1]) * (scale.force / scale.spread)
+        return jnp.append(slopes, free[-1] * scale.force - slopes[-1] * scale.centre)
+
+    def initial(self, pressure, force, valid, scale):
+        slope, offset = Affine().initial(pressure, force, valid, scale)
+        return jnp.append(jnp.broadcast_to(slope, (len(_SLOPES),)), offset)
+
+
+CURVES: dict[str, type[AbstractCurve]] = {
+    "linear": Linear,
+    "affine": Affine,
+    "power": PowerLaw,
+    "polynomial": MonotonePolynomial,
+    "spline": MonotoneSpline,
+    "play": Play,
+    "hysteresis": Hysteresis,
+}
 """Names used on the command line and in calibration files."""
 
 

@@ -6,7 +6,8 @@ variation.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,16 @@ import numpy as np
 import jaxeit as je
 
 _BOOTSTRAPS = 2000
+
+CALIBRATED = "calibrated"
+METHODS = {
+    "eit": "EIT only",
+    "hybrid": "hybrid",
+    CALIBRATED: "calibrated",
+    "true_place": "true place",
+}
+"""Ways to a total force, and what they are called: the image's integral alone, the paper's recipe (one number per
+pad), the calibration itself, and the same with the true place put in for the estimated one, for comparison."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +41,8 @@ class Evaluation:
     | image_sum: integral of the image, what the image alone tells       | (presses,)      | S m^2|
     | centre of the sheet                                                | (2,)            | m    |
     | held_out_by: what the fit had not seen, "location" or "session"    |                 |      |
+    | others: total force by other methods of `METHODS`, held out alike  | (presses,) each | N    |
+    | recipe: curve and location of the calibration, in words            |                 |      |
     | notes                                                              |                 |      |
     """
 
@@ -42,6 +55,8 @@ class Evaluation:
     centre: np.ndarray
     held_out_by: str
     notes: tuple[str, ...] = ()
+    others: Mapping[str, np.ndarray] = field(default_factory=dict)
+    recipe: str = ""
 
     @property
     def total_force(self) -> np.ndarray:
@@ -56,27 +71,46 @@ class Evaluation:
 
     @property
     def sensitivity_hybrid(self) -> np.ndarray:
-        """Estimated over true force, (presses,)."""
-        return self.total_force / self.force
+        """Estimated over true force of the paper's recipe, (presses,)."""
+        return self.sensitivity("hybrid" if "hybrid" in self.others else CALIBRATED)
+
+    @property
+    def forces(self) -> dict[str, np.ndarray]:
+        """Total force by method, (presses,) N each, the calibration's own last but for the comparison."""
+        last = {k: v for k, v in self.others.items() if k == "true_place"}
+        return {k: v for k, v in self.others.items() if k not in last} | {CALIBRATED: self.total_force} | last
+
+    def sensitivity(self, method: str) -> np.ndarray:
+        """Estimated over true force by one of the methods in `forces`, (presses,)."""
+        return self.forces[method] / self.force
 
     def summary(self) -> dict[str, float]:
         """The numbers a person would read; lengths in m, forces in N, each CV with its ddof."""
         out: dict[str, float] = {"presses": len(self.force)}
         for name, estimate in self.estimated.items():
             out |= {f"localisation_{name}_{k}": v for k, v in self._localisation(estimate).items()}
-        for name in ("eit", "hybrid"):
-            values = getattr(self, f"sensitivity_{name}")
+        spreads = {"eit": self.sensitivity_eit, "hybrid": self.sensitivity_hybrid}
+        spreads |= {name: self.sensitivity(name) for name in self.forces if name not in spreads}
+        for name, values in spreads.items():
             if len(values) > 1:
                 for ddof in (0, 1):
                     cv = je.coefficient_of_variation(values, ddof=ddof)
                     out[f"cv_{name}_ddof{ddof}"] = float(cv)
                 out[f"cv_{name}_se"] = _bootstrap(values, lambda v: v.std(1, ddof=1) / v.mean(1))
-        error = self.total_force - self.force
-        out["force_rmse"] = float(np.sqrt(np.mean(error**2)))
-        out["force_mean_absolute"] = float(np.abs(error).mean())
-        out["force_worst"] = float(np.abs(error).max())
-        out["force_rmse_percent_full_scale"] = 100 * out["force_rmse"] / float(self.force.max())
+        out |= {f"force_{k}": v for k, v in self._errors(self.total_force).items()}
+        for name, total in self.others.items():
+            out |= {f"force_{name}_{k}": v for k, v in self._errors(total).items()}
         return out
+
+    def _errors(self, total: np.ndarray) -> dict[str, float]:
+        error = total - self.force
+        size = float(np.sqrt(np.mean(error**2)))
+        return {
+            "rmse": size,
+            "mean_absolute": float(np.abs(error).mean()),
+            "worst": float(np.abs(error).max()),
+            "rmse_percent_full_scale": 100 * size / float(self.force.max()),
+        }
 
     def _localisation(self, estimate: np.ndarray) -> dict[str, float]:
         error = np.asarray(je.localisation_error(estimate, self.position))
@@ -91,7 +125,7 @@ class Evaluation:
 
     def attributes(self) -> dict[str, str]:
         """What `restore` needs beside the arrays."""
-        return {"held_out_by": self.held_out_by, "notes": "\n".join(self.notes)}
+        return {"held_out_by": self.held_out_by, "notes": "\n".join(self.notes), "recipe": self.recipe}
 
     def arrays(self) -> dict[str, tuple[np.ndarray, str, str]]:
         """Name -> values, units, meaning."""
@@ -105,17 +139,23 @@ class Evaluation:
         }
         for name, estimate in self.estimated.items():
             out[f"estimated_{name}"] = (estimate, "m", f"position estimated by {name}")
+        for name, total in self.others.items():
+            out[f"force_{name}"] = (total, "N", f"total force by {METHODS[name]}, held out by {self.held_out_by}")
         return out
 
     @classmethod
     def restore(cls, attrs: Mapping, arrays: Mapping[str, np.ndarray], attribute: str, array: str) -> "Evaluation":
         """The evaluation that `attributes` and `arrays` described, found under these prefixes."""
-        mark = f"{array}estimated_"
-        estimated = {k.removeprefix(mark): v for k, v in arrays.items() if k.startswith(mark)}
+
+        def named(mark: str) -> dict[str, np.ndarray]:
+            return {k.removeprefix(array + mark): v for k, v in arrays.items() if k.startswith(array + mark)}
+
         names = ("position", "force", "pressure", "pad_force", "image_sum", "centre")
         return cls(
             **{name: arrays[array + name] for name in names},
-            estimated=estimated,
+            estimated=named("estimated_"),
+            others={name: total for name, total in named("force_").items() if name in METHODS},
+            recipe=str(attrs.get(f"{attribute}recipe", "")),
             held_out_by=str(attrs[f"{attribute}held_out_by"]),
             notes=tuple(filter(None, str(attrs[f"{attribute}notes"]).split("\n"))),
         )
@@ -124,21 +164,24 @@ class Evaluation:
 def evaluate_presses(
     recon: je.Reconstructor,
     skin: je.Skin,
+    image: np.ndarray,
     position: np.ndarray,
-    dv: np.ndarray,
     force: np.ndarray,
     pressure: np.ndarray,
     pad_force: np.ndarray,
     *,
     held_out_by: str,
     notes: tuple[str, ...] = (),
+    others: Mapping[str, np.ndarray] = MappingProxyType({}),
+    fitted: np.ndarray | None = None,
+    recipe: str = "",
 ) -> Evaluation:
-    """Image every press and say where it is."""
-    image = recon(jnp.asarray(dv, recon.factor.dtype))
+    """Say where every press is, by its image and by the place that was `fitted` (if any)."""
     (x0, y0), (x1, y1) = skin.domain.bounds
+    estimated = {n: np.asarray(e(jnp.asarray(image), recon), float) for n, e in je.ESTIMATORS.items()}
     return Evaluation(
         position=position,
-        estimated={n: np.asarray(e(image, recon), float) for n, e in je.ESTIMATORS.items()},
+        estimated=estimated if fitted is None else estimated | {"fitted": fitted},
         force=force,
         pressure=np.asarray(pressure, float),
         pad_force=np.asarray(pad_force, float),
@@ -146,6 +189,8 @@ def evaluate_presses(
         centre=np.array([(x0 + x1) / 2, (y0 + y1) / 2]),
         held_out_by=held_out_by,
         notes=notes,
+        others=others,
+        recipe=recipe,
     )
 
 
@@ -156,7 +201,7 @@ def _bootstrap(values: np.ndarray, statistic) -> float:
 
 
 def render_table(evaluation: Evaluation, title: str) -> str:
-    """The results as a table for a terminal."""
+    """The results as a table for a terminal; CV with ddof 1."""
     s = evaluation.summary()
     lines = [
         f"{title}: {s['presses']:.0f} presses, forces held out by {evaluation.held_out_by}",
@@ -168,13 +213,20 @@ def render_table(evaluation: Evaluation, title: str) -> str:
             1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
         lines.append(f"    {name:<16}{mean:12.1f}  ({error:5.2f}) {median:7.1f} {p95:7.1f} {inward:13.1f}")
-    if "cv_eit_ddof1" in s:
-        lines += ["", "  sensitivity              CV    (+- SE)"]
-        for name, label in (("eit", "EIT only"), ("hybrid", "hybrid")):
-            lines.append(f"    {label:<16}{s[f'cv_{name}_ddof1']:12.3f}  ({s[f'cv_{name}_se']:.3f})   ddof 1")
-    lines += [
-        "",
-        f"  force: RMSE {s['force_rmse']:.2f} N ({s['force_rmse_percent_full_scale']:.1f} % of the "
-        f"largest), mean absolute {s['force_mean_absolute']:.2f} N, worst {s['force_worst']:.2f} N",
-    ]
+    lines += ["", *_force_lines(evaluation, s)]
     return "\n".join(lines + [f"  note: {note}" for note in evaluation.notes])
+
+
+def _force_lines(evaluation: Evaluation, s: Mapping[str, float]) -> list[str]:
+    """One row per method: evenness, and errors of the total force."""
+    out = ["  total force                       CV    (+- SE)   RMSE, N  % of largest  mean abs., N  worst, N"]
+    for name in dict.fromkeys(["eit", *evaluation.forces]):
+        label = METHODS[name] + (f" ({evaluation.recipe})" if name == CALIBRATED and evaluation.recipe else "")
+        spread = f"{s[f'cv_{name}_ddof1']:6.3f}  ({s[f'cv_{name}_se']:.3f})" if f"cv_{name}_ddof1" in s else " " * 15
+        mark = "" if name == CALIBRATED else f"{name}_"
+        numbers = [s.get(f"force_{mark}{k}") for k in ("rmse", "rmse_percent_full_scale", "mean_absolute", "worst")]
+        errors = "".join(
+            f"{'' if n is None else format(n, '.2f'):>{w}}" for n, w in zip(numbers, (10, 14, 14, 10), strict=True)
+        )
+        out.append(f"    {label:<28}{spread}{errors}")
+    return out

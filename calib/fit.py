@@ -128,14 +128,14 @@ class Samples(eqx.Module):
 
     | field    | meaning                                    | shape | unit |
     |----------|--------------------------------------------|-------|------|
-    | pressure | baseline removed                           | (n,)  | Pa   |
+    | pressure | baseline removed (or what a curve has seen) | (n,) | Pa   |
     | force    | baseline removed                           | (n,)  | N    |
     | sigma    | relative (or absolute) noise of the force  | (n,)  | 1, N |
     | valid    | use this sample                            | (n,)  |      |
     | group    | press of the sample, from 0                | (n,)  |      |
     """
 
-    pressure: Float[Array, " n"]
+    pressure: Float[Array, "n ..."]
     force: Float[Array, " n"]
     sigma: Float[Array, " n"]
     valid: Bool[Array, " n"]
@@ -198,7 +198,7 @@ class FittedCurve(eqx.Module):
         `valid` is false for NaN, for a failed fit, and more than `tolerance` of the fitted range outside that range.
         """
         p = jnp.asarray(pressure, self.parameters.dtype)
-        slope = jax.vmap(jax.grad(self.curve), (None, 0))(self.parameters, p.ravel())
+        slope = jax.jacfwd(self.curve)(self.parameters, p.ravel())
         variance = jnp.einsum("ni,ij,nj->n", slope, self.covariance, slope).reshape(p.shape)
         low, high = self.pressure_range
         margin = tolerance * (high - low)
@@ -251,8 +251,8 @@ def default_solver(dtype) -> LevenbergMarquardt:
 
 
 def _residuals(free, curve: AbstractCurve, samples: Samples, scale: Scale, spread):
-    """Standardised residuals; zero at samples that are not valid."""
-    force = curve(curve.bound(free, scale), samples.pressure)
+    """Standardised residuals; zero at samples that are not valid. Pressures are as `curve.seen` has them."""
+    force = curve.given(curve.bound(free, scale), samples.pressure)
     r = (samples.force - force) / (samples.sigma * spread)
     return jnp.where(samples.valid, r, 0.0)
 
@@ -336,6 +336,12 @@ def _groups_used(samples: Samples, n_groups: int):
     return jnp.sum(counts > 0)
 
 
+def _kept(pressure, present):
+    """Pressures with the last one before each gap held: what a curve with memory has been through."""
+    last = jax.lax.cummax(jnp.where(present, jnp.arange(len(pressure)), -1))
+    return jnp.where(last >= 0, jnp.where(present, pressure, 0.0)[last], 0.0)
+
+
 def _pressure_range(samples: Samples):
     p = samples.pressure
     low = jnp.min(jnp.where(samples.valid, p, jnp.inf))
@@ -375,7 +381,7 @@ def fit_samples(
     clean = jnp.all(present | ~samples.valid)
     valid = samples.valid & present
     used = Samples(
-        jnp.where(valid, samples.pressure, 0.0),
+        _kept(samples.pressure, present) if curve.path else jnp.where(valid, samples.pressure, 0.0),
         jnp.where(valid, samples.force, 0.0),
         samples.sigma,
         valid,
@@ -384,15 +390,16 @@ def fit_samples(
     scale = scale_of(used.pressure, used.force, valid)
     curve = curve.at(scale)
     start = curve.free(curve.initial(used.pressure, used.force, valid, scale), scale)
-    free, spread, ended = _solve(curve, used, scale, start, loss, solver, max_steps, rounds)
-    covariance, rank, decided = _covariance(free, curve, used, scale, spread, loss, n_groups)
+    seen = eqx.tree_at(lambda s: s.pressure, used, curve.seen(used.pressure))
+    free, spread, ended = _solve(curve, seen, scale, start, loss, solver, max_steps, rounds)
+    covariance, rank, decided = _covariance(free, curve, seen, scale, spread, loss, n_groups)
 
     n, k = jnp.sum(valid), free.size
     params = curve.bound(free, scale)
     limits = _pressure_range(used)
     groups = _groups_used(used, n_groups)
     rise = jnp.diff(curve(params, limits))[0]
-    raw = jnp.where(valid, used.force - curve(params, used.pressure), 0.0)
+    raw = jnp.where(valid, used.force - curve.given(params, seen.pressure), 0.0)
     result = _judge(
         finite=clean & (n > 0) & jnp.all(jnp.isfinite(params)),
         enough=(n > k) & ((groups > k) if n_groups else True),

@@ -1,6 +1,6 @@
 """Logs of force and a signal without EIT: one curve per log, tested on what it has not seen."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,25 +8,31 @@ import numpy as np
 from .curves import AbstractCurve, curve_name
 from .fit import FitError
 from .presses import resample
-from .response import LogFit, fit_log
+from .response import LogFit, fit_log, time_split
 from .session import Session, Stream, write_archive
 
 FORMAT = "pressure-force-curves"
 _NOT_SIGNALS = ("force", "stage", "temperature", "barometer")
 
 
-def fit_session(session: Session, curve: AbstractCurve) -> LogFit:
+def fit_session(session: Session, curve: AbstractCurve | Sequence[AbstractCurve]) -> LogFit:
     """Fit force against the session's signal on its first half; the second half is held out.
 
     The signal is the stream "pressure", or the only one that is not a force, a place or the weather;
-    it is interpolated to the times of the force.
+    it is interpolated to the times of the force. Of several curves the one is taken that, fitted on the first half of
+    the first half, predicts the rest of it best: the second half has no say.
 
     Raises:
         SessionError, FitError: if a stream is missing or nothing can be fitted.
     """
     force, signal = session.stream("force"), _signal(session)
     values = resample(signal.time, signal.read(), force.time)
-    return fit_log(curve, force.time, values, force.read()[:, 0])
+    loads = force.read()[:, 0]
+    if isinstance(curve, AbstractCurve):
+        return fit_log(curve, force.time, values, loads)
+    first, _ = time_split(force.time)
+    tried = [fit_log(c, force.time[first], values[first], loads[first]).held_out.rmse for c in curve]
+    return fit_log(curve[int(np.argmin(np.nan_to_num(tried, nan=np.inf)))], force.time, values, loads)
 
 
 def _signal(session: Session) -> Stream:

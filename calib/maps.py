@@ -11,6 +11,8 @@ import jaxeit as je
 
 from .calibration import Calibration
 from .corrections import correct
+from .fit import bucket
+from .location import Places
 from .measured import Processing, resting_levels
 from .presses import resample
 from .session import ArchiveWriter, Session, SessionError, Stream
@@ -39,13 +41,14 @@ class ForceEstimate(NamedTuple):
     valid: np.ndarray
 
 
-def force_map(calibration: Calibration, frames, pressures, *, gate: float = 0.6) -> ForceEstimate:
+def force_map(calibration: Calibration, frames, pressures, *, gate: float = 0.6, before=None) -> ForceEstimate:
     """Force maps of frames and pad pressures, each less its value without contact.
 
     Args:
         frames: change of the readings, (n, readings) V.
         pressures: change of the pads' gage pressure at the same times, (n, pads) Pa.
         gate: as in `jaxeit.fuse`.
+        before: pressures that came earlier, (m, pads) Pa, for curves that remember them; see `remembered`.
 
     Raises:
         ValueError: if the shapes do not fit the calibration.
@@ -57,11 +60,56 @@ def force_map(calibration: Calibration, frames, pressures, *, gate: float = 0.6)
             f"frames {frames.shape} and pressures {pressures.shape} do not fit this calibration: "
             f"give (n, {readings}) V and (n, {pads}) Pa"
         )
-    force, error, valid = calibration.pad_forces(pressures)
     image = calibration.recon(frames)
+    places = _places(calibration, frames, pressures, image)
+    force, error, valid = _pad_forces(calibration, pressures, places, before)
     fused = je.fuse(image, calibration.masks, jnp.asarray(force, image.dtype), gate=gate)
-    about = np.asarray(calibration.curves.residual_rms)
-    return ForceEstimate(fused, force, np.hypot(error, about), valid)
+    return ForceEstimate(fused, force, np.hypot(error, calibration.hybrid.scatter), valid)
+
+
+def _pad_forces(calibration: Calibration, pressures, places: Places | None, before):
+    """Forces, errors and validity (n, pads), of curves that remember after what came `before`."""
+    if before is None or not calibration.curves.curve.path:
+        return calibration.pad_forces(pressures, places)
+    first = bucket(len(before))  # missing pressures move nothing, and lengths recur
+    whole = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before, pressures])
+    if places is not None:
+        rows = jnp.maximum(jnp.arange(len(whole)) - first, 0)
+        places = places[rows]
+    return tuple(part[first:] for part in calibration.pad_forces(whole, places))
+
+
+def remembered(pressures: np.ndarray) -> np.ndarray:
+    """The turns (m, pads) of pressures (n, pads) that a curve with hysteresis still remembers; NaN fills up.
+
+    A turn is forgotten as soon as a later excursion goes back beyond it (Preisach's wiping out), so that few are left.
+    """
+    turns = [_turns(column) for column in np.asarray(pressures).T]
+    longest = max(map(len, turns), default=0)
+    return np.stack([np.r_[np.full(longest - len(t), np.nan), t] for t in turns], 1)
+
+
+def _turns(column: np.ndarray) -> list[float]:
+    kept: list[float] = [0.0]  # at rest
+    for value in column[np.isfinite(column)].tolist():
+        kept.append(value)
+        while len(kept) > 3 and abs(kept[-1] - kept[-2]) >= abs(kept[-2] - kept[-3]):
+            del kept[-3:-1]
+        while len(kept) > 2 and (kept[-1] - kept[-2]) * (kept[-2] - kept[-3]) >= 0:
+            del kept[-2]
+    return kept
+
+
+_LOADED = 3.0  # times the scatter of single samples: pads below are taken as idle, and their frames not searched
+
+
+def _places(calibration: Calibration, frames, pressures, image) -> Places | None:
+    """Where the frames in which some pad is loaded are touched; of the rest, nowhere."""
+    if calibration.locator is None:
+        return None
+    plain, _, _ = calibration.pad_forces(pressures)
+    loaded = np.any(plain > _LOADED * calibration.hybrid.scatter, axis=1, keepdims=True)
+    return calibration.locate(np.where(loaded, frames, 0.0), image)
 
 
 def apply(
@@ -103,17 +151,17 @@ def apply(
         writer.add_rows("pad_force_se", (pads,), "N", "standard error of a pad's force", "f8")
         writer.add_rows("pad_valid", (pads,), "1", "pressure in the calibrated range", "u1")
         writer.add_rows("shape_valid", (pads,), "1", "1: shape from the image; 0: even", "u1")
+        before = np.zeros((1, pads))
         for first in progress(range(0, len(eit), _BLOCK)):
             span = slice(first, min(first + _BLOCK, len(eit)))
             time, frames = _corrected(eit, span, filters["eit"])
             around = _around(pressure, time)
             pressure_time, values = _corrected(pressure, around, filters["pressure"])
             at_frames = resample(pressure_time, values, time)
-            found = force_map(
-                calibration,
-                frames - levels["eit"](time),
-                at_frames - levels["pressure"](time),
-            )
+            pressed = at_frames - levels["pressure"](time)
+            found = force_map(calibration, frames - levels["eit"](time), pressed, before=before)
+            if calibration.curves.curve.path:
+                before = remembered(np.concatenate([before, pressed]))
             for name, rows in (
                 ("time", time),
                 ("force", found.map.force),

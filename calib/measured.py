@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxeit as je
 
-from .corrections import AbstractBaseline, AbstractCorrection, LowPass, TwoSided, sample_rate
+from .corrections import AbstractBaseline, AbstractCorrection, Estimate, LowPass, TwoSided, sample_rate
 from .presses import (
     Cutting,
     PressSamples,
@@ -66,6 +66,7 @@ class Measured:
     | dv: change of the readings over the hold                         | (presses, readings)| V   |
     | pressure: change of the pads' gage pressure over the hold        | (presses, pads)   | Pa   |
     | force over the hold, from the load cell                          | (presses,)        | N    |
+    | noise: standard deviation of a single frame, at rest or held     | (readings,)       | V    |
     | channels: readings that were finite in every press               | (readings,)       |      |
     | samples: pressure and force all along the presses                |                   |      |
     | presses: all of them, with the reasons of those set aside        |                   |      |
@@ -78,6 +79,7 @@ class Measured:
     dv: np.ndarray
     pressure: np.ndarray
     force: np.ndarray
+    noise: np.ndarray
     channels: np.ndarray
     samples: PressSamples
     presses: PressTable
@@ -99,10 +101,11 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
     windows = press_windows(presses, processing.cutting, recording_end(streams.values()))
     presses = check_overlap(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
-    means = {
-        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0]).change.mean
+    changes = {
+        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0]).change
         for name, stream in streams.items()
     }
+    means = {name: change.mean for name, change in changes.items()}
     channels, lost = _finite_channels(means["eit"], presses.accepted)
     _require_pads(session, skin, means["pressure"][presses.accepted])
     force = means["force"][:, 0]
@@ -126,6 +129,7 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
         dv=means["eit"][kept],
         pressure=means["pressure"][kept],
         force=force[kept],
+        noise=_frame_noise(changes["eit"], kept),
         channels=channels,
         samples=samples,
         presses=presses,
@@ -194,6 +198,15 @@ def _finite_channels(dv: np.ndarray, accepted: np.ndarray) -> tuple[np.ndarray, 
         return good, []
     some = ", ".join(map(str, lost[:8])) + (", ..." if len(lost) > 8 else "")
     return good, [f"eit channels without a finite value in every press, left out: {some}"]
+
+
+def _frame_noise(change: Estimate, kept: np.ndarray) -> np.ndarray:
+    """Noise of one frame from the standard errors of the means over the holds; the median where a channel has none."""
+    each = (change.standard_error * np.sqrt(change.count))[kept]
+    good = np.isfinite(each) & (each > 0)
+    overall = np.median(each[good]) if good.any() else np.nanmax(np.abs(change.mean[kept])) * 1e-6
+    noise = np.array([np.median(e[g]) if g.any() else overall for e, g in zip(each.T, good.T, strict=True)])
+    return np.maximum(noise, 0.1 * overall)
 
 
 def _require_pads(session: Session, skin: je.Skin, pressure: np.ndarray) -> None:

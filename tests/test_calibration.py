@@ -4,12 +4,20 @@ from dataclasses import replace
 from datetime import datetime
 
 import h5py
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import calib
 import jaxeit as je
-from calib.bench import Bench, Timing, _voltages, simulate
+from calib.bench import Bench, Timing, simulate
+from calib.calibration import _to_archive
+from calib.curves import play
+from calib.evaluation import render_table
+from calib.locators import locator_from_numbers, locator_numbers
+from calib.maps import remembered
+from calib.measured import measure
 
 SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
 EFFECTS = (
@@ -83,6 +91,81 @@ def test_every_curve_survives_the_file(grid, folder, curve):
         np.testing.assert_array_equal(mine, theirs)
 
 
+@pytest.fixture(scope="session")
+def located(grid):
+    """With a correction by location, the place from the image."""
+    with calib.open_session(grid) as session:
+        return calib.calibrate(
+            [session],
+            location=calib.Bilinear(nodes=2, shared=True),
+            locator=calib.ImageCentroid("half"),
+            basis=je.Pixels(20),
+            fidelity=je.Fidelity.draft(),
+        )
+
+
+def test_a_correction_by_location_is_kept_in_the_file_beside_the_papers_recipe(located, calibration, folder):
+    located.save(folder / "located.h5")
+    loaded = calib.load_calibration(folder / "located.h5")
+    assert loaded.provenance["location"] == "bilinear"
+    summary = loaded.evaluation.summary()
+    assert summary == located.evaluation.summary()
+    for method in ("eit", "hybrid", "calibrated", "true_place"):
+        assert f"cv_{method}_ddof1" in summary
+    plain = calibration.evaluation.summary()
+    assert summary["cv_hybrid_ddof1"] == pytest.approx(plain["cv_hybrid_ddof1"], rel=1e-6)
+    assert summary["force_eit_rmse"] > summary["force_rmse"]
+    text = render_table(loaded.evaluation, "t")
+    assert all(word in text for word in ("EIT only", "calibrated (linear, bilinear)", "true place", "fitted"))
+    dv = np.random.default_rng(0).normal(size=(3, 550)) * 1e-4
+    pressures = np.array([[500.0, 0, 0, 100.0], [0, 0, 0, 0], [2000.0, 1, 2, 3]])
+    first, second = (calib.force_map(c, dv, pressures) for c in (located, loaded))
+    np.testing.assert_array_equal(first.map.force, second.map.force)
+    np.testing.assert_array_equal(first.standard_error, second.standard_error)
+    np.testing.assert_allclose(np.asarray(first.map.force).sum(1), first.force.sum(1), rtol=1e-12)
+
+
+def test_a_calibration_of_before_is_still_read(calibration, folder):
+    """Written without the arrays that came later."""
+    attrs, arrays = _to_archive(calibration)
+    old = {k: v for k, v in arrays.items() if not k.startswith(("baseline/", "presses/force_"))}
+    attrs = {k: v for k, v in attrs.items() if k not in ("image_gain", "provenance_location", "evaluation_recipe")}
+    calib.write_archive(folder / "old.h5", "skin-calibration", attrs, old)
+    loaded = calib.load_calibration(folder / "old.h5")
+    assert loaded.field is None
+    assert loaded.evaluation.summary()["force_rmse"] == calibration.evaluation.summary()["force_rmse"]
+    del arrays["pads/parameters"]
+    calib.write_archive(folder / "old.h5", "skin-calibration", attrs, arrays)
+    with pytest.raises(calib.SessionError, match="pads/parameters: missing"):
+        calib.load_calibration(folder / "old.h5")
+
+
+@pytest.mark.slow
+def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, calibration, grid):
+    locator = calib.FittedContact(columns=21, widths=(0.008, 0.03))
+    made = locator.prepare(model, np.full(550, 1e-5), np.ones(550, bool))
+    again = locator_from_numbers(locator_numbers(made), model.dtype)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (made, again)), strict=True))
+    with calib.open_session(grid) as session:
+        found = measure(session, calibration.skin)
+    places = calib.locate(again.single(), found.dv, calibration.recon, calibration.masks)
+    error = np.linalg.norm(np.asarray(places.position)[:, 0] - found.position, axis=1)
+    assert error.mean() < 0.006  # a draft mesh, and a table to match
+
+
+def test_what_a_curve_remembers_of_the_past_is_enough():
+    rng = np.random.default_rng(0)
+    past = np.cumsum(rng.normal(0, 1, (500, 2)), 0)
+    now = past[-1] + np.cumsum(rng.normal(0, 1, (40, 2)), 0)
+    few = remembered(past)
+    assert len(few) < 60
+    widths = jnp.array([0.5, 2.0, 8.0, 20.0])
+    for pad in range(2):
+        whole = play(jnp.asarray(np.r_[past[:, pad], now[:, pad]]), widths)[500:]
+        short = play(jnp.asarray(np.r_[few[:, pad], now[:, pad]]), widths)[len(few) :]
+        np.testing.assert_allclose(short, whole, atol=1e-12)
+
+
 def test_force_maps_sum_to_the_pads_and_know_their_limits(calibration):
     pressures = np.array([[1000.0, 0.0, 0.0, 500.0], [9000.0, 0.0, 0.0, 0.0]])
     found = calib.force_map(calibration, np.zeros((2, 550)), pressures)
@@ -132,18 +215,6 @@ def test_a_failed_apply_leaves_no_file(calibration, grid, folder):
         calib.apply(calibration, session, out, progress=break_off)
     assert not out.exists()
     assert not list(folder.glob("*never*"))
-
-
-@pytest.mark.parametrize(("width", "error"), [(0.012, 5e-6), (0.008, 1e-4)])
-def test_loads_between_the_solved_ones_are_interpolated(skin, width, error):
-    """What `calib.bench` says of its nine loads, far below the noise of any of its frames."""
-    scene = je.Scene(skin, (je.LoadSpreading(width=width), je.ContactPiezoresistance()))
-    model = je.discretise(scene, je.Fidelity.draft(solver=je.Dense()))
-    spread = je.load_spread(model, np.array([0.07, 0.06]), 0.02)
-    load = np.linspace(0, 1, 12)
-    exact = np.array([je.forward(model, je.conductivity(model, 20.0 * f * spread)) for f in load])
-    found = _voltages(model, spread, 20.0, load)
-    assert np.abs(found - exact).max() < error * np.abs(exact - exact[0]).max()
 
 
 def test_the_same_bench_makes_the_same_file(skin, folder):

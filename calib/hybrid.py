@@ -1,0 +1,277 @@
+"""The response of all pads together: a curve for each, times a field of gain over the place pressed.
+
+The two are fitted in turn. Given the field, each curve is the robust fit of `fit_curves`, untouched, to forces over
+gains; given the curves, the field is a linear fit in log force with evidence and covariance in closed form
+(`fit_field`). As the field's mean over the presses of a pad is zero, neither moves the other's level: the covariances
+of the two are each complete, and a few turns agree to well within the noise. One joint least-squares problem would
+give the same numbers but neither the evidence nor the sandwich over places.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .curves import AbstractCurve, curve_name
+from .fit import AbstractLoss, FitResult, FittedCurve, bucket, fit_curves, predict_pads
+from .location import AbstractField, FittedField, Geometry, Places, field_name, fit_field, log_gain
+from .response import assign_folds
+
+_TURNS = 2
+_FAINT = 0.05  # of the largest force: presses below weigh less, as their noise is not proportional
+
+
+@dataclass(frozen=True, eq=False)
+class PressData:
+    """Presses of one or more sessions: their samples, and the means over their holds.
+
+    | field           | meaning                                                      | shape           | unit |
+    |-----------------|--------------------------------------------------------------|-----------------|------|
+    | sample_pressure | along the presses                                            | (pads, n)       | Pa   |
+    | sample_force    |                                                              | (n,)            | N    |
+    | sample_press    | row of the sample's press                                    | (n,)            |      |
+    | mask            | samples from which a pad's curve is fitted                   | (pads, n)       |      |
+    | pressure        | over the hold                                                | (presses, pads) | Pa   |
+    | force           |                                                              | (presses,)      | N    |
+    | place           | number of the place pressed                                  | (presses,)      |      |
+    | reach           | lowest and highest corner of the box of places               | (2, 2)          | m    |
+    """
+
+    sample_pressure: np.ndarray
+    sample_force: np.ndarray
+    sample_press: np.ndarray
+    mask: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+    place: np.ndarray
+    reach: np.ndarray
+
+    @property
+    def sample_place(self) -> np.ndarray:
+        """Number of the place of each sample, (n,)."""
+        return self.place[self.sample_press]
+
+
+@dataclass(frozen=True, eq=False)
+class Hybrid:
+    """The fitted curves, and the field they are multiplied with (None: no correction by location)."""
+
+    curves: FittedCurve
+    field: FittedField | None = None
+
+    def pad_forces(self, pressures, places: Places | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Force on each pad, its standard error (N) and validity, (n, pads), from pressures (n, pads) Pa.
+
+        Without places, a field says nothing but how uncertain that leaves the force. Not valid: beyond the pressures
+        fitted, or a pad whose fit failed.
+        """
+        p = jnp.asarray(pressures, self.curves.parameters.dtype)
+        predicted = predict_pads(self.curves, p.T)
+        force, error, valid = (np.asarray(part).T for part in predicted)
+        if self.field is None:
+            return force, error, valid
+        if places is None:
+            pads = self.field.geometry.pads
+            places = Places(jnp.full((len(p), 1, 2), jnp.nan, p.dtype), jnp.zeros((len(p), 1, pads), p.dtype))
+        gain = log_gain(self.field, places)
+        factor = np.exp(np.asarray(gain.mean))
+        return force * factor, factor * np.sqrt(error**2 + force**2 * np.asarray(gain.variance)), valid
+
+    @property
+    def scatter(self) -> np.ndarray:
+        """Root mean square distance of single samples from each pad's response, (pads,) N."""
+        return np.asarray(self.curves.residual_rms)
+
+
+def fit_hybrid(
+    curve: AbstractCurve,
+    field: AbstractField | None,
+    data: PressData,
+    geometry: Geometry,
+    places: Places | None,
+    loss: AbstractLoss,
+    *,
+    use: np.ndarray | None = None,
+) -> Hybrid:
+    """Curves and field from the presses that `use` (presses,) marks; all by default.
+
+    Look at `curves.result` and `field.result`: nothing is raised for samples that do not determine them.
+    """
+    use = np.ones(len(data.force), bool) if use is None else use
+    hybrid = Hybrid(_curves(curve, data, np.zeros_like(data.sample_pressure), use, loss))
+    if field is None or places is None:
+        return hybrid
+    mean = np.zeros_like(data.pressure)
+    for _ in range(_TURNS):
+        fitted = _field(field, hybrid.curves, mean, data, geometry, places, use)
+        mean = np.asarray(log_gain(fitted, places).mean)
+        hybrid = Hybrid(_curves(curve, data, mean[data.sample_press].T, use, loss), fitted)
+    return hybrid
+
+
+def _curves(curve, data: PressData, gain: np.ndarray, use: np.ndarray, loss) -> FittedCurve:
+    """Each pad's curve through forces over gains, each with the noise that the division left it."""
+    return fit_curves(
+        curve,
+        data.sample_pressure,
+        data.sample_force * np.exp(-gain),
+        mask=data.mask & use[data.sample_press],
+        groups=data.sample_place,
+        sigma=np.exp(-gain),
+        loss=loss,
+    )
+
+
+_fit_field = eqx.filter_jit(fit_field)
+
+
+def _field(field, curves: FittedCurve, gain, data: PressData, geometry, places: Places, use) -> FittedField:
+    """The field that is left of the presses' log forces by the curves; `gain` is the one they were fitted with."""
+    force = np.asarray(predict_pads(curves, jnp.asarray(data.pressure.T)).force).T * np.exp(gain)
+    part = np.maximum(np.nan_to_num(force), 0)
+    total = part.sum(1)
+    use = use & (total > 0) & (data.force > 0)
+    share = part / np.where(total > 0, total, 1)[:, None]
+    log_ratio = np.log(np.where(use, data.force / np.where(use, total, 1), 1)) + (share * gain).sum(1)
+    weight = np.where(use, _weights(data.force, data.place, use), 0)
+    extra = bucket(len(use)) - len(use)  # presses without weight, so that compiled fits are reused
+    rows = [np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (log_ratio, share, weight)]
+    wide = Places(*(jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (places.position, places.weight)))
+    y, x, w = map(jnp.asarray, rows)
+    return _fit_field(field, geometry, wide, y, x, w, jnp.asarray(data.reach))
+
+
+def _weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """Places count once however often they are pressed, faint presses less."""
+    faint = _FAINT * force[use].max(initial=0)
+    weight = force**2 / (force**2 + faint**2)
+    return weight / np.maximum(np.bincount(place, use)[place], 1)
+
+
+def hold_out(
+    curve: AbstractCurve,
+    field: AbstractField | None,
+    data: PressData,
+    geometry: Geometry,
+    places: Places | None,
+    loss: AbstractLoss,
+    fold: np.ndarray,
+) -> np.ndarray:
+    """Pad forces over the hold of every press, (presses, pads) N, by fits that never saw its fold (presses,)."""
+    out = np.full(data.pressure.shape, np.nan)
+    for k in np.unique(fold):
+        held = fold == k
+        hybrid = fit_hybrid(curve, field, data, geometry, places, loss, use=~held)
+        force, _, _ = hybrid.pad_forces(data.pressure, places)
+        good = np.asarray(hybrid.curves.result) == FitResult.SUCCESS
+        out[held] = np.where(good, force, np.nan)[held]
+    return out
+
+
+class Choice(NamedTuple):
+    """A curve and a field, and in words why these (empty where there was nothing to choose from)."""
+
+    curve: AbstractCurve
+    field: AbstractField | None
+    why: str
+
+
+def choose(
+    curves: Sequence[AbstractCurve],
+    fields: Sequence[AbstractField | None],
+    data: PressData,
+    geometry: Geometry,
+    places: Places | None,
+    loss: AbstractLoss,
+    fold: np.ndarray,
+) -> Choice:
+    """The simplest field, then the simplest curve, whose held-out error is within one standard error of the least.
+
+    The error is the mean over places of the mean square over a press's samples, so that all loads of a ramp count,
+    predicted by fits that never saw the place (one-standard-error rule: Breiman et al. 1984, 3.4.3). The field is
+    chosen with the first curve; simple means few coefficients.
+    """
+
+    def best(candidates, describe, size, score) -> tuple[Any, str]:
+        if len(candidates) == 1:
+            return candidates[0], ""
+        return _within_one_error(sorted(candidates, key=size), describe, score)
+
+    def field_size(field):
+        return 0 if field is None else field.size(geometry.pads)
+
+    def judged(curve, field):
+        return place_errors(curve, field, data, geometry, places, loss, fold)
+
+    field, why = best(fields, _field_title, field_size, lambda f: judged(curves[0], f))
+    curve, more = best(curves, curve_name, lambda c: c.size, lambda c: judged(c, field))
+    return Choice(curve, field, "; ".join(filter(None, [why, more])))
+
+
+def _field_title(field: AbstractField | None) -> str:
+    return "none" if field is None else field_name(field)
+
+
+def _within_one_error(candidates: Sequence, describe, score) -> tuple[Any, str]:
+    """The first candidate whose mean error is at most the least one plus its standard error."""
+    errors = [score(candidate) for candidate in candidates]
+    means = np.array([np.mean(e) if np.isfinite(e).all() else np.inf for e in errors])
+    least = int(np.argmin(means))
+    limit = means[least] + np.std(errors[least], ddof=1) / np.sqrt(len(errors[least]))
+    chosen = int(np.argmax(means <= limit))
+    said = [f"{np.sqrt(mean):.2f}" if np.isfinite(mean) else "not determined" for mean in means]
+    table = ", ".join(f"{describe(c)} {text}" for c, text in zip(candidates, said, strict=True))
+    why = f"{describe(candidates[chosen])}, the simplest within one standard error ({np.sqrt(limit):.2f} N) of the best"
+    return candidates[chosen], f"{why}; held-out RMSE over places in N: {table}"
+
+
+def place_errors(curve, field, data: PressData, geometry, places, loss, fold: np.ndarray) -> np.ndarray:
+    """Mean square error of the total force at each place, (places,) N^2, by fits that never saw its fold."""
+    total = np.full(data.sample_force.shape, np.nan)
+    for k in np.unique(fold):
+        hybrid = fit_hybrid(curve, field, data, geometry, places, loss, use=fold != k)
+        held = fold[data.sample_press] == k
+        total[held] = _sample_forces(hybrid, data, places).sum(0)[held]
+    square = (total - data.sample_force) ** 2
+    square = np.where(np.isfinite(data.sample_force) & np.isfinite(data.sample_pressure).all(0), square, 0)
+    count = np.bincount(data.sample_place, minlength=data.place.max() + 1)
+    return np.bincount(data.sample_place, square, len(count)) / np.maximum(count, 1)
+
+
+def _sample_forces(hybrid: Hybrid, data: PressData, places: Places | None) -> np.ndarray:
+    """Pad forces along the presses, (pads, n) N; NaN from pads whose fit failed."""
+    force = np.asarray(_curve_forces(hybrid.curves, jnp.asarray(data.sample_pressure)))
+    force = np.where((np.asarray(hybrid.curves.result) == FitResult.SUCCESS)[:, None], force, np.nan)
+    if hybrid.field is None or places is None:
+        return force
+    return force * np.exp(np.asarray(log_gain(hybrid.field, places).mean)[data.sample_press].T)
+
+
+@eqx.filter_jit
+def _curve_forces(curves: FittedCurve, pressure):
+    return eqx.filter_vmap(lambda fitted, p: fitted.curve(fitted.parameters, p))(curves, pressure)
+
+
+def thinned(
+    press: np.ndarray, pressure: np.ndarray, force: np.ndarray, most: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means of at most `most` equal stretches of each press: press (n,), pressure (n, pads) and force (n,), in order.
+
+    A stretch with a missing sample is missing.
+    """
+    starts = np.flatnonzero(np.r_[True, press[1:] != press[:-1]]) if len(press) else np.empty(0, int)
+    ends = np.append(starts[1:], len(press))
+    cuts = [np.linspace(a, b, min(most, b - a) + 1).astype(int)[:-1] for a, b in zip(starts, ends, strict=True)]
+    first = np.concatenate([*cuts, np.empty(0, int)]).astype(int)
+    count = np.diff(np.append(first, len(press)))
+    if not len(first):
+        return press, pressure, force
+    return press[first], np.add.reduceat(pressure, first) / count[:, None], np.add.reduceat(force, first) / count
+
+
+def folds_by_place(place: np.ndarray, folds: int) -> np.ndarray:
+    """(presses,) fold of each press; presses at one place stay together."""
+    return assign_folds(place, min(folds, len(np.unique(place))))

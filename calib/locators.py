@@ -1,0 +1,175 @@
+"""Where a frame is touched, from its readings alone: choices of estimator, and what they become once prepared.
+
+A choice (`FittedContact`, `ImageCentroid`) is prepared with a model into a locator that needs neither mesh nor solver.
+"""
+
+import abc
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_type_hints
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import jaxeit as je
+
+from .location import Places, single_places
+
+
+class AbstractLocator(eqx.Module):
+    """Frames to `Places`."""
+
+    @abc.abstractmethod
+    def __call__(self, dv: Array, image: Array, recon: je.Reconstructor, masks: je.PadMasks) -> Places:
+        """Places of difference frames (n, readings) V with their images (n, pixels) S."""
+
+    def single(self) -> "AbstractLocator":
+        """The same for frames that are known to hold one contact: presses of a bench."""
+        return self
+
+
+class CentroidLocator(AbstractLocator):
+    """One contact a frame, where an estimator of `jaxeit.ESTIMATORS` puts it."""
+
+    estimator: str = eqx.field(static=True)
+
+    def __call__(self, dv, image, recon, masks):
+        return single_places(je.ESTIMATORS[self.estimator](image, recon), masks.weights.shape[0])
+
+
+class ContactLocator(AbstractLocator):
+    """Contacts fitted to the readings; a pad's contacts weigh by their strength and by how much of them lies on it."""
+
+    finder: je.ContactFinder
+
+    def single(self):
+        return ContactLocator(replace(self.finder, most=1))
+
+    def __call__(self, dv, image, recon, masks):
+        found = self.finder(dv)
+        position = jnp.where(found.present[..., None], found.position, jnp.nan)
+        if self.finder.most == 1:
+            return single_places(position[:, 0], masks.weights.shape[0])
+        lies = jax.vmap(lambda x, s: _lies(x, s, recon, masks))(found.position, found.width)
+        share = jnp.where(found.present, found.strength, 0)[..., None] * lies
+        return Places(position, share / jnp.maximum(share.sum(1, keepdims=True), jnp.finfo(share.dtype).tiny))
+
+
+def _lies(position, width, recon, masks) -> Float[Array, "K pads"]:
+    """How much of each bump lies on each pad."""
+    square = jnp.sum((position[:, None] - recon.centres) ** 2, -1)
+    bump = jnp.exp(-0.5 * square / jnp.where(width > 0, width, 1)[:, None] ** 2)
+    return bump @ (masks.weights * masks.areas).T / jnp.maximum(bump @ masks.areas, jnp.finfo(bump.dtype).tiny)[:, None]
+
+
+@eqx.filter_jit
+def _located(locator, dv, image, recon, masks) -> Places:
+    return locator(dv, image, recon, masks)
+
+
+class AbstractLocatorChoice(abc.ABC):
+    """How the place of a contact is to be estimated."""
+
+    @abc.abstractmethod
+    def prepare(self, model: je.Model, noise: np.ndarray, channels: np.ndarray) -> AbstractLocator:
+        """The locator for this model; `noise` (readings,) V of a frame, `channels` that are used."""
+
+
+@dataclass(frozen=True)
+class ImageCentroid(AbstractLocatorChoice):
+    """A named estimator of the image: quick to prepare, 5 mm off on a simulated testbed with "half".
+
+    Raises: `ValueError` for a name that `jaxeit.ESTIMATORS` has not.
+    """
+
+    estimator: str = "half"
+
+    def __post_init__(self) -> None:
+        if self.estimator not in je.ESTIMATORS:
+            raise ValueError(f"no estimator {self.estimator!r}; there are: {', '.join(je.ESTIMATORS)}")
+
+    def prepare(self, model, noise, channels):
+        return CentroidLocator(self.estimator)
+
+
+@dataclass(frozen=True)
+class FittedContact(AbstractLocatorChoice):
+    """Contacts fitted through the forward map (`jaxeit.prepare_contacts`): 2 mm off on a simulated testbed.
+
+    | meaning                                                              | default    | unit |
+    |----------------------------------------------------------------------|------------|------|
+    | most: contacts looked for in use; presses of a bench hold one        | 2          |      |
+    | columns: nodes of the table along x                                  | 31         |      |
+    | widths: smallest and largest standard deviation of a contact         | 0.006, 0.03 | m   |
+    """
+
+    most: int = 2
+    columns: int = 31
+    widths: tuple[float, float] = (0.006, 0.03)
+
+    def prepare(self, model, noise, channels):
+        finder = je.prepare_contacts(
+            model, noise=noise, most=self.most, columns=self.columns, widths=self.widths, channels=channels
+        )
+        return ContactLocator(jax.tree.map(_rounded, finder))
+
+
+_LARGE = 1 << 18  # numbers from which an array is rounded
+
+
+def _rounded(leaf):
+    """Large tables to single precision, as they are stored: a loaded calibration gives the same numbers."""
+    single = leaf.ndim > 0 and leaf.size >= _LARGE and jnp.issubdtype(leaf.dtype, jnp.floating)
+    return leaf.astype(jnp.float32).astype(leaf.dtype) if single else leaf
+
+
+def locate(
+    locator: AbstractLocator, dv: np.ndarray, recon: je.Reconstructor, masks: je.PadMasks, image: Array | None = None
+) -> Places:
+    """`Places` of difference frames (n, readings) V; `image`, if it is there already, is not made again."""
+    frames = jnp.asarray(dv, recon.factor.dtype)
+    return _located(locator, frames, recon(frames) if image is None else image, recon, masks)
+
+
+# --- as numbers, for the calibration file ----------------------------------------------------------------------------
+
+
+def locator_numbers(locator: AbstractLocator) -> dict[str, np.ndarray]:
+    """Every array and setting of a locator by a path of names."""
+    if isinstance(locator, CentroidLocator):
+        return {"estimator": np.array([locator.estimator])}
+    return dict(_numbers(locator))
+
+
+def _numbers(module: eqx.Module, at: str = ""):
+    for part in fields(module):
+        value = getattr(module, part.name)
+        if isinstance(value, eqx.Module):
+            yield from _numbers(value, f"{at}{part.name}-")
+        else:
+            array = np.asarray(value)
+            large = array.dtype == np.float64 and array.size >= _LARGE
+            yield at + part.name, array.astype(np.float32) if large else array
+
+
+def locator_from_numbers(numbers: dict[str, np.ndarray], dtype: Any) -> AbstractLocator:
+    """The locator that `locator_numbers` described; raises KeyError for what is missing."""
+    if "estimator" in numbers:
+        return CentroidLocator(str(numbers["estimator"][0]))
+    return _module(ContactLocator, numbers, "", dtype)
+
+
+def _module(kind: type, numbers: dict[str, np.ndarray], at: str, dtype: Any):
+    hints, parts = get_type_hints(kind), {}
+    for part in fields(kind):
+        hint = hints[part.name]
+        if isinstance(hint, type) and issubclass(hint, eqx.Module):
+            parts[part.name] = _module(hint, numbers, f"{at}{part.name}-", dtype)
+        elif hint is int:
+            parts[part.name] = int(numbers[at + part.name])
+        else:
+            array = numbers[at + part.name]
+            parts[part.name] = jnp.asarray(array, dtype if array.dtype.kind == "f" else None)
+    return kind(**parts)
