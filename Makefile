@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo
 
-.PHONY: demo test lint clean
+.PHONY: demo test slow lint clean
 
 # One stamp per set of extras: pip runs again only when pyproject.toml changes.
 $(VENV)/.report: pyproject.toml
@@ -18,11 +18,14 @@ $(VENV)/.dev: pyproject.toml
 	touch $@ $(VENV)/.report
 
 demo: $(VENV)/.report
-	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 --test data/sessions/testbed_presses.h5 \
+	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 --location edge --test data/sessions/testbed_presses.h5 \
 	    -o $(OUT)/calibration.h5 --report $(OUT)/report.html
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m "not slow"
+
+slow: $(VENV)/.dev
+	$(BIN)/python -m pytest -m slow
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -8,6 +8,7 @@ variation.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,26 @@ METHODS = {
 }
 """Ways to a total force, and what they are called: the image's integral alone, the paper's recipe (one number per
 pad), the calibration itself, and the same with the true place put in for the estimated one, for comparison."""
+
+
+class Worth(NamedTuple):
+    """One way to a total force: its evenness with the standard error, and its errors; NaN where not known.
+
+    | meaning                                                              | unit |
+    |----------------------------------------------------------------------|------|
+    | label: the method in words, the calibration's with its recipe        |      |
+    | cv, cv_error: coefficient of variation of the sensitivity, ddof 1    | 1    |
+    | rmse, mean_absolute, worst                                           | N    |
+    | percent: rmse of the largest force                                   | %    |
+    """
+
+    label: str
+    cv: float
+    cv_error: float
+    rmse: float
+    percent: float
+    mean_absolute: float
+    worst: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +122,18 @@ class Evaluation:
         for name, total in self.others.items():
             out |= {f"force_{name}_{k}": v for k, v in self._errors(total).items()}
         return out
+
+    def by_method(self) -> list[Worth]:
+        """What each way to a total force is worth: EIT only, then as in `forces`."""
+        s = self.summary()
+        return [self._worth(name, s) for name in dict.fromkeys(["eit", *self.forces])]
+
+    def _worth(self, name: str, s: Mapping[str, float]) -> Worth:
+        recipe = f" ({self.recipe})" if name == CALIBRATED and self.recipe else ""
+        mark = "" if name == CALIBRATED else f"{name}_"
+        keys = [f"cv_{name}_ddof1", f"cv_{name}_se"]
+        keys += [f"force_{mark}{k}" for k in ("rmse", "rmse_percent_full_scale", "mean_absolute", "worst")]
+        return Worth(METHODS[name] + recipe, *(float(s.get(key, np.nan)) for key in keys))
 
     def _errors(self, total: np.ndarray) -> dict[str, float]:
         error = total - self.force
@@ -213,20 +246,16 @@ def render_table(evaluation: Evaluation, title: str) -> str:
             1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
         lines.append(f"    {name:<16}{mean:12.1f}  ({error:5.2f}) {median:7.1f} {p95:7.1f} {inward:13.1f}")
-    lines += ["", *_force_lines(evaluation, s)]
+    lines += ["", *_force_lines(evaluation)]
     return "\n".join(lines + [f"  note: {note}" for note in evaluation.notes])
 
 
-def _force_lines(evaluation: Evaluation, s: Mapping[str, float]) -> list[str]:
+def _force_lines(evaluation: Evaluation) -> list[str]:
     """One row per method: evenness, and errors of the total force."""
     out = ["  total force                       CV    (+- SE)   RMSE, N  % of largest  mean abs., N  worst, N"]
-    for name in dict.fromkeys(["eit", *evaluation.forces]):
-        label = METHODS[name] + (f" ({evaluation.recipe})" if name == CALIBRATED and evaluation.recipe else "")
-        spread = f"{s[f'cv_{name}_ddof1']:6.3f}  ({s[f'cv_{name}_se']:.3f})" if f"cv_{name}_ddof1" in s else " " * 15
-        mark = "" if name == CALIBRATED else f"{name}_"
-        numbers = [s.get(f"force_{mark}{k}") for k in ("rmse", "rmse_percent_full_scale", "mean_absolute", "worst")]
-        errors = "".join(
-            f"{'' if n is None else format(n, '.2f'):>{w}}" for n, w in zip(numbers, (10, 14, 14, 10), strict=True)
-        )
-        out.append(f"    {label:<28}{spread}{errors}")
+    for label, cv, error, *errors in evaluation.by_method():
+        spread = " " * 15 if np.isnan(cv) else f"{cv:6.3f}  ({error:.3f})"
+        shown = ["" if np.isnan(e) else f"{e:.2f}" for e in errors]
+        numbers = "".join(f"{text:>{width}}" for text, width in zip(shown, (10, 14, 14, 10), strict=True))
+        out.append(f"    {label:<28}{spread}{numbers}")
     return out

@@ -1,10 +1,10 @@
-"""The pictures of a calibration: the paper's figures 5 and 6, and the pads' curves with their residuals.
+"""The pictures of a calibration: the paper's figures 5 and 6, the pads' curves with their residuals, and their gain.
 
 Lengths are drawn in mm, pressures in kPa, forces in N. Nothing here touches matplotlib's global state.
 """
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -14,13 +14,15 @@ import numpy as np
 import jaxeit as je
 
 from .calibration import Calibration
-from .evaluation import Evaluation
+from .evaluation import CALIBRATED, Evaluation
+from .location import FittedField, log_gain, single_places
 from .presses import dominant_pad
 
 try:  # an extra: without it everything but the figures works
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.figure import Figure
+    from matplotlib.patches import Polygon
 except ImportError:
     Figure = None  # type: ignore[assignment,misc]
 
@@ -36,9 +38,10 @@ ESTIMATOR_MEANING: Mapping[str, str] = MappingProxyType(
         "half": "centroid of the pixels at or above 1/2 of the maximum",
         "quarter": "centroid of the pixels at or above 1/4 of the maximum",
         "positive": "value-weighted centroid of the positive part",
+        "fitted": "place that the correction by location goes by",
     }
 )
-"""What each named estimator of `jaxeit.ESTIMATORS` takes as the position, for a person."""
+"""What each named estimator of an evaluation takes as the position, for a person."""
 
 
 class ReportError(ValueError):
@@ -58,34 +61,39 @@ def png(figure: "Figure") -> bytes:
     return buffer.getvalue()
 
 
-def localisation_figure(
-    evaluation: Evaluation, skin: je.Skin, estimator: str = "quarter", *, simulated: bool = False
-) -> "Figure":
+def localisation_figure(evaluation: Evaluation, skin: je.Skin, *estimators: str, simulated: bool = False) -> "Figure":
     """The paper's figure 5: true positions (black), estimated ones (red), a line between.
 
     Args:
         evaluation: of the presses.
         skin: for its outline, electrodes (green) and pads.
-        estimator: one of ``evaluation.estimated``.
+        estimators: of ``evaluation.estimated``, each in a panel of its own; left out, "quarter".
         simulated: say so in the picture.
 
     Raises:
         ReportError: no such estimator, or matplotlib is not installed.
     """
-    if estimator not in evaluation.estimated:
+    estimators = estimators or ("quarter",)
+    for unknown in set(estimators) - set(evaluation.estimated):
         known = ", ".join(evaluation.estimated) or "none"
-        raise ReportError(f"no estimator {estimator!r} in this evaluation; there are: {known}")
-    figure = _figure(6.6, 7.2, simulated)
-    axes = figure.add_subplot()
+        raise ReportError(f"no estimator {unknown!r} in this evaluation; there are: {known}")
+    figure = _figure(*((6.6, 7.2) if len(estimators) == 1 else (9.6, 6.2)), simulated)
+    panels = figure.subplots(1, len(estimators), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, estimator in zip(panels, estimators, strict=True):
+        _localisation_panel(axes, evaluation, skin, estimator)
+    _one_row(panels)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def _localisation_panel(axes: Any, evaluation: Evaluation, skin: je.Skin, estimator: str) -> None:
     _sheet(axes, skin)
     _electrodes(axes, skin)
     true, estimated = evaluation.position * _MM, evaluation.estimated[estimator] * _MM
     axes.add_collection(LineCollection(list(np.stack([true, estimated], 1)), colors=_GREY, linewidths=0.8))
     axes.plot(*true.T, "o", ms=3.2, color="black", label="true", zorder=3)
     axes.plot(*estimated.T, "o", ms=3.2, color=_RED, label="estimated", zorder=4)
-    axes.set_title(_localisation_title(evaluation, estimator), fontsize=10.5)
-    _legend_below(axes)
-    return figure
+    axes.set_title(_localisation_title(evaluation, estimator), fontsize=10)
 
 
 def _localisation_title(evaluation: Evaluation, estimator: str) -> str:
@@ -96,38 +104,52 @@ def _localisation_title(evaluation: Evaluation, estimator: str) -> str:
     lost = f", {np.count_nonzero(~found)} not found" if not found.all() else ""
     meaning = ESTIMATOR_MEANING.get(estimator, "")
     return f"Mean localisation error {mean} ({len(error)} presses{lost})\nestimator {_plain(estimator)}" + (
-        f": {meaning}" if meaning else ""
+        f":\n{meaning}" if meaning else ""
     )
 
 
 def sensitivity_figure(evaluation: Evaluation, skin: je.Skin, *, simulated: bool = False) -> "Figure":
     """The paper's figure 6: sensitivity over its mean at every place, EIT only and hybrid.
 
-    Both maps have one colour scale, symmetric about 1.
+    The calibration itself has a third panel where it is more than the paper's recipe. All maps have one colour scale,
+    symmetric about 1.
 
     Raises:
         ReportError: matplotlib is not installed.
     """
-    figure = _figure(9.6, 5.4, simulated)
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    maps = sensitivity_maps(evaluation)
+    figure = _figure(9.6, 5.4 if len(maps) == 2 else 4.0, simulated)
+    panels = figure.subplots(1, len(maps), sharex=True, sharey=True)
     summary = evaluation.summary()
-    maps = {
-        "eit": evaluation.sensitivity_eit,
-        "hybrid": evaluation.sensitivity_hybrid / evaluation.sensitivity_hybrid.mean(),
-    }
     reach = _reach(np.concatenate(list(maps.values())) - 1)
     for axes, (name, values) in zip(panels, maps.items(), strict=True):
         _sheet(axes, skin)
         drawn = _value_map(axes, evaluation.position, values, 1 - reach, 1 + reach, "RdBu_r")
-        axes.set_title(_sensitivity_title(name, summary), fontsize=10.5)
-    panels[1].set_ylabel("")
+        axes.set_title(_sensitivity_title(name, summary), fontsize=10)
+    _one_row(panels)
     bar = figure.colorbar(drawn, ax=panels, shrink=0.8, extend="both", pad=0.02)
     bar.set_label("sensitivity / its mean")
     return figure
 
 
+def sensitivity_maps(evaluation: Evaluation) -> dict[str, np.ndarray]:
+    """What figure 6 shows by method, (presses,) each over its mean."""
+    maps = {"eit": evaluation.sensitivity_eit, "hybrid": evaluation.sensitivity_hybrid}
+    calibrated = evaluation.sensitivity(CALIBRATED)
+    if not np.array_equal(calibrated, maps["hybrid"]):
+        maps[CALIBRATED] = calibrated
+    return {name: values / values.mean() for name, values in maps.items()}
+
+
+_SENSITIVITY_TITLE = {
+    "eit": "EIT only: image sum / force",
+    "hybrid": "Hybrid: estimated / true force",
+    CALIBRATED: "Calibrated: estimated / true force",
+}
+
+
 def _sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
-    label = {"eit": "EIT only: image sum / force", "hybrid": "Hybrid: estimated / true force"}[name]
+    label = _SENSITIVITY_TITLE[name]
     if f"cv_{name}_ddof1" not in summary:
         return f"{label}\nCV needs two presses or more"
     cv, error = summary[f"cv_{name}_ddof1"], summary[f"cv_{name}_se"]
@@ -135,10 +157,10 @@ def _sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
 
 
 def curves_figure(calibration: Calibration, evaluations: Mapping[str, Evaluation] = MappingProxyType({})) -> "Figure":
-    """Each pad's curve and 95 % band with the presses it carried; residuals by place and by force.
+    """Each pad's curve and 95 % band with the presses it carried; residuals by place, by force and over time.
 
     Residuals are estimated minus true force of presses that the fit had not seen; those of other
-    sessions (``evaluations``, by name) join the last panel.
+    sessions (``evaluations``, by name) join the last two panels. Time is the number of the press.
 
     Raises:
         ReportError: matplotlib is not installed.
@@ -146,14 +168,21 @@ def curves_figure(calibration: Calibration, evaluations: Mapping[str, Evaluation
     pads = len(calibration.skin.pads)
     columns = min(max(pads, 1), 4)
     rows = -(-pads // columns)
-    figure: Any = _figure(9.6, 2.9 * rows + 4.4, calibration.simulated)
-    top, bottom = figure.subfigures(2, 1, height_ratios=[2.9 * rows, 4.4], hspace=0.04)
+    figure: Any = _figure(9.6, 2.9 * rows + 5.2, calibration.simulated)
+    top, bottom = figure.subfigures(2, 1, height_ratios=[2.9 * rows, 5.2], hspace=0.04)
     if pads:
         _curve_panels(top, calibration, rows, columns)
-    place, force = bottom.subplots(1, 2, width_ratios=[1.15, 1])
+    panels = bottom.subplot_mosaic([["place", "force"], ["place", "order"]], width_ratios=[1.15, 1])
     figure.get_layout_engine().set(w_pad=0.09)
-    _residual_map(bottom, place, calibration)
-    _residuals_by_force(force, calibration.evaluation, evaluations)
+    _residual_map(bottom, panels["place"], calibration)
+    _residuals_by(panels["force"], lambda found: found.force, calibration.evaluation, evaluations)
+    panels["force"].set(xlabel="true force, N", xlim=(0, None))
+    panels["force"].set_title("Force error by force", fontsize=10)
+    _residuals_by(panels["order"], lambda found: np.arange(len(found.force)), calibration.evaluation, evaluations)
+    panels["order"].set(xlabel="number of the press, in the order recorded")
+    panels["order"].set_title("Force error over time", fontsize=10)
+    if evaluations:
+        panels["force"].legend(fontsize=8, loc="best")
     return figure
 
 
@@ -197,13 +226,16 @@ def _residual_map(figure: Any, axes: Any, calibration: Calibration) -> None:
     position = calibration.evaluation.position
     drawn = _value_map(axes, position, residual, -reach, reach, "RdBu_r")
     figure.colorbar(drawn, ax=axes, shrink=0.85, extend="both").set_label("estimated − true force, N")
-    axes.set_title("Force error by place", fontsize=10.5)
+    axes.set_title("Force error by place", fontsize=10)
 
 
-def _residuals_by_force(axes: Any, own: Evaluation, evaluations: Mapping[str, Evaluation]) -> None:
+def _residuals_by(
+    axes: Any, cause: Callable[[Evaluation], np.ndarray], own: Evaluation, evaluations: Mapping[str, Evaluation]
+) -> None:
+    """Force errors over what may explain them, (presses,) of each evaluation."""
     axes.axhline(0, color=_GREY, lw=1)
     axes.plot(
-        own.force,
+        cause(own),
         _residual(own),
         "o",
         ms=3,
@@ -213,14 +245,64 @@ def _residuals_by_force(axes: Any, own: Evaluation, evaluations: Mapping[str, Ev
     )
     for number, (name, other) in enumerate(evaluations.items()):
         colour = _MARKS[number % len(_MARKS)]
-        axes.plot(other.force, _residual(other), "D", ms=5, color=colour, label=_plain(name))
-    axes.set_xlim(left=0)
-    axes.set_xlabel("true force, N")
-    axes.set_ylabel("estimated − true force, N")
-    axes.set_title("Force error by force", fontsize=10.5)
+        axes.plot(cause(other), _residual(other), "D", ms=5, color=colour, label=_plain(name))
+    axes.set_ylabel("estimated − true, N")
     axes.grid(alpha=0.25)
-    if evaluations:
-        axes.legend(fontsize=8.5, loc="best")
+
+
+def gain_figure(calibration: Calibration) -> "Figure":
+    """Each pad's gain over the place pressed, and its standard error with the places from which it was fitted.
+
+    Raises:
+        ReportError: the calibration has no correction by location, or matplotlib is not installed.
+    """
+    field = calibration.field
+    if field is None:
+        raise ReportError("this calibration has no correction by location; calibrate with --location")
+    skin = calibration.skin
+    figure = _figure(9.6, 4.8, calibration.simulated)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    x, y, gain, error = zip(*(_pad_gain(field, i, pad.outline) for i, pad in enumerate(skin.pads)), strict=True)
+    reach = _most(np.stack(gain) - 1)
+    _pad_maps(figure, panels[0], skin, zip(x, y, gain, strict=True), (1 - reach, 1 + reach, "RdBu_r"), "gain")
+    shades = (0, _most(np.stack(error)), "Purples")
+    _pad_maps(figure, panels[1], skin, zip(x, y, error, strict=True), shades, "standard error of the gain, %")
+    place = calibration.evaluation.estimated.get("fitted", np.empty((0, 2))) * _MM
+    panels[1].plot(*place.T, ".", ms=2.5, color="black", zorder=3)
+    panels[0].set_title("Gain by place", fontsize=10)
+    panels[1].set_title("Its standard error, and the places of the presses", fontsize=10)
+    _one_row(panels)
+    return figure
+
+
+_CELLS = 48  # along each side of a pad
+
+
+def _pad_gain(field: FittedField, number: int, outline: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Centres of cells x, y (m) over a pad's box, and there (y, x) its gain and the gain's standard error, %."""
+    low, high = outline.min(0), outline.max(0)
+    x, y = (low + (high - low) * (np.arange(_CELLS)[:, None] + 0.5) / _CELLS).T
+    position = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    places = single_places(jnp.asarray(position, field.coefficients.dtype), field.geometry.pads)
+    mean, variance = (np.asarray(part, float)[:, number].reshape(len(y), len(x)) for part in log_gain(field, places))
+    return x, y, np.exp(mean), 100 * np.sqrt(variance)
+
+
+def _most(deviation: np.ndarray) -> float:
+    """The end of a colour scale for all values; a field of none still has one."""
+    return max(float(np.abs(deviation).max()), 0.01)
+
+
+def _pad_maps(figure: Any, axes: Any, skin: je.Skin, cells: Iterable, scale: tuple, label: str) -> None:
+    """Values on each pad (x, y, values) as cells cut along its outline, with their scale (low, high, colours)."""
+    low, high, colours = scale
+    options = {"vmin": low, "vmax": high, "cmap": colours, "zorder": 0}
+    for pad, (x, y, values) in zip(skin.pads, cells, strict=True):
+        drawn = axes.pcolormesh(_edges(x) * _MM, _edges(y) * _MM, values, **options)
+        drawn.set_clip_path(Polygon(pad.outline * _MM, transform=axes.transData))
+    figure.colorbar(drawn, ax=axes, shrink=0.85).set_label(label)
+    axes.use_sticky_edges = False
+    _sheet(axes, skin)
 
 
 # --- parts -----------------------------------------------------------------------------------------
@@ -270,8 +352,10 @@ def _electrodes(axes: Any, skin: je.Skin) -> None:
     axes.add_collection(PolyCollection(shapes, fc="none", ec=_GREEN, lw=1.6, label=label, zorder=2))
 
 
-def _legend_below(axes: Any) -> None:
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, frameon=False)
+def _one_row(panels: Any) -> None:
+    """Panels that share their axes: y is named once."""
+    for axes in panels[1:]:
+        axes.set_ylabel("")
 
 
 def _value_map(axes: Any, position, values, low: float, high: float, colours: str) -> Any:

@@ -11,19 +11,22 @@ from types import MappingProxyType
 import numpy as np
 
 from .calibration import Calibration
-from .evaluation import Evaluation
+from .evaluation import CALIBRATED, METHODS, Evaluation
 from .figures import (
     ESTIMATOR_MEANING,
     curves_figure,
+    gain_figure,
     localisation_figure,
     png,
     require_matplotlib,
     sensitivity_figure,
+    sensitivity_maps,
 )
+from .location import FittedField, field_name
 from .session import replacing
 
 _NO_EVALUATIONS: Mapping[str, Evaluation] = MappingProxyType({})
-_HEADLINE = "quarter"  # of the named estimators, the one nearest to the paper's figure on simulated skins
+_HEADLINES = ("quarter", "fitted")  # the image's estimator nearest to the paper's figure, and what the field goes by
 
 
 def write_report(
@@ -37,7 +40,8 @@ def write_report(
     Args:
         calibration: what the page is about.
         path: of the page; for ``report.html`` the figures are ``report_localisation.png``,
-            ``report_sensitivity.png`` and ``report_curves.png``.
+            ``report_sensitivity.png`` and ``report_curves.png``, with a correction by location also
+            ``report_gain.png``.
         evaluations: of the calibration on other sessions, by name.
 
     Returns: the paths written, the page first.
@@ -67,73 +71,105 @@ def _write(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class _Picture:
-    """A PNG file with its title, what it shows for who cannot see it, and what to look for."""
+    """A PNG file with its title, what it shows for who cannot see it, and what to look for; `single`: of one panel."""
 
     name: str
     title: str
     data: bytes
     alt: str
     caption: str
+    single: bool = False
 
 
 def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[_Picture]:
     found, skin, simulated = calibration.evaluation, calibration.skin, calibration.simulated
-    estimator = _HEADLINE if _HEADLINE in found.estimated else next(iter(found.estimated))
-    localisation = localisation_figure(found, skin, estimator, simulated=simulated)
+    estimators = [name for name in _HEADLINES if name in found.estimated] or list(found.estimated)[:1]
+    localisation = localisation_figure(found, skin, *estimators, simulated=simulated)
     sensitivity = sensitivity_figure(found, skin, simulated=simulated)
     curves = curves_figure(calibration, evaluations)
-    return [
-        _Picture("localisation", "Localisation", png(localisation), *_about_localisation(found, estimator)),
+    about, single = _about_localisation(found, estimators), len(estimators) == 1
+    pictures = [
+        _Picture("localisation", "Localisation", png(localisation), *about, single),
         _Picture("sensitivity", "Sensitivity over the sheet", png(sensitivity), *_about_sensitivity(found)),
         _Picture("curves", "Curves and force errors", png(curves), *_about_curves(calibration, evaluations)),
     ]
+    if calibration.field is not None:
+        gain = png(gain_figure(calibration))
+        pictures.append(_Picture("gain", "Gain by location", gain, *_about_gain(calibration.field)))
+    return pictures
 
 
-def _about_localisation(evaluation: Evaluation, estimator: str) -> tuple[str, str]:
+def _about_localisation(evaluation: Evaluation, estimators: Sequence[str]) -> tuple[str, str]:
     s = evaluation.summary()
-    mean, inward = (1e3 * s[f"localisation_{estimator}_{k}"] for k in ("mean", "inward_bias"))
+    means = (f"{_number(1e3 * s[f'localisation_{e}_mean'], 1)} mm by the estimator {e}" for e in estimators)
+    inward = 1e3 * s[f"localisation_{estimators[0]}_inward_bias"]
     alt = (
         f"Map of the sheet with true and estimated positions of {len(evaluation.force)} presses; "
-        f"mean error {_number(mean, 1)} mm by the estimator {estimator}."
+        f"mean error {', '.join(means)}."
     )
     caption = (
         "True positions of the tip are black, estimated ones red; green circles are the electrodes, dark lines the "
         "outlines of the pads. Look for lines that all point one way: towards the centre they are the inward shift "
-        f"of presses near the rim ({_number(inward, 1)} mm on average here, positive is inward); all in parallel they "
-        "are an offset between the stage and the sheet; swapped or mirrored regions are electrodes in another order."
+        f"of presses near the rim ({_number(inward, 1)} mm on average by {estimators[0]}, positive is inward); all in "
+        "parallel they are an offset between the stage and the sheet; swapped or mirrored regions are electrodes in "
+        "another order."
     )
     return alt, caption
 
 
 def _about_sensitivity(evaluation: Evaluation) -> tuple[str, str]:
-    s = evaluation.summary()
-    eit, hybrid = (_number(s.get(f"cv_{name}_ddof1", math.nan), 3) for name in ("eit", "hybrid"))
+    s, maps = evaluation.summary(), sensitivity_maps(evaluation)
+    spreads = [f"{METHODS[name]} {_number(s.get(f'cv_{name}_ddof1', math.nan), 3)}" for name in maps]
     alt = (
-        "Two maps of sensitivity over its mean at every place pressed: EIT only, coefficient of variation "
-        f"{eit}, and hybrid, {hybrid}."
+        f"{len(maps)} maps of sensitivity over its mean at every place pressed; coefficients of variation: "
+        f"{', '.join(spreads)}."
     )
     caption = (
-        "The same newton reads high where the map is red and low where it is blue; both maps share one colour scale, "
+        "The same newton reads high where the map is red and low where it is blue; the maps share one colour scale, "
         "which is cut at the largest 2 % of the values. Look for a blue rim in EIT only (fewer electrodes see it), for "
         "patches (uneven coating or contact), and in hybrid for lines along the edges of pads, where the stiff "
         "border carries part of the load or two pads share it. The hybrid map shows the pads and their curves, not the "
         "image: a force map sums to the pad's force whatever the image is."
     )
+    if CALIBRATED in maps:
+        caption += f" Calibrated is this calibration itself: {evaluation.recipe}."
     return alt, caption
 
 
 def _about_curves(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> tuple[str, str]:
     alt = (
         f"Pressure-force curves of {len(calibration.skin.pads)} pads with their presses; a map of force errors over "
-        "the sheet; force errors against force."
+        "the sheet; force errors against force and in the order of the presses."
     )
     caption = (
         "Top: the curve of each pad over the pressures fitted, with the 95 % band of the curve itself (1.96 standard "
         "errors; single presses scatter more), and the means over the hold of presses that this pad carried to 90 % "
-        "or more. The curve is fitted to whole presses, loading to release. Points in groups beside the curve "
-        "are places that respond differently. Bottom: estimated minus true force of presses the fit had not seen, "
-        "by place and by force. Structure in the map asks for a correction by location; a slope or bend over force "
-        "asks for another curve." + _one_level(calibration.evaluation, bool(evaluations))
+        "or more. The curve is fitted to whole presses, loading to release. Points in groups beside the curve are "
+        f"places that respond differently. {_about_structure(calibration)}; a slope or bend over force asks for "
+        "another curve; a trend or a step over time is drift." + _one_level(calibration.evaluation, bool(evaluations))
+    )
+    return alt, caption
+
+
+def _about_structure(calibration: Calibration) -> str:
+    below = "Bottom: estimated minus true force of presses the fit had not seen, by place, by force and over time."
+    if calibration.field is None:
+        return f"{below} Structure in the map asks for a correction by location"
+    return (
+        f"The curve is that of a gain of 1. {below} Structure left in the map is what the field of gain cannot follow, "
+        "or a place estimated wrongly"
+    )
+
+
+def _about_gain(field: FittedField) -> tuple[str, str]:
+    alt = "Two maps of the pads: the gain by the place pressed, and its standard error with the places of the presses."
+    spread, noise = (_number(100 * float(size), 1) for size in (field.spread, field.noise))
+    caption = (
+        "Force is the pad's curve times this gain at the estimated place: above 1 (red) the pad feels a press less "
+        "than on average over its presses, below 1 (blue) more. Black points are the estimated places of the presses; "
+        "beyond them the gain of the nearest edge of their box holds. Single presses scatter by "
+        f"{spread} % about the curves alone and by {noise} % about curves and gain. The standard error is that of the "
+        f"field chosen ({field_name(field.field)}): where it is large, more presses are wanted."
     )
     return alt, caption
 
@@ -157,7 +193,8 @@ def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figur
         _banner(calibration.simulated),
         f"<p>{escape(_lead(calibration))}</p>",
         _results(calibration, evaluations),
-        _localisation({"this calibration": calibration.evaluation, **evaluations}),
+        _localisation(_all(calibration, evaluations)),
+        _choice(calibration),
         *map(_figure, figures),
         _pads(calibration),
         _notes(calibration, evaluations),
@@ -196,67 +233,67 @@ def _places(evaluation: Evaluation) -> int:
 
 
 def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> str:
-    found = {"this calibration": calibration.evaluation, **evaluations}
-    numbers = [_headlines(e) for e in found.values()]
-    heads = [f"{name} (held out by {e.held_out_by})" for name, e in found.items()]
-    rows = [(label, *(n[label] for n in numbers), paper) for label, paper in _PAPER.items()]
-    table = _table(["quantity", *heads, "paper, measured on hardware"], rows)
+    groups = {
+        f"{name}: {len(e.force)} presses, held out by {e.held_out_by}": _method_rows(e)
+        for name, e in _all(calibration, evaluations).items()
+    }
+    groups[_PAPER] = [(METHODS[name], cv, *["—"] * 4) for name, cv in _PAPER_CV.items()]
+    head = ["total force by", "CV, ddof 1", "RMSE, N", "RMSE, % of largest", "mean absolute, N", "worst, N"]
     about = (
-        "After ±: standard error over presses (bootstrap). CV: standard deviation over mean of the sensitivity over "
-        "the presses. Full scale: the largest force pressed. The paper is arXiv 2605.28468; it states neither its "
-        "estimator of position nor ddof."
+        "EIT only: the integral of the image times one number; hybrid: the paper's recipe, one slope a pad; "
+        "calibrated: this calibration; true place: the same, told the true place instead of the estimated one, which "
+        "only a simulation knows exactly. CV: standard deviation over mean of the sensitivity over the presses; after "
+        "±: its standard error over presses (bootstrap). The paper is arXiv 2605.28468; it does not state its ddof, "
+        "nor errors of force."
     )
     if calibration.simulated:
         about += (
             " Its numbers were measured on a real skin, ours come from a simulation whose parameters were chosen to "
             "resemble it: likeness is consistency, not validation."
         )
-    return f"<h2>Results</h2>{table}<p class='small'>{escape(about)}</p>"
+    return f"<h2>Results</h2>{_table(head, groups)}<p class='small'>{escape(about)}</p>"
 
 
-_PAPER = {
-    f"localisation error, mean, estimator {_HEADLINE}, mm": "6.9",
-    "CV, EIT only, ddof 1": "0.31",
-    "CV, hybrid, ddof 1": "0.14",
-    "force RMSE, N": "not stated",
-    "force RMSE, % of full scale": "not stated",
-    "force, mean absolute error, N": "not stated",
-    "force, worst error, N": "not stated",
-    "presses": "225",
-}
-"""Rows of the table of results, and what the paper says."""
+_PAPER = "the paper: 225 presses on hardware"
+_PAPER_CV = {"eit": "0.31", "hybrid": "0.14"}
 
 
-def _headlines(evaluation: Evaluation) -> dict[str, str]:
-    """The rows of `_PAPER` for one evaluation."""
-    s = evaluation.summary()
-    get = {k: float(v) for k, v in s.items()}
-    place = f"localisation_{_HEADLINE}_mean"
-    values = (
-        _with_error(1e3 * get.get(place, math.nan), 1e3 * get.get(f"{place}_se", math.nan), 1),
-        *(_with_error(get.get(f"cv_{n}_ddof1", math.nan), get.get(f"cv_{n}_se", math.nan), 3) for n in _KINDS),
-        _number(get["force_rmse"], 2),
-        _number(get["force_rmse_percent_full_scale"], 1),
-        _number(get["force_mean_absolute"], 2),
-        _number(get["force_worst"], 2),
-        _number(get["presses"], 0),
-    )
-    return dict(zip(_PAPER, values, strict=True))
+def _all(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
+    return {"this calibration": calibration.evaluation, **evaluations}
 
 
-_KINDS = ("eit", "hybrid")
+def _method_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """What each way to a total force is worth on one session."""
+    return [
+        (
+            worth.label,
+            _with_error(worth.cv, worth.cv_error, 3),
+            _number(worth.rmse, 2),
+            _number(worth.percent, 1),
+            _number(worth.mean_absolute, 2),
+            _number(worth.worst, 2),
+        )
+        for worth in evaluation.by_method()
+    ]
+
+
+def _choice(calibration: Calibration) -> str:
+    """Why this curve and this field, where there was something to choose from."""
+    why = calibration.provenance.get("choice", "")
+    if not why:
+        return ""
+    about = "Chosen by cross-validation over places, each predicted by fits that had not seen it: "
+    return f"<h2>Choice of the model</h2><p>{escape(about + why)}.</p>"
 
 
 def _localisation(found: Mapping[str, Evaluation]) -> str:
-    rows = [
-        (estimator, *row, name)
-        for name, e in found.items()
-        for estimator, row in zip(e.estimated, _localisation_rows(e), strict=True)
-    ]
-    head = ["estimator", "mean, mm", "median, mm", "95th percentile, mm", "inward bias, mm", "session"]
-    meaning = "; ".join(f"{name}: {text}" for name, text in ESTIMATOR_MEANING.items())
+    groups = {name: _localisation_rows(e) for name, e in found.items()}
+    groups[_PAPER] = [("not stated", "6.9", "—", "—", "—")]
+    head = ["estimator", "mean, mm", "median, mm", "95th percentile, mm", "inward bias, mm"]
+    used = {name for e in found.values() for name in e.estimated}
+    meaning = "; ".join(f"{name}: {text}" for name, text in ESTIMATOR_MEANING.items() if name in used)
     return (
-        f"<h2>Localisation by estimator</h2>{_table(head, rows)}<p class='small'>{escape(meaning)}. Inward bias: how "
+        f"<h2>Localisation by estimator</h2>{_table(head, groups)}<p class='small'>{escape(meaning)}. Inward bias: how "
         "much nearer to the centre of the sheet the estimate lies than the truth.</p>"
     )
 
@@ -264,18 +301,19 @@ def _localisation(found: Mapping[str, Evaluation]) -> str:
 def _localisation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
     s = evaluation.summary()
     out = []
-    for name in evaluation.estimated:
+    for name in sorted(evaluation.estimated, key=[*ESTIMATOR_MEANING, *evaluation.estimated].index):
         mean, error, *rest = (
             1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
-        out.append((_with_error(mean, error, 1), *(_number(value, 1) for value in rest)))
+        out.append((name, _with_error(mean, error, 1), *(_number(value, 1) for value in rest)))
     return out
 
 
 def _figure(picture: _Picture) -> str:
     data = base64.b64encode(picture.data).decode()
+    kind = " class='single'" if picture.single else ""
     return (
-        f"<h2>{escape(picture.title)}</h2><figure class='{picture.name}'>"
+        f"<h2>{escape(picture.title)}</h2><figure{kind}>"
         f'<img alt="{escape(picture.alt)}" src="data:image/png;base64,{data}">'
         f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
     )
@@ -295,9 +333,9 @@ def _pads(calibration: Calibration) -> str:
     rows = [_pad_row(calibration, number) for number in range(len(calibration.skin.pads))]
     kind = escape(calibration.provenance.get("curve", type(curve).__name__))
     return (
-        f"<h2>Pads</h2>{_table(head, rows)}<p class='small'>Curve: {kind}. After ±: standard error, from the scatter "
-        "between places. Residual RMS: of all samples fitted, not held out. Outside the pressures fitted a force is "
-        "marked as not valid.</p>"
+        f"<h2>Pads</h2>{_table(head, {'': rows})}<p class='small'>Curve: {kind}. After ±: standard error, from the "
+        "scatter between places. Residual RMS: of all samples fitted, not held out. Outside the pressures fitted a "
+        "force is marked as not valid.</p>"
     )
 
 
@@ -324,20 +362,26 @@ def _notes(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> s
 
 def _provenance(calibration: Calibration) -> str:
     rows = [(key.replace("_", " "), value) for key, value in calibration.provenance.items()]
-    return f"<h2>Provenance</h2>{_table(['what', 'value'], rows, 'provenance')}"
+    return f"<h2>Provenance</h2>{_table(['what', 'value'], {'': rows}, 'provenance')}"
 
 
 # --- parts -----------------------------------------------------------------------------------------
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "numbers") -> str:
-    """A table from plain texts; the first column names the row."""
+def _table(head: Sequence[str], groups: Mapping[str, Iterable[Sequence[str]]], kind: str = "numbers") -> str:
+    """A table from plain texts in groups of rows under their names, if any; the first column names the row."""
     top = "".join(f"<th scope='col'>{escape(cell)}</th>" for cell in head)
+    body = "".join(_group(name, rows, len(head)) for name, rows in groups.items())
+    return f"<div class='wide'><table class='{kind}'><thead><tr>{top}</tr></thead>\n{body}</table></div>"
+
+
+def _group(name: str, rows: Iterable[Sequence[str]], columns: int) -> str:
+    title = f"<tr><th scope='rowgroup' colspan='{columns}'>{escape(name)}</th></tr>\n" if name else ""
     body = "".join(
         f"<tr><th scope='row'>{escape(first)}</th>{''.join(f'<td>{escape(cell)}</td>' for cell in rest)}</tr>\n"
         for first, *rest in rows
     )
-    return f"<div class='wide'><table class='{kind}'><thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>"
+    return f"<tbody>{title}{body}</tbody>"
 
 
 _PLUS_MINUS = "\u00a0±\u00a0"  # never broken over two lines
@@ -397,13 +441,14 @@ th, td { border-bottom: 1px solid var(--line); padding: .35em .8em; text-align: 
 thead th { background: var(--head); font-weight: 600; }
 th:first-child { text-align: left; }
 tbody th { font-weight: 400; }
+th[scope=rowgroup] { font-weight: 600; padding-top: .9em; }
 td { overflow-wrap: break-word; }
 .provenance td, .provenance th { text-align: left; white-space: pre-wrap; }
 .provenance td { overflow-wrap: anywhere; font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .9em; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; background: #ffffff; border: 1px solid var(--line);
   border-radius: 4px; margin-bottom: .5rem; }
-figure.localisation img { max-width: 42rem; }
+figure.single img { max-width: 42rem; }
 li { overflow-wrap: anywhere; }
 @media print {
   :root { --text: #000000; --page: #ffffff; --soft: #333333; --line: #999999; --head: #eeeeee;
@@ -417,6 +462,6 @@ li { overflow-wrap: anywhere; }
   h2 { break-after: avoid; }
   figure, tr, .banner { break-inside: avoid; }
   figure img { filter: none; }
-  figure.localisation img { max-width: 13cm; }
+  figure.single img { max-width: 13cm; }
   .wide { overflow: visible; } }
 """

@@ -75,7 +75,8 @@ def _effect(table: TomlTable) -> AbstractEffect:
         hint = f"did you mean {near[0]!r}?" if near else "known: " + ", ".join(EFFECTS)
         raise table.error("type", f"no effect {name!r}; {hint}")
     kind = EFFECTS[name]
-    given = {f.name: _value(table, f) for f in dataclasses.fields(kind) if table.has(f.name)}
+    parameters = [f for f in dataclasses.fields(kind) if f.default is not None]
+    given = {f.name: _value(table, f) for f in parameters if table.has(f.name)}
     table.done()
     return kind(**given)
 

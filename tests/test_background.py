@@ -42,6 +42,7 @@ def test_the_field_is_found_whatever_the_gain_and_without_a_reading(model, untou
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_touch_is_seen_through_the_field(model, uneven, untouched):
     """The place of a faint touch: wrong by much where the sheet is taken for even."""
     place = np.array([0.062, 0.091])
@@ -61,7 +62,7 @@ def test_a_touch_is_seen_through_the_field(model, uneven, untouched):
         (lambda v: v[1:], {}, "550 readings"),
         (lambda v: v * np.nan, {}, "no reading"),
         (lambda v: -v, {}, "polarity"),
-        (lambda v: np.abs(v), {}, "no coat explains"),
+        (lambda v: v * np.where(np.arange(len(v)) % 2, 3.0, 1.0), {}, "no coat explains"),
         (lambda v: v, {"std": 0.0}, "std is 0.0"),
     ],
 )

@@ -54,6 +54,7 @@ def _same(together, alone):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
 
 
+@pytest.mark.slow
 def test_conductivities_together():
     model = _model(SHEETS[1], SOLVERS[0])
     sigma = jnp.stack([model.background, _uneven(model), 2 * _uneven(model)[::-1]])
@@ -62,6 +63,7 @@ def test_conductivities_together():
     _same(jax.vmap(lambda s: je.jacobian(model, s, image))(sigma), [je.jacobian(model, s, image) for s in sigma])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS, ids=["nested", "dense"])
 def test_skins_of_one_shape_together(solver):
     """Stretched skins of different sheet resistance; nested dissection cuts all of them alike."""

@@ -291,6 +291,7 @@ def test_the_data_set_is_one_solve_each(skin):
     np.testing.assert_allclose(voltages[:, 0], np.tile(je.forward(model), (6, 1)), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_data_set_is_shared_out_over_devices(tmp_path):
     """Two devices give what one gives."""
     code = (

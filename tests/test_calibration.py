@@ -153,6 +153,7 @@ def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, cali
     assert error.mean() < 0.006  # a draft mesh, and a table to match
 
 
+@pytest.mark.slow
 def test_what_a_curve_remembers_of_the_past_is_enough():
     rng = np.random.default_rng(0)
     past = np.cumsum(rng.normal(0, 1, (500, 2)), 0)

@@ -96,6 +96,7 @@ def test_manufactured_solution(order, uneven, l2_rate, h1_rate):
     assert np.log2(h1 / h1_fine) > h1_rate - 0.1
 
 
+@pytest.mark.slow
 def test_the_jacobian_predicts_a_small_change():
     """The remainder after the linear term falls with the square of the change."""
     model = disc_model(0.1, 0.12, pattern=je.adjacent(16))

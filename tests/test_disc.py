@@ -94,6 +94,7 @@ def test_the_mesh_follows_the_inclusion():
         assert mesh.areas[inside].sum() == pytest.approx(np.pi / 4, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "z", "rate"),
     [

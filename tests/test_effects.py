@@ -165,6 +165,16 @@ def test_coating_is_log_normal_and_the_same_on_every_mesh():
     assert correlation == pytest.approx(np.exp(-0.5 * (2 / 199 / 0.01) ** 2), abs=0.1)
 
 
+def test_effects_laid_on_a_mesh_are_the_same_effects(bare):
+    pressure = jnp.linspace(0, 5e4, len(bare.background))
+    effects = (je.CoatingNonUniformity(seed=2), je.ContactGain(), je.ContactPiezoresistance())
+    laid = fx.laid(effects, bare.centroids)
+    found = [je.conductivity(_with(bare, *these), pressure) for these in (effects, laid)]
+    np.testing.assert_allclose(*found, rtol=1e-12)
+    assert "cos" in str(jax.make_jaxpr(lambda p: je.conductivity(_with(bare, *effects), p))(pressure))
+    assert "cos" not in str(jax.make_jaxpr(lambda p: je.conductivity(_with(bare, *laid), p))(pressure))
+
+
 def test_piezoresistance_follows_hill_and_keeps_its_slope_finite():
     effect = je.ContactPiezoresistance(amplitude=1.0, half_pressure=20e3, exponent=0.7)
     pressure = jnp.array([0.0, 20e3, 1e12])

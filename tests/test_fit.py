@@ -249,6 +249,7 @@ def test_every_loss_and_exact_data_is_fitted():
     np.testing.assert_allclose(got.parameters, [3e-3, -1.0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_float32_agrees_with_float64_and_stays_float32(fitted_power):
     pressure, force, good = fitted_power
     got = fit_curves(PowerLaw(2000.0), pressure.astype("f4"), force.astype("f4"))

@@ -79,6 +79,7 @@ def test_cross_validation_predicts_best(model, coarse, jac, frames, held):
     assert score(h) <= 1.001 * min(score(k * h) for k in (0.5, 0.8, 1.25, 2))
 
 
+@pytest.mark.slow
 def test_the_noise_figure_is_what_simulated_noise_gives(model, coarse, jac):
     h = chosen(model, coarse, je.NoiseFigure(0.5))
     q, _ = image_matrix(jac, h)

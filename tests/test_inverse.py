@@ -107,6 +107,7 @@ def test_noise_weights_only_matter_relative_to_each_other(model, pixels, recon):
     np.testing.assert_allclose(weighted.matrix, recon.matrix, atol=1e-10 * np.abs(recon.matrix).max())
 
 
+@pytest.mark.slow
 def test_float32_images_follow_float64(skin, model, pixels, recon):
     single = je.discretise(je.Scene(skin), je.Fidelity.draft(dtype="float32"))
     coarse = je.prepare(single, basis=je.Pixels(20))

@@ -55,6 +55,7 @@ def test_not_negative_meets_its_conditions_to_rounding(problem, y):
     assert slope[np.asarray(x) == 0].min() > -1e-9 * size
 
 
+@pytest.mark.slow
 def test_not_negative_has_the_derivative_of_its_image(problem, y):
     noser, along = problem(je.Noser()), 1e-4 * y[::-1]
     image = jax.jit(lambda y: je.NonNegative().image(noser, y))

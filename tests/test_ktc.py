@@ -109,6 +109,7 @@ def test_even_water_explains_the_reference(tank):
     assert water.residual < 0.043
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize(("level", "least"), [(1, 0.65), (7, 0.46)])
 def test_the_linear_recipe(tank, level, least):

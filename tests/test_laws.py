@@ -129,6 +129,7 @@ def test_help_imports_nothing_heavy():
     assert "calibrate" in done.stdout
 
 
+@pytest.mark.slow
 def test_float32_runs_without_x64():
     """Nothing in the library asks for 64 bits behind the user's back; warnings are errors."""
     code = (

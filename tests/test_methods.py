@@ -109,6 +109,7 @@ def test_the_image_that_may_not_be_negative_is_that_of_nnls(model, pixels, jac, 
     np.testing.assert_allclose(found, expected, atol=1e-4 * expected.max())
 
 
+@pytest.mark.slow
 def test_total_variation_keeps_edges_and_flat_parts(model, pixels, jac):
     """A block is told from its blurred image: less variation, nearer to the truth."""
     x, y = np.asarray(pixels.centres).T
@@ -124,6 +125,7 @@ def test_total_variation_keeps_edges_and_flat_parts(model, pixels, jac):
     assert error["tv"] < 0.6 * error["l2"]
 
 
+@pytest.mark.slow
 def test_total_variation_ends_where_its_own_weights_stand_still(model, coarse, frame):
     """A fixed point: one step more changes nothing."""
     few, more = (

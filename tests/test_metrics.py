@@ -186,6 +186,7 @@ def test_figures_under_jit_vmap_and_grad(patchy, batch):
     assert np.isfinite(jax.grad(lambda t: figures(t).amplitude)(jnp.zeros(256))).all()
 
 
+@pytest.mark.slow
 def test_figures_of_a_reconstruction(model, pixels):
     recon = je.prepare(model, basis=pixels)
     square = jnp.sum((model.centroids - jnp.array([0.07, 0.12])) ** 2, -1)

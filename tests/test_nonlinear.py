@@ -35,6 +35,7 @@ def readings(skin):
     return np.asarray(je.forward(fine, fine.background * block(fine.centroids)))
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_the_voltages(physics):
     rng = np.random.default_rng(0)
     x, step = (jnp.asarray(rng.normal(size=144)) for _ in range(2))
@@ -42,6 +43,7 @@ def test_slopes_are_those_of_the_voltages(physics):
     np.testing.assert_allclose(physics.slopes(x) @ step, along, atol=1e-9 * np.abs(along).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PENALTIES)
 def test_the_matrix_gives_the_gradient_of_the_penalty(coarse, name):
     penalty = PENALTIES[name](coarse.picture)
@@ -62,6 +64,7 @@ def test_variation_does_not_ask_which_way_an_edge_runs(coarse):
     np.testing.assert_allclose(list(cost.values()), 2 * np.array(length), rtol=0.07)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0, 60])
 def test_a_block_is_found_in_absolute_readings(physics, coarse, readings, missing):
     """Twice the conductivity is far from linear: its height comes out right, which one linear step misses."""
@@ -79,6 +82,7 @@ def test_a_block_is_found_in_absolute_readings(physics, coarse, readings, missin
     assert found[truth == 1].mean() == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_what_fits_already_is_left_alone(physics):
     readings = physics.voltages(jnp.zeros(144))
     found = je.gauss_newton(physics, je.IsotropicVariation(), readings, jnp.full(550, 1e-6))

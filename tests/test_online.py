@@ -76,6 +76,7 @@ def touches(tracker, time, seed):
     return frames, force, own
 
 
+@pytest.mark.slow
 def test_an_hour_of_drift_is_followed(tracker):
     time = np.arange(0, 3600, 3.0)
     frames, _, _ = touches(tracker, time, 0)

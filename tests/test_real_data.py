@@ -57,6 +57,7 @@ METHODS = {
 }
 
 
+@pytest.mark.slow
 @needs_tank
 @pytest.mark.parametrize("method", METHODS)
 def test_sign_of_the_change_at_every_labelled_electrode(tank, method):
@@ -88,6 +89,7 @@ LOGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOGS)
 def test_logs_of_others_are_imported_and_fitted(name, tmp_path, capsys):
     path = DATA / name

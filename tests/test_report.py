@@ -15,8 +15,9 @@ from calib import figures, report
 from calib.calibration import Calibration
 from calib.curves import Linear
 from calib.evaluation import Evaluation
-from calib.figures import ReportError, curves_figure, localisation_figure, png, sensitivity_figure
+from calib.figures import ReportError, curves_figure, gain_figure, localisation_figure, png, sensitivity_figure
 from calib.fit import FittedCurve
+from calib.location import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.report import write_report
 
 HOSTILE = "\u65e5 $x^$ <script>alert(1)</script> & 'pad' \"\x00"  # the start is what fits into a figure
@@ -40,6 +41,8 @@ def evaluation_on(places, levels=(5.0, 20.0), held_out_by="location"):
         image_sum=1e-4 * force * gain**2,
         centre=np.array([0.1, 0.1]),
         held_out_by=held_out_by,
+        others={"eit": force * gain**2, "hybrid": pad_force.sum(1)},
+        recipe="linear",
     )
 
 
@@ -91,6 +94,36 @@ def calibration(skin):
 
 
 @pytest.fixture(scope="module")
+def located(calibration):
+    """The same with a correction by location, which halves the errors of force, and a reason for it."""
+    found, field = calibration.evaluation, PadEdge()
+    better = found.force + (found.total_force - found.force) / 2
+    evaluation = replace(
+        found,
+        estimated=found.estimated | {"fitted": found.position + 0.001},
+        pad_force=np.where(found.pad_force > 0, better[:, None], 0),
+        others=found.others | {"true_place": found.force + (found.total_force - found.force) / 4},
+        recipe="linear, edge",
+    )
+    size = len(field.shapes()[0])
+    fitted = FittedField(
+        field=field,
+        geometry=geometry_of(calibration.skin),
+        coefficients=jnp.linspace(0.1, 0.3, size),
+        covariance=1e-4 * jnp.eye(size),
+        reach=jnp.array([[0.02, 0.02], [0.18, 0.18]]),
+        centre=jnp.full((4, size), 0.2),
+        noise=jnp.array(0.04),
+        spread=jnp.array(0.125),
+        evidence=jnp.array(90.0),
+        n=jnp.array(16.0),
+        result=jnp.array(0),
+    )
+    provenance = calibration.provenance | {"location": "edge", "choice": "edge, the simplest; none 3.02, edge 0.91"}
+    return replace(calibration, evaluation=evaluation, field=fitted, provenance=provenance)
+
+
+@pytest.fixture(scope="module")
 def written(calibration, tmp_path_factory):
     return write_report(calibration, tmp_path_factory.mktemp("report") / "r.html")
 
@@ -98,7 +131,7 @@ def written(calibration, tmp_path_factory):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Figures that cost nothing, for tests of the page alone."""
-    for name in ("localisation_figure", "sensitivity_figure", "curves_figure"):
+    for name in ("localisation_figure", "sensitivity_figure", "curves_figure", "gain_figure"):
         monkeypatch.setattr(report, name, lambda *_, **__: None)
     monkeypatch.setattr(report, "png", lambda _: b"picture")
 
@@ -153,21 +186,62 @@ def test_page_needs_nothing_but_itself(written):
 def test_page_is_readable_without_seeing_it(written):
     tags = Reader(written[0].read_text(encoding="utf-8")).tags
     assert all(len(a["alt"]) > 40 for tag, a in tags if tag == "img")
-    assert {a.get("scope") for tag, a in tags if tag == "th"} == {"row", "col"}
+    assert {a.get("scope") for tag, a in tags if tag == "th"} == {"row", "col", "rowgroup"}
     assert ("html", {"lang": "en"}) in tags
 
 
 def test_numbers_are_those_of_the_evaluation(calibration, written):
     cells = Reader(written[0].read_text(encoding="utf-8")).cells
     s = calibration.evaluation.summary()
-    row = cells.index("localisation error, mean, estimator quarter, mm")
-    assert cells[row + 1 : row + 3] == [f"3.0{PM}0.00", "6.9"]
-    row = cells.index("CV, hybrid, ddof 1")
-    assert cells[row + 1] == f"{s['cv_hybrid_ddof1']:.3f}{PM}{s['cv_hybrid_se']:.3f}"
-    assert cells[row + 2] == "0.14"
-    assert cells[cells.index("force RMSE, N") + 1] == f"{s['force_rmse']:.2f}"
+    row = cells.index("quarter")
+    inward = f"{1e3 * s['localisation_quarter_inward_bias']:.1f}".replace("-", "−")
+    assert cells[row + 1 : row + 5] == [f"3.0{PM}0.00", "3.0", "3.0", inward]
+    assert cells[cells.index("hybrid") : cells.index("hybrid") + 6] == row_of("hybrid", s, "hybrid", "force_hybrid")
+    last = len(cells) - cells[::-1].index("hybrid")  # the paper's
+    assert cells[last : last + 5] == ["0.14", "—", "—", "—", "—"]
     row = cells.index("0 lower left")
     assert cells[row + 1 : row + 7] == [f"0.01{PM}0.0001", "0 to 2000", "80", "9", "0.75", "fitted"]
+
+
+def row_of(label, s, spread, errors):
+    """One method's row of the table of results, from the summary."""
+    keys = {"rmse": 2, "rmse_percent_full_scale": 1, "mean_absolute": 2, "worst": 2}
+    cv = f"{s[f'cv_{spread}_ddof1']:.3f}{PM}{s[f'cv_{spread}_se']:.3f}"
+    return [label, cv, *(f"{s[f'{errors}_{key}']:.{digits}f}" for key, digits in keys.items())]
+
+
+def test_every_method_has_its_row(located, no_pictures, tmp_path):
+    cells, s = Reader(page_of(located, tmp_path)).cells, located.evaluation.summary()
+    first = cells.index("this calibration: 32 presses, held out by location") + 1
+    assert cells[first : first + 24] == [
+        *row_of("EIT only", s, "eit", "force_eit"),
+        *row_of("hybrid", s, "hybrid", "force_hybrid"),
+        *row_of("calibrated (linear, edge)", s, "calibrated", "force"),
+        *row_of("true place", s, "true_place", "force_true_place"),
+    ]
+
+
+def test_a_calibration_of_before_has_the_rows_it_can_have(calibration, no_pictures, tmp_path):
+    old = replace(calibration, evaluation=replace(calibration.evaluation, others={}, recipe=""))
+    cells = Reader(page_of(old, tmp_path)).cells
+    row = cells.index("EIT only")
+    assert cells[row + 2 : row + 7] == ["—", "—", "—", "—", "calibrated"]
+
+
+def test_the_choice_and_its_reason_are_told(calibration, located, no_pictures, tmp_path):
+    assert (
+        "none 3.02, edge 0.91" in page_of(located, tmp_path).split("<h2>Choice of the model</h2>")[1].split("</p>")[0]
+    )
+    assert "Choice of the model" not in page_of(calibration, tmp_path)
+
+
+def test_a_correction_by_location_is_drawn_and_told(located, no_pictures, tmp_path):
+    page, *pictures = write_report(located, tmp_path / "page.html")
+    assert [p.name for p in pictures][-1] == "page_gain.png"
+    text = page.read_text(encoding="utf-8")
+    assert text.count("data:image/png;base64,") == len(pictures) == 4
+    assert "by 12.5 % about the curves alone and by 4.0 % about curves and gain" in text
+    assert "fitted: place that the correction by location goes by" in text
 
 
 def test_simulated_is_said_only_of_simulated(calibration, no_pictures, tmp_path):
@@ -178,19 +252,20 @@ def test_simulated_is_said_only_of_simulated(calibration, no_pictures, tmp_path)
 
 
 @pytest.mark.parametrize("simulated", [False, True])
-def test_simulated_is_said_in_every_picture(calibration, skin, simulated):
+def test_simulated_is_said_in_every_picture(calibration, located, skin, simulated):
     made = [
         localisation_figure(calibration.evaluation, skin, simulated=simulated),
         sensitivity_figure(calibration.evaluation, skin, simulated=simulated),
         curves_figure(replace(calibration, simulated=simulated)),
+        gain_figure(replace(located, simulated=simulated)),
     ]
-    assert [f.get_suptitle() for f in made] == ["SIMULATED" if simulated else ""] * 3
+    assert [f.get_suptitle() for f in made] == ["SIMULATED" if simulated else ""] * 4
 
 
 def hostile_calibration(calibration):
     skin = replace(calibration.skin, name=HOSTILE, pads=(je.Pad(HOSTILE, calibration.skin.pads[0].outline),) * 4)
-    found = replace(calibration.evaluation, held_out_by=HOSTILE)
-    provenance = {HOSTILE: HOSTILE, "curve": HOSTILE}
+    found = replace(calibration.evaluation, held_out_by=HOSTILE, recipe=HOSTILE)
+    provenance = {HOSTILE: HOSTILE, "curve": HOSTILE, "choice": HOSTILE}
     return replace(calibration, skin=skin, evaluation=found, provenance=provenance, notes=(HOSTILE,))
 
 
@@ -211,12 +286,16 @@ def test_names_from_files_can_be_drawn(calibration):
     assert png(found)[:4] == b"\x89PNG"  # warnings are errors: no mathematics, no missing letter
 
 
-def test_other_sessions_have_their_own_column(calibration, no_pictures, tmp_path):
+def test_other_sessions_have_their_own_rows(calibration, no_pictures, tmp_path):
     page = page_of(calibration, tmp_path, evaluations={"next day.h5": evaluation_on(2, held_out_by="session")})
     cells = Reader(page).cells
-    assert "next day.h5 (held out by session)" in cells
-    row = cells.index("presses")
-    assert cells[row : row + 4] == ["presses", "32", "8", "225"]
+    row = cells.index("next day.h5: 8 presses, held out by session")
+    assert cells[row + 1 : row + 20 : 6] == [
+        "EIT only",
+        "hybrid",
+        "calibrated (linear)",
+        "the paper: 225 presses on hardware",
+    ]
 
 
 def test_errors_at_one_force_are_said_to_be_of_that_force(calibration, no_pictures, tmp_path):
@@ -280,6 +359,21 @@ def test_localisation_title_states_error_and_estimator(calibration, skin):
     assert "estimator quarter" in title
 
 
+def test_estimators_have_a_panel_each(located, skin):
+    titles = [axes.get_title() for axes in localisation_figure(located.evaluation, skin, "quarter", "fitted").axes]
+    assert ["estimator quarter" in titles[0], "1.4 mm" in titles[1], "correction by location" in titles[1]] == [
+        True
+    ] * 3
+
+
+def test_the_calibrated_force_has_a_third_map_where_it_is_not_the_papers(calibration, located, skin):
+    assert len(sensitivity_figure(calibration.evaluation, skin).axes) == 3  # two and the scale
+    *_, third, _ = sensitivity_figure(located.evaluation, skin).axes
+    s, expected = located.evaluation.summary(), located.evaluation.sensitivity("calibrated")
+    assert f"Calibrated: estimated / true force\nCV {s['cv_calibrated_ddof1']:.3f}" in third.get_title()
+    assert third.collections[0].get_array().ravel()[0] == pytest.approx(expected[:2].mean() / expected.mean())
+
+
 def test_both_sensitivity_maps_have_one_scale_about_their_mean(calibration, skin):
     found = calibration.evaluation
     eit, hybrid, _ = sensitivity_figure(found, skin).axes
@@ -296,18 +390,51 @@ def test_both_sensitivity_maps_have_one_scale_about_their_mean(calibration, skin
 def test_places_that_form_no_grid_are_marks(calibration, skin):
     found = calibration.evaluation
     part = {k: getattr(found, k)[:5] for k in ("position", "force", "pressure", "pad_force", "image_sum")}
-    part["estimated"] = {k: v[:5] for k, v in found.estimated.items()}
+    part |= {name: {k: v[:5] for k, v in getattr(found, name).items()} for name in ("estimated", "others")}
     axes = sensitivity_figure(replace(found, **part), skin).axes[0]
     assert len(axes.collections[0].get_offsets()) == 3  # five presses at two levels: three places
+
+
+def test_gain_and_its_error_are_those_of_the_field(located):
+    gain, error, *_ = gain_figure(located).axes
+    cells = [axes.collections[1] for axes in (gain, error)]  # of the second pad, 0.1 m wide, 48 cells
+    place = np.array([[0.1 + 30.5 * 0.1 / 48, 10.5 * 0.1 / 48]])
+    mean, variance = (part[0, 1] for part in log_gain(located.field, single_places(place, 4)))
+    centre = np.asarray(cells[0].get_coordinates())[10:12, 30:32].mean((0, 1))
+    assert centre == pytest.approx(1e3 * place[0])
+    assert cells[0].get_array()[10, 30] == pytest.approx(np.exp(mean))
+    assert cells[1].get_array()[10, 30] == pytest.approx(100 * np.sqrt(variance))
+    assert np.asarray(error.lines[-1].get_xydata()) == pytest.approx(1e3 * located.evaluation.estimated["fitted"])
+
+
+def test_a_pad_is_coloured_within_its_outline_alone(located):
+    whole = located.skin.pads[0].outline
+    cut = replace(located.skin, pads=(je.Pad("cut", whole[:3]), *located.skin.pads[1:]))
+    cells = gain_figure(replace(located, skin=cut)).axes[0].collections[0]
+    path, _ = cells.get_clip_path().get_transformed_path_and_affine()
+    assert len(path.vertices) == 4  # three sides, closed
+
+
+def test_no_field_no_picture_of_it(calibration):
+    with pytest.raises(ReportError, match="--location"):
+        gain_figure(calibration)
 
 
 def test_one_press_is_enough_for_a_page(calibration, tmp_path):
     found = calibration.evaluation
     part = {k: getattr(found, k)[:1] for k in ("position", "force", "pressure", "pad_force", "image_sum")}
-    part["estimated"] = {k: v[:1] for k, v in found.estimated.items()}
+    part |= {name: {k: v[:1] for k, v in getattr(found, name).items()} for name in ("estimated", "others")}
     text = page_of(replace(calibration, evaluation=replace(found, **part)), tmp_path)
     cells = Reader(text).cells
-    assert cells[cells.index("CV, hybrid, ddof 1") + 1] == "—"
+    assert cells[cells.index("hybrid") + 1] == "—"
+
+
+def test_force_errors_are_drawn_in_the_order_of_the_presses(calibration):
+    other = evaluation_on(2)
+    panel = next(a for a in curves_figure(calibration, {"next": other}).subfigs[1].axes if "time" in a.get_title())
+    for line, found in zip(panel.lines[1:], (calibration.evaluation, other), strict=True):
+        assert line.get_xdata().tolist() == list(range(len(found.force)))
+        assert line.get_ydata() == pytest.approx(found.total_force - found.force)
 
 
 def test_curve_and_band_are_those_of_the_fit(calibration):

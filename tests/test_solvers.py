@@ -250,6 +250,7 @@ TRANSFORMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transform", TRANSFORMS)
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
 def test_derivatives_are_those_of_dense_autodiff(solver, transform, small):
@@ -270,6 +271,7 @@ def test_derivatives_reuse_the_factorisation(small):
     assert jacobian.lower(values).as_text().count("potrf") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
 def test_vmap_is_the_loop(solver, small):
     pattern, values, rhs = small
@@ -343,6 +345,7 @@ def test_derivatives_of_the_columns(solver, transform, small):
         assert relative(ours, theirs) < 1e-9
 
 
+@pytest.mark.slow
 def test_wide_fronts_are_eliminated_in_halves():
     """A solid has wide separators: the recursion meets odd widths at several depths."""
     rng = np.random.default_rng(8)
@@ -370,6 +373,7 @@ print(float(found[0][0, 0] / found[3][0, 0]))
 """
 
 
+@pytest.mark.slow
 def test_several_solves_in_one_program_do_not_wait_for_each_other_for_ever():
     """What LAPACK calls of jaxlib 0.10 do once each of its threads has to wait for another (`_IN_PLACE`)."""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "JAX_ENABLE_X64": "1"}

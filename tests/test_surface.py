@@ -26,6 +26,7 @@ def test_the_chest(chest):
     assert steps.max() < 0.07
 
 
+@pytest.mark.slow
 def test_a_rolled_sheet_reads_as_the_flat_one(chest):
     """A cylinder is developable; the mesh's chords are shorter than the arcs by (h / r)^2 / 24."""
     fidelity = je.Fidelity.draft(solver=je.Dense())
@@ -38,6 +39,7 @@ def test_a_rolled_sheet_reads_as_the_flat_one(chest):
     assert float(rolled.areas.sum()) == pytest.approx(0.28**2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_images_and_forces_on_the_chest(chest):
     model = je.discretise(je.Scene(chest), je.Fidelity.draft(solver=je.Dense()))
     recon = je.prepare(model, basis=je.Pixels(20))

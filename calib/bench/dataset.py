@@ -1,6 +1,6 @@
 """The paper's data set: voltages of Gaussian contacts on a grid of places, at a range of amplitudes, as one batch."""
 
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -99,8 +99,13 @@ def write_data_set(
         raise BenchError(f"{columns} x {rows} places in {steps} steps make no data set; give one place and two steps")
     model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.02) if fidelity is None else fidelity)
     places, amplitudes = grid(skin, columns, rows), np.linspace(0, 1, steps)
-    voltages = partial(simulate_contacts, width=width, progress=progress)(model, places, amplitudes)
-    attrs: dict[str, str | bool | float] = {"skin": skin.name, "skin_toml": skin.toml, "simulated": True, "width_m": width}
+    voltages = simulate_contacts(model, places, amplitudes, width=width, progress=progress)
+    attrs: dict[str, str | bool | float] = {
+        "skin": skin.name,
+        "skin_toml": skin.toml,
+        "simulated": True,
+        "width_m": width,
+    }
     with ArchiveWriter(path, FORMAT, attrs) as writer:
         writer.add("places", places, "m", "centres of the contacts")
         writer.add("amplitudes", amplitudes, "1", "largest relative change of the conductivity")

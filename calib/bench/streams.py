@@ -355,6 +355,8 @@ class Recordings:
 def recordings(bench: Bench, fidelity: je.Fidelity) -> Recordings:
     """Discretise the scene, move the stage, and make the streams ready."""
     model = je.discretise(bench.scene, fidelity)
+    laid = fx.laid(model.effects, model.centroids)
+    model = eqx.tree_at(lambda m: m.effects, model, laid, is_leaf=lambda x: x is model.effects)
     key = jax.random.key(bench.seed)
     motion = _moved(bench, jax.random.fold_in(key, 0))
     one, two, three = jax.random.split(key, 3)

@@ -31,6 +31,7 @@ from ._base import (
     history,
     history_start,
     keys,
+    laid,
 )
 from .clocks import ClockError, DropOut
 from .coating import ContinuousCoating
@@ -176,4 +177,5 @@ __all__ = [
     "history",
     "history_start",
     "keys",
+    "laid",
 ]

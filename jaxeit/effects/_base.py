@@ -205,6 +205,10 @@ class AbstractSheetEffect(AbstractEffect):
     def __call__(self, sheet: Sheet) -> Sheet:
         """The sheet after this effect."""
 
+    def laid(self, centroids: Float[Array, "elements 2"]) -> "AbstractSheetEffect":
+        """The same on elements at these places, with what depends on places alone computed once; by default itself."""
+        return self
+
 
 class AbstractCoatEffect(AbstractSheetEffect):
     """Material: a second conducting sheet, which touches the first where it is pressed."""
@@ -276,6 +280,11 @@ class AbstractClockEffect(AbstractEffect):
     @abstractmethod
     def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:
         """The packets after this effect."""
+
+
+def laid(effects: Iterable[AbstractEffect], centroids: Float[Array, "elements 2"]) -> tuple[AbstractEffect, ...]:
+    """The effects, those of the sheet `laid`: for many sheets of one mesh."""
+    return tuple(e.laid(centroids) if isinstance(e, AbstractSheetEffect) else e for e in effects)
 
 
 def chosen(effects: Iterable[AbstractEffect], family: type, stream: Stream | None = None) -> tuple[Any, ...]:

@@ -1,5 +1,6 @@
 """Material: from load, pressure, manufacture and temperature to conductivity."""
 
+import dataclasses
 from typing import ClassVar
 
 import jax
@@ -27,10 +28,17 @@ class CoatingNonUniformity(AbstractSheetEffect):
     std: Float[Array, ""] = parameter(0.15)
     length: Float[Array, ""] = parameter(30e-3)
     seed: Int[Array, ""] = parameter(0)
+    field: Float[Array, " elements"] | None = None  # set by `laid`
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        field = own_field(self, self.seed, self.length, sheet.centroids)
+        field = self._field(sheet.centroids)
         return sheet._replace(sigma=sheet.sigma * jnp.exp(self.std * field))
+
+    def laid(self, centroids):
+        return dataclasses.replace(self, field=self._field(centroids))
+
+    def _field(self, places):
+        return own_field(self, self.seed, self.length, places) if self.field is None else self.field
 
 
 class ContactGain(AbstractSheetEffect):
@@ -48,10 +56,17 @@ class ContactGain(AbstractSheetEffect):
     std: Float[Array, ""] = parameter(0.12)
     length: Float[Array, ""] = parameter(15e-3)
     seed: Int[Array, ""] = parameter(0)
+    field: Float[Array, " elements"] | None = None  # set by `laid`
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        field = own_field(self, self.seed, self.length, sheet.centroids)
+        field = self._field(sheet.centroids)
         return sheet._replace(pressure=sheet.pressure * jnp.exp(self.std * field))
+
+    def laid(self, centroids):
+        return dataclasses.replace(self, field=self._field(centroids))
+
+    def _field(self, places):
+        return own_field(self, self.seed, self.length, places) if self.field is None else self.field
 
 
 class ContactPiezoresistance(AbstractSheetEffect):
