@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -157,10 +158,11 @@ def calibrate(
     recon = je.prepare(model, prior, basis=basis, hyperparameter=hyperparameter, channels=channels)
     masks = je.pad_masks(skin, recon)
     image = recon(jnp.asarray(dv, recon.factor.dtype))
-    found, places = None, None
+    found, places, uneven = None, None, ""
     if any(f is not None for f in fields):
         noise = np.max([m.noise for m in measured], 0)
-        found = (locator or FittedContact()).prepare(model, noise, channels)
+        sigma, uneven = _background(model, np.mean([m.untouched for m in measured], 0), channels)
+        found = (locator or FittedContact()).prepare(model, noise, channels, sigma)
         places = locate(found.single(), dv, recon, masks, image)
     progress("fitting")
     geometry = geometry_of(skin, places.position.dtype if places else None)
@@ -216,12 +218,21 @@ def calibrate(
         notes=(
             *(f"{m.session.name}: {note}" for m in measured for note in m.notes),
             *([f"chosen: {why}"] if why else []),
+            *([uneven] if uneven else []),
         ),
         field=hybrid.field,
         locator=found if hybrid.field is not None else None,
         baseline=baseline,
         image_gain=float(data.force.sum() / image_sum.sum()),
     )
+
+
+def _background(model: je.Model, untouched: np.ndarray, channels: np.ndarray) -> tuple[Any, str]:
+    """The sheet that contacts are seen through, and a note where it had to be taken for even."""
+    try:
+        return je.fit_background(model, np.where(channels, untouched, np.nan)), ""
+    except je.InverseError as error:
+        return None, f"contacts are placed on an even sheet, as the untouched frame shows none that fits: {error}"
 
 
 def _several(choice) -> tuple:

@@ -73,8 +73,11 @@ class AbstractLocatorChoice(abc.ABC):
     """How the place of a contact is to be estimated."""
 
     @abc.abstractmethod
-    def prepare(self, model: je.Model, noise: np.ndarray, channels: np.ndarray) -> AbstractLocator:
-        """The locator for this model; `noise` (readings,) V of a frame, `channels` that are used."""
+    def prepare(
+        self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
+    ) -> AbstractLocator:
+        """The locator for this model; `noise` (readings,) V of a frame, `channels` that are used, `sigma` (elements,) S
+        of the untouched sheet (default: even)."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +93,13 @@ class ImageCentroid(AbstractLocatorChoice):
         if self.estimator not in je.ESTIMATORS:
             raise ValueError(f"no estimator {self.estimator!r}; there are: {', '.join(je.ESTIMATORS)}")
 
-    def prepare(self, model, noise, channels):
+    def prepare(self, model, noise, channels, sigma=None):
         return CentroidLocator(self.estimator)
 
 
 @dataclass(frozen=True)
 class FittedContact(AbstractLocatorChoice):
-    """Contacts fitted through the forward map (`jaxeit.prepare_contacts`): 2 mm off on a simulated testbed.
+    """Contacts fitted through the forward map (`jaxeit.prepare_contacts`), on the sheet that the untouched frame shows.
 
     | meaning                                                              | default    | unit |
     |----------------------------------------------------------------------|------------|------|
@@ -109,9 +112,9 @@ class FittedContact(AbstractLocatorChoice):
     columns: int = 31
     widths: tuple[float, float] = (0.006, 0.03)
 
-    def prepare(self, model, noise, channels):
+    def prepare(self, model, noise, channels, sigma=None):
         finder = je.prepare_contacts(
-            model, noise=noise, most=self.most, columns=self.columns, widths=self.widths, channels=channels
+            model, noise=noise, most=self.most, columns=self.columns, widths=self.widths, channels=channels, sigma=sigma
         )
         return ContactLocator(jax.tree.map(_rounded, finder))
 

@@ -66,6 +66,7 @@ class Measured:
     | dv: change of the readings over the hold                         | (presses, readings)| V   |
     | pressure: change of the pads' gage pressure over the hold        | (presses, pads)   | Pa   |
     | force over the hold, from the load cell                          | (presses,)        | N    |
+    | untouched: readings without contact, mean over the presses       | (readings,)       | V    |
     | noise: standard deviation of a single frame, at rest or held     | (readings,)       | V    |
     | channels: readings that were finite in every press               | (readings,)       |      |
     | samples: pressure and force all along the presses                |                   |      |
@@ -79,6 +80,7 @@ class Measured:
     dv: np.ndarray
     pressure: np.ndarray
     force: np.ndarray
+    untouched: np.ndarray
     noise: np.ndarray
     channels: np.ndarray
     samples: PressSamples
@@ -101,11 +103,11 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
     windows = press_windows(presses, processing.cutting, recording_end(streams.values()))
     presses = check_overlap(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
-    changes = {
-        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0]).change
+    held = {
+        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0])
         for name, stream in streams.items()
     }
-    means = {name: change.mean for name, change in changes.items()}
+    means = {name: found.change.mean for name, found in held.items()}
     channels, lost = _finite_channels(means["eit"], presses.accepted)
     _require_pads(session, skin, means["pressure"][presses.accepted])
     force = means["force"][:, 0]
@@ -129,7 +131,8 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
         dv=means["eit"][kept],
         pressure=means["pressure"][kept],
         force=force[kept],
-        noise=_frame_noise(changes["eit"], kept),
+        untouched=held["eit"].baseline[kept].mean(0),
+        noise=_frame_noise(held["eit"].change, kept),
         channels=channels,
         samples=samples,
         presses=presses,

@@ -12,7 +12,7 @@ import pytest
 import calib
 import jaxeit as je
 from calib.bench import Bench, Timing, simulate
-from calib.calibration import _to_archive
+from calib.calibration import _background, _to_archive
 from calib.curves import play
 from calib.evaluation import render_table
 from calib.locators import locator_from_numbers, locator_numbers
@@ -316,3 +316,12 @@ def test_bundled_sessions_say_that_they_are_simulated(bundled):
             assert session.seed == calib.load_bench(path.with_suffix(".toml")).seed
         with h5py.File(path) as file:
             assert file.attrs["simulated"] == 1
+
+
+def test_an_untouched_frame_that_fits_no_sheet_is_said(model):
+    """Contacts are then placed on an even sheet."""
+    v0 = np.asarray(je.forward(model))
+    sigma, note = _background(model, -v0, np.ones(len(v0), bool))
+    assert sigma is None
+    assert "even sheet" in note
+    assert "polarity" in note
