@@ -1,6 +1,6 @@
 """What a scene's effects cost: nothing where they are not listed.
 
-python -m benchmarks.bench_scene [--smoke] [--presets NAME ...]
+python -m benchmarks.bench_scene [--smoke] [--sessions-only] [--presets NAME ...]
 
 Two tables.  First the program of one frame of a touch on the testbed (load, sheet, electrodes, voltages) and that of a
 block of 1,024 frames (histories and readout) as effects are added one by one, in the order of the stages: compile time,
@@ -35,6 +35,7 @@ LEFT_OUT = (je.IndentationSpreading, je.HomogenisedIslands, je.ContinuousCoating
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="coarse, one scene; writes nothing")
+    parser.add_argument("--sessions-only", action="store_true", help="the second table alone")
     parser.add_argument("--presets", nargs="*", default=list(presets()), metavar="NAME")
     args = parser.parse_args(argv)
     set_up()
@@ -42,11 +43,11 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     fidelity = je.Fidelity.draft() if args.smoke else je.Fidelity(edge_length=0.02)
     names = ["ideal"] if args.smoke else args.presets
     before = c.circumstances()
-    rows = programs(fidelity, smoke=args.smoke)
+    rows = [] if args.sessions_only else programs(fidelity, smoke=args.smoke)
     print(_table(rows))
     sessions = [simulated(name, fidelity) for name in names]
     print(_table(sessions))
-    data = {"rows": rows, "sessions": sessions, "edge_length": fidelity.edge_length}
+    data = ({"rows": rows} if rows else {}) | {"sessions": sessions, "edge_length": fidelity.edge_length}
     data = c.closed(data | {"circumstances": before})
     if not args.smoke:
         print(c.write("scene", data))
@@ -55,6 +56,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     """Markdown, a line per row."""
+    if not rows:
+        return ""
     lines = ["| " + " | ".join(rows[0]) + " |", "|---" * len(rows[0]) + "|"]
     cells = ([f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in cells)])

@@ -264,7 +264,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     _outputs(args.output, args.report)
     processing = _processing(args.low_pass)
     if args.report:
-        _require_report()
+        _require_matplotlib("--report")
     with ExitStack() as stack:
         sessions = [stack.enter_context(open_session(path)) for path in args.sessions]
         if all("eit" not in session.streams for session in sessions):
@@ -316,11 +316,11 @@ def _calibrate_logs(args: argparse.Namespace, sessions) -> int:
     return 0
 
 
-def _require_report() -> None:
+def _require_matplotlib(option: str) -> None:
     from importlib.util import find_spec
 
     if find_spec("matplotlib") is None:
-        raise ImportError("--report needs matplotlib: pip install 'jaxeit[report]'")
+        raise ImportError(f"{option} needs matplotlib: pip install 'jaxeit[report]'")
 
 
 def _outputs(*paths: str | None) -> None:
@@ -561,6 +561,81 @@ def _doctor(args: argparse.Namespace) -> int:
     return 0 if all(line.ok for line in lines) else 2
 
 
+# --- bench ---------------------------------------------------------------------------------------
+
+
+def _bench_args(parser: argparse.ArgumentParser) -> None:
+    text = "a shipped skin or scene by its name, or the TOML file of your own; default: testbed"
+    parser.add_argument("what", nargs="?", default="testbed", metavar="SKIN|SCENE.toml", help=text)
+    text = "recommend the most accurate rung that solves in this time"
+    parser.add_argument("--budget-ms", type=_above_zero, metavar="MS", help=text)
+    text = "recommend the quickest rung whose error of a touch is no more than this, such as 2e-3"
+    parser.add_argument("--error", type=_above_zero, metavar="E", help=text)
+    parser.add_argument("--smoke", action="store_true", help="a few coarse rungs, within a minute")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    parser.add_argument("-o", "--output", metavar="FIGURE.png", help="draw error against time")
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from shutil import get_terminal_size
+
+    import jax
+
+    import jaxeit as je
+
+    _outputs(args.output)
+    if args.output:
+        _require_matplotlib("-o")
+    scene = _bench_scene(args.what)
+    rungs, budget = (je.few_choices(), 0.1) if args.smoke else (None, 0.5)
+    with jax.enable_x64(True):  # and no cache of programs: how long they take to compile is measured
+        found = je.ladder(scene, rungs, budget=budget, progress=_progress("rungs"))
+    if args.output:
+        _write_ladder_figure(found, Path(args.output))
+    wishes = {"budget_ms": args.budget_ms, "error": args.error}
+    wanted = any(wish is not None for wish in wishes.values())
+    if not args.json:
+        print(found.table(get_terminal_size((110, 24)).columns), flush=True)
+        if wanted:
+            print("\n" + found.advice(**wishes))
+        return 0
+    report = found.summary()
+    try:
+        if wanted:
+            report["recommended"] = found.recommend(**wishes).choice.label
+    finally:  # what was measured is told even where no rung is good enough
+        print(json.dumps(report, indent=2))
+    return 0
+
+
+def _bench_scene(what: str):
+    """A scene by name or file; of a skin, the ideal sensor."""
+    import re
+
+    import jaxeit as je
+
+    from .bench import load_bench, presets
+
+    path = Path(what)
+    if what in je.shipped_skins():
+        return je.Scene(je.load_skin(what))
+    if not path.exists() and what not in presets():
+        known = ", ".join((*je.shipped_skins(), *presets()))
+        raise ValueError(f"{what}: no such file, skin or scene; shipped are {known}")
+    if path.is_file() and re.search(r'^format\s*=\s*"jaxeit-skin"', je.read_text(path), re.MULTILINE):
+        return je.Scene(je.load_skin(path))
+    return load_bench(what).scene
+
+
+def _write_ladder_figure(found, path: Path) -> None:
+    from .figures import png
+    from .ladder_figure import ladder_figure
+    from .session import replacing
+
+    with replacing(path) as new:
+        new.write_bytes(png(ladder_figure([found.summary()])))
+
+
 def _size(path: str) -> int:
     return os.path.getsize(path) if os.path.isfile(path) else 0
 
@@ -580,6 +655,7 @@ _COMMANDS: dict[str, tuple[Callable, Callable, str]] = {
     "calibrate": (_calibrate, _calibrate_args, "fit a calibration to recorded sessions"),
     "evaluate": (_evaluate, _evaluate_args, "judge a calibration on other sessions"),
     "apply": (_apply, _apply_args, "write the force map of every frame of a session"),
+    "bench": (_bench, _bench_args, "measure what accuracy costs in time, for a skin on this machine"),
     "record": (_record, _record_args, "record devices into a session file; nothing that arrived is lost"),
     "live": (_live, _live_args, "show the force map as frames arrive, on a page of its own"),
     "doctor": (_doctor, _doctor_args, "examine this machine: versions, device, threads, cache, disk, ports"),

@@ -9,6 +9,7 @@ from importlib import metadata
 from . import effects
 from .background import fit_background
 from .basis import BasisMap, Bumps, Elements, Picture, Pixels
+from .choices import Choice, Imaging, LadderError, Touch, few_choices, fidelity_choices, image_choices
 from .contacts import ContactFinder, ContactResult, Contacts, prepare_contacts, refine_contacts, strongest
 from .discretise import Model, discretise, make_mesh
 from .domain import Disc, Polygon, Rectangle
@@ -66,6 +67,7 @@ from .hyperparameter import (
 )
 from .inverse import IterativeReconstructor, Reconstructor, prepare
 from .jacobian import jacobian
+from .ladder import fit_fidelity, ladder
 from .mesh import Mesh, MeshError, Pattern, structured, triangulate
 from .methods import BackProjection, Greit, NonNegative, OneStep, Reweighted, SparseBayes, TruncatedSvd
 from .metrics import (
@@ -91,6 +93,7 @@ from .pneumatics import pad_response
 from .priors import GaussianSmooth, Laplace, Noser, Tikhonov, TotalVariation
 from .protocol import Protocol, adjacent, reciprocal_rows
 from .regions import RegionError, Regions, find_regions
+from .rungs import Ladder, Rung
 from .scene import Scene, read_effects
 from .skin import Pad, PressureSensor, Skin, load_skin, parse_skin, shipped_skins
 from .solvers import ConjugateGradient, Dense, NestedDissection, Single
@@ -115,6 +118,7 @@ __all__ = [
     "BasisMap",
     "BoundaryPatch",
     "Bumps",
+    "Choice",
     "ClockError",
     "CoatedSheet",
     "CoatingNonUniformity",
@@ -150,12 +154,15 @@ __all__ = [
     "HomogenisedIslands",
     "HyperparameterError",
     "Hysteresis",
+    "Imaging",
     "IndentationSpreading",
     "IntermittentElectrode",
     "InverseError",
     "IsotropicVariation",
     "IterativeReconstructor",
     "LCurve",
+    "Ladder",
+    "LadderError",
     "Laplace",
     "LevelCentroid",
     "LoadCellError",
@@ -199,6 +206,7 @@ __all__ = [
     "RegionError",
     "Regions",
     "Reweighted",
+    "Rung",
     "ScanSkew",
     "Scene",
     "SensorError",
@@ -214,6 +222,7 @@ __all__ = [
     "TomlError",
     "TomlTable",
     "TotalVariation",
+    "Touch",
     "TpuRelaxation",
     "TruncatedSvd",
     "adjacent",
@@ -223,18 +232,23 @@ __all__ = [
     "disc_resistance",
     "discretise",
     "effects",
+    "few_choices",
+    "fidelity_choices",
     "find_regions",
     "fit_background",
+    "fit_fidelity",
     "forward",
     "from_numbers",
     "fuse",
     "gauss_newton",
     "greit_figures",
+    "image_choices",
     "image_correlation",
     "image_sum",
     "inward_bias",
     "jacobian",
     "ktc_score",
+    "ladder",
     "load_reconstructor",
     "load_skin",
     "load_spread",
