@@ -108,15 +108,15 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = ["| load spreading (seeds) | " + " | ".join(label for label, _ in COLUMNS.values()) + " |"]
     lines.append("|---" * (1 + len(COLUMNS)) + "|")
     for row in rows:
-        cells = [_cell(*row[name], scale) for name, (_, scale) in COLUMNS.items()]
+        cells = [_cell(*row[name], scale, row["seeds"]) for name, (_, scale) in COLUMNS.items()]
         lines.append(f"| {row['spreading_mm']:g} mm ({row['seeds']}) | " + " | ".join(cells) + " |")
     lines.append("| the paper, on hardware | " + " | ".join(PAPER.get(name, "") for name in COLUMNS) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _cell(mean: float, std: float, scale: float) -> str:
+def _cell(mean: float, std: float, scale: float, seeds: int) -> str:
     digits = 1 if scale > 1 else 3
-    return f"{scale * mean:.{digits}f} ± {scale * std:.{digits}f}"
+    return f"{scale * mean:.{digits}f}" + (f" ± {scale * std:.{digits}f}" if seeds > 1 else "")
 
 
 if __name__ == "__main__":

@@ -99,9 +99,9 @@ def _figures(ms: float) -> str:
 
 def _table(s: dict[str, float]) -> str:
     rows = [
-        f"| localisation error, {name} estimator, mean | {1e3 * s[f'localisation_{name}_mean']:.1f} ± "
+        f"| localisation error, {label}, mean | {1e3 * s[f'localisation_{name}_mean']:.1f} ± "
         f"{1e3 * s[f'localisation_{name}_mean_se']:.1f} mm | {PAPER['localisation'] if name == 'quarter' else ''} |"
-        for name in je.ESTIMATORS
+        for name, label in {**{n: f"{n} estimator" for n in je.ESTIMATORS}, "fitted": "contacts fitted"}.items()
     ]
     rows += [
         f"| coefficient of variation of sensitivity, {label} | {s[f'cv_{name}_ddof1']:.3f} ± {s[f'cv_{name}_se']:.3f} "
