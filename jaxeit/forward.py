@@ -97,7 +97,11 @@ def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None 
 
 @verb
 def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Float[Array, " readings"]:
-    z = transfer(model, coefficients(model, sigma))
+    return voltages(model, transfer(model, coefficients(model, sigma)))
+
+
+def voltages(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
+    """Voltages of the protocol from the transfer matrix in ohm, as source and amplifiers of the scene make them."""
     circuit = Circuit(z, model.pattern, model.current)
     return fold(model.effects, AbstractTerminalEffect, readings(model, z), circuit)
 

@@ -7,6 +7,8 @@ readings are differences of these L(L+1)/2 products, which are formed for a batc
 a time: nothing of the size elements times readings exists unless it is asked for.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from .basis import AbstractBasis, BasisMap, Elements
 from .discretise import Model
-from .forward import Coefficients, coefficients, fields, series_resistance
+from .effects import AbstractTerminalEffect, chosen
+from .forward import CoatedSheet, Coefficients, coefficients, fields, series_resistance, transfer, voltages
 from .verbs import verb
 
 _BATCH = 512  # elements at once: their slopes and products stay in a core's cache
@@ -36,8 +39,10 @@ def jacobian(
             `BasisMap` made outside with ``basis.on(model)``.
 
     Raises:
-        ValueError: if ``sigma`` does not fit the model.
+        ValueError: if ``sigma`` does not fit the model, or is that of two sheets.
     """
+    if isinstance(sigma, CoatedSheet):
+        raise ValueError("sigma is that of a sheet and its coat; the Jacobian is for one sheet: give sigma.sigma")
     basis = Elements() if basis is None else basis
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     return _jacobian(model, None if sigma is None else jnp.asarray(sigma), image)
@@ -52,6 +57,10 @@ def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: Basi
     pair = jnp.asarray(number)
     slopes = _pair_slopes(model, sigma, image, np.stack([first, second], 1))
     by_pair = jax.lax.optimization_barrier(slopes.T)
+    if chosen(model.effects, AbstractTerminalEffect):
+        z = transfer(model, coefficients(model, sigma))
+        at_terminals = partial(jax.jvp, partial(voltages, model), (z,))
+        return jax.vmap(lambda column: at_terminals((column[pair],))[1], 1, 1)(by_pair)
     source, sink, plus, minus = model.pattern.T
     out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
     return model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])

@@ -26,6 +26,7 @@ from scipy.linalg import solve_triangular as solve_lower
 from scipy.linalg.lapack import dpstrf, dtrtri
 
 from .discretise import Model
+from .effects import AbstractTerminalEffect, chosen
 
 
 class InverseError(ValueError):
@@ -208,6 +209,12 @@ def _factors(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def whitened_readings(model: Model, noise, channels) -> Whitened:
     """What of a frame is used, and how much it weighs; noise and channels as for `prepare`."""
+    between = chosen(model.effects, AbstractTerminalEffect)
+    if between:
+        raise InverseError(
+            f"{type(between[0]).__name__} acts between sheet and readings, which are then not the differences of "
+            "potentials that reconstruction takes them for; reconstruct with a scene without it"
+        )
     readings = model.pattern.shape[0]
     used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
     weight = noise_weight(noise, readings, used)

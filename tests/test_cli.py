@@ -1,6 +1,12 @@
 """The command line: what it prints, how it exits, and one clear line for every wrong input."""
 
 import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -131,3 +137,32 @@ def test_no_command_is_an_error():
     with pytest.raises(SystemExit) as caught:
         main([])
     assert caught.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["ideal"], "give either -o SESSION.h5 to simulate, or --explain"),
+        (["ideal", "--explain", "-o", "s.h5"], "give either -o SESSION.h5 to simulate, or --explain"),
+        (["ideel", "--explain"], "ideel: no such scene file or preset; presets: broken_electrode"),
+        (["testbed", "--data-set", "3", "--serve", "-o", "s.h5"], "--serve are for scenes"),
+    ],
+)
+def test_simulate_says_what_it_needs(words, message, capsys):
+    assert main(["simulate", *words]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+
+
+def test_a_scene_served_as_a_device(presses_file, tmp_path):
+    """A session that is there is played at local ports until interrupted; what listens there gets frames."""
+    path = shutil.copy(presses_file, tmp_path / "s.h5")
+    command = [sys.executable, "-m", "calib.cli", "simulate", "ideal", "-o", str(path), "--serve"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
+        said = serving.stdout.readline()
+        port = int(re.search(r"--eit tcp://127\.0\.0\.1:(\d+)", said)[1])
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as link:
+            assert link.recv(4096)
+        serving.send_signal(signal.SIGINT)
+        assert serving.wait(20) == 0

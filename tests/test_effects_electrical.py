@@ -190,3 +190,16 @@ def test_effects_of_a_scene_file_have_their_types():
     assert int(effect.electrode) == 7
     assert effect.electrode.dtype == jnp.asarray(0).dtype
     assert effect.resistance.dtype == jnp.asarray(0.0).dtype
+
+
+def test_the_jacobian_is_that_of_what_the_terminals_see():
+    """Against forward differentiation of `forward`, through a fault that limits the current."""
+    points = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.12)]
+    effects = (je.CommonMode(gain=0.01), je.ElectrodeFault(electrode=0, resistance=50.0, compliance=20.0))
+    model = square_model(points, [[0, 1, 2, 3], [2, 3, 0, 1], [1, 2, 0, 3]], 10, effects=effects)
+    expected = jax.jacfwd(lambda sigma: je.forward(model, sigma))(model.background)
+    np.testing.assert_allclose(je.jacobian(model), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    bare = square_model(points, [[0, 1, 2, 3], [2, 3, 0, 1], [1, 2, 0, 3]], 10)
+    assert np.abs(je.jacobian(bare) - expected).max() > 0.1 * np.abs(expected).max()
+    with pytest.raises(ValueError, match="CommonMode acts between sheet and readings"):
+        je.prepare(model)
