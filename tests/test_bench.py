@@ -280,6 +280,7 @@ def test_chance_is_of_the_seed_and_of_nothing_else(skin):
     assert np.abs(first - other).std() > 1e-6
 
 
+@pytest.mark.slow
 def test_the_data_set_is_one_solve_each(skin):
     model = je.discretise(je.Scene(skin), DRAFT)
     places, amplitudes = grid(skin, 3, 2), np.array([0.0, 0.5, 1.0])

@@ -126,6 +126,7 @@ def test_jacobians_agree(problem):
         assert common.difference(pyeit.prepare_jacobian(problem)(problem.sigma), by_hand) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [False, True])
 def test_reconstruction_matrices_agree(problem, pixels):
     by_hand = bench_inverse.by_hand(problem, pixels)(problem.sigma)

@@ -136,6 +136,7 @@ def test_weights_are_those_of_weighted_least_squares():
     np.testing.assert_allclose(got.parameters, [slope, offset], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_losses_are_what_they_are_called():
     r = np.linspace(-6, 6, 25) + 0.01  # not on Huber's corner
     s = (r / 2.0) ** 2

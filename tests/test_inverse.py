@@ -37,6 +37,7 @@ def test_matches_stacked_least_squares(model, pixels, recon):
     np.testing.assert_allclose(recon(dv), exact, atol=1e-9 * np.abs(exact).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("columns", [12, 30])
 def test_data_space_and_image_space_agree(model, columns):
     """12 x 12 pixels are fewer than the 300 pair sums, 30 x 30 are more; against the SVD of all readings."""

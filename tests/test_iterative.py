@@ -35,6 +35,7 @@ def y(problem):
     return jnp.asarray(clean + 0.01 * np.abs(clean).max() * np.random.default_rng(0).normal(size=550))
 
 
+@pytest.mark.slow
 def test_not_negative_in_data_space_is_the_interior_point_of_the_dense_form(problem, y):
     found = np.asarray(je.NonNegative().image(problem(je.Noser()), y))
     dense = np.asarray(je.NonNegative(60).image(problem(_Dense()), y))

@@ -329,6 +329,7 @@ def test_root_without_unknowns(solver):
     assert quick(solver.corner)(solver.analyse(pattern), values).shape == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS[:2], ids=str)
 @pytest.mark.parametrize("transform", ["jacfwd", "reverse over reverse", "reverse over forward"])
 def test_derivatives_of_the_columns(solver, transform, small):

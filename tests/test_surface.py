@@ -53,6 +53,7 @@ def test_images_and_forces_on_the_chest(chest):
     assert float(fmap.force.sum()) == pytest.approx(9.0, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edge_length", [0.08, 0.04])
 def test_a_spherical_cap_is_the_flat_disc_of_its_stereographic_projection(edge_length):
     """Conduction in a sheet is invariant under conformal maps, and this projection is conformal."""
@@ -71,6 +72,7 @@ def test_a_spherical_cap_is_the_flat_disc_of_its_stereographic_projection(edge_l
     np.testing.assert_allclose(bent, flat, rtol=1.5 * edge_length**2)
 
 
+@pytest.mark.slow
 def test_a_sphere_of_large_radius_is_flat():
     disc = je.Disc(0.1)
     skin = skin_of(disc, [je.PointElectrode(p) for p in POINTS], PATTERN)
