@@ -254,7 +254,8 @@ def test_tips_stay_on_the_sheet(skin, change, message):
 
 
 def test_explain_names_each_effect_in_its_stage(skin):
-    effects = (*SHEET, je.ContactScatter(), je.PadLeak(), je.Noise(std=1e-5))
+    whole = (je.StageError(), je.PadEdgeDip(), je.ScanSkew(), je.DropOut(), je.IntermittentElectrode())
+    effects = (*SHEET, *whole, je.ContactScatter(), je.PadLeak(), je.Noise(std=1e-5))
     bench = _bench(skin, *effects, sites=((0.06, 0.07),))
     parts = explain(bench, DRAFT)
     by_name = {part.name: part for part in parts}

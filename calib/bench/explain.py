@@ -38,7 +38,7 @@ class Part:
 def explain(bench: Bench, fidelity: je.Fidelity | None = None) -> tuple[Part, ...]:
     """Measure each part of a scene's simulation alone, compilation apart."""
     made = recordings(bench, je.Fidelity(edge_length=0.02) if fidelity is None else fidelity)
-    parts = [*_of_sheet(made), *_of_histories(made)]
+    parts = [*_once(made), *_of_sheet(made), *_of_histories(made)]
     return tuple(sorted(parts, key=lambda part: STAGES.index(part.stage)))
 
 
@@ -54,6 +54,20 @@ def render(bench: Bench, parts: tuple[Part, ...]) -> str:
         before = part.stage
     lines.append(f"{'':10}  {'':{width}}  of {whole:.3g} s for {bench.duration:.0f} s of recording")
     return "\n".join(lines)
+
+
+def _once(made: Recordings) -> Iterator[Part]:
+    """What runs once per session."""
+    motion, model, key = made.motion, made.eit.model, jax.random.key(0)
+    path = fx.Path(jnp.asarray(motion.places[:, 0]), jnp.asarray(motion.start), jnp.asarray(motion.pace))
+    for effect in fx.chosen(model.effects, fx.AbstractStageEffect):
+        yield _part(effect, 1, effect, path, key)
+    response = jnp.ones((len(made.bench.scene.skin.pads), model.background.size), model.dtype)
+    for effect in fx.chosen(model.effects, fx.AbstractPadEffect):
+        yield _part(effect, 1, effect, response, response)
+    when = jnp.zeros(len(model.pattern))
+    for effect in fx.chosen(model.effects, fx.AbstractScanEffect):
+        yield _part(effect, 1, effect, when, when)
 
 
 def _of_sheet(made: Recordings) -> Iterator[Part]:
@@ -96,6 +110,9 @@ def _of_histories(made: Recordings) -> Iterator[Part]:
             for effect in fx.chosen(made.bench.scene.effects, family, stream):
                 state = fx.history_start((effect,), values[0])
                 yield _part(effect, recording.blocks, history, (effect,), values, state, line)
+        packets = fx.Packets(jnp.asarray(times), jnp.asarray(times), jnp.zeros(len(times), bool))
+        for effect in fx.chosen(made.bench.scene.effects, fx.AbstractClockEffect, recording.kind):
+            yield _part(effect, recording.blocks, effect, packets, line.key)
 
 
 def _joining(eit: EitRecording) -> float:

@@ -183,8 +183,8 @@ def _append(writer: SessionWriter, name: str, recording: AbstractRecording, stor
         if not len(samples.host):
             gap = True
             continue
-        host = np.maximum.accumulate(np.maximum(_nanoseconds(samples.host), last + 1))
-        host = np.maximum.accumulate(host - np.arange(len(host))) + np.arange(len(host))
+        index = np.arange(len(samples.host))
+        host = np.maximum.accumulate(np.maximum(_nanoseconds(samples.host) - index, last + 1)) + index
         flags = samples.gap.copy()
         flags[0] |= gap
         extras: dict[str, Any] = {}

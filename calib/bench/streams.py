@@ -85,8 +85,6 @@ class AbstractRecording(ABC):
         values, before = self.quantity(number, times, state[0])
         after = state[1]
         if self._readouts:
-            pattern = jnp.asarray(self.bench.scene.skin.protocol.pattern, jnp.int32)
-            line = line._replace(pattern=pattern if self.kind is fx.Stream.EIT else pattern[:0])
             recorded, after = history(self._readouts, jnp.asarray(values), after, line)
             values = np.asarray(recorded)
         return self._received(number, times, values), (before, after)
@@ -100,7 +98,9 @@ class AbstractRecording(ABC):
         times = self.times(number)
         key = jax.random.fold_in(jax.random.fold_in(self._key, purpose), number)
         warmth, air = jnp.asarray(temperature(self.bench, times)), jnp.asarray(barometer(self.bench, times))
-        return fx.Line(key, jnp.asarray(1 / self.rate), warmth, air, jnp.zeros((0, 4), jnp.int32))
+        pattern = jnp.asarray(self.bench.scene.skin.protocol.pattern, jnp.int32)
+        pattern = pattern if self.kind is fx.Stream.EIT else pattern[:0]
+        return fx.Line(key, jnp.asarray(1 / self.rate), warmth, air, pattern)
 
     def _received(self, number: int, times: np.ndarray, values: np.ndarray) -> Samples:
         used = min(_ROWS, self.samples - number * _ROWS)

@@ -2,10 +2,10 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._base import AbstractCoatEffect, Sheet, parameter
+from .material import power
 
 
 class ContinuousCoating(AbstractCoatEffect):
@@ -38,9 +38,8 @@ class ContinuousCoating(AbstractCoatEffect):
     coverage: Float[Array, ""] = parameter(1 / 3)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        # The power has an infinite slope at zero pressure for n < 1: keep it off that point.
-        touched = sheet.pressure > 0
-        ratio = jnp.where(touched, sheet.pressure, self.reference_pressure) / self.reference_pressure
-        coupling = jnp.where(touched, self.coverage / self.contact_resistivity * ratio**self.exponent, 0.0)
+        coupling = (
+            self.coverage / self.contact_resistivity * power(sheet.pressure / self.reference_pressure, self.exponent)
+        )
         bearing = coupling if sheet.share is None else sheet.share * coupling
         return sheet._replace(metal=1 / self.resistance, coupling=bearing)

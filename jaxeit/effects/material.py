@@ -88,7 +88,7 @@ class ContactPiezoresistance(AbstractSheetEffect):
     exponent: Float[Array, ""] = parameter(1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        x = _power(sheet.pressure / self.half_pressure, self.exponent)
+        x = power(sheet.pressure / self.half_pressure, self.exponent)
         return _conducting(sheet, 1 + self.amplitude * x / (1 + x))
 
 
@@ -123,7 +123,7 @@ class HomogenisedIslands(AbstractSheetEffect):
     exponent: Float[Array, ""] = parameter(1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        conductance = _power(sheet.pressure / self.reference, self.exponent) / self.contact
+        conductance = power(sheet.pressure / self.reference, self.exponent) / self.contact
         b = _island_dipole(self.radius**2 * conductance / sheet.sigma)
         return _conducting(sheet, _mixture(self.fraction * b))
 
@@ -248,7 +248,7 @@ def _logarithm(load: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.log(jnp.maximum(load, jnp.finfo(load.dtype).tiny))
 
 
-def _power(x: Float[Array, " elements"], exponent: Float[Array, ""]) -> Float[Array, " elements"]:
+def power(x: Float[Array, " elements"], exponent: Float[Array, ""]) -> Float[Array, " elements"]:
     """``x^exponent``, and 0 without pressure, where a power below one would have an infinite slope."""
     touched = x > 0
     return jnp.where(touched, jnp.where(touched, x, 1.0) ** exponent, 0.0)
