@@ -337,6 +337,19 @@ def write(section: str, data: dict[str, Any], folder: Path = RESULTS) -> Path:
     return path
 
 
+def stored(section: str) -> Any:
+    """What this machine measured last.
+
+    Raises:
+        SystemExit: if it has not measured this.
+    """
+    path = RESULTS / f"{machine()}.json"
+    results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if section not in results:
+        raise SystemExit(f"{path} has no {section!r} to draw; measure first (leave out --draw-only)")
+    return results[section]
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: a line per tool, a column per size, median (least to most) in ms."""
     sizes = sorted({row["nodes"] for row in rows})

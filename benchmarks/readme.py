@@ -5,6 +5,7 @@ python -m benchmarks.readme
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import calib
@@ -42,6 +43,9 @@ def main() -> None:
     text = _replaced(text, "images", _images(measured["images"]))
     text = _replaced(text, "scenes", _scenes(measured["scene"]["sessions"]))
     text = _replaced(text, "paper", bench_paper.table(measured["paper"]["rows"]))
+    for mark, (section, table) in COSTS.items():
+        if section in measured:
+            text = _replaced(text, mark, table(measured[section]))
     with replacing(readme) as new:
         new.write_text(text, encoding="utf-8")
     (ROOT / "docs").mkdir(exist_ok=True)
@@ -91,6 +95,82 @@ def _scenes(sessions: list[dict]) -> str:
             f"| {row['times_real_time']:.0f} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _pipeline(results: dict) -> str:
+    """Mesh to images of 100 frames, by tool and mesh."""
+    nodes = sorted({row["nodes"] for row in results["rows"]})
+    lines = ["| mesh to images of 100 frames, ms | " + " | ".join(f"{n:,} nodes" for n in nodes) + " |"]
+    lines.append("|---" * (1 + len(nodes)) + "|")
+    for tool in dict.fromkeys(row["tool"] for row in results["rows"]):
+        found = {row["nodes"]: _figures(row["median_ms"]) for row in results["rows"] if row["tool"] == tool}
+        lines.append(f"| {tool.replace(', ', ', onto ')} | " + " | ".join(found.get(n, "") for n in nodes) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _to_accuracy(results: dict) -> str:
+    """The quickest mesh of each tool that reaches an accuracy."""
+    targets = list(dict.fromkeys(row["target"] for row in results["to_accuracy"]))
+    heads = [f"voltages to {100 * target:g} %" for target in targets]
+    lines = ["| forward, ms (unknowns) | " + " | ".join(heads) + " |", "|---" * (1 + len(targets)) + "|"]
+    for kind in dict.fromkeys(row["kind"] for row in results["to_accuracy"]):
+        best = [row["best"] for row in results["to_accuracy"] if row["kind"] == kind]
+        cells = (f"{_figures(b['median_ms'])} ({b['unknowns']:,})" if b else "not reached" for b in best)
+        lines.append(f"| {kind} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _calibration(results: dict) -> str:
+    """Error of held-out forces by presses scattered over the skin, and by recipe."""
+    rows = [row for row in results["presses"] if row["spread"] == "scattered" or row["presses"] == 225]
+    sizes = {row["presses"]: row["minutes"] for row in rows}
+    heads = [f"{n} presses, {minutes:.0f} min" for n, minutes in sorted(sizes.items())]
+    lines = ["| error of held-out forces, N | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]
+    for curve, location in dict.fromkeys((row["curve"], row["location"]) for row in rows):
+        found = {r["presses"]: r for r in rows if (r["curve"], r["location"]) == (curve, location)}
+        cells = (f"{found[n]['hold_n']:.2f}" if "hold_n" in found[n] else "not determined" for n in sorted(sizes))
+        lines.append(f"| {curve}, location {location} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _protocol(results: dict) -> str:
+    """Error of place by readings of a frame, and by the way they are chosen."""
+    rows = results["rows"]
+    counts = sorted({row["readings"]: row["frames_per_s"] for row in rows}.items())
+    heads = [f"{n} readings, {rate:,.0f} frames/s" for n, rate in counts]
+    lines = ["| mean error of place, contacts fitted, mm | " + " | ".join(heads) + " |"]
+    lines.append("|---" * (1 + len(counts)) + "|")
+    for way in dict.fromkeys(row["way"] for row in rows):
+        found = {row["readings"]: row["fit_mm"] for row in rows if row["way"] == way and row["fit_mm"] is not None}
+        lines.append(f"| {way} | " + " | ".join(f"{found[n]:.2g}" if n in found else "" for n, _ in counts) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _growth(results: dict) -> str:
+    """Fitted exponents beside the theory's."""
+    lines = ["| | sizes | time grows as size to the | theory | memory | theory |", "|---" * 6 + "|"]
+    for fit in results["fits"]:
+        cells = [f"{fit[n]['exponent']} | {fit[n]['theory']}" for n in ("time", "memory")]
+        ends = f"{fit['sizes'][0]:,} to {fit['sizes'][-1]:,}"
+        lines.append(f"| {fit['series']} by {fit['of']} | {ends} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _start(results: dict) -> str:
+    """Seconds of fresh processes."""
+    lines = ["| fresh process | s |", "|---|---|"]
+    lines += [f"| {row['start']} | {row['median_ms'] / 1e3:.2f} |" for row in results["rows"]]
+    return "\n".join(lines) + "\n"
+
+
+COSTS: dict[str, tuple[str, Callable[[dict], str]]] = {
+    "pipeline": ("pipeline", _pipeline),
+    "to-accuracy": ("pipeline", _to_accuracy),
+    "calibration-cost": ("calibration_cost", _calibration),
+    "measurement-cost": ("protocol_cost", _protocol),
+    "growth": ("growth", _growth),
+    "start": ("start", _start),
+}
 
 
 def _figures(ms: float) -> str:

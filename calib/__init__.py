@@ -7,11 +7,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .batch import Outcome, calibrate_many
     from .bench import Bench, Timing, load_bench, simulate
     from .calibration import Calibration, calibrate, evaluate, load_calibration
     from .check import check_session
     from .corrections import LowPass, PreOnly, TwoSided
-    from .curves import Affine, Hysteresis, Linear, MonotonePolynomial, MonotoneSpline, Play, PowerLaw
+    from .curves import Affine, Hysteresis, HysteresisSpline, Linear, MonotonePolynomial, MonotoneSpline, Play, PowerLaw
     from .evaluation import Evaluation
     from .fit import Cauchy, FittedCurve, Huber, SoftL1, Squared, fit_curve, fit_curves
     from .hybrid import Hybrid
@@ -46,11 +47,12 @@ if TYPE_CHECKING:
     )
 
 _HOMES = {
+    "batch": "Outcome calibrate_many",
     "bench": "Bench Timing load_bench simulate",
     "calibration": "Calibration calibrate evaluate load_calibration",
     "check": "check_session",
     "corrections": "LowPass PreOnly TwoSided",
-    "curves": "Affine Hysteresis Linear MonotonePolynomial MonotoneSpline Play PowerLaw",
+    "curves": "Affine Hysteresis HysteresisSpline Linear MonotonePolynomial MonotoneSpline Play PowerLaw",
     "evaluation": "Evaluation",
     "fit": "Cauchy FittedCurve Huber SoftL1 Squared fit_curve fit_curves",
     "hybrid": "Hybrid",

@@ -39,6 +39,7 @@ from .locators import (
 from .measured import Measured, Processing, measure
 from .presses import dominant_pad
 from .session import Archive, Session, SessionError, read_archive, write_archive
+from .splits import leave_out
 
 FORMAT = "skin-calibration"
 STAGES = ("reading", "model and images", "fitting", "holding out")
@@ -149,52 +150,19 @@ def calibrate(
     skin = skin or je.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
     curves, fields, loss = _several(curve or Linear()), _several(location), loss or SoftL1()
     progress("reading")
-    measured = [measure(session, skin, processing) for session in sessions]
-    data, dv, position = _join(measured)
-    _require_pressed(skin, data)
+    pressed = _join([measure(session, skin, processing) for session in sessions])
+    _require_pressed(skin, pressed.data)
     progress("model and images")
-    model = je.discretise(je.Scene(skin), fidelity)
-    channels = np.logical_and.reduce([m.channels for m in measured])
-    recon = je.prepare(model, prior, basis=basis, hyperparameter=hyperparameter, channels=channels)
-    masks = je.pad_masks(skin, recon)
-    image = recon(jnp.asarray(dv, recon.factor.dtype))
-    found, places, uneven = None, None, ""
-    if any(f is not None for f in fields):
-        noise = np.max([m.noise for m in measured], 0)
-        sigma, uneven = _background(model, np.mean([m.untouched for m in measured], 0), channels)
-        found = (locator or FittedContact()).prepare(model, noise, channels, sigma)
-        places = locate(found.single(), dv, recon, masks, image)
+    wanted = (locator or FittedContact()) if any(f is not None for f in fields) else None
+    seen = _look(skin, pressed, fidelity, wanted, prior=prior, basis=basis, hyperparameter=hyperparameter)
     progress("fitting")
-    geometry = geometry_of(skin, places.position.dtype if places else None)
-    fold = folds_by_place(data.place, folds)
-    law, where, why = choose(curves, fields, data, geometry, places, loss, fold)
-    hybrid = fit_hybrid(law, where, data, geometry, places, loss)
+    geometry = geometry_of(skin, seen.places.position.dtype if seen.places else None)
+    trial = _Trial(pressed.data, geometry, seen.places, loss, folds_by_place(pressed.data.place, folds))
+    law, where, why = choose(curves, fields, pressed.data, geometry, seen.places, loss, trial.fold)
+    hybrid = trial.fit(law, where)
     _require_fits(skin, hybrid)
-    baseline = (
-        hybrid.curves if _is_papers(law, where) else fit_hybrid(Linear(), None, data, geometry, None, loss).curves
-    )
+    baseline = hybrid.curves if _is_papers(law, where) else trial.fit(Linear(), None).curves
     progress("holding out")
-    trial = _Trial(data, geometry, loss, fold)
-    pad_force = trial.predict(law, where, places)
-    image_sum = np.asarray(je.image_sum(image, recon.areas), float)
-    others = {"eit": trial.image_only(image_sum)}
-    others["hybrid"] = (pad_force if _is_papers(law, where) else trial.predict(Linear(), None, None)).sum(1)
-    if where is not None and any("contact_position" in s.truth for s in sessions):
-        true = single_places(jnp.asarray(position), len(skin.pads))
-        others["true_place"] = trial.predict(law, where, true).sum(1)
-    evaluation = evaluate_presses(
-        recon,
-        skin,
-        np.asarray(image),
-        position,
-        data.force,
-        data.pressure,
-        pad_force,
-        held_out_by="location",
-        others=others,
-        fitted=None if places is None else np.asarray(places.position[:, 0], float),
-        recipe=_recipe(law, where),
-    )
     options = {
         "curve": curve_name(law),
         "location": "none" if where is None else field_name(where),
@@ -202,29 +170,83 @@ def calibrate(
         "loss": type(loss).__name__,
         "hyperparameter": repr(float(hyperparameter)),
         "prior": repr(prior or je.Noser()),
-        "pixels": "x".join(map(str, recon.shape[::-1])),
+        "pixels": "x".join(map(str, seen.recon.shape[::-1])),
         "fidelity": repr(fidelity or je.Fidelity.standard()),
         "processing": repr(processing or Processing()),
         "folds": str(folds),
     }
     return Calibration(
         skin=skin,
-        recon=recon,
-        masks=masks,
+        recon=seen.recon,
+        masks=seen.masks,
         curves=hybrid.curves,
-        evaluation=evaluation,
+        evaluation=_held_out(skin, pressed, seen, trial, law, where),
         provenance=_provenance(sessions, options),
         simulated=any(s.simulated for s in sessions),
-        notes=(
-            *(f"{m.session.name}: {note}" for m in measured for note in m.notes),
-            *([f"chosen: {why}"] if why else []),
-            *([uneven] if uneven else []),
-        ),
+        notes=(*pressed.notes, *([f"chosen: {why}"] if why else []), *filter(None, [seen.note])),
         field=hybrid.field,
-        locator=found if hybrid.field is not None else None,
+        locator=seen.locator if hybrid.field is not None else None,
         baseline=baseline,
-        image_gain=float(data.force.sum() / image_sum.sum()),
+        image_gain=float(pressed.data.force.sum() / seen.image_sum.sum()),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Pressed:
+    """Sessions one after the other, press by press.
+
+    | meaning                                                       | shape               | unit |
+    |---------------------------------------------------------------|---------------------|------|
+    | data: what curves and fields are fitted to                    |                     |      |
+    | dv: change of the readings over the hold                      | (presses, readings) | V    |
+    | position of the tip, true                                     | (presses, 2)        | m    |
+    | groups: number of each press's pad, indenter, session         | (presses,) each     |      |
+    | channels: readings that were finite in every press            | (readings,)         |      |
+    | noise of a frame: the largest of the sessions                 | (readings,)         | V    |
+    | untouched: readings without contact                           | (readings,)         | V    |
+    | true_place: whether a simulation knows the place exactly      |                     |      |
+    | notes                                                         |                     |      |
+    """
+
+    data: PressData
+    dv: np.ndarray
+    position: np.ndarray
+    groups: Mapping[str, np.ndarray]
+    channels: np.ndarray
+    noise: np.ndarray
+    untouched: np.ndarray
+    true_place: bool
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the presses look like: image (presses, pixels) S, its integral (presses,) S m^2, and places if asked for."""
+
+    recon: je.Reconstructor
+    masks: je.PadMasks
+    image: np.ndarray
+    image_sum: np.ndarray
+    locator: AbstractLocator | None
+    places: Places | None
+    note: str
+
+
+def _look(
+    skin: je.Skin, pressed: _Pressed, fidelity: je.Fidelity | None, choice: AbstractLocatorChoice | None, **imaging: Any
+) -> _Seen:
+    """Images of the presses; with a choice of locator, their places on the sheet that the untouched frames show."""
+    model = je.discretise(je.Scene(skin), fidelity)
+    recon = je.prepare(model, channels=pressed.channels, **imaging)
+    masks = je.pad_masks(skin, recon)
+    image = recon(jnp.asarray(pressed.dv, recon.factor.dtype))
+    found, places, note = None, None, ""
+    if choice is not None:
+        sigma, note = _background(model, pressed.untouched, pressed.channels)
+        found = choice.prepare(model, pressed.noise, pressed.channels, sigma)
+        places = locate(found.single(), pressed.dv, recon, masks, image)
+    image_sum = np.asarray(je.image_sum(image, recon.areas), float)
+    return _Seen(recon, masks, np.asarray(image), image_sum, found, places, note)
 
 
 def _background(model: je.Model, untouched: np.ndarray, channels: np.ndarray) -> tuple[Any, str]:
@@ -249,16 +271,23 @@ def _recipe(curve: AbstractCurve, field: AbstractField | None) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Presses, and how they are divided: predictions by fits that never saw a press's place."""
+    """Presses, where they were found, and how they are divided: fits of all, and predictions by fits that never saw
+    a press's place."""
 
     data: PressData
     geometry: Geometry
+    places: Places | None
     loss: AbstractLoss
     fold: np.ndarray
 
-    def predict(self, curve: AbstractCurve, field: AbstractField | None, places: Places | None) -> np.ndarray:
-        """Pad forces over the holds, (presses, pads) N."""
-        return hold_out(curve, field, self.data, self.geometry, places, self.loss, self.fold)
+    def fit(self, curve: AbstractCurve, field: AbstractField | None) -> Hybrid:
+        """From all presses."""
+        return fit_hybrid(curve, field, self.data, self.geometry, self.places, self.loss)
+
+    def predict(self, curve: AbstractCurve, field: AbstractField | None, places: Places | None = None) -> np.ndarray:
+        """Pad forces over the holds, (presses, pads) N; `places`: other ones than those found."""
+        there = self.places if places is None else places
+        return hold_out(curve, field, self.data, self.geometry, there, self.loss, self.fold)
 
     def image_only(self, image_sum: np.ndarray) -> np.ndarray:
         """Total force by the integral of the image times one number, (presses,) N."""
@@ -268,6 +297,32 @@ class _Trial:
             gain = self.data.force[~held].sum() / image_sum[~held].sum() if (~held).any() else np.nan
             out[held] = gain * image_sum[held]
         return out
+
+
+def _held_out(
+    skin: je.Skin, pressed: _Pressed, seen: _Seen, trial: _Trial, law: AbstractCurve, where: AbstractField | None
+) -> Evaluation:
+    """What is predicted of presses by fits that had not seen their places, and of whole parts left out."""
+    pad_force, data = trial.predict(law, where), pressed.data
+    others = {"eit": trial.image_only(seen.image_sum)}
+    others["hybrid"] = (pad_force if _is_papers(law, where) else trial.predict(Linear(), None)).sum(1)
+    if where is not None and pressed.true_place:
+        true = single_places(jnp.asarray(pressed.position), len(skin.pads))
+        others["true_place"] = trial.predict(law, where, true).sum(1)
+    return evaluate_presses(
+        seen.recon,
+        skin,
+        seen.image,
+        pressed.position,
+        data.force,
+        data.pressure,
+        pad_force,
+        held_out_by="location",
+        others=others,
+        fitted=None if seen.places is None else np.asarray(seen.places.position[:, 0], float),
+        recipe=_recipe(law, where),
+        splits=leave_out(law, where, data, trial.geometry, seen.places, trial.loss, pressed.groups),
+    )
 
 
 def evaluate(calibration: Calibration, session: Session, processing: Processing | None = None) -> Evaluation:
@@ -318,8 +373,31 @@ def _by_others(calibration: Calibration, found: Measured, image_sum: np.ndarray)
 _PER_PRESS = 24  # means that stand for the samples of a press, near-duplicates of each other
 
 
-def _join(measured: Sequence[Measured]) -> tuple[PressData, np.ndarray, np.ndarray]:
-    """Sessions one after the other: their presses, frames (presses, readings) V and positions (presses, 2) m."""
+def _join(measured: Sequence[Measured]) -> _Pressed:
+    data, dv, position = press_data(measured)
+    tip = np.concatenate([m.presses.tip_diameter[m.presses.accepted] for m in measured])
+    return _Pressed(
+        data=data,
+        dv=dv,
+        position=position,
+        groups={
+            "pad": dominant_pad(data.pressure),
+            "indenter": np.unique(np.round(tip, 6), return_inverse=True)[1].ravel(),
+            "session": np.repeat(np.arange(len(measured)), [len(m.force) for m in measured]),
+        },
+        channels=np.logical_and.reduce([m.channels for m in measured]),
+        noise=np.max([m.noise for m in measured], 0),
+        untouched=np.mean([m.untouched for m in measured], 0),
+        true_place=any("contact_position" in m.session.truth for m in measured),
+        notes=tuple(f"{m.session.name}: {note}" for m in measured for note in m.notes),
+    )
+
+
+def press_data(measured: Sequence[Measured]) -> tuple[PressData, np.ndarray, np.ndarray]:
+    """Sessions one after the other: their presses, frames (presses, readings) V and positions (presses, 2) m.
+
+    What `fit_hybrid` takes, whose ``use`` fits from some of the presses without reading the sessions again.
+    """
     position = np.concatenate([m.position for m in measured])
     place = np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel()
     pressure = np.concatenate([m.pressure for m in measured])
@@ -471,6 +549,9 @@ def load_calibration(path: str | Path) -> Calibration:
         ) from None
     except je.StoreError as error:
         raise SessionError(f"{Path(path).name}: image/{error}; calibrate again") from None
+    except (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        why = " ".join(str(error).split())[:200]
+        raise SessionError(f"{Path(path).name}: its numbers do not fit each other ({why}); calibrate again") from None
 
 
 def _from_archive(archive: Archive) -> Calibration:
@@ -482,13 +563,18 @@ def _from_archive(archive: Archive) -> Calibration:
     provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
     kind = CURVES[provenance["curve"]]
     old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
-    curve = kind(**{f.name: jnp.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)})
-    fitted = {name: jnp.asarray(arrays[f"pads/{name}"]) for name in _CURVE_FIELDS}
+    choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
+    for name, array in choices.items():
+        _shaped(choices, name, (len(skin.pads), *array.shape[1:]), "f")
+    curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
+    fitted = _fitted(arrays, "pads/", len(skin.pads), kind())
     located = provenance.get("location", "none") != "none"
     return Calibration(
         skin=skin,
         recon=recon,
-        masks=je.PadMasks(jnp.asarray(arrays["image/masks"]), recon.areas),
+        masks=je.PadMasks(
+            jnp.asarray(_shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")), recon.areas
+        ),
         curves=FittedCurve(curve=curve, **fitted),
         evaluation=Evaluation.restore(attrs, arrays, "evaluation_", "presses/"),
         provenance=provenance,
@@ -496,7 +582,7 @@ def _from_archive(archive: Archive) -> Calibration:
         notes=tuple(filter(None, str(attrs["notes"]).split("\n"))),
         field=_field_from(arrays, FIELDS[provenance["location"]]) if located else None,
         locator=_locator_from(arrays, recon.factor.dtype) if located else None,
-        baseline=_baseline_from(arrays),
+        baseline=_baseline_from(arrays, len(skin.pads)),
         image_gain=float(attrs.get("image_gain", "nan")),
     )
 
@@ -513,8 +599,26 @@ def _locator_from(arrays: Mapping[str, np.ndarray], dtype) -> AbstractLocator:
     return locator_from_numbers(numbers, dtype)
 
 
-def _baseline_from(arrays: Mapping[str, np.ndarray]) -> FittedCurve | None:
+def _baseline_from(arrays: Mapping[str, np.ndarray], pads: int) -> FittedCurve | None:
     """None: a calibration written before the paper's recipe was kept beside it."""
     if "baseline/parameters" not in arrays:
         return None
-    return FittedCurve(curve=Linear(), **{name: jnp.asarray(arrays[f"baseline/{name}"]) for name in _CURVE_FIELDS})
+    return FittedCurve(curve=Linear(), **_fitted(arrays, "baseline/", pads, Linear()))
+
+
+def _fitted(arrays: Mapping[str, np.ndarray], where: str, pads: int, curve: AbstractCurve) -> dict[str, jax.Array]:
+    """The numbers of `FittedCurve` for all pads."""
+    tails = {"parameters": (curve.size,), "covariance": (curve.size, curve.size), "pressure_range": (2,)}
+    kinds = dict.fromkeys(("n", "n_missing", "n_groups", "rank", "result"), "iu")
+    return {
+        name: jnp.asarray(_shaped(arrays, where + name, (pads, *tails.get(name, ())), kinds.get(name, "f")))
+        for name in _CURVE_FIELDS
+    }
+
+
+def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray:
+    """An array that is used as it is, once it has been looked at."""
+    array = arrays[name]
+    if array.shape != shape or array.dtype.kind not in kinds:
+        raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not numbers of shape {shape}")
+    return array

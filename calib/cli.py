@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-_CURVE_NAMES = ("linear", "affine", "power", "polynomial", "spline", "play", "hysteresis", "auto")
+_CURVE_NAMES = ("linear", "affine", "power", "polynomial", "spline", "play", "hysteresis", "hysteresis-spline", "auto")
 _LOCATION_NAMES = ("none", "constant", "bilinear", "rbf", "edge", "spline", "gp", "auto")
 _STREAMS = ("eit", "pressure", "force", "stage", "temperature", "barometer")
 
@@ -204,8 +204,10 @@ def _import(args: argparse.Namespace) -> int:
 
 def _calibrate_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
-    parser.add_argument("-o", "--output", required=True, metavar="CALIBRATION.h5")
-    parser.add_argument("--report", metavar="REPORT.html", help="write a page with figures")
+    text = "one calibration of all sessions together; with --jobs or --scheduler the folder for one of each"
+    parser.add_argument("-o", "--output", required=True, metavar="CALIBRATION.h5", help=text)
+    text = "write a page with figures; with --jobs or --scheduler without a name, one beside each calibration"
+    parser.add_argument("--report", nargs="?", const="", metavar="REPORT.html", help=text)
     text = "sessions the fit does not see, to judge it on"
     parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
     text = "force from pressure; auto: chosen by cross-validation over locations; default: linear"
@@ -216,7 +218,20 @@ def _calibrate_args(parser: argparse.ArgumentParser) -> None:
     _low_pass_arg(parser)
     parser.add_argument("--hyperparameter", type=float, default=0.1, help="default: 0.1")
     parser.add_argument("--pixels", type=int, default=40, help="along x; default: 40")
+    text = "parts into which the places are divided, each predicted from the others; from the number of places on, "
+    parser.add_argument("--folds", type=_count, default=5, metavar="K", help=text + "one place at a time; default: 5")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    many = parser.add_mutually_exclusive_group()
+    text = "calibrate every session by itself, N at a time; those that are done in the output folder are skipped"
+    many.add_argument("--jobs", type=_count, metavar="N", help=text)
+    text = "the same by the workers of a Dask scheduler, which must see the same files"
+    many.add_argument("--scheduler", metavar="ADDRESS", help=text)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: give a whole number above zero")
+    return int(text)
 
 
 def _low_pass_arg(parser: argparse.ArgumentParser) -> None:
@@ -255,33 +270,45 @@ def _calibrate(args: argparse.Namespace) -> int:
     from .runtime import set_up
 
     set_up()
+    if args.report is not None:
+        _require_matplotlib("--report")
+    if args.jobs or args.scheduler:
+        return _calibrate_many(args)
+    if args.report == "":
+        raise ValueError("--report: give the name of the page, as --report report.html")
+    return _calibrate_together(args)
+
+
+def _choices(args: argparse.Namespace) -> dict:
+    """What a calibration is told, beside its sessions."""
     import jaxeit as je
 
+    return {
+        "skin": _skin(args.skin),
+        "curve": _curves(args.curve),
+        "location": _locations(args.location),
+        "basis": je.Pixels(args.pixels),
+        "hyperparameter": args.hyperparameter,
+        "folds": args.folds,
+        "processing": _processing(args.low_pass),
+    }
+
+
+def _calibrate_together(args: argparse.Namespace) -> int:
     from .calibration import STAGES, calibrate, evaluate
     from .evaluation import render_table
     from .session import open_session
 
     _outputs(args.output, args.report)
-    processing = _processing(args.low_pass)
-    if args.report:
-        _require_matplotlib("--report")
+    choices = _choices(args)
     with ExitStack() as stack:
         sessions = [stack.enter_context(open_session(path)) for path in args.sessions]
         if all("eit" not in session.streams for session in sessions):
             return _calibrate_logs(args, sessions)
         stages = stack.enter_context(_stages(len(STAGES)))
-        calibration = calibrate(
-            sessions,
-            _skin(args.skin),
-            curve=_curves(args.curve),
-            location=_locations(args.location),
-            basis=je.Pixels(args.pixels),
-            hyperparameter=args.hyperparameter,
-            processing=processing,
-            progress=stages,
-        )
+        calibration = calibrate(sessions, **choices, progress=stages)
         tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}
-        tried = {name: evaluate(calibration, session, processing) for name, session in tests.items()}
+        tried = {name: evaluate(calibration, session, choices["processing"]) for name, session in tests.items()}
     calibration.save(args.output)
     if args.report:
         from .report import write_report
@@ -299,6 +326,42 @@ def _calibrate(args: argparse.Namespace) -> int:
         print("\n" + render_table(found, _title(name, tests[name].simulated)))
     print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
     return 0
+
+
+def _calibrate_many(args: argparse.Namespace) -> int:
+    """Each session by itself; status 2 if one failed, when all others are done."""
+    from tqdm import tqdm
+
+    from .batch import calibrate_many, render_outcomes
+    from .cluster import dask_executor
+
+    if args.test:
+        raise ValueError("--test is for one calibration; try those of a folder with jaxeit evaluate")
+    if args.report:
+        raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
+    with ExitStack() as stack:
+        executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
+        bar = stack.enter_context(tqdm(total=len(args.sessions), desc="sessions", disable=None, leave=False))
+
+        def tell(outcome) -> None:
+            bar.update()
+            if outcome.reason:
+                tqdm.write(f"jaxeit: {Path(outcome.session).name}: {outcome.reason}", file=sys.stderr)
+
+        outcomes = calibrate_many(
+            args.sessions,
+            args.output,
+            executor=executor,
+            jobs=args.jobs,
+            report=args.report is not None,
+            tell=tell,
+            **_choices(args),
+        )
+    if args.json:
+        print(json.dumps({o.session: o.summary or {"failed": o.reason} for o in outcomes}, indent=2, sort_keys=True))
+    else:
+        print(render_outcomes(outcomes, args.output))
+    return 2 if any(outcome.reason for outcome in outcomes) else 0
 
 
 def _calibrate_logs(args: argparse.Namespace, sessions) -> int:
@@ -509,9 +572,17 @@ def _live_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8765, help="of the page; 0: any; default: 8765")
     parser.add_argument("--publish", type=int, metavar="PORT", help="send results there as lines of JSON; 0: any")
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
+    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record what arrives as well")
+    text = "tell the device what to read next: few readings at rest, those around a contact while there is one"
+    parser.add_argument("--event-driven", action="store_true", help=text)
+
+
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def _live(args: argparse.Namespace) -> int:
+    for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
+        os.environ.setdefault(name, "1")
     from .runtime import set_up
 
     set_up()
@@ -523,6 +594,7 @@ def _live(args: argparse.Namespace) -> int:
     from .acquisition.setup import prepare
     from .calibration import load_calibration
 
+    _outputs(args.output)
     calibration = load_calibration(args.calibration)
     plan, sources = prepare({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
     orders = Orders()
@@ -540,6 +612,8 @@ def _live(args: argparse.Namespace) -> int:
             port=args.port,
             publish=args.publish,
             also=[lambda result: print(result.to_json(), flush=True)] if args.json else [],
+            output=args.output,
+            event_driven=args.event_driven,
             tell=lambda line: print(f"jaxeit: {line}", file=sys.stderr),
             rest=args.rest,
             wait=args.wait,

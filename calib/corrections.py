@@ -39,10 +39,16 @@ def correct(
 
 
 def sample_rate(time: np.ndarray) -> float:
-    """Median rate in Hz of time stamps in ns."""
+    """Median rate in Hz of time stamps in ns.
+
+    Raises: `CorrectionError` for fewer than two samples, or times of which most repeat or go back.
+    """
     if len(time) < 2:
         raise CorrectionError("a stream of fewer than two samples has no sample rate.")
-    return 1e9 / float(np.median(np.diff(time)))
+    period = float(np.median(np.diff(time)))
+    if not period > 0:
+        raise CorrectionError("times repeat or go back more often than they rise; check the clock, sort the samples.")
+    return 1e9 / period
 
 
 def bridge(column: np.ndarray) -> np.ndarray:
@@ -55,8 +61,12 @@ def bridge(column: np.ndarray) -> np.ndarray:
 
 
 def _pieces(time: np.ndarray, rate: float) -> list[slice]:
-    """Runs of samples without a gap of more than five periods: a filter knows nothing of what was not sampled."""
-    breaks = np.flatnonzero(np.diff(time) > 5e9 / rate) + 1
+    """Runs of samples without a gap of more than five periods, or a step back of the clock.
+
+    A filter knows nothing of what was not sampled.
+    """
+    steps = np.diff(time)
+    breaks = np.flatnonzero((steps > 5e9 / rate) | (steps < 0)) + 1
     edges = [0, *breaks.tolist(), len(time)]
     return [slice(a, b) for a, b in pairwise(edges)]
 

@@ -266,6 +266,19 @@ class PowerLaw(AbstractCurve):
         return jnp.stack([secant, exponent])
 
 
+class _PositiveSlopes(AbstractCurve):
+    """Parameters that are slopes in N/Pa, each above zero; from the start all alike."""
+
+    def free(self, params, scale):
+        return jnp.log(params * (scale.pressure / scale.force))
+
+    def bound(self, free, scale):
+        return jnp.exp(free) * (scale.force / scale.pressure)
+
+    def initial(self, pressure, force, valid, scale):
+        return jnp.broadcast_to(_start_slope(pressure, force, valid, scale), (len(self.names),))
+
+
 def _knots(value) -> Scalar | None:
     return None if value is None else jnp.asarray(value)
 
@@ -349,7 +362,7 @@ class MonotonePolynomial(_Stretch):
         return jnp.broadcast_to(slope * self._top(slope.dtype) / 3, (3,))
 
 
-class MonotoneSpline(_Stretch):
+class MonotoneSpline(_PositiveSlopes, _Stretch):
     """A curve whose slope is straight between five knots from 0 to `top`, and positive at each: a quadratic I-spline.
 
     | parameter     | meaning                       | shape | unit | bound |
@@ -369,15 +382,6 @@ class MonotoneSpline(_Stretch):
     def _ends(self, params):
         top = self._top(params.dtype)
         return params[0] * top, params[-1] * top
-
-    def free(self, params, scale):
-        return jnp.log(params * (scale.pressure / scale.force))
-
-    def bound(self, free, scale):
-        return jnp.exp(free) * (scale.force / scale.pressure)
-
-    def initial(self, pressure, force, valid, scale):
-        return jnp.broadcast_to(_start_slope(pressure, force, valid, scale), (len(self.names),))
 
 
 def play(signal: Float[Array, " n"], width: Float[Array, " m"]) -> Float[Array, "n m"]:
@@ -401,6 +405,14 @@ def play(signal: Float[Array, " n"], width: Float[Array, " m"]) -> Float[Array, 
 def _cumulative_weights(slopes: Float[Array, " m"]) -> Float[Array, " m"]:
     """Weights of a Prandtl-Ishlinskii operator whose curve of first loading has these slopes."""
     return jnp.concatenate([slopes[:1], jnp.diff(slopes)])
+
+
+def _undone(weights: Float[Array, " m"], widths: Float[Array, " m-1"], out: Samples) -> Samples:
+    """The series that a Prandtl-Ishlinskii operator makes `out` of: an operator of the same kind."""
+    sums, all_widths = jnp.cumsum(weights), jnp.concatenate([jnp.zeros(1, weights.dtype), widths])
+    turned = [jnp.sum(weights[: i + 1] * (r - all_widths[: i + 1])) for i, r in enumerate(all_widths)]
+    back = -weights[1:] / (sums[1:] * sums[:-1])
+    return out / weights[0] + play(out, jnp.stack(turned[1:])) @ back
 
 
 _WIDTHS = (0.2, 0.4, 0.8)  # of half the distance between the 5 % and 95 % quantiles of the pressure
@@ -443,20 +455,13 @@ class _PrandtlIshlinskii(AbstractCurve):
 
     def inverse(self, params, force):
         weights, offset = self._split(params)
-        sums, widths = jnp.cumsum(weights), self._widths(params.dtype)
-        all_widths = jnp.concatenate([jnp.zeros(1, params.dtype), widths])
-        turned = jnp.stack([jnp.sum(weights[: i + 1] * (r - all_widths[: i + 1])) for i, r in enumerate(all_widths)])[
-            1:
-        ]
-        back = -weights[1:] / (sums[1:] * sums[:-1])
-        flat = jnp.ravel(force) - offset
-        return (flat / weights[0] + play(flat, turned) @ back).reshape(jnp.shape(force))
+        return _undone(weights, self._widths(params.dtype), jnp.ravel(force) - offset).reshape(jnp.shape(force))
 
 
 _SLOPES = tuple(f"slope {j}" for j in range(len(_WIDTHS) + 1))
 
 
-class Play(_PrandtlIshlinskii):
+class Play(_PositiveSlopes, _PrandtlIshlinskii):
     """Hysteresis of a pad: force from the series of its pressures; zero as long as nothing has been pressed.
 
     | parameter    | meaning                                                    | shape | unit | bound |
@@ -468,15 +473,6 @@ class Play(_PrandtlIshlinskii):
 
     names: ClassVar[tuple[str, ...]] = _SLOPES
     units: ClassVar[tuple[str, ...]] = ("N/Pa",) * len(_SLOPES)
-
-    def free(self, params, scale):
-        return jnp.log(params * (scale.pressure / scale.force))
-
-    def bound(self, free, scale):
-        return jnp.exp(free) * (scale.force / scale.pressure)
-
-    def initial(self, pressure, force, valid, scale):
-        return jnp.broadcast_to(_start_slope(pressure, force, valid, scale), (len(self.names),))
 
 
 class Hysteresis(_PrandtlIshlinskii):
@@ -508,6 +504,70 @@ class Hysteresis(_PrandtlIshlinskii):
         return jnp.append(jnp.broadcast_to(slope, (len(_SLOPES),)), offset)
 
 
+_RATIOS = tuple(f"ratio {j}" for j in range(len(_WIDTHS)))
+
+
+class HysteresisSpline(AbstractCurve):
+    """F = b + S(y), S a `MonotoneSpline` of y, the pressure seen through play operators: bent, and with hysteresis.
+
+    y = w_0 P + sum of w_i play(P; r_i); its slope of first loading is ratio i beyond the i-th width and 1 beyond all:
+    y is in pascal, and S carries the size. A generalised Prandtl-Ishlinskii operator (Al Janaideh et al. 2011, IEEE
+    Trans. Mechatronics 16): the inverse is that of S, then that of the operator.
+
+    | parameter     | meaning                                                    | shape | unit | bound |
+    |---------------|------------------------------------------------------------|-------|------|-------|
+    | slope 0 .. 4  | of S at its knots, evenly spaced from 0 to `top`           | ()    | N/Pa | > 0   |
+    | ratio 0 .. 2  | of first loading: at once, and beyond all widths but one   | ()    | 1    | > 0   |
+    | offset        | added throughout                                           | ()    | N    | none  |
+    """
+
+    widths: Float[Array, " m"] | None = eqx.field(converter=_knots, default=None)
+    top: Scalar | None = eqx.field(converter=_knots, default=None)
+
+    path: ClassVar[bool] = True
+    names: ClassVar[tuple[str, ...]] = (*MonotoneSpline.names, *_RATIOS, "offset")
+    units: ClassVar[tuple[str, ...]] = (*MonotoneSpline.units, *("1",) * len(_RATIOS), "N")
+
+    def at(self, scale):
+        return HysteresisSpline(Play(self.widths).at(scale).widths, MonotoneSpline(self.top).at(scale).top)
+
+    def _parts(self, params: Params) -> tuple[Params, Float[Array, " m"], Scalar]:
+        """Of the spline; weights of the operator; offset."""
+        knots = len(MonotoneSpline.names)
+        ratios = jnp.append(params[knots:-1], jnp.ones((), params.dtype))
+        return params[:knots], _cumulative_weights(ratios), params[-1]
+
+    def __call__(self, params, pressure):
+        return self.given(params, self.seen(jnp.ravel(pressure))).reshape(jnp.shape(pressure))
+
+    def seen(self, pressure):
+        return Play(self.widths).seen(pressure)
+
+    def given(self, params, seen):
+        slopes, weights, offset = self._parts(params)
+        return MonotoneSpline(self.top)(slopes, seen @ weights) + offset
+
+    def inverse(self, params, force):
+        slopes, weights, offset = self._parts(params)
+        seen = MonotoneSpline(self.top).inverse(slopes, jnp.ravel(force) - offset)
+        return _undone(weights, Play(self.widths)._widths(params.dtype), seen).reshape(jnp.shape(force))
+
+    def free(self, params, scale):
+        knots = len(MonotoneSpline.names)
+        slopes = MonotoneSpline(self.top).free(params[:knots], scale)
+        return jnp.concatenate([slopes, jnp.log(params[knots:-1]), params[-1:] / scale.force])
+
+    def bound(self, free, scale):
+        knots = len(MonotoneSpline.names)
+        slopes = MonotoneSpline(self.top).bound(free[:knots], scale)
+        return jnp.concatenate([slopes, jnp.exp(free[knots:-1]), free[-1:] * scale.force])
+
+    def initial(self, pressure, force, valid, scale):
+        slope, offset = Affine().initial(pressure, force, valid, scale)
+        slopes = jnp.broadcast_to(slope, (len(MonotoneSpline.names),))
+        return jnp.concatenate([slopes, jnp.ones(len(_RATIOS), slopes.dtype), offset[None]])
+
+
 CURVES: dict[str, type[AbstractCurve]] = {
     "linear": Linear,
     "affine": Affine,
@@ -516,6 +576,7 @@ CURVES: dict[str, type[AbstractCurve]] = {
     "spline": MonotoneSpline,
     "play": Play,
     "hysteresis": Hysteresis,
+    "hysteresis-spline": HysteresisSpline,
 }
 """Names used on the command line and in calibration files."""
 

@@ -5,8 +5,10 @@ over true force, up to a constant for the image alone) at every place, and its c
 variation.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -15,7 +17,7 @@ import numpy as np
 
 import jaxeit as je
 
-_BOOTSTRAPS = 2000
+from .splits import Split, interval, place_draws
 
 CALIBRATED = "calibrated"
 METHODS = {
@@ -64,6 +66,7 @@ class Evaluation:
     | held_out_by: what the fit had not seen, "location" or "session"    |                 |      |
     | others: total force by other methods of `METHODS`, held out alike  | (presses,) each | N    |
     | recipe: curve and location of the calibration, in words            |                 |      |
+    | splits: what is left out otherwise than by place, and what comes of it |             |      |
     | notes                                                              |                 |      |
     """
 
@@ -78,6 +81,7 @@ class Evaluation:
     notes: tuple[str, ...] = ()
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
     recipe: str = ""
+    splits: tuple[Split, ...] = ()
 
     @property
     def total_force(self) -> np.ndarray:
@@ -117,11 +121,25 @@ class Evaluation:
                 for ddof in (0, 1):
                     cv = je.coefficient_of_variation(values, ddof=ddof)
                     out[f"cv_{name}_ddof{ddof}"] = float(cv)
-                out[f"cv_{name}_se"] = _bootstrap(values, lambda v: v.std(1, ddof=1) / v.mean(1))
+                out |= {f"cv_{name}_{k}": v for k, v in self._spread(values, _cv).items()}
         out |= {f"force_{k}": v for k, v in self._errors(self.total_force).items()}
         for name, total in self.others.items():
             out |= {f"force_{name}_{k}": v for k, v in self._errors(total).items()}
+        for split in self.splits:
+            if not split.note:
+                out[f"force_left_out_{split.by}_rmse"] = split.rmse
         return out
+
+    @cached_property
+    def _draws(self) -> np.ndarray:
+        """(draws, presses) how often a press is drawn when places are."""
+        return place_draws(np.unique(np.round(self.position, 6), axis=0, return_inverse=True)[1].ravel())
+
+    def _spread(self, values: np.ndarray, statistic: Callable) -> dict[str, float]:
+        """Standard error and 90 % interval of a statistic over places drawn again."""
+        drawn = statistic(values, self._draws)
+        low, high = interval(drawn)
+        return {"se": float(drawn.std(ddof=1)), "low": low, "high": high}
 
     def by_method(self) -> list[Worth]:
         """What each way to a total force is worth: EIT only, then as in `forces`."""
@@ -140,6 +158,7 @@ class Evaluation:
         size = float(np.sqrt(np.mean(error**2)))
         return {
             "rmse": size,
+            **{f"rmse_{k}": v for k, v in self._spread(error, _rms).items()},
             "mean_absolute": float(np.abs(error).mean()),
             "worst": float(np.abs(error).max()),
             "rmse_percent_full_scale": 100 * size / float(self.force.max()),
@@ -150,7 +169,7 @@ class Evaluation:
         inward = np.asarray(je.inward_bias(estimate, self.position, self.centre))
         return {
             "mean": float(error.mean()),
-            "mean_se": _bootstrap(error, lambda v: v.mean(1)),
+            "mean_se": self._spread(error, _mean)["se"],
             "median": float(np.median(error)),
             "p95": float(np.percentile(error, 95)),
             "inward_bias": float(inward.mean()),
@@ -158,7 +177,13 @@ class Evaluation:
 
     def attributes(self) -> dict[str, str]:
         """What `restore` needs beside the arrays."""
-        return {"held_out_by": self.held_out_by, "notes": "\n".join(self.notes), "recipe": self.recipe}
+        splits = json.dumps([split._asdict() for split in self.splits])
+        return {
+            "held_out_by": self.held_out_by,
+            "notes": "\n".join(self.notes),
+            "recipe": self.recipe,
+            "splits": splits,
+        }
 
     def arrays(self) -> dict[str, tuple[np.ndarray, str, str]]:
         """Name -> values, units, meaning."""
@@ -189,6 +214,7 @@ class Evaluation:
             estimated=named("estimated_"),
             others={name: total for name, total in named("force_").items() if name in METHODS},
             recipe=str(attrs.get(f"{attribute}recipe", "")),
+            splits=tuple(Split(**split) for split in json.loads(str(attrs.get(f"{attribute}splits", "[]")))),
             held_out_by=str(attrs[f"{attribute}held_out_by"]),
             notes=tuple(filter(None, str(attrs[f"{attribute}notes"]).split("\n"))),
         )
@@ -208,6 +234,7 @@ def evaluate_presses(
     others: Mapping[str, np.ndarray] = MappingProxyType({}),
     fitted: np.ndarray | None = None,
     recipe: str = "",
+    splits: tuple[Split, ...] = (),
 ) -> Evaluation:
     """Say where every press is, by its image and by the place that was `fitted` (if any)."""
     (x0, y0), (x1, y1) = skin.domain.bounds
@@ -224,13 +251,24 @@ def evaluate_presses(
         notes=notes,
         others=others,
         recipe=recipe,
+        splits=splits,
     )
 
 
-def _bootstrap(values: np.ndarray, statistic) -> float:
-    """Standard error over presses drawn again with replacement; the same draw every time."""
-    draws = np.random.default_rng(0).integers(len(values), size=(_BOOTSTRAPS, len(values)))
-    return float(statistic(values[draws]).std(ddof=1))
+def _mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(draws,) of values (presses,) that are drawn so often, (draws, presses)."""
+    return weight @ values / weight.sum(1)
+
+
+def _rms(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return np.sqrt(_mean(values**2, weight))
+
+
+def _cv(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Coefficient of variation with ddof 1; drawn presses of one value have none."""
+    mean, count = _mean(values, weight), weight.sum(1)
+    about = np.maximum(_mean((values - values.mean()) ** 2, weight) - (mean - values.mean()) ** 2, 0)
+    return np.sqrt(about * count / np.maximum(count - 1, 1)) / mean
 
 
 def render_table(evaluation: Evaluation, title: str) -> str:
@@ -246,7 +284,7 @@ def render_table(evaluation: Evaluation, title: str) -> str:
             1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
         lines.append(f"    {name:<16}{mean:12.1f}  ({error:5.2f}) {median:7.1f} {p95:7.1f} {inward:13.1f}")
-    lines += ["", *_force_lines(evaluation)]
+    lines += ["", *_force_lines(evaluation), *_split_lines(evaluation)]
     return "\n".join(lines + [f"  note: {note}" for note in evaluation.notes])
 
 
@@ -258,4 +296,20 @@ def _force_lines(evaluation: Evaluation) -> list[str]:
         shown = ["" if np.isnan(e) else f"{e:.2f}" for e in errors]
         numbers = "".join(f"{text:>{width}}" for text, width in zip(shown, (10, 14, 14, 10), strict=True))
         out.append(f"    {label:<28}{spread}{numbers}")
+    return out
+
+
+def _split_lines(evaluation: Evaluation) -> list[str]:
+    """What comes of leaving out more than a place."""
+    if not evaluation.splits:
+        return []
+    out = ["", "  one left out at a time    parts  presses   RMSE, N   (90 % interval)   worst part, N"]
+    for split in evaluation.splits:
+        if split.note:
+            out.append(f"    {split.by:<20}{split.parts:9}  {split.note}")
+        else:
+            ends = f"({split.low:.2f} to {split.high:.2f})"
+            out.append(
+                f"    {split.by:<20}{split.parts:9}{split.presses:9}{split.rmse:10.2f}   {ends:<17}{split.worst:12.2f}"
+            )
     return out

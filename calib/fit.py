@@ -9,6 +9,9 @@ few rounds and then held.
 Samples of one press are near-duplicates. Given `groups` (a press or location per sample), the covariance is the
 cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), so that it is honest for a dozen presses; the
 sample count then hardly matters, which is the point. Without groups it is Huber's (Robust Statistics, 1981, 7.6).
+
+No large stack of matrices goes to LAPACK at once: jaxlib 0.10.2 spreads one over its threads while the caller, one of
+them, waits, and two programs that do so in two threads of Python may wait for ever.
 """
 
 import abc
@@ -43,6 +46,7 @@ class FitResult(enum.IntEnum):
     MAX_STEPS = 3
     NO_RESPONSE = 4
     SINGULAR = 5
+    AT_BOUND = 6
 
     @property
     def message(self) -> str:
@@ -56,8 +60,11 @@ _MESSAGES = {
     FitResult.TOO_FEW: "too few samples or presses for this curve: record more presses, or choose a curve "
     "with fewer parameters",
     FitResult.MAX_STEPS: "the solver ran out of steps: raise max_steps, or choose a curve with fewer parameters",
-    FitResult.NO_RESPONSE: "force does not rise with pressure: check the pad's tube, its sign and its number",
+    FitResult.NO_RESPONSE: "force does not rise with pressure, or there is only one pressure: check the pad's tube, "
+    "its sign and its number, and record presses at more load levels",
     FitResult.SINGULAR: "the samples do not determine all parameters: record presses at more load levels",
+    FitResult.AT_BOUND: "somewhere the force does not rise with pressure at all, and this curve must: choose a curve "
+    "with fewer parameters, and check the range of the pressure sensor",
 }
 
 
@@ -301,7 +308,7 @@ def _cluster_covariance(left, psi, dpsi, group, n_groups):
     """
     score = jax.ops.segment_sum(left * psi[:, None], group, n_groups)
     leverage = jax.ops.segment_sum(left[:, :, None] * left[:, None, :], group, n_groups)
-    values, vectors = jnp.linalg.eigh(leverage)
+    values, vectors = jax.lax.map(jnp.linalg.eigh, leverage)
     decided = values > 1 - 1e-3
     root = jax.lax.rsqrt(jnp.where(decided, 1.0, 1 - values))
     adjusted = jnp.einsum("gij,gj,gkj,gk->gi", vectors, root, vectors, score)
@@ -311,11 +318,25 @@ def _cluster_covariance(left, psi, dpsi, group, n_groups):
     return bread @ adjusted.T @ adjusted @ bread, enough
 
 
+def _thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, " k"], Float[Array, "k k"]]:
+    """U, singular values and V' of a tall matrix of few columns, by Gram-Schmidt done twice (Giraud et al. 2005)."""
+    columns: list[Array] = []
+    for column in matrix.T:
+        for _ in range(2):
+            for earlier in columns:
+                column = column - earlier * (earlier @ column)
+        length = jnp.sqrt(column @ column)
+        columns.append(column / jnp.where(length > 0, length, 1))
+    q = jnp.stack(columns, 1)
+    left, singular, right = jnp.linalg.svd(q.T @ matrix)
+    return q @ left, singular, right
+
+
 def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_groups):
     """Covariance of the parameters in their units, rank of the Jacobian, and whether presses suffice."""
     r = _residuals(free, curve, samples, scale, spread)
     jacobian = jax.jacfwd(_residuals)(free, curve, samples, scale, spread)
-    left, singular, right = jnp.linalg.svd(jacobian, full_matrices=False)
+    left, singular, right = _thin_svd(jacobian)
     tiny = singular[0] * max(jacobian.shape) * jnp.finfo(r.dtype).eps
     rank = jnp.sum(singular > tiny)
     psi = jnp.where(samples.valid, loss.psi(r), 0.0)
@@ -349,12 +370,16 @@ def _pressure_range(samples: Samples):
     return jnp.stack([low, high])
 
 
-def _judge(finite, enough, ended, rises, determined):
+_VANISHED = 7.0  # e-folds below its start, at which a slope or an exponent has run to its bound of zero
+
+
+def _judge(finite, enough, ended, rises, determined, inside):
     """The first thing that went wrong, as a FitResult code."""
     checks = [
         (finite, FitResult.NOT_FINITE),
         (enough, FitResult.TOO_FEW),
         (rises, FitResult.NO_RESPONSE),
+        (inside | (ended & determined), FitResult.AT_BOUND),
         (ended, FitResult.MAX_STEPS),
         (determined, FitResult.SINGULAR),
     ]
@@ -406,6 +431,7 @@ def fit_samples(
         ended=ended,
         rises=rise > 1e-3 * scale.force,
         determined=(rank == k) & decided,
+        inside=jnp.all(free > start - _VANISHED),
     )
     unusable = (result == FitResult.NOT_FINITE) | (result == FitResult.TOO_FEW)
     failed = result != FitResult.SUCCESS

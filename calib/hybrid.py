@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .curves import AbstractCurve, curve_name
-from .fit import AbstractLoss, FitResult, FittedCurve, bucket, fit_curves, predict_pads
+from .fit import AbstractLoss, FitResult, FittedCurve, Prediction, bucket, fit_curves, predict_pads
 from .location import AbstractField, FittedField, Geometry, Places, field_name, fit_field, log_gain
 from .response import assign_folds
 
@@ -69,21 +70,39 @@ class Hybrid:
         fitted, or a pad whose fit failed.
         """
         p = jnp.asarray(pressures, self.curves.parameters.dtype)
-        predicted = predict_pads(self.curves, p.T)
-        force, error, valid = (np.asarray(part).T for part in predicted)
-        if self.field is None:
-            return force, error, valid
-        if places is None:
-            pads = self.field.geometry.pads
-            places = Places(jnp.full((len(p), 1, 2), jnp.nan, p.dtype), jnp.zeros((len(p), 1, pads), p.dtype))
-        gain = log_gain(self.field, places)
-        factor = np.exp(np.asarray(gain.mean))
-        return force * factor, factor * np.sqrt(error**2 + force**2 * np.asarray(gain.variance)), valid
+        found = pad_forces(self.curves, self.field, p, places)
+        return tuple(map(np.asarray, found))  # type: ignore[return-value]
+
+    def log_gains(self, places: Places) -> np.ndarray:
+        """Log of the gain of each pad at places, (n, pads)."""
+        assert self.field is not None
+        return np.asarray(log_gain(self.field, places).mean)
 
     @property
     def scatter(self) -> np.ndarray:
         """Root mean square distance of single samples from each pad's response, (pads,) N."""
         return np.asarray(self.curves.residual_rms)
+
+
+@eqx.filter_jit
+def pad_forces(
+    curves: FittedCurve, field: FittedField | None, pressures: Float[Array, "n pads"], places: Places | None = None
+) -> Prediction:
+    """`Hybrid.pad_forces` as one program: arrays (n, pads)."""
+    predicted = predict_pads(curves, pressures.T)
+    force, error, valid = (part.T for part in predicted)
+    if field is None:
+        return Prediction(force, error, valid)
+    gain = field.log_gain(nowhere(pressures) if places is None else places)
+    factor = jnp.exp(gain.mean)
+    return Prediction(force * factor, factor * jnp.sqrt(error**2 + force**2 * gain.variance), valid)
+
+
+def nowhere(pressures: Float[Array, "n pads"], contacts: int = 1) -> Places:
+    """Places of which nothing is known."""
+    n, pads = pressures.shape
+    position = jnp.full((n, contacts, 2), jnp.nan, pressures.dtype)
+    return Places(position, jnp.zeros((n, contacts, pads), pressures.dtype))
 
 
 def fit_hybrid(

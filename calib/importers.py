@@ -437,7 +437,9 @@ def _write_stream(writer: SessionWriter, loaded: _Loaded, spec: StreamSpec, time
     transport = printable(loaded.spec.path.name)
     about |= {"long_name": long_name, "clock": "recorder", "transport": transport}
     writer.add_stream(spec.name, variable, dtype="f8", **about)
-    writer.append(spec.name, times, values * unit.factor + unit.offset)
+    with np.errstate(over="ignore"):  # beyond what can be stored: the writer flags it as missing
+        values_si = values * unit.factor + unit.offset
+    writer.append(spec.name, times, values_si)
     return StreamReport(
         name=spec.name,
         variable=variable,

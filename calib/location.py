@@ -451,7 +451,7 @@ def _of_shape(white: _Whitened, shape) -> _Shape:
 
 def _average(white: _Whitened, shapes) -> _Averaged:
     """Posterior over all sizes and shapes of the prior, by the law of total variance."""
-    each = jax.vmap(lambda shape: _of_shape(white, shape))(shapes)
+    each = jax.lax.map(lambda shape: _of_shape(white, shape), shapes)  # a stack at once may hang, see `fit`
     weight = jnp.exp(each.evidence - jnp.max(each.evidence))
     weight = weight / jnp.sum(weight)
     of_shape = jnp.sum(weight, 1)

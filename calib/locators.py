@@ -48,7 +48,10 @@ class ContactLocator(AbstractLocator):
         return ContactLocator(replace(self.finder, most=1))
 
     def __call__(self, dv, image, recon, masks):
-        found = self.finder(dv)
+        return self.placed(self.finder(dv), recon, masks)
+
+    def placed(self, found: je.Contacts, recon: je.Reconstructor, masks: je.PadMasks) -> Places:
+        """`Places` of contacts that were found."""
         position = jnp.where(found.present[..., None], found.position, jnp.nan)
         if self.finder.most == 1:
             return single_places(position[:, 0], masks.weights.shape[0])

@@ -2,17 +2,21 @@
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 
 from .calibration import Calibration
 from .corrections import correct
-from .fit import bucket
-from .location import Places
+from .fit import FittedCurve, bucket
+from .hybrid import pad_forces
+from .location import FittedField, Places
+from .locators import AbstractLocator
 from .measured import Processing, resting_levels
 from .presses import resample
 from .session import ArchiveWriter, Session, SessionError, Stream
@@ -36,9 +40,30 @@ class ForceEstimate(NamedTuple):
     """
 
     map: je.ForceMap
-    force: np.ndarray
-    standard_error: np.ndarray
-    valid: np.ndarray
+    force: Any
+    standard_error: Any
+    valid: Any
+
+
+class ForceLaw(eqx.Module):
+    """What of a calibration turns numbers into forces, as one pytree for compiled programs; see `Calibration`."""
+
+    recon: je.Reconstructor
+    masks: je.PadMasks
+    curves: FittedCurve
+    field: FittedField | None
+    locator: AbstractLocator | None
+
+    @property
+    def remembers(self) -> bool:
+        """Whether forces depend on the pressures that came before."""
+        return self.curves.curve.path
+
+
+def law_of(calibration: Calibration) -> ForceLaw:
+    """What of a calibration turns numbers into forces."""
+    c = calibration
+    return ForceLaw(c.recon, c.masks, c.curves, c.field, c.locator)
 
 
 def force_map(calibration: Calibration, frames, pressures, *, gate: float = 0.6, before=None) -> ForceEstimate:
@@ -60,23 +85,62 @@ def force_map(calibration: Calibration, frames, pressures, *, gate: float = 0.6,
             f"frames {frames.shape} and pressures {pressures.shape} do not fit this calibration: "
             f"give (n, {readings}) V and (n, {pads}) Pa"
         )
-    image = calibration.recon(frames)
-    places = _places(calibration, frames, pressures, image)
-    force, error, valid = _pad_forces(calibration, pressures, places, before)
-    fused = je.fuse(image, calibration.masks, jnp.asarray(force, image.dtype), gate=gate)
-    return ForceEstimate(fused, force, np.hypot(error, calibration.hybrid.scatter), valid)
+    law = law_of(calibration)
+    frames = np.asarray(frames, law.recon.factor.dtype)
+    pressures = np.asarray(pressures, law.curves.parameters.dtype)
+    found = _force_map(law, frames, pressures, filled(law, before), gate)
+    return ForceEstimate(found.map, *map(np.asarray, found[1:]))
 
 
-def _pad_forces(calibration: Calibration, pressures, places: Places | None, before):
+def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
+    """Earlier pressures (m, pads) after rows that move nothing, so that lengths recur; None for curves that forget."""
+    if before is None or not law.remembers:
+        return None
+    first = bucket(len(before))
+    rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
+    return rows.astype(law.curves.parameters.dtype)
+
+
+@eqx.filter_jit
+def _force_map(law: ForceLaw, frames, pressures, before, gate) -> ForceEstimate:
+    image = law.recon(frames)
+    places = None
+    if law.locator is not None:
+        touched = jnp.any(is_loaded(law, pressures), 1, keepdims=True)
+        places = law.locator(jnp.where(touched, frames, 0), image, law.recon, law.masks)
+    return fused(law, image, pressures, places, before, gate)
+
+
+def fused(
+    law: ForceLaw,
+    image: Float[Array, "n pixels"],
+    pressures: Float[Array, "n pads"],
+    places: Places | None,
+    before: Float[Array, "m pads"] | None,
+    gate: float,
+) -> ForceEstimate:
+    """`force_map` from images and places that are known (None: nothing known); pure."""
+    force, error, valid = _pad_forces(law, pressures, places, before)
+    found = je.fuse(image, law.masks, force.astype(image.dtype), gate=gate)
+    return ForceEstimate(found, force, jnp.hypot(error, law.curves.residual_rms), valid)
+
+
+def _pad_forces(law: ForceLaw, pressures, places: Places | None, before):
     """Forces, errors and validity (n, pads), of curves that remember after what came `before`."""
-    if before is None or not calibration.curves.curve.path:
-        return calibration.pad_forces(pressures, places)
-    first = bucket(len(before))  # missing pressures move nothing, and lengths recur
-    whole = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before, pressures])
+    if before is None:
+        return pad_forces(law.curves, law.field, pressures, places)
+    first, whole = len(before), jnp.concatenate([before, pressures])
     if places is not None:
-        rows = jnp.maximum(jnp.arange(len(whole)) - first, 0)
-        places = places[rows]
-    return tuple(part[first:] for part in calibration.pad_forces(whole, places))
+        places = places[jnp.maximum(jnp.arange(len(whole)) - first, 0)]
+    return (part[first:] for part in pad_forces(law.curves, law.field, whole, places))
+
+
+_LOADED = 3.0  # times the scatter of single samples: pads below are taken as idle, and their frames not searched
+
+
+def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
+    """Whether a pad carries more than its pressure's scatter, wherever it is touched; pure."""
+    return pad_forces(law.curves, None, pressures).force > _LOADED * law.curves.residual_rms
 
 
 def remembered(pressures: np.ndarray) -> np.ndarray:
@@ -98,18 +162,6 @@ def _turns(column: np.ndarray) -> list[float]:
         while len(kept) > 2 and (kept[-1] - kept[-2]) * (kept[-2] - kept[-3]) >= 0:
             del kept[-2]
     return kept
-
-
-_LOADED = 3.0  # times the scatter of single samples: pads below are taken as idle, and their frames not searched
-
-
-def _places(calibration: Calibration, frames, pressures, image) -> Places | None:
-    """Where the frames in which some pad is loaded are touched; of the rest, nowhere."""
-    if calibration.locator is None:
-        return None
-    plain, _, _ = calibration.pad_forces(pressures)
-    loaded = np.any(plain > _LOADED * calibration.hybrid.scatter, axis=1, keepdims=True)
-    return calibration.locate(np.where(loaded, frames, 0.0), image)
 
 
 def apply(

@@ -253,12 +253,15 @@ def find_presses(
       threshold: N. finder: lengths and tolerances.
 
     Returns: a `Timeline`, empty if nothing was found. Damaged and cut-off presses are in it, not accepted.
-    Raises: `PressError` for fewer than ten samples or no finite one.
+    Raises: `PressError` for fewer than ten samples or no finite one, or times that do not increase.
     """
     finder = Finder() if finder is None else finder
     time, force = np.asarray(time), np.asarray(force, float)
     if force.ndim != 1 or time.shape != force.shape:
         raise PressError(f"force must be (time,) like its time stamps, not {force.shape} and {time.shape}.")
+    back = np.flatnonzero(time[1:] <= time[:-1]) + 1
+    if len(back):
+        raise PressError(f"time does not increase at sample {back[0]}: sort the samples and drop equal times.")
     if np.isfinite(force).sum() < 10:
         raise PressError("fewer than ten finite force samples: there is nothing to find presses in.")
     signal, noise, rate = _condition(time, force, finder)

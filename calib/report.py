@@ -194,6 +194,7 @@ def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figur
         f"<p>{escape(_lead(calibration))}</p>",
         _results(calibration, evaluations),
         _localisation(_all(calibration, evaluations)),
+        _left_out(calibration.evaluation),
         _choice(calibration),
         *map(_figure, figures),
         _pads(calibration),
@@ -243,7 +244,7 @@ def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
         "EIT only: the integral of the image times one number; hybrid: the paper's recipe, one slope a pad; "
         "calibrated: this calibration; true place: the same, told the true place instead of the estimated one, which "
         "only a simulation knows exactly. CV: standard deviation over mean of the sensitivity over the presses; after "
-        "±: its standard error over presses (bootstrap). The paper is arXiv 2605.28468; it does not state its ddof, "
+        "±: its standard error over places (bootstrap). The paper is arXiv 2605.28468; it does not state its ddof, "
         "nor errors of force."
     )
     if calibration.simulated:
@@ -275,6 +276,29 @@ def _method_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
         )
         for worth in evaluation.by_method()
     ]
+
+
+def _left_out(evaluation: Evaluation) -> str:
+    """What comes of leaving out a pad, an indenter or a session; of those there is only one of, a sentence."""
+    rows = [
+        (
+            split.by,
+            str(split.parts),
+            str(split.presses),
+            f"{_number(split.rmse, 2)} ({_number(split.low, 2)} to {_number(split.high, 2)})",
+            _number(split.worst, 2),
+        )
+        for split in evaluation.splits
+        if not split.note
+    ]
+    notes = "".join(f"<li>{escape(split.note)}</li>" for split in evaluation.splits if split.note)
+    head = ["left out at a time", "parts", "presses", "RMSE, N (90 % interval)", "worst part, N"]
+    about = (
+        "Each part is predicted by fits that had not seen it; a pad by the curve of all others together. Intervals are "
+        "of a bootstrap over places: all presses of a place are drawn together."
+    )
+    table = f"{_table(head, {'': rows})}<p class='small'>{about}</p>" if rows else ""
+    return f"<h2>Beyond what was pressed</h2>{table}<ul>{notes}</ul>" if rows or notes else ""
 
 
 def _choice(calibration: Calibration) -> str:
@@ -361,7 +385,7 @@ def _notes(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> s
 
 
 def _provenance(calibration: Calibration) -> str:
-    rows = [(key.replace("_", " "), value) for key, value in calibration.provenance.items()]
+    rows = [(key.replace("_", " "), value) for key, value in calibration.provenance.items() if value]
     return f"<h2>Provenance</h2>{_table(['what', 'value'], {'': rows}, 'provenance')}"
 
 

@@ -228,22 +228,25 @@ def _held_out_error(signals, force, held, ridge) -> float:
 class BlendChannels:
     """Make one signal of all channels by `fit_blend` (needs a few hundred samples)."""
 
-    def __call__(self, signals, force, curve) -> tuple[Callable, str]:
-        del curve
-        blend = fit_blend(signals, force)
-        return blend, f"all {signals.shape[1]} channels blended (ridge {blend.ridge:g})"
+    def __call__(self, time, signals, force, curve) -> tuple[np.ndarray, str]:
+        del time, curve
+        known = np.isfinite(force)
+        blend = fit_blend(signals[known], force[known])
+        return blend(signals), f"all {signals.shape[1]} channels blended (ridge {blend.ridge:g})"
 
 
 class BestChannel:
     """Take the one channel, turned round if it falls with force, whose own curve leaves the smallest residual."""
 
-    def __call__(self, signals, force, curve) -> tuple[Callable, str]:
-        ranks = [_rank_correlation(s, force) for s in signals.T]
+    def __call__(self, time, signals, force, curve) -> tuple[np.ndarray, str]:
+        del time
+        known = np.isfinite(force)
+        ranks = [_rank_correlation(s, force[known]) for s in signals[known].T]
         signs = np.where(np.array(ranks) < 0, -1.0, 1.0)
-        fitted = fit_curves(curve, (signals * signs).T, force)
+        fitted = fit_curves(curve, (signals[known] * signs).T, force[known])
         good = np.asarray(fitted.result) == FitResult.SUCCESS
         best = int(np.argmin(np.where(good, np.asarray(fitted.residual_rms), np.inf)))
-        return (lambda s: s[:, best] * signs[best]), f"channel {best}"
+        return signals[:, best] * signs[best], f"channel {best}"
 
 
 def _rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
@@ -285,8 +288,8 @@ def fit_log(
     Args:
       time: (n,); signals: (n,) or (n, channels), Pa or a sensor's own unit; force: (n,) N; NaN: missing.
       fraction: of the time span that is fitted; the rest is held out.
-      channels: how several channels become one: `BlendChannels()` (default) or `BestChannel()`, from the
-        fitted part alone.
+      channels: how several channels become one: `BlendChannels()` (default), `BestChannel()` or
+        `calib.smooth.SmoothChannels()`, from the fitted part alone.
       options: as for `fit_curves`.
 
     Raises: `FitError` if no sample of the fitted part is complete.
@@ -298,16 +301,16 @@ def fit_log(
     train = first & complete
     if not train.any():
         raise FitError("no sample of the fitted part has both a force and a signal; nothing can be fitted.")
-    signal, source = _one_signal(signals, force, train, curve, channels)
+    signal, source = _one_signal(np.asarray(time), signals, np.where(train, force, np.nan), curve, channels)
     fitted = fit_curves(curve, signal[None], force, mask=train, **options)
     predicted = _trusted(fitted, signal[None])[0]
     scores = [score(predicted[m], force[m]) for m in (train, rest & complete)]
     return LogFit(fitted.pad(0), signal, predicted, source, int((~complete).sum()), *scores)
 
 
-def _one_signal(signals, force, train, curve, channels) -> tuple[np.ndarray, str]:
+def _one_signal(time, signals, force, curve, channels) -> tuple[np.ndarray, str]:
+    """A signal (n,) from all channels; `force` is NaN where it is not to be looked at."""
     if signals.shape[1] == 1:
         return signals[:, 0], "channel 0"
     choose = BlendChannels() if channels is None else channels
-    make, source = choose(signals[train], force[train], curve)
-    return make(signals), source
+    return choose(time, signals, force, curve)

@@ -3,7 +3,9 @@
 import os
 import stat
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -16,6 +18,26 @@ def set_up() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+
+
+def settings() -> dict[str, Any]:
+    """Those of JAX on which results and the time to compile depend."""
+    return {name: getattr(jax.config, name) for name in _SETTINGS}
+
+
+def take_over(wanted: Mapping[str, Any]) -> None:
+    """Make this process, a worker, set up as the one whose `settings` these are."""
+    for name, value in wanted.items():
+        if getattr(jax.config, name) != value:
+            jax.config.update(name, value)
 
 
 def cache_folder() -> Path | None:

@@ -7,6 +7,22 @@ not in the scene is not in the program.
 from importlib import metadata
 
 from . import effects
+from .adaptive import (
+    Chosen,
+    DOptimal,
+    EventScan,
+    ScanState,
+    Sensitive,
+    Volume,
+    around,
+    choose_readings,
+    drives,
+    in_frame,
+    prepare_event_scan,
+    scan_time,
+    shortened,
+    signal_covariance,
+)
 from .background import fit_background
 from .basis import BasisMap, Bumps, Elements, Picture, Pixels
 from .choices import Choice, Imaging, LadderError, Touch, few_choices, fidelity_choices, image_choices
@@ -91,7 +107,7 @@ from .metrics import (
 from .nonlinear import IsotropicVariation, LogConductivity, Quadratic, gauss_newton
 from .pneumatics import pad_response
 from .priors import GaussianSmooth, Laplace, Noser, Tikhonov, TotalVariation
-from .protocol import Protocol, adjacent, reciprocal_rows
+from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
 from .regions import RegionError, Regions, find_regions
 from .rungs import Ladder, Rung
 from .scene import Scene, read_effects
@@ -119,6 +135,7 @@ __all__ = [
     "BoundaryPatch",
     "Bumps",
     "Choice",
+    "Chosen",
     "ClockError",
     "CoatedSheet",
     "CoatingNonUniformity",
@@ -133,6 +150,7 @@ __all__ = [
     "ContinuousCoating",
     "Creep",
     "Cylinder",
+    "DOptimal",
     "Dense",
     "Disc",
     "Discrepancy",
@@ -140,6 +158,7 @@ __all__ = [
     "ElectrodeError",
     "ElectrodeFault",
     "Elements",
+    "EventScan",
     "Fidelity",
     "FidelityError",
     "ForceMap",
@@ -198,6 +217,7 @@ __all__ = [
     "PositiveCentroid",
     "PressureSensor",
     "Protocol",
+    "ProtocolError",
     "ProtrusionGrid",
     "Quadratic",
     "Quantisation",
@@ -208,7 +228,9 @@ __all__ = [
     "Reweighted",
     "Rung",
     "ScanSkew",
+    "ScanState",
     "Scene",
+    "Sensitive",
     "SensorError",
     "SheetTemperature",
     "Single",
@@ -225,12 +247,16 @@ __all__ = [
     "Touch",
     "TpuRelaxation",
     "TruncatedSvd",
+    "Volume",
     "adjacent",
+    "around",
+    "choose_readings",
     "coefficient_of_variation",
     "compiler_options",
     "conductivity",
     "disc_resistance",
     "discretise",
+    "drives",
     "effects",
     "few_choices",
     "fidelity_choices",
@@ -245,6 +271,7 @@ __all__ = [
     "image_choices",
     "image_correlation",
     "image_sum",
+    "in_frame",
     "inward_bias",
     "jacobian",
     "ktc_score",
@@ -262,12 +289,16 @@ __all__ = [
     "parse_toml",
     "prepare",
     "prepare_contacts",
+    "prepare_event_scan",
     "read_effects",
     "read_text",
     "reciprocal_rows",
     "refine_contacts",
     "save_reconstructor",
+    "scan_time",
     "shipped_skins",
+    "shortened",
+    "signal_covariance",
     "strongest",
     "structural_similarity",
     "structured",

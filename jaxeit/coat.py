@@ -36,9 +36,9 @@ _NEAREST = 16  # triangles among which the one around a point is looked for
 class Coat(eqx.Module):
     """The matrix of sheet and metal with its numbers left out; unknowns and entries of the sheet come first.
 
-    Index ``unknowns`` of both stands for what is held at zero.  A contact node joins six unknowns: w
-    of the sheet and U of the electrode above (`discretise`), v at the corners of the triangle of metal
-    around it, and c.
+    Index ``unknowns`` of both stands for the v that is held at zero, and for no electrode.  A contact node
+    joins six unknowns: w of the sheet and U of the electrode above (`discretise`), v at the corners of the
+    triangle of metal around it, and c.
 
     | meaning                                                                   | shape            |
     |---------------------------------------------------------------------------|------------------|
@@ -100,18 +100,17 @@ def lay_coat(
 
     Args:
         metal: its mesh.
-        index: the sheet's unknown at each dof, ``sheet.n`` where it is grounded.
+        index: the sheet's unknown at each dof.
         above: the complete electrode over each dof, or the number of electrodes.
         electrode_dof: the unknown that is each electrode's potential.
     """
     end = sheet.n + len(metal.nodes)
     v = np.append(end, np.arange(sheet.n, end - 1))
-    of_sheet = np.append(np.arange(sheet.n), end)
     nodes, areas, touching = _contact_nodes(space)
     triangle, corners = _around(metal, space.chart[nodes])
-    potential = np.append(of_sheet[electrode_dof], end)[above[nodes]]
+    potential = np.append(electrode_dof, end)[above[nodes]]
     common = np.full(len(nodes), end - 1)
-    sides = np.column_stack([of_sheet[index[nodes]], potential, v[metal.triangles[triangle]], common])
+    sides = np.column_stack([index[nodes], potential, v[metal.triangles[triangle]], common])
     of_metal = function_space(metal, 1)
     entries, stiffness = _metal(v[of_metal.dofs], of_metal.stiffness, end)
     entries, slots = _joined(np.append(_key(sheet.rows, sheet.cols, end), entries), sides, end)

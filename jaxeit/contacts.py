@@ -4,6 +4,7 @@ Levenberg-Marquardt on whitened readings (`descent`), whose response to bumps co
 no solver and no matrix with a row per element is left when a frame comes.
 """
 
+from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
 from typing import NamedTuple
@@ -15,7 +16,6 @@ import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
-from scipy.optimize import brentq
 
 from .basis import Elements
 from .descent import STEPS, Fit, descend, ridge, scale_of
@@ -509,7 +509,15 @@ def _threshold(finder: ContactFinder, false_alarm: float) -> float:
     falls = np.sort(np.asarray(_falls(finder, noise.astype(finder.compress.dtype)), float))
     tenth = max(falls[int(0.9 * _TRIALS)], 3.0)
     number = -np.log(0.9) / _field(tenth)
-    return float(brentq(lambda z: number * _field(z) + np.log1p(-false_alarm), 2.5, 400))
+    return _root(lambda z: number * _field(z) + np.log1p(-false_alarm), 2.5, 400)
+
+
+def _root(falling: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function above zero at ``low`` and below at ``high`` vanishes (scipy.optimize takes 0.1 s to import)."""
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
+    return low
 
 
 def _field(square: float) -> float:

@@ -12,6 +12,11 @@ conductance and G_s = chi^T K chi that of the sheet around it.  The diagonal ent
 conductance of the two in series, no entry is formed by subtraction, and after diagonal scaling the
 matrix is well conditioned from a perfect contact to none.  (Derived here; a congruence, so the
 matrix stays symmetric positive definite.)
+
+Potentials are known but for a constant, so one unknown is grounded: through a conductance as large as its
+own, which decides nothing but the constant.  Which one is left to the conductivities, as all potentials are
+then differences from that place (`forward.assemble`): one in a tear of the sheet would see the rest through
+what the tear still conducts, and readings would be the last digits of far larger numbers.
 """
 
 from collections.abc import Callable
@@ -50,8 +55,7 @@ class Entries(eqx.Module):
 class System(eqx.Module):
     """The assembled problem with its numbers left out: which coefficient goes where.
 
-    One unknown is grounded; index ``unknowns`` stands for it wherever an index can meet it.  An
-    electrode of index ``electrodes`` stands for none.
+    An electrode of index ``electrodes`` stands for none.
 
     | meaning                                                                 | shape           |
     |-------------------------------------------------------------------------|-----------------|
@@ -62,10 +66,14 @@ class System(eqx.Module):
     | contact_electrode: whose piece it is                                    | (p,)            |
     | rim_element, rim_electrode: elements around an electrode                | (e,), (e,)      |
     | rim_chi, rim_flux: chi at their nodes, and their stiffness times chi    | (e, k), (e, k)  |
+    | bridge_element, bridge_electrodes: elements between two electrodes      | (b,), (b, 2)    |
+    | bridge_flux: chi of the one, times their stiffness, times chi of the other | (b,)         |
     | measure: area (m^2) or length (m) of each electrode, 0 if tied          | (electrodes,)   |
-    | under: the complete electrode over each unknown, and over the ground    | (unknowns + 1,) |
+    | under: the complete electrode over each unknown                         | (unknowns,)     |
     | electrode_dof: the unknown that is each electrode's potential           | (electrodes,)   |
-    | electrode_root: its place in the root of the plan, past it if grounded  | (electrodes,)   |
+    | electrode_root: its place in the root of the plan                       | (electrodes,)   |
+    | ground: unknowns that may be grounded                                   | (g,)            |
+    | ground_weight: how fit each is on a sheet without tears                 | (g,)            |
     | slots: place in the matrix of what contacts add (`forward.assemble`)    | (contributions,)|
     | lumped: radius of discs whose contact is in closed form, else 0, m      | (electrodes,)   |
     | near_element, near_electrode, near_share: elements under those discs,   | (q,), (q,), (q,)|
@@ -82,10 +90,15 @@ class System(eqx.Module):
     rim_electrode: Int[Array, " e"]
     rim_chi: Float[Array, "e k"]
     rim_flux: Float[Array, "e k"]
+    bridge_element: Int[Array, " b"]
+    bridge_electrodes: Int[Array, "b 2"]
+    bridge_flux: Float[Array, " b"]
     measure: Float[Array, " electrodes"]
-    under: Int[Array, " unknowns_and_ground"]
+    under: Int[Array, " unknowns"]
     electrode_dof: Int[Array, " electrodes"]
     electrode_root: Int[Array, " electrodes"]
+    ground: Int[Array, " g"]
+    ground_weight: Float[Array, " g"]
     slots: Int[Array, " contributions"]
     lumped: Float[Array, " electrodes"]
     near_element: Int[Array, " q"]
@@ -96,7 +109,7 @@ class System(eqx.Module):
     @property
     def unknowns(self) -> int:
         """Number of unknowns solved for."""
-        return self.under.shape[0] - 1
+        return self.under.shape[0]
 
 
 class Model(eqx.Module):
@@ -210,10 +223,12 @@ def _put(values: np.ndarray | Array, dtype: np.dtype) -> Array:
 class _Layout:
     """Numbering of the unknowns; indices of the space's dofs go through ``index``."""
 
-    index: np.ndarray  # (space dofs + electrodes,) -> unknown; the grounded one -> unknowns
+    index: np.ndarray  # (space dofs + electrodes,) -> unknown
     unknowns: int
     coords: np.ndarray  # (unknowns, 2), NaN for electrodes
     electrode_dof: np.ndarray
+    ground: np.ndarray  # (g,) unknowns that may be grounded
+    ground_weight: np.ndarray
     complete: list[tuple[int, np.ndarray, np.ndarray]]  # electrode, dofs and mass of its pieces
     lumped: np.ndarray  # (electrodes,) radius of the disc, or 0
 
@@ -234,12 +249,10 @@ def _lay_out(space: Space, scene: Scene, ground: int | None) -> _Layout:
         else:  # a perfect contact, or one in series: one potential under the whole electrode
             alias[patch] = alias[count + number] = patch[0]
     covered = [number for number, _, _ in complete]
-    grounded = _ground(space, np.isin(owner, covered), ground)
-    names = np.setdiff1d(alias, alias[grounded])
-    index = np.searchsorted(names, alias)
-    index[alias == alias[grounded]] = len(names)
+    names, index = np.unique(alias, return_inverse=True)
     places = np.concatenate([space.chart, np.full((len(electrodes), 2), np.nan)])
-    return _Layout(index, len(names), places[names], index[count:], complete, lumped)
+    chosen, weight = _grounds(space, np.isin(owner, covered), len(electrodes), ground)
+    return _Layout(index, len(names), places[names], index[count:], index[chosen], weight, complete, lumped)
 
 
 def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
@@ -252,16 +265,17 @@ def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
     owner[patch] = number
 
 
-def _ground(space: Space, covered: np.ndarray, ground: int | None) -> int:
-    """A node amid the sheet that no complete electrode covers, as one at the rim would see more
-    resistance and cost a digit."""
+def _grounds(space: Space, covered: np.ndarray, electrodes: int, ground: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Which dofs may be grounded, and how fit each is: best amid the sheet, as one at the rim sees more
+    resistance, and none that a complete electrode covers; electrodes themselves where these cover all."""
     if ground is None:
-        away = np.linalg.norm(space.chart - space.chart.mean(0), axis=1)
-        # Rounded, so that skins of one shape choose alike where several nodes are equally near.
-        return int(np.argmin(np.where(covered, np.inf, np.round(away / np.ptp(space.chart), 9))))
+        if covered.all():
+            return len(covered) + np.arange(electrodes), np.ones(electrodes)
+        away = np.linalg.norm(space.chart - space.chart.mean(0), axis=1) / np.ptp(space.chart)
+        return np.flatnonzero(~covered), 1 / (1 + 10 * away[~covered] ** 2)
     if not (0 <= ground < len(covered)) or covered[ground]:
         raise ElectrodeError(f"node {ground} cannot be the ground: it is under an electrode")
-    return ground
+    return np.array([ground]), np.ones(1)
 
 
 def _system(
@@ -275,14 +289,18 @@ def _system(
     dofs = layout.index[space.dofs]
     contact_dofs, contact_mass, contact_electrode = _contacts(layout, width)
     measure = np.bincount(contact_electrode, contact_mass.sum((1, 2)), minlength=electrodes)
-    under = np.full(layout.unknowns + 1, electrodes)
+    under = np.full(layout.unknowns, electrodes)
     under[contact_dofs[contact_mass.any(2)]] = np.repeat(contact_electrode, contact_mass.any(2).sum(1))
     rim_element, rim_electrode, rim_chi = _rims(dofs, under, electrodes)
     stiffness = space.stiffness
-    added = _contact_places(dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, layout.electrode_dof)
+    rim_flux = np.einsum("eij,ej->ei", stiffness[rim_element], rim_chi)
+    first, second = _bridges(rim_element)
+    bridge = rim_electrode[np.stack([first, second], 1)]
+    added = _contact_places(
+        dofs, contact_dofs, contact_electrode, rim_element, rim_electrode, bridge, layout.electrode_dof
+    )
     sheet, slots, (rows, cols) = _matrix(dofs, stiffness, added, layout.unknowns)
     roots = np.unique(layout.electrode_dof)
-    roots = roots[roots < layout.unknowns]
     pattern = Pattern(layout.unknowns, rows, cols, layout.coords, roots)
     solver = fidelity.solver or default_solver(layout.unknowns)
     put = partial(_put, dtype=fidelity.dtype)
@@ -296,11 +314,16 @@ def _system(
         rim_element=put(rim_element),
         rim_electrode=put(rim_electrode),
         rim_chi=put(rim_chi),
-        rim_flux=put(np.einsum("eij,ej->ei", stiffness[rim_element], rim_chi)),
+        rim_flux=put(rim_flux),
+        bridge_element=put(rim_element[first]),
+        bridge_electrodes=put(bridge),
+        bridge_flux=put(np.sum(rim_chi[first] * rim_flux[second], 1)),
         measure=put(measure),
         under=put(under),
         electrode_dof=put(layout.electrode_dof),
         electrode_root=put(np.searchsorted(roots, layout.electrode_dof)),
+        ground=put(layout.ground),
+        ground_weight=put(layout.ground_weight),
         slots=put(slots),
         lumped=put(layout.lumped),
         **{name: put(part) for name, part in _near(space, layout, hardware).items()},
@@ -359,12 +382,22 @@ def _rims(dofs: np.ndarray, under: np.ndarray, electrodes: int) -> tuple[np.ndar
     return pairs[partly, 0], pairs[partly, 1], chi[partly].astype(float)
 
 
+def _bridges(element: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of places in this ascending list of elements that hold the same one, each pair once."""
+    first, second = np.concatenate(
+        [np.stack([np.arange(len(element) - k), np.arange(k, len(element))]) for k in (1, 2)], 1
+    )
+    alike = element[first] == element[second]
+    return first[alike], second[alike]
+
+
 def _contact_places(
     dofs: np.ndarray,
     contact_dofs: np.ndarray,
     contact_electrode: np.ndarray,
     rim_element: np.ndarray,
     rim_electrode: np.ndarray,
+    bridge: np.ndarray,
     electrode_dof: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of every contribution of the contacts, in the order of `forward.assemble`."""
@@ -374,7 +407,8 @@ def _contact_places(
     # A node and the electrode over it make one entry, which the lower triangle holds once; a block
     # makes each of its entries twice, and the upper one is dropped.
     low, high = np.sort([nodes.ravel(), potential], axis=0)
-    return np.concatenate([rows, high, electrode_dof]), np.concatenate([cols, low, electrode_dof])
+    left, right = np.sort(electrode_dof[bridge], axis=1).T
+    return np.concatenate([rows, high, electrode_dof, right]), np.concatenate([cols, low, electrode_dof, left])
 
 
 def _blocks(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -392,7 +426,7 @@ def _matrix(
     alike can be summed as one table.
     """
     rows, cols = (np.concatenate(pair) for pair in zip(_blocks(dofs), added, strict=True))
-    kept = (rows >= cols) & (rows < unknowns)
+    kept = rows >= cols
     keys, entry = np.unique(rows[kept] * np.int64(unknowns) + cols[kept], return_inverse=True)
     whole = np.full(len(rows), len(keys))
     whole[kept] = entry

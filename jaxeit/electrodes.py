@@ -115,6 +115,9 @@ class AreaPatch(AbstractElectrode):
     0.08 mm for the default.  Where triangles under the bolt are larger, the bolt is a perfect
     contact in series with the closed form `disc_resistance`; where they are smaller, the area
     integral over ``(u - U) / contact`` is resolved.  Four-terminal readings feel neither.
+
+    The mesh generator needs it wholly inside the sheet.  On a mesh of your own the rim may cut off less than
+    half of it: what is left is what conducts.
     """
 
     position: tuple[float, float]
@@ -134,6 +137,12 @@ class AreaPatch(AbstractElectrode):
         inside = np.flatnonzero(np.linalg.norm(offset, axis=1) < self.radius)
         if not len(inside):
             raise ElectrodeError(f"the mesh has no triangle under the bolt at {self.position}")
+        covered = space.mesh.areas[inside].sum() / (np.pi * self.radius**2)
+        if covered < 0.5:
+            raise ElectrodeError(
+                f"the mesh covers {100 * covered:.0f} % of the bolt of radius {self.radius} m at {self.position}; "
+                "move it inside the sheet, or make the mesh finer there"
+            )
         return inside
 
     def pieces(self, space: Space, domain: Domain) -> Pieces:
@@ -223,15 +232,21 @@ class BoundaryPatch(AbstractElectrode):
         return ArcFootprint(self.start, self.stop)
 
     def pieces(self, space: Space, domain: Domain) -> Pieces:
-        middles = space.mesh.chart[space.mesh.boundary_edges].mean(1)
-        along = (domain.boundary_coordinate(middles) - self.start) % domain.perimeter
-        touched = np.flatnonzero(along < self.stop - self.start)
+        ends = space.mesh.chart[space.mesh.boundary_edges]
+        along = (domain.boundary_coordinate(ends.mean(1)) - self.start) % domain.perimeter
+        touched = np.flatnonzero((along < self.stop - self.start) & _on_the_rim(ends, domain))
         if not len(touched):
             raise ElectrodeError(f"the mesh has no edge under the electrode from {self.start} to {self.stop} m")
         return Pieces(space.boundary_dofs[touched], space.edge_mass(touched))
 
     def centre(self, domain: Domain) -> np.ndarray:
         return np.asarray(domain.boundary_point(0.5 * (self.start + self.stop)))
+
+
+def _on_the_rim(ends: np.ndarray, domain: Domain) -> np.ndarray:
+    """Which of these edges (e, 2, 2) are of the sheet's own rim and not of a hole in the mesh; (e,) bool."""
+    away = domain.boundary_distance(ends.reshape(-1, 2)).reshape(-1, 2).max(1)
+    return away < 0.1 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
 def disc_resistance(radius: float, contact: float, sheet_resistance: float) -> float:

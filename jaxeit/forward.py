@@ -1,8 +1,8 @@
 """The forward model: from sheet conductivity to voltages.
 
 All readings are differences of the entries of one small symmetric matrix, the transfer matrix
-``Z[a, b]``: the potential of electrode a per ampere driven into electrode b (and out at the ground,
-which cancels).  With x_a the field of a unit current into electrode a, and
+``Z[a, b]``: the potential of electrode a per ampere driven into electrode b (and out at a ground amid the
+sheet, which cancels).  With x_a the field of a unit current into electrode a, and
 ``A(theta; x, y) = integral of sigma grad x . grad y + sum_l g_l integral over E_l of (x - X_l)(y - Y_l)``,
 
     Z[a, b] = A(theta; x_a, x_b),          dZ[a, b] = -A(dtheta; x_a, x_b),
@@ -66,14 +66,14 @@ class Fields(NamedTuple):
 
     | meaning                                        | shape                       |
     |------------------------------------------------|-----------------------------|
-    | potential of the sheet at its unknowns         | (unknowns + 1, electrodes)  |
-    | drop from sheet to electrode, where under one  | (unknowns + 1, electrodes)  |
+    | potential of the sheet at its unknowns         | (unknowns, electrodes)      |
+    | drop from sheet to electrode, where under one  | (unknowns, electrodes)      |
     | terminal: potential of each electrode          | (electrodes, electrodes)    |
     | coat: fields of the coat, if that touches      |                             |
     """
 
-    potential: Float[Array, "unknowns_and_ground electrodes"]
-    drop: Float[Array, "unknowns_and_ground electrodes"]
+    potential: Float[Array, "unknowns electrodes"]
+    drop: Float[Array, "unknowns electrodes"]
     terminal: Float[Array, "electrodes electrodes"]
     coat: CoatFields | None
 
@@ -87,7 +87,8 @@ def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None 
             the untouched sheet.
 
     Returns:
-        (readings,) V, in the order of the protocol.  Not finite if ``sigma`` is not positive.
+        (readings,) V, in the order of the protocol; none of them finite if ``sigma`` is negative anywhere, or
+        zero all around a place.
 
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model, or the model no coat.
@@ -178,7 +179,8 @@ def _fitting(model: Model, name: str, values: Float[Array, " elements"]) -> Floa
             f"{name} is {values.dtype}{list(values.shape)}; this model needs "
             f"{model.dtype}{list(model.background.shape)}, one value per element"
         )
-    return values
+    # A little below zero the matrix stays positive definite, and the voltages look like any others.
+    return jnp.where(values < 0, jnp.nan, values)
 
 
 def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
@@ -211,9 +213,9 @@ def series_resistance(system: System, theta: Coefficients) -> Float[Array, " ele
 
 @eqx.filter_custom_jvp
 def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes electrodes"]:
-    plan, values, _, _ = _matrix(model, theta)
-    grounded = jnp.pad(model.solver.corner(plan, values), (0, 1))
-    return grounded[model.system.electrode_root][:, model.system.electrode_root]
+    plan, matrix = _matrix(model, theta)
+    corner = model.solver.corner(plan, matrix.values) - matrix.lift
+    return corner[model.system.electrode_root][:, model.system.electrode_root]
 
 
 @_transfer.def_jvp
@@ -235,27 +237,41 @@ def _filled(direction: Coefficients, theta: Coefficients) -> Coefficients:
 def fields(model: Model, theta: Coefficients) -> Fields:
     """Fields of a unit current into each electrode; one factorisation, differentiable."""
     system = model.system
-    plan, values, share, rest = _matrix(model, theta)
-    whole = inverse_columns(model.solver, plan, values)
-    whole = jnp.pad(whole, ((0, 0), (0, 1)))[:, system.electrode_root]  # a column for who is grounded
-    x = jnp.pad(whole[: system.unknowns], ((0, 1), (0, 0)))  # the ground's row
+    plan, matrix = _matrix(model, theta)
+    whole = inverse_columns(model.solver, plan, matrix.values)[:, system.electrode_root]
+    x = whole[: system.unknowns]
     terminal = x[system.electrode_dof]
     return Fields(
-        potential=x + _over(system, share[:, None] * terminal),
-        drop=x - _over(system, rest[:, None] * terminal),
-        terminal=terminal,
-        coat=coat_fields(model.coat, theta.coat, whole, share) if model.coat and theta.coat else None,
+        potential=x + _over(system, matrix.share[:, None] * terminal) - matrix.lift,
+        drop=x - _over(system, matrix.rest[:, None] * terminal),
+        terminal=terminal - matrix.lift,
+        coat=coat_fields(model.coat, theta.coat, whole, matrix.share) if model.coat and theta.coat else None,
     )
 
 
-def _matrix(
-    model: Model, theta: Coefficients
-) -> tuple[AbstractPlan, Float[Array, " nnz"], Float[Array, " electrodes"], Float[Array, " electrodes"]]:
-    """The matrix of the sheet, or of both where a coat touches it; and what `assemble` gives with it."""
-    values, share, rest = assemble(model.system, theta)
+class Matrix(NamedTuple):
+    """The matrix for (w, U), as numbers.
+
+    | meaning                                                            | shape         | unit |
+    |--------------------------------------------------------------------|---------------|------|
+    | values of its lower triangle                                       | (nnz,)        | S    |
+    | share, rest: s and 1 - s of `discretise`                           | (electrodes,) | 1    |
+    | lift: potential of the grounded unknown per ampere into the sheet  | ()            | ohm  |
+    """
+
+    values: Float[Array, " nnz"]
+    share: Float[Array, " electrodes"]
+    rest: Float[Array, " electrodes"]
+    lift: Float[Array, ""]
+
+
+def _matrix(model: Model, theta: Coefficients) -> tuple[AbstractPlan, Matrix]:
+    """The matrix of the sheet, or of both where a coat touches it."""
+    matrix = assemble(model.system, theta)
     if model.coat and theta.coat:
-        return model.coat.plan, assemble_coat(model.coat, theta.coat, values, share), share, rest
-    return model.system.plan, values, share, rest
+        both = assemble_coat(model.coat, theta.coat, matrix.values, matrix.share)
+        return model.coat.plan, matrix._replace(values=both)
+    return model.system.plan, matrix
 
 
 def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, "n k"]:
@@ -263,12 +279,11 @@ def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, 
     return jnp.concatenate([values, jnp.zeros_like(values[:1])])[system.under]
 
 
-def assemble(
-    system: System, theta: Coefficients
-) -> tuple[Float[Array, " nnz"], Float[Array, " electrodes"], Float[Array, " electrodes"]]:
-    """Lower triangle of the matrix for (w, U), and the shares s and 1 - s of `discretise`.
+def assemble(system: System, theta: Coefficients) -> Matrix:
+    """The matrix for (w, U).
 
-    The shares only choose the unknowns: the potentials do not depend on them, nor derivatives.
+    The shares only choose the unknowns, and the ground the constant: no difference of potentials depends on
+    them, nor its derivatives.
     """
     sigma, contact = theta.sigma, theta.contact
     chi, electrode = system.rim_chi, system.rim_electrode
@@ -285,10 +300,23 @@ def assemble(
         share[electrode, None] * around,
         -rest[system.contact_electrode, None] * load,
         share**2 * sheet + rest**2 * touch,
+        jnp.prod(share[system.bridge_electrodes], 1) * sigma[system.bridge_element] * system.bridge_flux,
     ]
     values = jnp.concatenate([jnp.sum(e.weight * sigma[e.element], 1) for e in system.sheet])
     added = jnp.concatenate([c.ravel() for c in contributions])
-    return values.at[system.slots].add(added, mode="drop"), share, rest
+    values, lift = _grounded(system, values.at[system.slots].add(added, mode="drop"))
+    return Matrix(values, share, rest, lift)
+
+
+def _grounded(system: System, values: Float[Array, " nnz"]) -> tuple[Float[Array, " nnz"], Float[Array, ""]]:
+    """With the unknown that conducts best, of those fit, tied to zero by as much again; and what lifts it.
+
+    All current leaves there, so the unknown's potential is one over that conductance, whatever the rest.
+    """
+    own = jax.lax.stop_gradient(values[system.plan.diagonal[system.ground]])
+    best = jnp.argmax(own * system.ground_weight)
+    place = system.plan.diagonal[system.ground[best]]
+    return values.at[place].add(own[best]), 1 / own[best]
 
 
 def energy(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:

@@ -99,7 +99,7 @@ def fuse(
     part of its image; where the image over a pad is mostly noise (its positive part less than
     ``gate`` of its magnitude; noise alone gives a half) or not finite, or the pad's force is not
     positive, the force is spread evenly over the pad and flagged as not valid.  Either way the
-    map over a pad sums to the pad's force.  A pad whose force is NaN has NaN on its own pixels only.
+    map over a pad sums to the pad's force.  A pad whose force is not finite has NaN on its own pixels only.
 
     Args:
         image: conductivity change, (..., pixels) S.
@@ -123,10 +123,14 @@ def fuse(
     total = positive + discarded
     concentration = positive / jnp.where(total > 0, total, 1)
     missing = (~finite).astype(mass.dtype) @ masks.weights.T > 0
-    valid = (concentration >= gate) & ~missing & (forces > 0)
+    known = jnp.isfinite(forces)
+    valid = (concentration >= gate) & ~missing & known & (forces > 0)
 
     shape = jnp.where(valid[..., None], jnp.maximum(mass, 0)[..., None, :], masks.areas)
     part = masks.weights * shape
-    part = part / part.sum(-1, keepdims=True)
-    force = jnp.where(masks.weights > 0, part * forces[..., None], 0).sum(-2)
+    whole = part.sum(-1, keepdims=True)
+    part = part / jnp.where(whole > 0, whole, 1)
+    force = (part * jnp.where(known, forces, 0)[..., None]).sum(-2)
+    silent = (~known).astype(mass.dtype) @ masks.weights > 0  # NaN last: it spreads in no sum, and in no derivative
+    force = jnp.where(silent, jnp.nan, force)
     return ForceMap(force, valid, concentration, discarded, masks.areas)

@@ -33,6 +33,7 @@ from .whitening import (
 )
 
 _VERSION = metadata.version("jaxeit")
+_MOST = 1e4  # hyperparameter
 _FEW = 16  # readings missing from a frame, up to which they are mended one by one
 
 
@@ -74,7 +75,8 @@ class AbstractReconstructor(AbstractPictured):
         Readings that `prepare` was told to leave out are not looked at, whatever they hold.  Any other that is not
         finite is replaced by what the one-step image of the other readings predicts for it, at the cost of one small
         solve: the image of `OneStep` is exactly that of a reconstructor which never had the reading (prior and
-        strength as they were).
+        strength as they were).  That loses digits as one over the square of the hyperparameter, three of which are left
+        at 1e-5: what is dead for good is better left out by `prepare`.
 
         Raises:
             InverseError: if the last axis does not hold the readings of a frame.
@@ -289,6 +291,10 @@ def prepare(
         channels: readings to use; a dead one is left out, never taken for zero.
         provenance: what to write down beside the numbers.
 
+    Returns:
+        A reconstructor whose ``provenance["rank"]`` says how many numbers a one-step image follows, ``tr(J Q)``, of
+        those that the readings hold.
+
     Raises:
         InverseError: if a value is out of range or no channel is left, or the result is not finite.
     """
@@ -303,16 +309,17 @@ def prepare(
         picture=image.picture,
     )
     chosen = _chosen(hyperparameter, problem, found, noise is not None)
+    _check_range(chosen, method, model.dtype)
     problem = replace(problem, hyperparameter=jnp.asarray(chosen, model.dtype))
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
     recon = _build(problem, linear, found, noise is not None)
-    settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
-    about = Provenance({"jaxeit": _VERSION, **settings, **(provenance or {})})
     if not np.isfinite(recon.factor).all():
         raise InverseError(
-            "the reconstruction matrix is not finite: the conductivity must be positive, and in "
-            "float32 the hyperparameter not below 1e-3"
+            "the reconstruction matrix is not finite: the conductivity must be positive, and the noise, in V, within "
+            f"the range of {model.dtype}"
         )
+    settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
+    about = Provenance({"jaxeit": _VERSION, **settings, "rank": _rank(found, recon), **(provenance or {})})
     if isinstance(method, AbstractIterativeMethod):
         eqx.filter_eval_shape(
             method.image, problem, problem.jacobian[:, 0]
@@ -347,9 +354,23 @@ def _chosen(hyperparameter, problem: Problem, found: Whitened, noise_is_known: b
         if hyperparameter.needs_noise and not noise_is_known:
             raise InverseError(f"{type(hyperparameter).__name__} compares with the noise; give prepare(..., noise=...)")
         return hyperparameter.choose(spectrum(problem), partial(_whiten, found, problem.jacobian.dtype))
-    if not (np.isfinite(hyperparameter) and hyperparameter > 0):
-        raise InverseError(f"the hyperparameter is {hyperparameter}; give a number above zero")
     return float(hyperparameter)
+
+
+def _check_range(hyperparameter: float, method, dtype: np.dtype) -> None:
+    """Refuse what leaves no digit: rounding grows by h and 1/h, in methods that work with squares by 1/h^2."""
+    eps = float(np.finfo(dtype).eps)
+    least = (1e3 * eps) ** 0.5 if isinstance(method, AbstractIterativeMethod) else 8e3 * eps
+    if not least <= hyperparameter <= _MOST:
+        raise InverseError(
+            f"the hyperparameter is {hyperparameter}; give a number above zero, for {type(method).__name__} in {dtype} "
+            f"from {least:.1e} to {_MOST:.0e}: below that the image is made of rounding errors, above it of nothing"
+        )
+
+
+def _rank(found: Whitened, recon: Reconstructor) -> str:
+    followed = np.sum(found.factor * (found.factor @ np.asarray(recon.predict, float)))
+    return f"{followed:.3g} of {len(found.factor)}"
 
 
 def _whiten(found: Whitened, dtype: np.dtype, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... r"]:

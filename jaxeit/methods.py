@@ -19,6 +19,8 @@ from jaxtyping import Array, Float
 from .basis import Picture
 from .priors import AbstractPrecision, AbstractPrior, Diagonal
 
+_SQUARABLE = 1e-3  # of the largest column squared: above it l^2 may be added to squares without loss to speak of
+
 
 class Problem(eqx.Module):
     """A linearised problem, whitened.
@@ -44,6 +46,10 @@ class Problem(eqx.Module):
     def strength(self, gained: Float[Array, "basis k"]) -> Float[Array, ""]:
         """``l^2``, given ``R^-1 J^T``."""
         return self.hyperparameter**2 * jnp.sum(self.jacobian.T * gained) / self.readings
+
+    def level(self, seen: Float[Array, "k n"]) -> Float[Array, ""]:
+        """``l``, given ``J Gamma^-1``; no square of the hyperparameter is formed."""
+        return self.hyperparameter * jnp.sqrt(jnp.sum(seen**2) / self.readings)
 
 
 class AbstractMethod(eqx.Module):
@@ -73,7 +79,7 @@ class AbstractIterativeMethod(AbstractMethod):
 class OneStep(AbstractLinearMethod):
     """One regularised Gauss-Newton step, ``Q = (J^T J + l^2 R)^-1 J^T``  (the paper's equation 2).
 
-    Solved by Cholesky in the smaller of the two spaces, which agree to rounding:
+    Solved by an orthogonal factor in the smaller of the two spaces, which agree to rounding:
     ``Q = R^-1 J^T (J R^-1 J^T + l^2 I)^-1``.
     """
 
@@ -81,47 +87,82 @@ class OneStep(AbstractLinearMethod):
         return one_step(problem, problem.precision(), y)[0]
 
     def variance(self, problem):
-        """The diagonal of ``(J^T J + l^2 R)^-1 = (R^-1 - Q J R^-1) / l^2``, the posterior of a Gaussian image."""
+        """The diagonal of ``(J^T J + l^2 R)^-1``, the posterior of a Gaussian image."""
         precision = problem.precision()
-        gained, square, (upper, _) = _data_space(problem, precision)
-        known = jnp.sum(solve_triangular(upper, gained.T, trans=1) ** 2, 0)
-        return (precision.variance() - known) / square
+        b = precision.seen(problem.jacobian)
+        (k, n), level = b.shape, problem.level(b)
+        q, r = _stacked(b, level)
+        if k > n:
+            return jnp.sum(precision.image(solve_triangular(r, jnp.eye(n, dtype=b.dtype))) ** 2, 1)
+        return (precision.variance() - jnp.sum(precision.image(q[:n]) ** 2, 1)) / level**2
 
 
 def one_step(
     problem: Problem, precision: AbstractPrecision, y: Float[Array, "k ..."]
 ) -> tuple[Float[Array, "basis ..."], Float[Array, "k ..."]]:
     """``x = Q y`` of `OneStep`, and ``J x``, what the image predicts for the readings."""
-    j = problem.jacobian
-    if isinstance(precision, Diagonal) and len(j) > j.shape[1]:
-        small = j.T @ j + problem.strength(precision.solve(j.T)) * precision.matrix()
-        x = cho_solve(cho_factor(small), j.T @ y)
-        return x, j @ x
-    gained, square, factor = _data_space(problem, precision)
-    solved = cho_solve(factor, y)
-    return gained @ solved, y - square * solved
+    b = precision.seen(problem.jacobian)
+    z, left = _damped(b, problem.level(b), y)
+    return precision.image(z), y - left
 
 
-def _data_space(problem: Problem, precision: AbstractPrecision):
-    """``R^-1 J^T``, ``l^2``, and the Cholesky factor of ``J R^-1 J^T + l^2 I``."""
+def _damped(b: Float[Array, "k n"], level, y: Float[Array, "k ..."]) -> tuple[Array, Array]:
+    """``z = argmin |b z - y|^2 + level^2 |z|^2``, and ``y - b z``.
+
+    From the Cholesky factor of ``b b^T + level^2 I``, in the smaller space, while its rounding errors, which grow as
+    one over level squared, are small.  Below that from Q and R of b stacked on level I, which takes four times as
+    long and whose errors grow as one over level.
+    """
+    enough = level**2 > _SQUARABLE * jnp.max(jnp.sum(b**2, 0))
+    return jax.lax.cond(enough, _squared, _orthogonal, b, level, y)
+
+
+def _squared(b: Float[Array, "k n"], level, y: Float[Array, "k ..."]) -> tuple[Array, Array]:
+    k, n = b.shape
+    eye = jnp.eye(min(k, n), dtype=b.dtype)
+    if k > n:
+        z = cho_solve(cho_factor(b.T @ b + level**2 * eye), b.T @ y)
+        return z, y - b @ z
+    solved = cho_solve(cho_factor(b @ b.T + level**2 * eye), y)
+    return b.T @ solved, level**2 * solved
+
+
+def _orthogonal(b: Float[Array, "k n"], level, y: Float[Array, "k ..."]) -> tuple[Array, Array]:
+    k, n = b.shape
+    q, r = _stacked(b, level)
+    if k > n:
+        z = solve_triangular(r, q[:k].T @ y)
+        return z, y - b @ z
+    z = q @ solve_triangular(r, y, trans=1)
+    return z[:n], level * z[n:]
+
+
+def _stacked(b: Float[Array, "k n"], level) -> tuple[Array, Array]:
+    """Q and R of ``[b; level I]``, of ``[b^T; level I]`` where b is wide."""
+    tall = b if len(b) > b.shape[1] else b.T
+    return jnp.linalg.qr(jnp.concatenate([tall, level * jnp.eye(tall.shape[1], dtype=b.dtype)]))
+
+
+def _by_squares(problem: Problem, precision: AbstractPrecision, y: Float[Array, " k"]) -> Float[Array, " basis"]:
+    """``Q y`` by Cholesky: for a precision that serves one frame, where a hyperparameter near zero makes no sense."""
     j = problem.jacobian
     gained = precision.solve(j.T)
-    square = problem.strength(gained)
-    return gained, square, cho_factor(j @ gained + square * jnp.eye(len(j), dtype=j.dtype))
+    return gained @ cho_solve(cho_factor(j @ gained + problem.strength(gained) * jnp.eye(len(j), dtype=j.dtype)), y)
 
 
 class TruncatedSvd(AbstractLinearMethod):
     """The pseudo-inverse on the singular values of ``J R^-1/2`` above l, the others left out.
 
-    l as for `OneStep`, which halves what lies there.  Taken from the eigenvectors of ``J R^-1 J^T``.
+    l as for `OneStep`, which halves what lies there; what is but rounding is left out in any case.
     """
 
     def image(self, problem, y):
-        gained = problem.precision().solve(problem.jacobian.T)
-        squares, vectors = jnp.linalg.eigh(problem.jacobian @ gained)
-        kept = squares > problem.strength(gained)
-        inverse = jnp.where(kept, 1 / jnp.where(kept, squares, 1), 0)
-        return gained @ (vectors * inverse @ (vectors.T @ y))
+        precision = problem.precision()
+        b = precision.seen(problem.jacobian)
+        u, s, vt = jnp.linalg.svd(b, full_matrices=False)
+        kept = s > jnp.maximum(problem.level(b), max(b.shape) * jnp.finfo(b.dtype).eps * s[0])
+        inverse = jnp.where(kept, 1 / jnp.where(kept, s, 1), 0)
+        return precision.image((vt.T * inverse) @ (u.T @ y))
 
 
 class BackProjection(AbstractLinearMethod):
@@ -165,9 +206,7 @@ class Greit(AbstractLinearMethod):
         mass, whole = areas @ contacts, areas @ disc
         desired = disc * jnp.where(whole > 0, mass / jnp.where(whole > 0, whole, 1), 0)
         trained = problem.jacobian @ contacts
-        square = problem.hyperparameter**2 * jnp.sum(trained**2) / problem.readings
-        small = trained @ trained.T + square * jnp.eye(len(trained), dtype=trained.dtype)
-        return desired @ (trained.T @ cho_solve(cho_factor(small), y))
+        return desired @ _damped(trained, problem.level(trained), y)[0]
 
 
 class NonNegative(AbstractIterativeMethod):
@@ -191,13 +230,11 @@ class NonNegative(AbstractIterativeMethod):
             return _positive_part(j, square * precision.values, y, self.steps)
         b = j.T @ y
         hessian = j.T @ j + square * precision.matrix()
-        scale = jnp.max(jnp.abs(b))
-        scale = jnp.where(scale > 0, scale, 1)
-        x = jnp.full_like(b, scale / jnp.mean(jnp.diagonal(hessian)))
-        x, _ = jax.lax.fori_loop(
-            0, self.steps, lambda _, state: _inwards(hessian, b, *state), (x, jnp.full_like(b, scale))
-        )
-        return x
+        top, curved = jnp.max(jnp.abs(b)), jnp.mean(jnp.diagonal(hessian))
+        top = jnp.where(top > 0, top, 1)  # all below is of the size of one, whatever the units
+        start = jnp.ones_like(b), jnp.ones_like(b)
+        x, _ = jax.lax.fori_loop(0, self.steps, lambda _, state: _inwards(hessian / curved, b / top, *state), start)
+        return x * (top / curved)
 
 
 def _positive_part(j, weight, y, steps: int):
@@ -247,7 +284,7 @@ def _step_length(a, towards, y, here, ahead, weight):
 
 def _inwards(hessian, b, x, z):
     """One step towards ``H x - b = z``, ``x z = 0``, staying inside x, z > 0."""
-    target = 0.1 * jnp.mean(x * z)
+    target = jnp.maximum(0.1 * jnp.mean(x * z), jnp.finfo(x.dtype).eps ** 2)  # to zero, z / x would lose its sense
     dx = cho_solve(cho_factor(hessian + jnp.diag(z / x)), b - hessian @ x + target / x)
     dz = (target - z * dx) / x - z
     x_step, z_step = (jnp.min(jnp.where(d < 0, -0.99 * v / jnp.where(d < 0, d, 1), 1)) for v, d in ((x, dx), (z, dz)))
@@ -264,9 +301,9 @@ class Reweighted(AbstractIterativeMethod):
 
     def image(self, problem, y):
         def again(_, x):
-            return one_step(problem, problem.precision(x), y)[0]
+            return _by_squares(problem, problem.precision(x), y)
 
-        return jax.lax.fori_loop(0, self.steps, again, one_step(problem, problem.precision(), y)[0])
+        return jax.lax.fori_loop(0, self.steps, again, _by_squares(problem, problem.precision(), y))
 
 
 class SparseBayes(AbstractIterativeMethod):
@@ -287,6 +324,9 @@ class SparseBayes(AbstractIterativeMethod):
         j, precision = problem.jacobian, problem.precision()
         if not isinstance(precision, Diagonal):
             raise ValueError("SparseBayes needs a diagonal prior: Noser() or Tikhonov()")
+        top = jnp.max(jnp.abs(y))
+        top = jnp.where(top > 0, top, 1)
+        y = y / top
         power = jnp.sum(y**2) / len(j)
         power = jnp.where(power > 0, power, 1)
         g = 1 / precision.values
@@ -304,4 +344,4 @@ class SparseBayes(AbstractIterativeMethod):
             return g * seen**2 / jnp.where(own > 0, own, 1), jnp.maximum(left / len(j), 1e-12 * power)
 
         g, s = jax.lax.fori_loop(0, self.steps, again, (g, problem.hyperparameter**2 * power))
-        return g * (j.T @ cho_solve((lower(g, s), True), y))
+        return top * g * (j.T @ cho_solve((lower(g, s), True), y))

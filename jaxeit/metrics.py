@@ -113,9 +113,14 @@ def image_sum(image: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " p
 
 
 def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) -> Float[Array, "..."]:
-    """Standard deviation over mean along the last axis; ``ddof`` is 0 or 1, and must be said."""
+    """Standard deviation over mean along the last axis; ``ddof`` is 0 or 1, and must be said.
+
+    NaN where the mean is zero, and for one value with ``ddof=1``: nothing is known of their spread.
+    """
     values = jnp.asarray(values)
-    return jnp.std(values, -1, ddof=ddof) / jnp.mean(values, -1)
+    mean = jnp.mean(values, -1)
+    spread = _length(values - mean[..., None]) / jnp.sqrt(values.shape[-1] - ddof)
+    return jnp.where(mean == 0, jnp.nan, spread / jnp.where(mean == 0, 1, mean))
 
 
 # --- GREIT figures of merit ------------------------------------------------------------------------------------------

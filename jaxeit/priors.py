@@ -34,6 +34,14 @@ class AbstractPrecision(eqx.Module):
         """The diagonal of ``R^-1``."""
 
     @abstractmethod
+    def seen(self, j: Float[Array, "k basis"]) -> Float[Array, "k basis"]:
+        """``J Gamma^-1``, Gamma as in `residual`."""
+
+    @abstractmethod
+    def image(self, z: Float[Array, "basis k"]) -> Float[Array, "basis k"]:
+        """``Gamma^-1 z``: ``x^T R x = |z|^2``."""
+
+    @abstractmethod
     def residual(self, x: Float[Array, " basis"]) -> Float[Array, " rows"]:
         """``Gamma x``, whose sum of squares is ``x^T R x``: a block for any least-squares method."""
 
@@ -54,6 +62,12 @@ class Diagonal(AbstractPrecision):
 
     def variance(self):
         return 1 / self.values
+
+    def seen(self, j):
+        return j / jnp.sqrt(self.values)
+
+    def image(self, z):
+        return (z.T / jnp.sqrt(self.values)).T
 
     def residual(self, x):
         return jnp.sqrt(self.values) * x
@@ -76,6 +90,12 @@ class Precision(AbstractPrecision):
     def variance(self):
         return jnp.diagonal(self.solve(jnp.eye(len(self.values), dtype=self.values.dtype)))
 
+    def seen(self, j):
+        return solve_triangular(cholesky(self.values), j.T, trans=1).T
+
+    def image(self, z):
+        return solve_triangular(cholesky(self.values), z)
+
     def residual(self, x):
         return cholesky(self.values) @ x
 
@@ -96,6 +116,12 @@ class Covariance(AbstractPrecision):
 
     def variance(self):
         return jnp.diagonal(self.values)
+
+    def seen(self, j):
+        return j @ cholesky(self.values, lower=True)
+
+    def image(self, z):
+        return cholesky(self.values, lower=True) @ z
 
     def residual(self, x):
         return solve_triangular(cholesky(self.values, lower=True), x, lower=True)

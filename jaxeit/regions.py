@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.ndimage import maximum_filter
 
 from .metrics import Pictured
 
@@ -109,7 +108,8 @@ def _climb(picture):
     order = np.argsort(picture.ravel(), kind="stable")  # a rank per pixel leaves no flat ground
     rank = np.empty(order.size, int)
     rank[order] = np.arange(order.size)
-    up = order[maximum_filter(rank.reshape(picture.shape), size=3, mode="nearest").ravel()]
+    framed = np.pad(rank.reshape(picture.shape), 1, constant_values=-1)
+    up = order[np.lib.stride_tricks.sliding_window_view(framed, (3, 3)).max((2, 3)).ravel()]
     while (up[up] != up).any():
         up = up[up]
     return up

@@ -1,6 +1,7 @@
 """The hardware as one TOML file: sheet, electrodes, protocol, pads and pressure sensors."""
 
 import math
+import os
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -87,7 +88,7 @@ def load_skin(name_or_path: str | Path) -> Skin:
         shipped = resources.files(__package__).joinpath("skins", f"{name_or_path}.toml")
         return parse_skin(shipped.read_text(encoding="utf-8"), str(name_or_path))
     path = Path(name_or_path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # False, too, for a name that no file can have
         raise TomlError(
             f"{name_or_path}: no such file, and not a shipped skin; shipped are {', '.join(shipped_skins())}"
         )

@@ -3,8 +3,11 @@
 Numbers, not a compiled program: those fail, or worse load and differ, under another version of JAX.
 """
 
+import io
 import json
+import math
 import os
+import struct
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -34,6 +37,9 @@ NUMBERS = {
     "edge_length": ("edges", "m", "length of the border that neighbours share"),
 }
 
+_KINDS = {"pairs": "iu", "edges": "iu", "channels": "b"}
+_WORDS = {"f": "floating point", "iu": "integers", "b": "boolean"}
+
 
 class StoreError(ValueError):
     """A file or numbers that are no reconstructor; the message says what is wrong, and where."""
@@ -60,10 +66,12 @@ def from_numbers(
     if missing:
         raise StoreError(f"{missing[0]}: missing")
     sizes = _sizes(numbers)
-    if len(extent) != 4 or int(np.prod(shape)) != sizes["basis"]:
+    if len(extent) != 4 or not np.isfinite(extent).all() or math.prod(shape) != sizes["basis"]:
         raise StoreError(f"a picture of shape {shape} and extent {extent} does not hold {sizes['basis']} coefficients")
-    if not 0 <= int(numbers["pairs"].min()) <= int(numbers["pairs"].max()) < sizes["k"]:
-        raise StoreError(f"pairs: must count the {sizes['k']} pair sums from 0")
+    for name, what, count in (("pairs", "pair sums", sizes["k"]), ("edges", "coefficients", sizes["basis"])):
+        array = np.asarray(numbers[name])
+        if ((array < 0) | (array >= count)).any():
+            raise StoreError(f"{name}: must count the {count} {what} from 0")
     factor = jnp.asarray(numbers["factor"])
     lines, sign = lines_of(np.asarray(numbers["pairs"]), sizes["k"])
     return Reconstructor(
@@ -95,6 +103,8 @@ def _sizes(numbers: Mapping[str, np.ndarray]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for name, (dimensions, _, _) in NUMBERS.items():
         array = np.asarray(numbers[name])
+        if array.dtype.kind not in _KINDS.get(name, "f"):
+            raise StoreError(f"{name}: is of type {array.dtype}; it must be {_WORDS[_KINDS.get(name, 'f')]}")
         words = dimensions.replace("*", "readings" if array.ndim == 2 else "").split()
         if len(words) != array.ndim:
             raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)})")
@@ -133,8 +143,7 @@ def load_reconstructor(path: str | Path) -> Reconstructor:
     """
     name = Path(path).name
     try:
-        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            numbers = {key: file[key] for key in file.files}
+        numbers = _read_numbers(path)
         about = json.loads(str(numbers.pop("about")))
         if about["format"] != FORMAT:
             raise StoreError(f"is a {about['format']!r}; this version reads {FORMAT!r}")
@@ -143,5 +152,35 @@ def load_reconstructor(path: str | Path) -> Reconstructor:
         raise StoreError(f"{name}: {error}") from None
     except OSError as error:
         raise StoreError(f"{name}: {error.strerror or 'is no reconstructor'}") from None
-    except (ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise StoreError(f"{name}: is damaged or no reconstructor ({error}); prepare and save it again") from None
+    except _DAMAGE as error:
+        why = " ".join(str(error).split())[:120]
+        raise StoreError(f"{name}: is damaged or no reconstructor ({why}); prepare and save it again") from None
+
+
+_DAMAGE = (
+    *(ValueError, KeyError, TypeError, AttributeError, ArithmeticError),
+    *(EOFError, RuntimeError, MemoryError, struct.error, zipfile.BadZipFile),  # RuntimeError: a password, a recursion
+)
+
+
+def _read_numbers(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of a .npz; none is taken to be larger than the file that holds it."""
+    with zipfile.ZipFile(path) as file:
+        for member in file.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise StoreError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
+        return {m.filename.removesuffix(".npy"): _read_array(file, m) for m in file.infolist()}
+
+
+def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """One member, read whole before its own claims are looked at."""
+    stream = io.BytesIO(file.read(member))
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    if dtype.hasobject:
+        raise StoreError(f"{member.filename[:80]!r} holds Python objects, which could run any code; it is not read")
+    if math.prod(shape) * dtype.itemsize != len(stream.getbuffer()) - stream.tell():
+        raise StoreError(f"{member.filename[:80]!r} claims another size than it has")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)

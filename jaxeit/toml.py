@@ -32,6 +32,8 @@ def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T]) -> T:
         return build(TomlTable(tomllib.loads(text), source))
     except tomllib.TOMLDecodeError as error:
         raise TomlError(f"{source}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise TomlError(f"{source}: not valid TOML: nested too deeply") from None
     except TomlError:
         raise
     except ValueError as error:  # an object refused the values it was given
@@ -71,7 +73,7 @@ class TomlTable:
         return float(self.get(key, lambda v: _is_number(v) and v > 0, f"{meaning}, above zero"))
 
     def count(self, key: str) -> int:
-        return self.get(key, lambda v: type(v) is int and v > 0, "a whole number, one or more")
+        return self.get(key, lambda v: type(v) is int and 0 < v <= _MOST, f"a whole number from 1 to {_MOST:,}")
 
     def choice(self, key: str, *names: str, default: Any = ...) -> str:
         meaning = "one of " + ", ".join(f'"{name}"' for name in names)
@@ -117,5 +119,9 @@ class TomlTable:
         return ", ".join(sorted(self._asked))
 
 
+_MOST = 1_000_000  # of anything that is counted: electrodes, rows, places
+
+
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
+    """Finite, and a float can hold it."""
+    return (type(value) is int and abs(value) < 1 << 63) or (type(value) is float and math.isfinite(value))

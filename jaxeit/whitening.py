@@ -218,6 +218,8 @@ def whitened_readings(model: Model, noise, channels) -> Whitened:
     readings = model.pattern.shape[0]
     used = require_some(np.ones(readings, bool) if channels is None else as_flags(channels, readings))
     weight = noise_weight(noise, readings, used)
+    if not np.abs(weight).max() < np.finfo(model.dtype).max:
+        raise InverseError(f"one over the noise squared is beyond {model.dtype}; is the noise in V?")
     return whitened(np.asarray(model.pattern), float(model.current), weight, used, model.dtype)
 
 

@@ -5,6 +5,8 @@ import pytest
 
 import jaxeit as je
 
+pytest_plugins = ["tests.hard_cases"]
+
 jax.config.update("jax_enable_x64", True)
 # Programs compiled once serve all later tests, and the next run.
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))

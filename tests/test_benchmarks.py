@@ -8,7 +8,7 @@ import pytest
 
 import jaxeit as je
 from benchmarks import _common as common
-from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_inverse, bench_jacobian
+from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_inverse, bench_jacobian, stability
 from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
 
 from .oracles.rectangle import four_point
@@ -306,3 +306,24 @@ def test_smoke_of_batches(capsys):
     assert all(row["min_per_s"] <= row["median_per_s"] <= row["max_per_s"] for row in data["rows"])
     assert [row["cache"] for row in data["startup"]] == list(bench_batch.CACHES)
     assert capsys.readouterr().out.count("| second process |") == 1
+
+
+def test_stability_holds_where_the_textbook_fails(tmp_path):
+    """On two axes, the mildest and the hardest of each; all panels are drawn."""
+    rows = stability.measure([stability.AXES[0], stability.AXES[-1]], 2)
+    assert [row["severity"] for row in rows] == pytest.approx([1e-12, 1e8, 100, 0.01])
+    assert max(row["float64"] for row in rows) < 1e-12
+    assert max(row["float32"] for row in rows) < 1e-4
+    assert min(row["naive"] for row in rows) > 1e-4
+    rows[0]["naive"] = None
+    stability.draw(rows, tmp_path / "map.png")
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    titles = [axes.get_title() for axes in stability.picture(rows).axes]
+    assert titles == [axis.title for axis in stability.AXES]
+
+
+@pytest.mark.slow
+def test_smoke_of_stability(capsys):
+    rows = stability.main(["--smoke"])["rows"]
+    assert len(rows) == 2 * len(stability.AXES)
+    assert capsys.readouterr().out.count("naive") == len(stability.AXES)

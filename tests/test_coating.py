@@ -179,7 +179,7 @@ def _contact(model, coupling):
     """Conductance from each unknown of P2 to the metal, through the midpoints of edges."""
     dofs = np.asarray(model.system.dofs)[:, -3:]
     share = np.repeat(np.asarray(coupling * model.areas)[:, None] / 3, 3, 1)
-    return np.bincount(dofs.ravel(), share.ravel(), model.system.unknowns + 1)
+    return np.bincount(dofs.ravel(), share.ravel(), model.system.unknowns)
 
 
 def _only(theta, **coat):

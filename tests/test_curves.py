@@ -9,6 +9,7 @@ from calib.curves import (
     CURVES,
     Affine,
     Hysteresis,
+    HysteresisSpline,
     Linear,
     MonotonePolynomial,
     MonotoneSpline,
@@ -30,6 +31,7 @@ CASES = [
     (MonotoneSpline(4000.0), [4e-3, 2e-3, 3e-3, 6e-3, 8e-3]),
     (Play([150.0, 400.0, 900.0]), [3e-3, 4e-3, 5e-3, 8e-3]),
     (Hysteresis([75.0, 150.0, 300.0]), [9e-3, 4e-3, 4e-3, 3e-3, -2.0]),
+    (HysteresisSpline([75.0, 150.0, 300.0], 4000.0), [4e-3, 2e-3, 3e-3, 6e-3, 8e-3, 1.5, 0.7, 1.2, -2.0]),
 ]
 MEMORYLESS = [case for case in CASES if not case[0].path]
 

@@ -20,12 +20,12 @@ ORDER = [
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise", "forward",
     "pneumatics", "basis", "jacobian", "whitening", "gaps", "priors", "methods", "hyperparameter", "inverse", "store",
     "responses", "descent", "contacts", "nonlinear", "background", "fusion", "metrics", "regions",
-    "choices", "rungs", "ladder",
+    "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
 BENCH = [
-    "session", "units", "corrections", "presses", "curves", "fit", "response", "location", "locators", "hybrid",
-    "online", "measured", "evaluation", "calibration", "maps", "acquisition", "bench", "check", "importers", "logs",
-    "figures", "ladder_figure", "report", "runtime", "cli",
+    "session", "units", "corrections", "presses", "curves", "fit", "response", "smooth", "taxels", "location",
+    "locators", "hybrid", "splits", "online", "measured", "evaluation", "calibration", "maps", "acquisition", "bench",
+    "check", "importers", "logs", "figures", "ladder_figure", "report", "runtime", "workers", "batch", "cluster", "cli",
 ]  # fmt: skip
 
 

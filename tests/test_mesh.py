@@ -507,9 +507,14 @@ def _with(array, row, value):
         ),
     ],
 )
-def test_check_names_what_is_wrong(nodes, triangles, message):
+def test_check_names_what_is_wrong(nodes, triangles, message, hard):
     with pytest.raises(MeshError, match=message):
         Mesh(nodes, triangles).check()
+    hard(
+        "unsound meshes",
+        "nodes not finite, unused or twice; triangles turned round, flat or overlapping; sheets in pieces",
+        beyond="an error that names the node or triangle, its place and what to do",
+    )
 
 
 @pytest.mark.parametrize(

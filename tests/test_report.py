@@ -15,10 +15,20 @@ from calib import figures, report
 from calib.calibration import Calibration
 from calib.curves import Linear
 from calib.evaluation import Evaluation
-from calib.figures import ReportError, curves_figure, gain_figure, localisation_figure, png, sensitivity_figure
+from calib.figures import (
+    ForceSeries,
+    ReportError,
+    curves_figure,
+    force_series_figure,
+    gain_figure,
+    localisation_figure,
+    png,
+    sensitivity_figure,
+)
 from calib.fit import FittedCurve
 from calib.location import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.report import write_report
+from calib.splits import Split
 
 HOSTILE = "\u65e5 $x^$ <script>alert(1)</script> & 'pad' \"\x00"  # the start is what fits into a figure
 SLOPE = 0.01  # N/Pa
@@ -226,6 +236,26 @@ def test_a_calibration_of_before_has_the_rows_it_can_have(calibration, no_pictur
     cells = Reader(page_of(old, tmp_path)).cells
     row = cells.index("EIT only")
     assert cells[row + 2 : row + 7] == ["—", "—", "—", "—", "calibrated"]
+
+
+def test_what_is_left_out_at_a_time_is_told(calibration, no_pictures, tmp_path):
+    splits = (Split("pad", 4, 144, 0.7, 0.55, 0.85, 0.84), Split("indenter", 1, note="one indenter <only>"))
+    found = replace(calibration, evaluation=replace(calibration.evaluation, splits=splits))
+    page = page_of(found, tmp_path)
+    assert "0.70 (0.55 to 0.85)" in page
+    assert "one indenter &lt;only&gt;" in page
+    assert "Beyond what was pressed" not in page_of(calibration, tmp_path)
+
+
+def test_forces_over_time_are_drawn_beside_the_truth():
+    time = np.linspace(0, 6, 50)
+    true = np.stack([np.sin(time), np.cos(time)], 1)
+    one = ForceSeries("two $contacts$", ("1", "2"), time, true, true + 0.1, {"press 1": 1.0})
+    figure = force_series_figure([one, one], simulated=True)
+    assert png(figure).startswith(b"\x89PNG")
+    above, _, below, _ = figure.axes
+    np.testing.assert_allclose(below.lines[0].get_ydata(), 0.1)
+    assert above.get_ylabel() == "force, N"
 
 
 def test_the_choice_and_its_reason_are_told(calibration, located, no_pictures, tmp_path):

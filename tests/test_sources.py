@@ -1,6 +1,7 @@
 """Links to devices, and the simulated device they are tried on."""
 
 import contextlib
+import json
 import socket
 import sys
 import threading
@@ -12,10 +13,10 @@ import pytest
 
 from calib.acquisition import sources
 from calib.acquisition.device import Device, recording, rows
-from calib.acquisition.entries import EVENT, RESTARTED, pack_frame, unpack_event
+from calib.acquisition.entries import EVENT, RESTARTED, Code, pack_frame, unpack_event
 from calib.acquisition.recorder import PATIENCE, Intake
 from calib.acquisition.sources import POLL, ReplayLink, SerialLink, SourceError, TcpLink, source
-from calib.acquisition.wire import State, decode, encode
+from calib.acquisition.wire import State, decode, encode, encode_read
 from calib.session import Status, open_session
 
 S = 1_000_000_000
@@ -173,12 +174,15 @@ def test_a_replay_ends(bundled):
     link = source("force", f"replay://{bundled[0]}?speed=1e9", 1).link()
     assert isinstance(link, ReplayLink)
     link.open()
-    size = 0
+    state, count = State(), 0
     with contextlib.suppress(EOFError):
         while True:
-            size += len(link.read())
+            state, found = decode({3: source("force", "loop://", 1).plan.layout}, state, link.read())
+            count += len(found)
     with open_session(bundled[0]) as session:
-        assert size == 18 * len(session.stream("force"))
+        assert count == len(session.stream("force"))
+    assert json.loads(state.note)["simulated"] is True
+    assert state.counts.dropped == {}
 
 
 def test_several_streams_of_a_session_on_one_line(bundled):
@@ -191,7 +195,8 @@ def test_several_streams_of_a_session_on_one_line(bundled):
 
 
 def test_a_session_played_twice_goes_on_counting(bundled):
-    count = sum(1 for _ in sources.packets(bundled[1], "force"))
+    with open_session(bundled[1]) as session:
+        count = len(session.stream("force"))
     state, raw = State(), b"".join(packet for _, packet in sources.packets(bundled[1], "force", rounds=2))
     _, found = decode({3: source("force", "loop://", 1).plan.layout}, state, raw)
     assert [frame.seq for frame in found] == list(range(2 * count))
@@ -242,6 +247,50 @@ def test_a_port_is_ours_alone():
         with pytest.raises(OSError, match="lock"):
             other.open()
         one.close()
+
+
+def gathered(url, condition, channels=4):
+    """What a device sends until a condition on the frames so far holds."""
+    with Running(url, channels=channels) as run:
+        until(lambda: condition(run))
+    return run
+
+
+def test_a_device_that_plays_a_simulated_session_says_so_whenever_one_joins(bundled):
+    with Device([recording(bundled[1], ["pressure"])], speed=5.0) as device:
+        for _ in range(2):
+            run = gathered(device.urls[0], lambda run: run.tally.simulated)
+            ((_, text),) = [note for note in run.kept.notes if note[0] is Code.SIMULATED]
+            assert bundled[1].name in json.loads(text)["scene"]
+            time.sleep(0.3)
+
+
+@pytest.mark.parametrize("port", [0, pytest.param(None, marks=posix)])
+def test_a_device_sends_only_the_readings_that_it_is_asked_for(port):
+    """And all of them again when it is asked no more."""
+    wanted = np.array([True, False, False, True])
+    with Device([ramp(10**6)], [port]) as device, Running(device.urls[0]) as run:
+
+        def values():
+            return [np.frombuffer(payload[16:], "<f4") for *_, payload in run.kept.records[-1:]]
+
+        until(lambda: run.tally.frames > 5)
+        assert np.isfinite(values()).all()
+        run.intake.send(encode_read(2, wanted))
+        until(lambda: np.array_equal(np.isfinite(values()[0]), wanted))
+        assert len({*values()[0][wanted]}) == 1
+        until(lambda: np.isfinite(values()).all())
+    seq = np.array(run.kept.seq)
+    assert (np.diff(seq) == 1).all()
+    assert run.tally.dropped == {}
+
+
+def test_nothing_is_sent_to_who_is_not_there():
+    intake = Intake(0, source("pressure", "tcp://127.0.0.1:1", 4), Kept())
+    intake.send(b"x")
+    for url in ("tcp://127.0.0.1:1", "serial:///dev/none"):
+        with pytest.raises(OSError, match="not connected"):
+            source("pressure", url, 4).link().write(b"x")
 
 
 # --- faults on the line --------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The wire: bytes to frames, however cut, damaged or invented."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -20,13 +21,17 @@ from calib.acquisition.wire import (
     Place,
     State,
     WireError,
+    asked,
     cobs_decode,
     cobs_encode,
     crc16,
     decode,
     decode_lines,
     encode,
+    encode_note,
+    encode_read,
     follow,
+    part_of_scan,
 )
 
 LAYOUTS = {1: Layout(1, 5, limit=1e3), 2: Layout(2, 2, scale=1e-3, limit=1e3)}
@@ -188,6 +193,44 @@ def test_random_bytes_make_no_frame():
     assert sum(counts.dropped.values()) > 5000
 
 
+@given(st.integers(1, 40), st.sampled_from(["f4", "i2"]), st.sampled_from([32, 64]), st.data())
+def test_a_part_of_a_scan_comes_back_in_its_place(channels, dtype, bits, data):
+    """Readings that were not asked for are missing, whatever part it is; the rest is as in the whole frame."""
+    asked_for = np.array(data.draw(st.lists(st.booleans(), min_size=channels, max_size=channels)))
+    values = np.arange(1, channels + 1).astype(dtype)
+    packet = encode(1, 7, 9, values, bits)
+    rest, found = asked(b"", b"junk\0" + encode_read(1, asked_for) + b"begun")
+    assert rest == b"begun"
+    part = part_of_scan(packet, found[1])
+    (frame,) = decode({1: Layout(1, channels)}, State(), part)[1]
+    missing = np.nan if dtype == "f4" else np.iinfo("i2").min
+    np.testing.assert_array_equal(frame.values, np.where(asked_for, values, missing).astype(dtype))
+    assert (frame.seq, frame.ticks, frame.bits) == (7, 9, bits)
+    if asked_for.sum() * values.itemsize + channels // 8 + 2 < values.nbytes:
+        assert len(part) < len(packet)
+    assert decode({1: Layout(1, channels + 8)}, State(joining=False), part)[0].counts.length == 1
+
+
+def test_what_is_no_frame_is_not_cut():
+    note = encode_note(1, {"simulated": True})
+    for packet in (note, b"abc\0", b"\0", encode(1, 0, 0, np.zeros(20, "f4"))):
+        assert part_of_scan(packet, np.ones(8, bool)) == packet
+
+
+def test_a_note_is_no_sample_and_is_kept():
+    packets = encode_note(2, {"seed": 1}) + encode(2, 0, 0, np.zeros(4, "f4")) + encode_note(1, {"other": 1})
+    state, found = decode({2: Layout(2, 4)}, State(), packets)
+    assert (json.loads(state.note), len(found)) == ({"seed": 1}, 1)
+    assert (state.counts.good, state.counts.other, state.counts.dropped) == (1, 1, {})
+    for text in (b"[1]", b"{", b"\xff"):
+        body = b"\x18\x02" + text
+        bad = cobs_encode(body + crc16(body).to_bytes(2, "little")) + b"\0"
+        after, _ = decode({2: Layout(2, 4)}, state, bad)
+        assert (after.note, after.counts.framing) == (state.note, 1)
+    with pytest.raises(WireError, match="keep below"):
+        encode_note(1, {"scene": "x" * 70_000})
+
+
 @pytest.mark.slow
 def test_a_hundred_million_random_bytes_make_no_frame():
     counts, found = random_bytes(LAYOUTS, 100)
@@ -318,6 +361,32 @@ def test_the_example_is_what_is_sent_and_read(reference):
     np.testing.assert_array_equal(frame.values, values)
 
 
+def output_of(code, folder):
+    """What a program in C prints."""
+    (folder / "f.c").write_text(code)
+    subprocess.run(["cc", "-Wall", "-Werror", "-o", folder / "f", folder / "f.c"], check=True, timeout=60)
+    return subprocess.run([folder / "f"], capture_output=True, check=True, timeout=60).stdout
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_the_part_of_a_scan_in_c_is_the_same(reference, tmp_path):
+    code = re.findall(r"```c\n(.*?)```", reference, re.DOTALL)[1]
+    main = """
+    #include <stdio.h>
+    int main(void) {
+        uint8_t which[] = {0xa5, 0x01}, out[100];
+        float values[12];
+        for (int i = 0; i < 12; i++) values[i] = (float)i;
+        fwrite(out, 1, part(which, values, 12, out), stdout);
+        return 0;
+    }
+    """
+    sent = output_of("#include <stddef.h>\n#include <stdint.h>\n#include <string.h>\n" + code + main, tmp_path)
+    readings = np.isin(np.arange(12), [0, 2, 5, 7, 8])
+    ours = cobs_decode(part_of_scan(encode(1, 0, 0, np.arange(12, dtype="f4")), readings)[:-1])
+    assert ours[10:-2] == sent
+
+
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 def test_the_program_in_c_sends_the_same(reference, tmp_path):
     code = re.search(r"```c\n(.*?)```", reference, re.DOTALL)[1]
@@ -334,10 +403,7 @@ def test_the_program_in_c_sends_the_same(reference, tmp_path):
         return 0;
     }
     """
-    (tmp_path / "f.c").write_text(code + main)
-    program = tmp_path / "f"
-    subprocess.run(["cc", "-Wall", "-Werror", "-o", program, tmp_path / "f.c"], check=True, timeout=60)
-    sent = subprocess.run([program], capture_output=True, check=True, timeout=60).stdout
+    sent = output_of(code + main, tmp_path)
     index = np.arange(928)
     for k, packet in enumerate(sent.split(b"\0")[:-1]):
         values = np.where(index % 37 < k, 0, np.float32(1) / (1 + index + k).astype("f4")).astype("f4")

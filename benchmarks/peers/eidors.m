@@ -53,6 +53,9 @@ function ways = ways_of (work)
   if (isfield (work, "hyperparameter"))
     ways.hyperparameter = work.hyperparameter;
   end
+  if (strcmp (work.verb, "pipeline"))
+    ways.work = work;
+  end
   if (isfield (work, "coarse2fine"))
     ways(2) = ways;
     ways(2).verb = [work.verb " by product"];
@@ -75,7 +78,14 @@ function [result, seconds] = answer (way)
   if (strncmp (way.verb, "inverse", 7))
     forget ();
   end
+  whole = strncmp (way.verb, "pipeline", 8);
+  if (whole)
+    eidors_cache ("clear_all");
+  end
   start = tic;
+  if (whole)
+    way.img = from_mesh (way);
+  end
   switch (way.verb)
     case "forward"
       result = fwd_solve (way.img).meas;
@@ -87,8 +97,21 @@ function [result, seconds] = answer (way)
       result = one_step (way.img, way.hyperparameter);
     case "inverse by product"
       result = one_step_of (calc_jacobian (way.img) * way.matrix, way.hyperparameter);
+    case "pipeline"
+      result = one_step (way.img, way.hyperparameter) * way.work.frames;
+    case "pipeline by product"
+      result = one_step_of (calc_jacobian (way.img) * way.matrix, way.hyperparameter) * way.work.frames;
   end
   seconds = toc (start);
+end
+
+% The model made anew, as for a mesh never seen.
+function img = from_mesh (way)
+  img = mk_image (forward_model (way.work), 1);
+  img.elem_data = way.img.elem_data;
+  if (strcmp (way.verb, "pipeline") && isfield (way.work, "coarse2fine"))
+    img.fwd_model.coarse2fine = way.work.coarse2fine;
+  end
 end
 
 % What get_RM in inv_solve_diff_GN_one_step.m does, which cannot be called from outside.

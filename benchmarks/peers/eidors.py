@@ -35,11 +35,11 @@ def missing() -> str | None:
 class Eidors:
     """A tool that has Octave at work; `last_seconds` is what Octave measured around its last call."""
 
-    def __init__(self, problem, verb: str, order: int = 1, pixels=None, **extra: float) -> None:
+    def __init__(self, problem, verb: str, order: int = 1, pixels=None, **extra: Any) -> None:
         folder = tempfile.TemporaryDirectory(prefix="eidors-")
         self.folder, self.last_seconds = Path(folder.name), float("nan")
         image = problem.mesh.triangles if pixels is None else pixels.T
-        self.rows = (image if verb == "inverse" else problem.pattern).shape[0]
+        self.rows = (image if verb in ("inverse", "pipeline") else problem.pattern).shape[0]
         savemat(self.folder / "work.mat", _work(problem, pixels) | {"verb": verb, "order": order} | extra)
         self.process: Any = subprocess.Popen(
             ["octave-cli", "--norc", "--quiet", SCRIPT, self.folder],
@@ -131,3 +131,8 @@ def prepare_jacobian(problem, pixels=None) -> Eidors:
 def prepare_inverse(problem, hyperparameter: float, pixels=None) -> Eidors:
     """The matrix of `inv_solve_diff_GN_one_step` with `prior_noser`, (basis, readings), its Jacobian included."""
     return Eidors(problem, "inverse", pixels=pixels, hyperparameter=hyperparameter)
+
+
+def prepare_pipeline(problem, hyperparameter: float, frames: np.ndarray, pixels=None) -> Eidors:
+    """From the mesh to images of frames, (readings, frames): each call makes the model anew."""
+    return Eidors(problem, "pipeline", pixels=pixels, hyperparameter=hyperparameter, frames=frames)

@@ -50,3 +50,12 @@ def prepare_inverse(problem, strength: float):
         return -solver._compute_h(jacobian, 0.5, strength, "kotre")
 
     return matrix
+
+
+def prepare_pipeline(problem, strength: float, frames: np.ndarray):
+    """From the mesh to images of frames, (readings, frames); see `prepare_inverse`."""
+
+    def images(sigma):
+        return prepare_inverse(problem, strength)(sigma) @ frames
+
+    return images

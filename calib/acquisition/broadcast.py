@@ -11,10 +11,23 @@ _BURST = 1 << 16
 class Listener:
     """Something to send to: whole packets, or none of them where too much waits already."""
 
-    def __init__(self, send: Callable[[memoryview], int], close: Callable[[], None], backlog: int = BACKLOG):
-        self._send, self.close, self._backlog = send, close, backlog
+    def __init__(
+        self,
+        send: Callable[[memoryview], int],
+        close: Callable[[], None],
+        backlog: int = BACKLOG,
+        hear: Callable[[int], bytes] = lambda size: b"",
+    ):
+        self._send, self.close, self._backlog, self._hear = send, close, backlog, hear
         self._waiting = bytearray()
+        self.tail = b""  # of what was heard, for whoever understands it
         self.dropped = 0
+
+    def heard(self) -> bytes:
+        """What it has said, without waiting."""
+        with contextlib.suppress(OSError):  # nothing yet; that it has gone is noticed by sending
+            return self._hear(_BURST)
+        return b""
 
     def give(self, packets: Sequence[bytes]) -> None:
         """Send what it takes; raises OSError if it is gone."""
@@ -50,7 +63,7 @@ class Broadcaster:
                     continue
                 client.setblocking(False)
                 client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self.listeners.append(Listener(client.send, client.close, self._backlog))
+                self.listeners.append(Listener(client.send, client.close, self._backlog, client.recv))
         while away and self.listeners:
             self.listeners.pop().close()
 

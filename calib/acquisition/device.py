@@ -16,7 +16,7 @@ import numpy as np
 
 from .broadcast import Broadcaster, Listener, give
 from .sources import packets
-from .wire import encode
+from .wire import asked, encode, part_of_scan
 
 try:
     import tty
@@ -26,6 +26,7 @@ except ImportError:  # Windows has no pseudo-terminals
 Packets = Iterator[tuple[int, bytes]]
 _FIFO = 1 << 12  # bytes held for a terminal, which is always there
 _TURN = 0.02  # s, the longest sleep
+_OBEYED = 1.0  # s, after which a host that says nothing more is taken for gone
 
 
 def rows(number: int, times: Iterable[int], values: Iterable[np.ndarray], *, tick: float = 1e-6) -> Packets:
@@ -39,13 +40,35 @@ def recording(path: str | Path, names: Sequence[str], rounds: int = 1) -> Packet
     return heapq.merge(*(packets(path, name, rounds=rounds) for name in names), key=lambda packet: packet[0])
 
 
+class _Wanted:
+    """Which readings of a stream its listeners want: all of them, unless one has said so of late."""
+
+    def __init__(self) -> None:
+        self._readings: np.ndarray | None = None
+        self._until = 0.0
+
+    def hear(self, listeners: Sequence[Listener]) -> None:
+        """Take in what they ask."""
+        for listener in listeners:
+            listener.tail, found = asked(listener.tail, listener.heard())
+            for readings in found.values():
+                self._readings, self._until = readings, time.monotonic() + _OBEYED
+
+    def of(self, packet: bytes) -> bytes:
+        """A frame as it is wanted."""
+        if self._readings is None or time.monotonic() > self._until:
+            return packet
+        return part_of_scan(packet, self._readings)
+
+
 class Device:
     """Streams packets in real time from when it is entered; a context manager.
 
     ``streams`` are iterators of (due time in ns, bytes), each with a TCP port of its own (0 lets the system
     choose) on `host` or, where ``ports`` holds None, a pseudo-terminal. ``speed`` may be above 1. After
     entering, ``urls`` says where each is to be found. ``unplug`` disconnects everyone for a while; ``done`` is
-    set when everything was sent.
+    set when everything was sent. A listener may ask for some readings of the frames (`encode_read`), which the
+    device then sends to all, until it has heard nothing for a second.
     """
 
     def __init__(
@@ -114,7 +137,9 @@ class Device:
         self.urls.append(f"serial://{os.ttyname(theirs)}")
 
         def run(number: int, stream: Packets) -> None:
-            listener = Listener(lambda data: os.write(ours, data[:2048]), lambda: None, _FIFO)
+            listener = Listener(
+                lambda data: os.write(ours, data[:2048]), lambda: None, _FIFO, lambda size: os.read(ours, size)
+            )
             self._stream(number, stream, [listener], lambda: None)
 
         return run
@@ -123,13 +148,14 @@ class Device:
         while len(listeners) < self._wait_for and not self._stop.wait(0.005):
             meet()
         begin = time.monotonic_ns() if self._wait_for else self._begin
-        ahead = next(stream, None)
+        ahead, wanted = next(stream, None), _Wanted()
         while ahead is not None and not self._stop.is_set():
             meet()
+            wanted.hear(listeners)
             due: list[bytes] = []
             now = (time.monotonic_ns() - begin) * self._speed
             while ahead is not None and ahead[0] <= now and len(due) < 1000:
-                due.append(ahead[1])
+                due.append(wanted.of(ahead[1]))
                 ahead = next(stream, None)
             self.sent[number] += len(due)
             give(listeners, due)

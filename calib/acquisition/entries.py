@@ -24,6 +24,7 @@ class Code(enum.IntEnum):
     LOST = 2
     CLOCK_STEP = 3
     NOTE = 4
+    SIMULATED = 5  # the device says that its values are; the label holds scene and seed
 
 
 def pack_frame(frame: Frame) -> bytes:

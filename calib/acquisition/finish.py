@@ -4,9 +4,10 @@ The first reading learns how many frames there are, of what type, and how each d
 second writes them. The file appears whole or not at all; the journal is left to the caller.
 """
 
+import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from .plan import Plan, StreamPlan, plan_from_json
 _ROWS = 512
 _MAX_EVENTS = 100_000
 _HOST = "time of arrival"
+_SIMULATED = "the device says that its values are simulated"
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ def finish(
     """
     scan = Scan(journal)
     plan = _plan(scan)
-    surveys, end = _survey(scan, plan, progress)
+    surveys, end, plan = _survey(scan, plan, progress)
     if not any(survey.frames for survey in surveys.values()):
         raise JournalError(f"{scan.path.name}: no frame was recorded; there is nothing to make a session of")
     timelines = {number: survey.timeline() for number, survey in surveys.items()}
@@ -238,18 +240,30 @@ def _plan(scan: Scan) -> Plan:
     raise JournalError(f"{scan.path.name}: its description is damaged; what it held cannot be told")
 
 
-def _survey(scan: Scan, plan: Plan, progress: Progress) -> tuple[dict[int, _Survey], tuple[bool, str] | None]:
+def _survey(scan: Scan, plan: Plan, progress: Progress) -> tuple[dict[int, _Survey], tuple[bool, str] | None, Plan]:
+    """What each stream holds, how the recording ended, and the plan with what the devices said."""
     end = None
     surveys = {number: _Survey(stream, _Follower(stream)) for number, stream in enumerate(plan.streams)}
     for record in scan:
         progress(len(record.payload))
         if record.stream in surveys:
             surveys[record.stream].add(record)
+        elif record.stream == EVENT:
+            plan = _as_said(plan, *unpack_event(record.payload))
         elif record.stream == END:
             end = unpack_end(record.payload)
     for survey in surveys.values():
         survey.flush()
-    return surveys, end
+    return surveys, end, plan
+
+
+def _as_said(plan: Plan, code: Code, label: str) -> Plan:
+    """A plan of what is simulated, if a device said that its values are."""
+    if code is not Code.SIMULATED or plan.simulated:
+        return plan
+    said = json.loads(label)
+    scene, seed = str(said.get("scene") or "not told by the device"), said.get("seed")
+    return replace(plan, simulated=True, scene=scene, seed=seed if isinstance(seed, int) else 0)
 
 
 class _StreamWriter:
@@ -379,7 +393,9 @@ def _write_records(
             streams[record.stream].add(record, record.stream in broken)
             broken.discard(record.stream)
         elif record.stream == EVENT and len(events) < _MAX_EVENTS:
-            events.append((record.host - plan.host_epoch, *unpack_event(record.payload)))
+            code, label = unpack_event(record.payload)
+            label = _SIMULATED if code is Code.SIMULATED else label  # the scene is told once, for the file
+            events.append((record.host - plan.host_epoch, code, label))
     return events
 
 

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 from calib.calibration import Calibration
 
 from .broadcast import Broadcaster
-from .live import Publish, Result, Show, live
+from .live import Publish, Show, live
 from .plan import Plan
+from .recorder import kept
+from .results import Result
 from .sources import Source
 from .web import LOOPBACK, Page
 
@@ -22,6 +25,8 @@ def present(
     port: int = 8765,
     publish: int | None = None,
     also: Sequence[Publish] = (),
+    output: str | Path | None = None,
+    event_driven: bool = False,
     tell: Callable[[str], object] = lambda line: None,
     rest: float = 2.0,
     wait: float = 10.0,
@@ -32,11 +37,12 @@ def present(
         plan, sources: of eit and pressure, from `prepare`.
         host, port: of the page, 0 for any port; `publish`: of the lines of JSON, or None.
         also: told each result as well.
+        output: a session file to record into meanwhile.
         tell: told where to look.
-        rest, wait: as in `live`.
+        event_driven, rest, wait: as in `live`.
 
     Raises:
-        LiveError: as `live`. OSError: if a port is taken.
+        LiveError: as `live`. RecordError: as `kept`. OSError: if a port is taken.
     """
     with ExitStack() as stack:
         page = stack.enter_context(Page(calibration, show, host, port))
@@ -48,7 +54,18 @@ def present(
             out.append(lambda result: lines.say([result.to_json().encode() + b"\n"]))
         if host not in LOOPBACK:
             tell("anyone who can reach this machine can look, and set to zero")
-        return live(calibration, plan, sources, lambda result: _all(out, result), show, rest=rest, wait=wait)
+        log = None if output is None else stack.enter_context(kept(output, tell))
+        return live(
+            calibration,
+            plan,
+            sources,
+            lambda result: _all(out, result),
+            show,
+            log=log,
+            event_driven=event_driven,
+            rest=rest,
+            wait=wait,
+        )
 
 
 def _all(out: Sequence[Publish], result: Result) -> None:

@@ -4,9 +4,11 @@ Nothing here computes: a frame is decoded, placed by its sequence number and wri
 made from the journal when the recording ends; if the recorder does not live to see that, `finish` does it later.
 """
 
+import json
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +17,7 @@ from calib.session import Status
 
 from .entries import END, EVENT, PLAN, RESTARTED, Code, pack_end, pack_event, pack_frame
 from .finish import Progress, Summary, finish
-from .journal import Journal, JournalError
+from .journal import Journal, JournalError, Scan
 from .plan import Plan
 from .sources import Link, Source
 from .wire import Counts, Frame, Order, Place, State, follow
@@ -65,6 +67,7 @@ class Tally:
     lost: int = 0
     repeated: int = 0
     connections: int = 0
+    simulated: bool = False
     earlier: Counts = field(default_factory=Counts)  # of links before the present one
     present: Counts = field(default_factory=Counts)
 
@@ -81,11 +84,20 @@ class Intake:
         self.number, self.source, self.tally = number, source, Tally()
         self._journal, self._tap, self._order = journal, tap, Order()
         self._rejoined = False
+        self._link: Link | None = None
+        self._noted = ""
         self.ended = False
+
+    def send(self, data: bytes) -> None:
+        """To the device, if it is there and takes it; called by another thread."""
+        link = self._link
+        if link is not None and self.tally.connected:
+            with suppress(OSError):
+                link.write(data)
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop` is set or the source has no more; raises JournalError when writing fails."""
-        link = self.source.link()
+        self._link = link = self.source.link()
         try:
             while not stop.is_set() and not self.ended:
                 self._connect(link, stop)
@@ -126,6 +138,8 @@ class Intake:
             if data:
                 state, frames = self.source.decode(state, data)
                 self.tally.present = state.counts
+                if state.note != self._noted:
+                    self._heed(state.note)
                 for frame in frames:
                     self._take(frame, host)
                 if frames:
@@ -161,6 +175,13 @@ class Intake:
         self.tally.frames += 1
         if self._tap is not None:
             self._tap(self.number, frame, host)
+
+    def _heed(self, note: str) -> None:
+        """What the device says: whether its values are simulated, once, as it may say so ever again."""
+        self._noted = note
+        if json.loads(note).get("simulated"):
+            self.tally.simulated = True
+            self._journal.append(EVENT, 0, time.monotonic_ns(), pack_event(Code.SIMULATED, note))
 
     def _note(self, code: Code, text: str) -> None:
         self._journal.append(EVENT, 0, time.monotonic_ns(), pack_event(code, text[:200]))
@@ -285,9 +306,7 @@ def record(
         JournalError: if an unfinished recording waits beside `output`.
     """
     orders = Orders() if orders is None else orders
-    part = part_of(output)
-    if Path(output).exists():
-        raise RecordError(f"{output}: exists already, and recordings are not overwritten; choose another name")
+    part = _begun(output)
     with Journal(part) as journal:
         recorder = Recorder(plan, sources, journal, tap)
         failure = _attend(recorder, orders, seconds, wait, progress)
@@ -297,8 +316,20 @@ def record(
         part.unlink()
         raise failure if isinstance(failure, RecordError) else RecordError(f"nothing was recorded ({why or 'stopped'})")
     progress("writing the session")
+    return _concluded(part, output, failure, finishing)
+
+
+def _begun(output: str | Path) -> Path:
+    """The journal's name, if there is room for a session."""
+    if Path(output).exists():
+        raise RecordError(f"{output}: exists already, and recordings are not overwritten; choose another name")
+    return part_of(output)
+
+
+def _concluded(part: Path, output: str | Path, failure: Exception | None, progress: Progress) -> Summary:
+    """Make the session of the journal; raises RecordError also for what cut the recording short."""
     try:
-        summary = finish(part, output, progress=finishing)
+        summary = finish(part, output, progress=progress)
     except (ValueError, OSError) as error:
         todo = f"the recording is kept: jaxeit recover {part}"
         raise RecordError(f"{failure or error}; {todo}") from error
@@ -306,6 +337,31 @@ def record(
     if failure is not None:
         raise RecordError(f"{failure}; what had been recorded is in {output}") from failure
     return summary
+
+
+@contextmanager
+def kept(output: str | Path, tell: Callable[[str], object] = lambda line: None) -> Iterator[Journal]:
+    """A journal for whoever runs a `Recorder` himself; on leaving it becomes the session `output`.
+
+    An exception that passes is told in the session as what cut it short; without a single frame nothing is left.
+
+    Raises:
+        RecordError, JournalError: as `record`.
+    """
+    part = _begun(output)
+    failure: BaseException | None = None
+    with Journal(part) as journal:
+        try:
+            yield journal
+        except BaseException as error:
+            failure = error
+        ended = _end(journal, "" if failure is None else str(failure) or type(failure).__name__)
+    if not any(record.stream < END for record in Scan(part)):
+        part.unlink()
+    else:
+        tell(_concluded(part, output, ended, lambda size: None).render())
+    if failure is not None:
+        raise failure
 
 
 def _end(journal: Journal, why: str) -> JournalError | None:

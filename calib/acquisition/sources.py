@@ -13,6 +13,7 @@ can be told to stop, and raises OSError when it is lost; opening it again is up 
 
 import abc
 import re
+import select
 import socket
 import time
 from collections.abc import Iterator
@@ -26,11 +27,12 @@ import serial
 from calib.session import Session, Stream, open_session
 
 from .plan import KINDS, StreamPlan
-from .wire import Layouts, State, decode, decode_lines, encode
+from .wire import Layouts, State, decode, decode_lines, encode, encode_note
 
 POLL = 0.1
 CONNECT = 1.0
 _PIECE = 1 << 16
+_TOLD = 1_000_000_000  # ns between notes
 _NUMBERS = {"rate", "tick", "scale", "offset", "baud", "speed"}
 _WHOLE = {"id", "channels"}
 _OPTIONS = _NUMBERS | _WHOLE | {"format"}
@@ -58,6 +60,10 @@ class Link(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Disconnect; no error if it is not connected."""
+
+    def write(self, data: bytes) -> None:
+        """Send to the device without waiting, as far as it takes it; OSError if it is gone, or cannot hear."""
+        raise OSError(None, f"{type(self).__name__} only talks")
 
 
 class TcpLink(Link):
@@ -88,6 +94,14 @@ class TcpLink(Link):
             raise ConnectionResetError("closed by the device")
         return data
 
+    def write(self, data: bytes) -> None:
+        """Send to the device what it takes at once."""
+        link = self._socket
+        if link is None:
+            raise OSError(None, "not connected")
+        if select.select([], [link], [], 0)[1]:
+            link.send(data)
+
     def close(self) -> None:
         """Disconnect."""
         if self._socket is not None:
@@ -106,7 +120,10 @@ class SerialLink(Link):
         """Open the port; raises OSError."""
         native = "://" not in self._name
         try:
-            self._port = serial.serial_for_url(self._name, self._baud, timeout=POLL, exclusive=True if native else None)
+            exclusive = True if native else None
+            self._port = serial.serial_for_url(
+                self._name, self._baud, timeout=POLL, write_timeout=POLL, exclusive=exclusive
+            )
         except serial.serialutil.SerialException as error:
             raise OSError(error.errno, f"{self._name}: {error.strerror or error}") from error
         except ValueError as error:
@@ -123,7 +140,8 @@ class SerialLink(Link):
 
     def write(self, data: bytes) -> None:
         """Send to the device."""
-        assert self._port is not None
+        if self._port is None:
+            raise OSError(None, "not connected")
         self._port.write(data)
 
     def close(self) -> None:
@@ -170,19 +188,30 @@ class ReplayLink(Link):
 def packets(path: str | Path, name: str, number: int | None = None, rounds: int = 1) -> Iterator[tuple[int, bytes]]:
     """A session's stream as binary frames in SI (f4): when each is due, ns since the epoch, and its bytes.
 
-    After the end it begins again, ``rounds`` times in all, with numbers and ticks going on.
+    After the end it begins again, ``rounds`` times in all, with numbers and ticks going on. Of a simulated session
+    a note that says so comes first, and every second.
     """
     with open_session(path) as session:
         stream = session.stream(name)
         number = KINDS[name].number if number is None else number
-        turn = _duration(session)
+        turn, told = _duration(session), -_TOLD
+        note = encode_note(number, _about(session)) if session.simulated else b""
         for again in range(rounds):
             seq = _seq(stream) + again * (int(_seq(stream)[-1]) + 1 if len(stream) else 0)
             times = stream.time + again * turn
             for start, stop, values in stream.blocks(1 << 20):
                 for row, block in zip(range(start, stop), values.astype("<f4"), strict=True):
                     at = int(times[row])
+                    if note and at - told >= _TOLD:
+                        told = at
+                        yield at, note
                     yield at, encode(number, seq[row], at // 1000, block)
+
+
+def _about(session: Session) -> dict[str, object]:
+    """What a device that plays a simulated session says of it: short, as it is said again and again."""
+    scene = f"# played by a device from {session.name}, session {session.session_id}"
+    return {"simulated": True, "scene": scene, "seed": session.seed}
 
 
 def _duration(session: Session) -> int:

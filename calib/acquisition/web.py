@@ -14,7 +14,8 @@ import numpy as np
 
 from calib.calibration import Calibration
 
-from .live import Result, Show
+from .live import Show
+from .results import Result
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _PAGE = Path(__file__).with_name("page.html")
@@ -147,10 +148,11 @@ class _Handler(BaseHTTPRequestHandler):
         number, stop = 0, self.server.show.stop
         while not stop.is_set():
             result = self.server.newest(number)
-            state = json.dumps(self.server.show.state)
+            show = self.server.show
+            about = json.dumps({"state": show.state, "simulated": show.simulated, "lost": show.lost})
             text = result.to_json(image=True) if result is not None else "null"
             number = number if result is None else result.number
-            self.wfile.write(f'data: {{"state": {state}, "result": {text}}}\n\n'.encode())
+            self.wfile.write(f'data: {{"about": {about}, "result": {text}}}\n\n'.encode())
             self.wfile.flush()
             stop.wait(_FASTEST)
 

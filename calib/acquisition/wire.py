@@ -7,6 +7,7 @@ far, however they were cut, and hold at most one frame's worth of them.
 
 import binascii
 import enum
+import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -19,7 +20,8 @@ MAX_CHANNELS = 16_000
 LONGEST = 1 << 16  # bytes of a frame of that many channels, as sent
 _HEADS = {32: struct.Struct("<BBII"), 64: struct.Struct("<BBIQ")}
 _TYPES: dict[int, np.dtype] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
-_LONG_TICKS = 2
+_LONG_TICKS, _PART = 2, 4
+_NOTE, _READ = VERSION << 4 | 8, VERSION << 4 | 9  # messages, not samples
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
 _TEXT_BYTES = 32  # what one number in a line may take
@@ -95,7 +97,8 @@ class State:
     """A decoder between two pieces of input.
 
     ``tail`` has begun but not ended; ``joining`` until a first end is seen, as one joins a device in
-    mid-frame; ``skipping`` to the next end after an overlong piece; ``damaged`` since the last frame.
+    mid-frame; ``skipping`` to the next end after an overlong piece; ``damaged`` since the last frame;
+    ``note`` is the last thing that the device said about the stream.
     """
 
     tail: bytes = b""
@@ -103,6 +106,7 @@ class State:
     skipping: bool = False
     damaged: bool = False
     counts: Counts = Counts()
+    note: str = ""
 
 
 Layouts = Mapping[int, Layout]
@@ -162,7 +166,60 @@ def encode(stream: int, seq: int, ticks: int, values: np.ndarray, bits: int = 32
     kind = VERSION << 4 | (_LONG_TICKS if bits == 64 else 0) | kinds[0]
     head = _HEADS[bits].pack(kind, stream, int(seq) % 2**32, int(ticks) % 2**bits)
     body = head + values.astype(_TYPES[kinds[0]]).tobytes()
+    return _sealed(body)
+
+
+def encode_note(stream: int, about: Mapping[str, object]) -> bytes:
+    """What a device says about a stream, once a second, as one message: ``simulated``, ``scene``, ``seed``.
+
+    Raises:
+        WireError: if it is longer than a frame may be.
+    """
+    body = bytes([_NOTE, stream]) + json.dumps(about).encode()
+    if len(body) > LONGEST - 1024:
+        raise WireError(f"note: {len(body):,} bytes; keep below {LONGEST - 1024:,}")
+    return _sealed(body)
+
+
+def encode_read(stream: int, readings: np.ndarray) -> bytes:
+    """What a host asks of a device: from the next frame on, of this stream, only these readings, (channels,) bool."""
+    return _sealed(bytes([_READ, stream]) + _bits(readings))
+
+
+def _sealed(body: bytes) -> bytes:
     return cobs_encode(body + _CRC.pack(crc16(body))) + b"\0"
+
+
+def _bits(readings: np.ndarray) -> bytes:
+    return np.packbits(np.asarray(readings, bool), bitorder="little").tobytes()
+
+
+def asked(tail: bytes, data: bytes) -> tuple[bytes, dict[int, np.ndarray]]:
+    """What a device hears: the rest that has not ended, and the readings last asked of each stream.
+
+    Flags come in whole bytes: (n,) bool with n the number of readings, rounded up to eight.
+    """
+    *pieces, tail = (tail + data).split(b"\0")
+    found: dict[int, np.ndarray] = {}
+    for piece in pieces:
+        body = cobs_decode(piece) or b""
+        if len(body) > 4 and body[0] == _READ and crc16(body[:-2]) == _CRC.unpack(body[-2:])[0]:
+            found[body[1]] = np.unpackbits(np.frombuffer(body[2:-2], np.uint8), bitorder="little").astype(bool)
+    return tail[-LONGEST:], found
+
+
+def part_of_scan(packet: bytes, readings: np.ndarray) -> bytes:
+    """A frame as a device sends it that was asked for some readings only; what is no frame stays as it is."""
+    body = cobs_decode(packet[:-1]) or b"\xff"
+    dtype = _TYPES.get(body[0] & ~_LONG_TICKS & 0x0F)
+    if body[0] >> 4 != VERSION or dtype is None:
+        return packet
+    head = _HEADS[64 if body[0] & _LONG_TICKS else 32].size
+    values = np.frombuffer(body[head:-2], dtype)
+    chosen = readings[: len(values)]
+    if len(chosen) < len(values):
+        return packet
+    return _sealed(bytes([body[0] | _PART]) + body[1:head] + _bits(chosen) + values[chosen].tobytes())
 
 
 def decode(layouts: Layouts, state: State, data: bytes) -> tuple[State, list[Frame]]:
@@ -187,12 +244,14 @@ def decode_lines(layouts: Layouts, state: State, data: bytes) -> tuple[State, li
 
 def _decode(layouts, state, data, end, parse, limit) -> tuple[State, list[Frame]]:
     *pieces, tail = (state.tail + data).split(end)
-    frames, counts = [], state.counts
+    frames, counts, note = [], state.counts, state.note
     joining, skipping, damaged = state.joining, state.skipping, state.damaged
     for piece in pieces:
         if piece and not skipping:  # else it is the rest of an overlong piece, which was counted
             frame, dropped = (None, Counts(overlong=1)) if len(piece) > limit else parse(layouts, piece)
-            if frame is not None:
+            if isinstance(frame, str):
+                note = frame
+            elif frame is not None:
                 frames.append(frame._replace(resync=damaged))
                 damaged = False
             elif not joining:
@@ -203,32 +262,53 @@ def _decode(layouts, state, data, end, parse, limit) -> tuple[State, list[Frame]
         counts += Counts(overlong=0 if joining else 1)
         skipping, damaged = True, damaged or not joining
     counts = replace(counts, good=counts.good + len(frames))
-    return State(b"" if skipping else tail, joining, skipping, damaged, counts), frames
+    return State(b"" if skipping else tail, joining, skipping, damaged, counts, note), frames
 
 
 _NOTHING = Counts()
-_Parsed = tuple[Frame | None, Counts]
+_Parsed = tuple[Frame | str | None, Counts]  # a sample, or a note
 
 
 def _binary(layouts: Layouts, packet: bytes) -> _Parsed:
     body = cobs_decode(packet)
     if body is None:
         return None, Counts(framing=1)
-    if len(body) < _HEADS[32].size + _CRC.size or crc16(body[:-2]) != _CRC.unpack(body[-2:])[0]:
+    if len(body) < 2 + _CRC.size or crc16(body[:-2]) != _CRC.unpack(body[-2:])[0]:
         return None, Counts(checksum=1)
     kind, stream = body[0], body[1]
-    dtype = _TYPES.get(kind & ~_LONG_TICKS & 0x0F)
-    if kind >> 4 != VERSION or dtype is None:
+    dtype = _TYPES.get(kind & ~(_LONG_TICKS | _PART) & 0x0F)
+    if kind != _NOTE and (kind >> 4 != VERSION or dtype is None):
         return None, Counts(version=1)
     if stream not in layouts:
         return None, Counts(other=1)
-    layout, bits = layouts[stream], 64 if kind & _LONG_TICKS else 32
-    head = _HEADS[bits]
-    if len(body) != head.size + layout.channels * dtype.itemsize + _CRC.size:
+    return _noted(body) if dtype is None else _sample(layouts[stream], body, dtype)
+
+
+def _noted(body: bytes) -> _Parsed:
+    try:
+        text = body[2:-2].decode()
+        if isinstance(json.loads(text), dict):
+            return text, _NOTHING
+    except ValueError:
+        pass
+    return None, Counts(framing=1)
+
+
+def _sample(layout: Layout, body: bytes, dtype: np.dtype) -> _Parsed:
+    kind, bits = body[0], 64 if body[0] & _LONG_TICKS else 32
+    head, mask = _HEADS[bits].size, -(-layout.channels // 8) if kind & _PART else 0
+    flags = body[head : head + mask]
+    read = np.unpackbits(np.frombuffer(flags, np.uint8), bitorder="little").astype(bool)[: layout.channels]
+    count = int(read.sum()) if mask else layout.channels
+    if len(flags) < mask or len(body) != head + mask + count * dtype.itemsize + _CRC.size:
         return None, Counts(length=1)
-    _, _, seq, ticks = head.unpack_from(body)
-    values = np.frombuffer(body, dtype, layout.channels, head.size)
-    return _in_range(layout, Frame(stream, seq, ticks, bits, values))
+    _, _, seq, ticks = _HEADS[bits].unpack_from(body)
+    values = np.frombuffer(body, dtype, count, head + mask)
+    if mask:
+        whole = np.full(layout.channels, np.nan if dtype.kind == "f" else np.iinfo(dtype).min, dtype)
+        whole[read] = values
+        values = whole
+    return _in_range(layout, Frame(layout.stream, seq, ticks, bits, values))
 
 
 def _in_range(layout: Layout, frame: Frame) -> _Parsed:

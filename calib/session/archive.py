@@ -275,9 +275,9 @@ def open_archive(path: str | os.PathLike[str], format: str) -> ArchiveReader:
 
 
 def _check_archive(root: Node, format: str) -> None:
-    found = root.attribute("format")
+    found = root.text("format", "")
     if found != format:
-        what = f"is {printable(found)!r}, not {format!r}" if found is not None else "has no format"
+        what = f"is {printable(found)!r}, not {format!r}" if found else "has no format"
         raise problem(root.path, "file", what, f"name a {format} file")
     check_version(root)
     if root.number("complete", 0) != 1:

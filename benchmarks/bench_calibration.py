@@ -1,0 +1,323 @@
+"""How short may a bench session be?  Presses, and forces at each of them, against the error on presses not fitted.
+
+python -m benchmarks.bench_calibration [--smoke | --draw-only]
+
+The pool is the bundled session testbed_grid.h5: 225 simulated presses to 20 N on a 15 x 15 grid.  Some of them are
+fitted and the others predicted, over their holds and all along their presses; of all 225 each fifth of the places is
+predicted from the rest.  They lie on a grid (nearest to the middles of equal cells), are scattered evenly without one
+(Roberts' R2 sequence), or drawn at random.  The second session, testbed_presses.h5, is predicted too: four presses of
+other forces, elsewhere.  With so many force levels, only the samples nearest to equal steps up to the hold are fitted,
+as a bench that stops at these forces would record them.  Places are found with the noise of the whole session, and
+through the sheet that the mean of its untouched frames shows.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import calib
+from calib.calibration import press_data
+from calib.figures import png
+from calib.fit import FitResult
+from calib.hybrid import Hybrid, PressData, fit_hybrid, folds_by_place
+from calib.location import Geometry, Places, geometry_of
+from calib.runtime import set_up
+from calib.session import replacing
+
+from . import _common as c
+
+PICTURE = c.ROOT / "docs" / "calibration-cost.png"
+SESSIONS = c.ROOT / "data" / "sessions"
+SIDES = (3, 4, 5, 6, 8, 10, 15)  # of the grid of presses
+LEVELS = (1, 2, 3, 5, None)  # None: the whole press
+DRAWS, FOLDS = 3, 5
+SIDE = 15  # of the pool's grid
+CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib.PowerLaw()}
+FIELDS = {"none": None, "pad edge": calib.PadEdge()}
+RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))
+
+LINES = {"scattered": "-", "grid": "--", "random": ":"}
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Presses to fit from and to predict, with the places that their images tell.
+
+    | meaning                                                        | shape        | unit |
+    |----------------------------------------------------------------|--------------|------|
+    | data, geometry, places: what `fit_hybrid` takes                |              |      |
+    | position of each press                                         | (presses, 2) | m    |
+    | seconds a press takes, from one to the next                    | ()           | s    |
+    | other, elsewhere: pressures and forces of the second session, and its places | |     |
+    """
+
+    data: PressData
+    geometry: Geometry
+    places: Places
+    position: np.ndarray
+    seconds: float
+    other: PressData
+    elsewhere: Places
+
+
+def pool() -> Pool:
+    with calib.open_session(SESSIONS / "testbed_grid.h5") as session:
+        calibration = calib.calibrate([session], location=calib.PadEdge())
+        found = calib.measure(session, calibration.skin)
+        data, dv, position = press_data([found])
+        seconds = float(np.median(np.diff(found.presses.t_press))) * 1e-9
+    with calib.open_session(SESSIONS / "testbed_presses.h5") as session:
+        other, other_dv, _ = press_data([calib.measure(session, calibration.skin)])
+    places, elsewhere = (_places(calibration, frames) for frames in (dv, other_dv))
+    geometry = geometry_of(calibration.skin, places.position.dtype)
+    return Pool(data, geometry, places, position, seconds, other, elsewhere)
+
+
+def _places(calibration: calib.Calibration, frames: np.ndarray) -> Places:
+    found = calibration.locate(frames, single=True)
+    assert found is not None  # it has a field
+    return found
+
+
+# --- what is fitted
+
+
+def on_grid(position: np.ndarray, side: int) -> np.ndarray:
+    """(presses,) true for those nearest to the middles of side x side cells of the box of presses."""
+    low, high = position.min(0), position.max(0)
+    pitch = (high - low) / (SIDE - 1)
+    cell = (high - low + pitch) / side
+    middles = (np.arange(side)[:, None] + 0.5) * cell + low - pitch / 2
+    wanted = np.stack(np.meshgrid(*middles.T), -1).reshape(-1, 1, 2)
+    chosen = np.zeros(len(position), bool)
+    chosen[np.linalg.norm(wanted - position, axis=-1).argmin(1)] = True
+    return chosen
+
+
+def scattered(position: np.ndarray, count: int) -> np.ndarray:
+    """(presses,) true for ``count`` of them, each the nearest left to the next point of the sequence."""
+    low, high = position.min(0), position.max(0)
+    step = 1 / 1.32471795724474602596 ** np.arange(1, 3)  # of the plastic number
+    chosen = np.zeros(len(position), bool)
+    for k in range(count):
+        away = np.linalg.norm(position - (low + (high - low) * ((0.5 + k * step) % 1)), axis=1)
+        chosen[np.where(chosen, np.inf, away).argmin()] = True
+    return chosen
+
+
+def drawn(presses: int, count: int, seed: int) -> np.ndarray:
+    chosen = np.zeros(presses, bool)
+    chosen[np.random.default_rng(seed).choice(presses, count, replace=False)] = True
+    return chosen
+
+
+def at_levels(data: PressData, levels: int | None) -> PressData:
+    """The data with only those samples to fit that are nearest to ``levels`` equal steps on the way to the hold."""
+    if levels is None:
+        return data
+    kept = np.zeros(len(data.sample_force), bool)
+    for press in np.unique(data.sample_press):
+        mine = np.flatnonzero((data.sample_press == press) & np.isfinite(data.sample_force))
+        force = data.sample_force[mine]
+        if len(mine):
+            up = mine[: 1 + np.flatnonzero(force >= 0.98 * force.max())[-1]]
+            steps = force.max() * (1 + np.arange(levels)) / levels
+            kept[up[np.abs(data.sample_force[up] - steps[:, None]).argmin(1)]] = True
+    return replace(data, mask=data.mask & kept)
+
+
+def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> Hybrid | None:
+    """None where the presses do not determine it."""
+    curve, field = CURVES[recipe[0]], FIELDS[recipe[1]]
+    places = None if field is None else pool.places
+    hybrid = fit_hybrid(curve, field, at_levels(pool.data, levels), pool.geometry, places, calib.SoftL1(), use=use)
+    results = [np.asarray(hybrid.curves.result), *([] if hybrid.field is None else [np.asarray(hybrid.field.result)])]
+    return hybrid if all((found == FitResult.SUCCESS).all() for found in results) else None
+
+
+# --- how well it predicts
+
+
+def errors(hybrid: Hybrid, data: PressData, places: Places) -> tuple[np.ndarray, np.ndarray]:
+    """Of the total force, N: over the holds, (presses,), and of samples along the presses, (n,); NaN: not told."""
+    held = hybrid.pad_forces(data.pressure, places)[0].sum(1) - data.force
+    along = Places(places.position[data.sample_press], places.weight[data.sample_press])
+    return held, hybrid.pad_forces(data.sample_pressure.T, along)[0].sum(1) - data.sample_force
+
+
+def judged(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> dict[str, float] | None:
+    """Root mean squares over presses not fitted, N; all presses: over folds of places."""
+    folds = folds_by_place(pool.data.place, FOLDS)
+    parts = [folds != k for k in range(FOLDS)] if use.all() else [use]
+    hybrids = [fitted(pool, recipe, part, levels) for part in (*parts, use)]
+    if not all(hybrids):
+        return None
+    whole, held, along = hybrids[-1], [], []
+    for part, hybrid in zip(parts, hybrids, strict=False):
+        over_holds, over_samples = errors(hybrid, pool.data, pool.places)
+        held.append(over_holds[~part])
+        along.append(over_samples[~part[pool.data.sample_press]])
+    other = errors(whole, pool.other, pool.elsewhere)[0]
+    return {"hold_n": rms(held), "press_n": rms(along), "other_session_n": rms([other])}
+
+
+def rms(parts: Sequence[np.ndarray]) -> float:
+    values = np.concatenate(parts)
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def row(pool: Pool, recipe: tuple[str, str], spread: str, uses: Sequence[np.ndarray], levels: int | None) -> Row:
+    """Means over the draws that determine the fit, and their standard deviations."""
+    tried = [judged(pool, recipe, use, levels) for use in uses]
+    good = [one for one in tried if one]
+    count = int(uses[0].sum())
+    out: Row = {"curve": recipe[0], "location": recipe[1], "spread": spread, "presses": count, "levels": levels}
+    out |= {"minutes": round(count * pool.seconds / 60, 1), "draws": len(tried), "failed": len(tried) - len(good)}
+    for name in good[0] if good else ():
+        values = np.array([one[name] for one in good])
+        out[name] = float(values.mean())
+        if len(values) > 1:
+            out[f"{name}_sd"] = float(values.std(ddof=1))
+    return out
+
+
+def by_presses(pool: Pool, sides: Sequence[int], draws: int, recipes: Sequence[tuple[str, str]]) -> Iterator[Row]:
+    presses = len(pool.data.force)
+    for recipe in recipes:
+        for count in (side**2 for side in sides):
+            uses = {"grid": [on_grid(pool.position, round(count**0.5))]}
+            if count < presses:
+                uses["scattered"] = [scattered(pool.position, count)]
+                uses["random"] = [drawn(presses, count, seed) for seed in range(draws)]
+            for spread, some in uses.items():
+                yield row(pool, recipe, spread, some, None)
+
+
+def by_levels(pool: Pool, levels: Sequence[int | None], counts: Sequence[int]) -> Iterator[Row]:
+    for curve in CURVES:
+        for presses in counts:
+            for count in levels:
+                yield row(pool, (curve, "pad edge"), "scattered", [scattered(pool.position, presses)], count)
+
+
+# --- what is said of it
+
+
+def table(rows: Sequence[Row]) -> str:
+    lines = [
+        "| curve | location | presses | minutes | levels | spread | held out, N | all along, N | other session, N |",
+        "|---" * 9 + "|",
+    ]
+    for r in rows:
+        levels = "whole press" if r["levels"] is None else r["levels"]
+        failed = f", {r['failed']} of {r['draws']} undetermined" if r["failed"] else ""
+        cells = [_cell(r, name) for name in ("hold_n", "press_n", "other_session_n")]
+        heads = [r["curve"], r["location"], r["presses"], f"{r['minutes']:.1f}", levels, r["spread"] + failed]
+        lines.append("| " + " | ".join(map(str, [*heads, *cells])) + " |")
+    return "\n".join(lines)
+
+
+def _cell(r: Row, name: str) -> str:
+    if name not in r:
+        return ""
+    return f"{r[name]:.2f}" + (f" ± {r[f'{name}_sd']:.2f}" if f"{name}_sd" in r else "")
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """The fewest presses, scattered, whose error is within a quarter of that of all."""
+    said = []
+    for recipe in RECIPES:
+        mine = [r for r in rows if (r["curve"], r["location"]) == recipe and "hold_n" in r]
+        most = max((r["presses"] for r in mine), default=0)
+        mine = sorted(
+            (r for r in mine if r["spread"] == "scattered" or r["presses"] == most), key=lambda r: r["presses"]
+        )
+        if len(mine) > 1:
+            best = mine[-1]["hold_n"]
+            few = next(r for r in mine if r["hold_n"] <= 1.25 * best)
+            said.append(
+                f"{recipe[0]}, {recipe[1]}: {few['presses']} presses ({few['minutes']:.1f} minutes) come within a "
+                f"quarter of all {most} ({few['hold_n']:.2f} against {best:.2f} N)"
+            )
+    return "\n".join(said)
+
+
+def picture(data: Mapping[str, Any]) -> Figure:
+    """Error against presses, and against force levels."""
+    figure = Figure(figsize=(10.8, 4.6), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for number, recipe in enumerate(RECIPES):
+        for spread, line in LINES.items():
+            mine = [r for r in data["presses"] if (r["curve"], r["location"]) == recipe and "hold_n" in r]
+            mine = [r for r in mine if r["spread"] == spread]
+            label = f"{recipe[0]}, place: {recipe[1]}" if spread == "scattered" else None
+            left.errorbar(
+                [r["presses"] for r in mine],
+                [r["hold_n"] for r in mine],
+                [r.get("hold_n_sd", 0) for r in mine],
+                color=f"C{number}",
+                linestyle=line,
+                marker="o" if spread == "scattered" else ".",
+                label=label,
+            )
+    for number, curve in enumerate(CURVES):
+        mine = [r for r in data["levels"] if r["curve"] == curve and "press_n" in r]
+        most = max((r["presses"] for r in mine), default=0)
+        for count, line in {r["presses"]: "-" if r["presses"] == most else "--" for r in mine}.items():
+            some = [r for r in mine if r["presses"] == count]
+            places = [LEVELS.index(r["levels"]) for r in some]
+            values = [r["press_n"] for r in some]
+            right.plot(places, values, line, color=f"C{number}", marker="o", label=f"{curve}, {count} presses")
+    left.set(xscale="log", yscale="log", xlabel="presses fitted", ylabel="RMS error of held-out forces, N")
+    left.set_title("over the holds; scattered (lines), grid (dashed), random (dotted, ± sd)", fontsize=10)
+    left.set_xticks([s**2 for s in SIDES], labels=[str(s**2) for s in SIDES])
+    left.minorticks_off()
+    right.set_xticks(range(len(LEVELS)), labels=["whole press" if n is None else str(n) for n in LEVELS])
+    right.set(xlabel="force levels")
+    right.set_title("all along the press; place: pad edge", fontsize=10)
+    for axes in (left, right):
+        axes.grid(True, which="both", color="#e4e4e4", linewidth=0.7)
+        axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def draw(data: Mapping[str, Any], path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path) as new:
+        new.write_bytes(png(picture(data)))
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="few fits, nothing written")
+    parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
+    args = parser.parse_args(argv)
+    set_up()
+    if args.draw_only:
+        draw(c.stored("calibration_cost"), PICTURE)
+        return {}
+    data: dict[str, Any] = {"circumstances": c.circumstances()}
+    found = pool()
+    sides, draws, recipes = ((5, 15), 1, RECIPES[1:2]) if args.smoke else (SIDES, DRAWS, RECIPES)
+    data["presses"] = list(by_presses(found, sides, draws, recipes))
+    data["levels"] = [] if args.smoke else list(by_levels(found, LEVELS, (36, 100)))
+    data["verdict"] = verdict(data["presses"])
+    print(table([*data["presses"], *data["levels"]]), data["verdict"], sep="\n\n", flush=True)
+    if not args.smoke:
+        c.write("calibration_cost", c.closed(data))
+        draw(data, PICTURE)
+    return data
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,34 @@
+"""What a worker process sets up before it imports anything heavy: this module imports the standard library only."""
+
+import contextlib
+import os
+import signal
+import threading
+from multiprocessing import connection, parent_process
+
+ONE_THREAD = {
+    "PJRT_NPROC": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+"""Environment of a worker: one thread of XLA and of every BLAS, as each core has a worker of its own."""
+
+
+def begin() -> None:
+    """One thread of computation; a worker outlives neither its parent nor, by Ctrl-C, what it has begun."""
+    own = {name: value for name, value in ONE_THREAD.items() if name != "XLA_FLAGS"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
+    os.environ.update(own | {"XLA_FLAGS": flags})
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and lets us finish
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    """A pool's workers hold both ends of their queue, and would wait on it for ever were the parent killed."""
+    connection.wait([sentinel])
+    os._exit(1)

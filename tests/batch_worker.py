@@ -1,0 +1,58 @@
+"""A batch whose sessions take no time to calibrate, to be killed.
+
+    python -m tests.batch_worker MADE LOG OUT SESSION...
+
+Workers give every session the calibration MADE, and write a line to LOG for each result that they have saved.
+"""
+
+import multiprocessing
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import calib.batch
+from calib.calibration import Calibration, load_calibration
+from calib.workers import begin
+
+
+def begin_quick(made: str, log: str) -> None:
+    """In place of `calib.workers.begin`."""
+    begin()
+    ready, save = load_calibration(made), Calibration.save
+
+    def logged(self, path):
+        save(self, path)
+        file = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        os.write(file, f"{path}\n".encode())
+        os.close(file)
+
+    Calibration.save = logged
+    calib.batch.calibrate = lambda sessions, **options: ready
+
+
+def begin_deadly(made: str) -> None:
+    """A session named kills.h5 ends its worker without a word, as the kernel does when memory runs out."""
+    begin()
+    ready = load_calibration(made)
+
+    def calibrate(sessions, **options):
+        if sessions[0].name == "kills.h5":
+            os._exit(9)
+        return ready
+
+    calib.batch.calibrate = calibrate
+
+
+def deadly_pool(jobs: int, made: str) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(jobs, mp_context=context, initializer=begin_deadly, initargs=(made,))
+
+
+def main(made: str, log: str, out: str, *sessions: str) -> None:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=context, initializer=begin_quick, initargs=(made, log)) as pool:
+        calib.batch.calibrate_many(sessions, out, executor=pool)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,133 @@
+"""The table of hard cases: tests say what they reached, and ``pytest --hard-cases PATH`` writes it down.
+
+Each test carries its rows with its report, so that they come home from parallel workers too.
+"""
+
+import math
+import os
+import tempfile
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+PROPERTY = "hard case"
+INTRODUCTION = """\
+# Hard cases
+
+How far jaxeit has been taken, how wrong its numbers were at worst, and what a user sees there or beyond. The tests
+write this table, if they all pass:
+
+    python -m pytest --hard-cases docs/hard-cases.md
+
+Errors are the largest found over the whole severity reached, relative to the largest of the values compared unless the
+case says otherwise. "Naive" is the textbook form of the same computation, which the test keeps to show that it
+fails. A dash: not asked there.
+
+"""
+HEADER = ("case", "severity reached", "error, float64", "error, float32", "error, naive form", "what the user sees")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one test says of one hard case; several rows of a case become one, with the worst errors."""
+
+    case: str
+    reached: str
+    float64: float | None
+    float32: float | None
+    naive: float | None
+    beyond: str
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--hard-cases", metavar="PATH", type=Path, help="write the table of hard cases, Markdown")
+
+
+@pytest.fixture
+def hard(record_property):
+    """``hard(case, reached, float64=, float32=, naive=, beyond=)`` adds a row; errors are numbers or None."""
+
+    def note(case, reached, *, float64=None, float32=None, naive=None, beyond):
+        errors = (None if e is None else float(e) for e in (float64, float32, naive))
+        record_property(PROPERTY, (case, reached, *errors, beyond))
+
+    return note
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    path = config.getoption("hard_cases")
+    if path and not hasattr(config, "workerinput"):  # parallel workers leave it to their controller
+        config.pluginmanager.register(_Collector(path))
+
+
+class _Collector:
+    """Rows of the tests that passed, written once all have."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[Row] = []
+        self.said = ""
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "call" and report.passed:
+            self.rows += [Row(*value) for name, value in report.user_properties if name == PROPERTY]
+
+    def pytest_sessionfinish(self, exitstatus: int) -> None:
+        if exitstatus != pytest.ExitCode.OK:
+            self.said = f"hard cases: {self.path} is left as it was, as not all tests passed"
+            return
+        merged = merge(self.rows)
+        replace(self.path, INTRODUCTION + table(merged))
+        self.said = f"hard cases: {len(merged)} written to {self.path}"
+
+    def pytest_terminal_summary(self, terminalreporter) -> None:
+        terminalreporter.write_line(self.said)
+
+
+def merge(rows: list[Row]) -> list[Row]:
+    """One row per case, sorted: the worst error of each kind, and all that is said, once each."""
+    alike = defaultdict(list)
+    for row in rows:
+        alike[row.case].append(row)
+    return [_merged(case, alike[case]) for case in sorted(alike)]
+
+
+def _merged(case: str, rows: list[Row]) -> Row:
+    reached, beyond = ("; ".join(sorted({getattr(r, field) for r in rows})) for field in ("reached", "beyond"))
+    float64, float32, naive = (worst([getattr(r, field) for r in rows]) for field in ("float64", "float32", "naive"))
+    return Row(case, reached, float64, float32, naive, beyond)
+
+
+def worst(errors: list[float | None]) -> float | None:
+    """The largest of those that are known; what is not a number is worse than any."""
+    known = [math.inf if math.isnan(e) else e for e in errors if e is not None]
+    return max(known, default=None)
+
+
+def table(rows: list[Row]) -> str:
+    """Markdown."""
+    lines = [HEADER, ("---",) * len(HEADER)]
+    lines += [(r.case, r.reached, *map(_number, (r.float64, r.float32, r.naive)), r.beyond) for r in rows]
+    return "".join("| " + " | ".join(_cell(text) for text in line) + " |\n" for line in lines)
+
+
+def _number(error: float | None) -> str:
+    if error is None:
+        return "–"
+    return f"{error:.0e}" if math.isfinite(error) else "not finite"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def replace(path: Path, text: str) -> None:
+    """Write a whole file or none."""
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False, encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.chmod(file.name, 0o644)
+    os.replace(file.name, path)

@@ -1,0 +1,245 @@
+"""Benchmarks of what accuracy costs beside solves: presses, readings, growth, start, the whole way; runs compared."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import _common as common
+from benchmarks import (
+    bench_calibration,
+    bench_growth,
+    bench_pipeline,
+    bench_protocol,
+    bench_start,
+    readme,
+    repeat,
+)
+from benchmarks.peers import eidors, pyeit
+from calib.hybrid import PressData
+
+pytestmark = pytest.mark.filterwarnings("default")  # peers' own warnings are theirs
+
+
+@pytest.fixture
+def positions():
+    line = np.linspace(0.01, 0.19, 15)
+    return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+
+
+# --- presses
+
+
+@pytest.mark.parametrize("side", bench_calibration.SIDES)
+def test_a_grid_of_presses_is_even(positions, side):
+    chosen = bench_calibration.on_grid(positions, side)
+    assert chosen.sum() == side**2
+    for column in positions[chosen].T:
+        assert len(np.unique(column.round(9))) == side
+    np.testing.assert_allclose(positions[chosen].mean(0), [0.1, 0.1], atol=0.5 * 0.18 / 14)
+
+
+def test_scattered_presses_fill_the_sheet_better_than_drawn_ones(positions):
+    def widest_gap(chosen):
+        return np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1).max()
+
+    scattered = bench_calibration.scattered(positions, 36)
+    drawn = [bench_calibration.drawn(225, 36, seed) for seed in range(10)]
+    assert scattered.sum() == 36
+    assert all(d.sum() == 36 for d in drawn)
+    assert widest_gap(scattered) < min(map(widest_gap, drawn))
+    np.testing.assert_array_equal(bench_calibration.scattered(positions, 225), np.ones(225, bool))
+
+
+def test_force_levels_are_samples_on_the_way_up():
+    up = np.concatenate([np.linspace(1, 20, 20), np.full(5, 20.0), np.linspace(19, 0, 20)])
+    force = np.concatenate([up, up / 2])
+    data = PressData(
+        sample_pressure=np.ones((1, 90)),
+        sample_force=force,
+        sample_press=np.repeat([0, 1], 45),
+        mask=np.ones((1, 90), bool),
+        pressure=np.ones((2, 1)),
+        force=np.array([20.0, 10.0]),
+        place=np.array([0, 1]),
+        reach=np.zeros((2, 2)),
+    )
+    for levels in (1, 2, 4):
+        kept = np.flatnonzero(bench_calibration.at_levels(data, levels).mask[0])
+        wanted = np.concatenate([top * (1 + np.arange(levels)) / levels for top in (20, 10)])
+        np.testing.assert_allclose(force[kept], wanted)
+        assert (kept % 45 < 25).all()
+    assert bench_calibration.at_levels(data, None) is data
+
+
+# --- the whole way
+
+
+def _reached(tool, order, mesh, error, ms):
+    row = {"tool": tool, "order": order, "mesh": mesh, "relative_error": error, "unknowns": 9, "min_ms": ms}
+    return row | {"median_ms": ms, "max_ms": ms}
+
+
+def test_the_quickest_mesh_that_reaches_the_accuracy():
+    rows = [
+        _reached("jaxeit", 2, "growth 1.7", 5e-4, 4.0),
+        _reached("jaxeit", 2, "growth 1.4", 1e-4, 9.0),
+        _reached("jaxeit", 1, "regular", 5e-3, 1.0),
+        _reached("EIDORS first order", 1, "regular", 9e-3, 20.0),
+    ]
+    found = {(r["kind"], r["target"]): r["best"] for r in bench_pipeline.to_accuracy(rows)}
+    assert [found["jaxeit P2, graded", t]["median_ms"] for t in bench_pipeline.TARGETS] == [4.0, 4.0, 9.0]
+    assert found["EIDORS first order", 1e-3] is None
+    assert "| jaxeit P1, regular | 1 (1 to 1)" in bench_pipeline.accuracy_table(bench_pipeline.to_accuracy(rows))
+
+
+@pytest.mark.slow
+def test_all_tools_make_the_same_images_from_the_mesh():
+    problem = common.Problem(10)
+    tools = {"by hand": bench_pipeline.by_hand, "jaxeit": bench_pipeline.ours}
+    tools |= {} if eidors.missing() else {"EIDORS": bench_pipeline.by_eidors}
+    for pixels in (True, False):
+        images = {name: prepare(problem, pixels)(problem.sigma) for name, prepare in tools.items()}
+        if not pyeit.missing() and not pixels:
+            images["pyEIT"] = bench_pipeline.by_pyeit(problem)(problem.sigma)
+        for name, image in images.items():
+            assert common.difference(image, images["by hand"]) < 1e-7, name
+
+
+# --- runs compared
+
+
+def _run(*ms, low=0.9, high=1.1):
+    tools = ("jaxeit float64", "EIDORS", "pyEIT")
+    return [
+        {"tool": tool, "nodes": 961, "median_ms": m, "min_ms": low * m, "max_ms": high * m}
+        for tool, m in zip(tools, ms, strict=True)
+    ]
+
+
+def test_ratios_that_moved_more_than_the_spread_are_named():
+    found = repeat.compared(_run(1, 10, 100), _run(2, 21, 300))
+    assert [(one.what, one.agrees) for one in found] == [("EIDORS, 961 nodes", True), ("pyEIT, 961 nodes", False)]
+    assert found[0].first == pytest.approx((10, 10 * 0.9 / 1.1, 10 * 1.1 / 0.9))
+    assert "1 of 2 ratios agree" in repeat.table(found)
+    assert not repeat.compared(_run(1, 10, 100), _run(1, 10.5, 100, low=0.99, high=1.01))[0].first.allows(
+        repeat.Ratio(13, 12, 14)
+    )
+
+
+def test_two_files_or_two_sections_are_compared(tmp_path, capsys):
+    files = [tmp_path / "a.json", tmp_path / "b.json"]
+    for file, again in zip(files, (100, 300), strict=True):
+        runs = {"forward": {"rows": _run(1, 10, 100)}, "again": {"rows": _run(1, 10, again)}}
+        file.write_text(json.dumps(runs))
+    names = [str(file) for file in files]
+    assert repeat.main([*names, "--sections", "forward"]) == 0
+    assert repeat.main([*names, "--sections", "forward", "again"]) == 1
+    assert repeat.main([names[1], "--sections", "forward", "again"]) == 1
+    assert "NO" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="two sections are compared"):
+        repeat.main([names[0]])
+
+
+def test_nothing_stored(monkeypatch, tmp_path):
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    with pytest.raises(SystemExit, match="measure first"):
+        common.stored("protocol_cost")
+    (tmp_path / f"{common.machine()}.json").write_text('{"start": {"rows": []}}')
+    assert common.stored("start") == {"rows": []}
+
+
+# --- growth and start
+
+
+def test_exponents_of_a_power_law():
+    one = bench_growth.Series("work", "size", (), "2", "1", lambda size: (None, (), size))
+    rows = [{"size": n, "median_ms": 3e-3 * n**2, "megabytes": 5.0 * n} for n in (10, 30, 200)]
+    found = bench_growth.fits(one, rows)
+    assert (found["time"]["exponent"], found["time"]["at_the_end"], found["memory"]["exponent"]) == (2.0, 2.0, 1.0)
+
+
+def test_the_first_program_is_the_readmes():
+    code = bench_start.program()
+    assert code.startswith("import jax\n")
+    assert "je.fuse" in code
+
+
+# --- smoke
+
+
+@pytest.mark.slow
+def test_smoke_calibration():
+    data = bench_calibration.main(["--smoke"])
+    assert {row["presses"] for row in data["presses"]} == {25, 225}
+    every = next(row for row in data["presses"] if row["presses"] == 225)
+    assert 0 < every["hold_n"] < 1.5  # N of 20, corrected for the place
+    assert bench_calibration.picture(data | {"levels": []}).axes
+
+
+@pytest.mark.slow
+def test_smoke_protocol():
+    data = bench_protocol.main(["--smoke"])
+    errors = {row["way"]: row["fit_mm"] for row in data["rows"]}
+    assert errors["D-optimal"] < 2
+    assert data["events"]["rest"]["readings"] == 24
+    assert len(bench_protocol.picture(data["rows"]).axes) == 3
+
+
+@pytest.mark.slow
+def test_smoke_growth():
+    data = bench_growth.main(["--smoke"])
+    assert len(data["fits"]) == 3
+    assert all(row["median_ms"] > 0 and row["megabytes"] > 0 for row in data["rows"])
+
+
+@pytest.mark.slow
+def test_smoke_start():
+    data = bench_start.main(["--smoke"])
+    assert {row["start"] for row in data["rows"]} == set(bench_start.COMMANDS)
+    packages = {row["package"] for row in data["imports"]["jaxeit"]}
+    assert {"jax", "jaxeit", "numpy"} <= packages
+
+
+@pytest.mark.slow
+def test_smoke_pipeline():
+    data = bench_pipeline.main(["--smoke"])
+    assert {row["tool"] for row in data["rows"]} >= {"jaxeit float64, pixels", "jaxeit float64, elements"}
+    best = {(r["kind"], r["target"]): r["best"] for r in data["to_accuracy"]}
+    assert best["jaxeit P2, regular", 1e-2] is not None
+
+
+# --- tables of the README
+
+
+def test_tables_of_the_readme():
+    spread = {"median_ms": 1234.0, "min_ms": 1.0, "max_ms": 2e3}
+    press = {"curve": "linear", "location": "none", "spread": "scattered", "minutes": 2.1}
+    results = {
+        "pipeline": {
+            "rows": [{"tool": "EIDORS, pixels", "nodes": n, **spread} for n in (961, 3721)],
+            "to_accuracy": bench_pipeline.to_accuracy([_reached("EIDORS first order", 1, "regular", 5e-4, 20.0)]),
+        },
+        "calibration_cost": {"presses": [press | {"presses": 25}, press | {"presses": 225, "hold_n": 3.014}]},
+        "protocol_cost": {
+            "rows": [
+                {"way": "D-optimal", "readings": 40, "frames_per_s": 2500.0, "fit_mm": 0.213},
+                {"way": "at random", "readings": 40, "frames_per_s": 2500.0, "fit_mm": None},
+            ]
+        },
+        "growth": {
+            "fits": [
+                {"series": "forward", "of": "nodes", "sizes": [961, 3721]}
+                | {name: {"exponent": 1.2, "theory": "1 to 1.5"} for name in ("time", "memory")}
+            ]
+        },
+        "start": {"rows": [{"start": "import jaxeit", **spread}]},
+    }
+    text = {mark: table(results[section]) for mark, (section, table) in readme.COSTS.items()}
+    assert "| EIDORS, onto pixels | 1,234 | 1,234 |" in text["pipeline"]
+    assert "| EIDORS first order | 20 (9) | 20 (9) | not reached |" in text["to-accuracy"]
+    assert "| linear, location none | not determined | 3.01 |" in text["calibration-cost"]
+    assert "40 readings, 2,500 frames/s" in text["measurement-cost"]
+    assert "| at random |  |" in text["measurement-cost"]
+    assert "| forward by nodes | 961 to 3,721 | 1.2 | 1 to 1.5 | 1.2 |" in text["growth"]
+    assert "| import jaxeit | 1.23 |" in text["start"]

@@ -1,0 +1,160 @@
+"""Identities of the physics, as properties of any sheet: conductivities over six decades, contacts over fifteen.
+
+One program serves all examples of a test: sheets and contacts are its arguments, and the ground is too.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxeit as je
+from jaxeit.forward import coefficients, transfer
+
+from .hard_sheet import MESH, paired, sheet_model
+from .helpers import skin_of
+
+examples = settings(max_examples=25, deadline=None, derandomize=True, database=None)
+seeds = st.integers(0, 2**32 - 1)
+decades = st.floats(0, 3)
+contacts = st.lists(st.floats(-9, 6), min_size=4, max_size=4).map(lambda powers: 10.0 ** np.array(powers))
+MODEL = je.NestedDissection()
+
+
+def _theta(seed, spread, resistances):
+    sigma = 10.0 ** np.random.default_rng(seed).uniform(-spread, spread, len(MESH.triangles))
+    return coefficients(sheet_model(MODEL), jnp.asarray(sigma))._replace(contact=1 / jnp.asarray(resistances))
+
+
+def _z(theta):
+    return np.asarray(transfer(sheet_model(MODEL), theta))
+
+
+def _rounding(z):
+    return 1e-9 * np.abs(paired(z)).max()
+
+
+@examples
+@given(seeds, decades, contacts)
+def test_reciprocity(seed, spread, resistances):
+    readings = paired(_z(_theta(seed, spread, resistances)))
+    np.testing.assert_allclose(readings, readings.T, rtol=1e-9, atol=1e-12 * np.abs(readings).max())
+
+
+@examples
+@given(seeds, decades, contacts, st.integers(-60, 60))
+def test_readings_scale_with_resistance(seed, spread, resistances, power):
+    """U(c sigma, z / c) = U / c, and in powers of two to the last digit."""
+    theta = _theta(seed, spread, resistances)
+    scaled = jax.tree.map(lambda leaf: leaf * 2.0 ** (2 * power), theta)
+    np.testing.assert_array_equal(2.0 ** (2 * power) * paired(_z(scaled)), paired(_z(theta)))
+
+
+@examples
+@given(seeds, decades, contacts, st.integers(0, 3), st.floats(1.01, 100))
+def test_what_conducts_better_has_less_resistance(seed, spread, resistances, part, more):
+    """For any currents that sum to zero, in the sense of Loewner; a quarter of the sheet, and each contact."""
+    theta = _theta(seed, spread, resistances)
+    before, quarter = _balanced(_z(theta)), np.arange(len(MESH.triangles)) % 4 == part
+    for better in (
+        theta._replace(sigma=jnp.where(quarter, more * theta.sigma, theta.sigma)),
+        theta._replace(contact=theta.contact.at[part].multiply(more)),
+    ):
+        fall = np.linalg.eigvalsh(before - _balanced(_z(better)))
+        assert fall[0] > -1e-9 * np.abs(before).max()
+        assert fall[-1] > 0
+
+
+def _balanced(z):
+    """The quadratic form for currents that sum to zero."""
+    into_last = np.concatenate([np.eye(len(z) - 1), -np.ones((1, len(z) - 1))])
+    return into_last.T @ z @ into_last
+
+
+@examples
+@given(seeds, decades, contacts)
+def test_sensitivities_sum_to_minus_the_voltage(seed, spread, resistances):
+    """Euler: of sheet and contacts together, as readings are homogeneous of degree -1 in both."""
+    theta = _theta(seed, spread, resistances)
+    z, slope = _along_itself(sheet_model(MODEL), theta)
+    np.testing.assert_allclose(
+        paired(np.asarray(slope)), -paired(np.asarray(z)), rtol=1e-8, atol=_rounding(np.asarray(z))
+    )
+
+
+@eqx.filter_jit
+def _along_itself(model, theta):
+    return jax.jvp(lambda t: transfer(model, t), (theta,), (theta,))
+
+
+@examples
+@given(seeds, decades, contacts, st.integers(0, 29))
+def test_the_ground_may_be_anywhere(seed, spread, resistances, which):
+    model, theta = sheet_model(MODEL), _theta(seed, spread, resistances)
+    ground = model.system.ground.at[:].set(model.system.ground[which])  # the same program
+    there = eqx.tree_at(lambda m: m.system.ground, model, ground)
+    z = _z(theta)
+    np.testing.assert_allclose(paired(np.asarray(transfer(there, theta))), paired(z), rtol=1e-7, atol=_rounding(z))
+
+
+SQUARE = je.Rectangle(1.0, 1.0)
+CELLS = 4
+PLACES = [(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)]  # a quarter turn takes each to the next
+
+
+@pytest.fixture(scope="module")
+def square():
+    skin = skin_of(SQUARE, [je.PointElectrode(p) for p in PLACES], [[0, 1, 2, 3]])
+    mesh = je.structured(SQUARE, CELLS, CELLS, pattern=je.Pattern.CROSSED)
+    return je.discretise(je.Scene(skin), je.Fidelity(solver=je.Dense()), mesh=mesh), mesh
+
+
+def _moved(mesh, image):
+    """The triangle that each one is moved to."""
+    where = {tuple(p): k for k, p in enumerate(mesh.centroids.round(9))}
+    return np.array([where[tuple(p)] for p in image(mesh.centroids).round(9)])
+
+
+@examples
+@given(seeds, decades, st.integers(0, 3), st.booleans())
+def test_a_turned_or_mirrored_sheet_reads_the_same(square, seed, spread, turns, mirrored):
+    model, mesh = square
+    sigma = 10.0 ** np.random.default_rng(seed).uniform(-spread, spread, len(mesh.triangles))
+    there, moved = np.arange(4), sigma
+    for _ in range(turns):
+        moved, there = _carried(mesh, moved, lambda p: np.stack([1 - p[:, 1], p[:, 0]], 1)), (there + 1) % 4
+    if mirrored:
+        moved, there = _carried(mesh, moved, lambda p: p[:, ::-1]), np.array([0, 3, 2, 1])[there]
+    one, other = (np.asarray(transfer(model, coefficients(model, jnp.asarray(s)))) for s in (sigma, moved))
+    np.testing.assert_allclose(paired(other[there][:, there]), paired(one), rtol=1e-9, atol=_rounding(one))
+
+
+def _carried(mesh, sigma, image):
+    out = np.empty_like(sigma)
+    out[_moved(mesh, image)] = sigma
+    return out
+
+
+@pytest.mark.slow
+@settings(max_examples=12, deadline=None, derandomize=True, database=None)
+@given(seeds, st.integers(4, 9), st.floats(0.05, 0.2), st.floats(1.2, 2.0), st.sampled_from([1, 2]))
+def test_any_skin_and_protocol_keeps_the_identities(seed, count, edge, growth, order):
+    """Bolts at random places of a sheet of random proportions, readings between random electrodes."""
+    rng = np.random.default_rng(seed)
+    sheet = je.Rectangle(*rng.uniform(0.1, 0.4, 2))
+    grid = np.stack(np.meshgrid(*(np.arange(1, 4) / 4,) * 2), -1).reshape(-1, 2)[rng.permutation(9)[:count]]
+    places = (grid + rng.uniform(-0.05, 0.05, grid.shape)) * [sheet.width, sheet.height]
+    bolts = [je.AreaPatch(tuple(p), 0.003, 10.0 ** rng.uniform(-9, 0)) for p in places.tolist()]
+    pattern = np.array([rng.permutation(count)[:4] for _ in range(10)])
+    skin = skin_of(sheet, bolts, np.concatenate([pattern, pattern[:, [2, 3, 0, 1]]]), sheet_resistance=100.0)
+    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=edge, growth=growth, order=order))
+    sigma = model.background * jnp.asarray(10.0 ** rng.uniform(-1, 1, model.background.shape))
+    readings = np.asarray(je.forward(model, sigma))
+    np.testing.assert_allclose(readings[:10], readings[10:], rtol=1e-8, atol=1e-10 * np.abs(readings).max())
+    theta = coefficients(model, sigma)
+    z, slope = jax.jvp(lambda t: transfer(model, t), (theta,), (theta,))
+    np.testing.assert_allclose(slope, -z, atol=1e-9 * np.abs(z).max())
+    np.testing.assert_allclose(4 * transfer(model, jax.tree.map(lambda x: 4 * x, theta)), z, rtol=1e-12)
