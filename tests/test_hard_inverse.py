@@ -113,7 +113,10 @@ def naive(problem, y):
 @pytest.mark.parametrize("rows", [20, 50])
 @pytest.mark.parametrize("name", PRIORS)
 def test_lambda_to_zero_costs_digits_one_by_one(hard, name, rows):
-    """Rounding is amplified by 1 / lambda; by squares, as in the formula as it stands, by 1 / lambda^2."""
+    """Rounding is amplified by 1 / lambda; by squares, as in the formula as it stands, by 1 / lambda^2.
+
+    Squares serve only where they keep three quarters of the digits.
+    """
     j, y = _spread(rows)[0], np.random.default_rng(1).normal(size=rows)
     worst = dict.fromkeys([*EPS, "naive"], 0.0)
     for h in 10.0 ** -np.arange(1, 12):
@@ -125,7 +128,7 @@ def test_lambda_to_zero_costs_digits_one_by_one(hard, name, rows):
             if h >= 8e3 * eps:
                 found = _imaged(je.OneStep(), _problem(j, h, PRIORS[name], dtype), jnp.asarray(y, dtype))
                 error = _error(found, exact)
-                assert error < 100 * eps / h, (dtype, h)
+                assert error < max(100 * eps / h, eps**0.75), (dtype, h)
                 worst[dtype] = max(worst[dtype], error)
     assert worst["naive"] > 1
     hard(
