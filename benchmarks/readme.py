@@ -163,7 +163,26 @@ def _start(results: dict) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _ladder(results: dict) -> str:
+    """The rungs of the testbed that name a fidelity or lie on the front of error against time of a forward solve."""
+    lines = [
+        "| rung | nodes | voltages, error | a touch, error | forward, ms | Jacobian, ms | localised, mm | frame, ms |",
+        "|---" * 8 + "|",
+    ]
+    for row in results["ladders"][0]["rungs"]:
+        if not (row["front"] or row["label"] in ("draft", "standard", "reference")):
+            continue
+        image = row["image"]
+        cells = [f"{row['nodes']:,}", f"{100 * row['voltage_error']:.2g} %", f"{100 * row['difference_error']:.2g} %"]
+        cells += [_figures(1e3 * row[name]["median"]) for name in ("forward", "jacobian")]
+        cells += [f"{1e3 * image['localisation']:.2f}", _figures(1e3 * image["frame"]["median"])] if image else ["", ""]
+        name = f"**{row['label']}**" if row["front"] else row["label"]
+        lines.append("| " + " | ".join([name, *cells]) + " |")
+    return "\n".join(lines) + "\n"
+
+
 COSTS: dict[str, tuple[str, Callable[[dict], str]]] = {
+    "ladder": ("ladder", _ladder),
     "pipeline": ("pipeline", _pipeline),
     "to-accuracy": ("pipeline", _to_accuracy),
     "calibration-cost": ("calibration_cost", _calibration),

@@ -27,6 +27,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+import jaxeit as je
 from calib.curves import AbstractCurve, Scale, scale_of
 
 MAD_TO_SIGMA = 1.4826
@@ -214,7 +215,7 @@ class FittedCurve(eqx.Module):
         return Prediction(self.curve(self.parameters, p), jnp.sqrt(variance), ok)
 
 
-@eqx.filter_jit
+@je.verb
 def predict_pads(fitted: FittedCurve, pressures: Float[Array, "pads n"], tolerance: float = 0.05) -> Prediction:
     """`FittedCurve.predict` for every pad of a batch: pressures (pads, n) -> arrays (pads, n)."""
     return eqx.filter_vmap(lambda f, p: f.predict(p, tolerance))(fitted, pressures)
@@ -450,7 +451,7 @@ def fit_samples(
     )
 
 
-@eqx.filter_jit
+@je.verb
 def _fit_batch(curve, samples, loss, solver, n_groups, max_steps, rounds):
     return eqx.filter_vmap(
         lambda s: fit_samples(curve, s, loss, solver, n_groups=n_groups, max_steps=max_steps, rounds=rounds)

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+import jaxeit as je
+
 from .curves import AbstractCurve, curve_name
 from .fit import AbstractLoss, FitResult, FittedCurve, Prediction, bucket, fit_curves, predict_pads
 from .location import AbstractField, FittedField, Geometry, Places, field_name, fit_field, log_gain
@@ -84,7 +86,7 @@ class Hybrid:
         return np.asarray(self.curves.residual_rms)
 
 
-@eqx.filter_jit
+@je.verb
 def pad_forces(
     curves: FittedCurve, field: FittedField | None, pressures: Float[Array, "n pads"], places: Places | None = None
 ) -> Prediction:
@@ -144,7 +146,7 @@ def _curves(curve, data: PressData, gain: np.ndarray, use: np.ndarray, loss) -> 
     )
 
 
-_fit_field = eqx.filter_jit(fit_field)
+_fit_field = je.verb(fit_field)
 
 
 def _field(field, curves: FittedCurve, gain, data: PressData, geometry, places: Places, use) -> FittedField:
@@ -269,7 +271,7 @@ def _sample_forces(hybrid: Hybrid, data: PressData, places: Places | None) -> np
     return force * np.exp(np.asarray(log_gain(hybrid.field, places).mean)[data.sample_press].T)
 
 
-@eqx.filter_jit
+@je.verb
 def _curve_forces(curves: FittedCurve, pressure):
     return eqx.filter_vmap(lambda fitted, p: fitted.curve(fitted.parameters, p))(curves, pressure)
 

@@ -385,7 +385,7 @@ class FittedField(eqx.Module):
         return FitResult(int(self.result)).message
 
 
-@eqx.filter_jit
+@je.verb
 def log_gain(fitted: FittedField, places: Places) -> LogGain:
     """`FittedField.log_gain`, compiled."""
     return fitted.log_gain(places)

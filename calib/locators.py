@@ -67,7 +67,7 @@ def _lies(position, width, recon, masks) -> Float[Array, "K pads"]:
     return bump @ (masks.weights * masks.areas).T / jnp.maximum(bump @ masks.areas, jnp.finfo(bump.dtype).tiny)[:, None]
 
 
-@eqx.filter_jit
+@je.verb
 def _located(locator, dv, image, recon, masks) -> Places:
     return locator(dv, image, recon, masks)
 

@@ -101,7 +101,7 @@ def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
     return rows.astype(law.curves.parameters.dtype)
 
 
-@eqx.filter_jit
+@je.verb
 def _force_map(law: ForceLaw, frames, pressures, before, gate) -> ForceEstimate:
     image = law.recon(frames)
     places = None

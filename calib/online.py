@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+import jaxeit as je
+
 from .location import AbstractField, Bilinear, Geometry, Places, pad_features
 
 
@@ -72,7 +74,7 @@ class RecursiveLeastSquares(eqx.Module):
         return Estimate(jnp.where(go, new, theta), jnp.where(go, shrunk, covariance))
 
 
-@eqx.filter_jit
+@je.verb
 def follow(
     rls: RecursiveLeastSquares,
     state: Estimate,
@@ -169,7 +171,7 @@ class SensitivityTracker(eqx.Module):
         return phi / noise[:, None], force / noise, use
 
 
-@eqx.filter_jit
+@je.verb
 def follow_frames(
     tracker: SensitivityTracker, state: Estimate, frames: Touched
 ) -> tuple[Estimate, Float[Array, "n k"], Bool[Array, " n"]]:

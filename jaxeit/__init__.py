@@ -116,7 +116,7 @@ from .solvers import ConjugateGradient, Dense, NestedDissection, Single
 from .store import NUMBERS, StoreError, from_numbers, load_reconstructor, save_reconstructor, to_numbers
 from .surface import AbstractSurface, Cylinder, Sphere
 from .toml import TomlError, TomlTable, parse_toml, read_text
-from .verbs import compiler_options
+from .verbs import compiler_options, verb
 from .whitening import InverseError, noise_covariance
 
 __version__ = metadata.version("jaxeit")
@@ -304,4 +304,5 @@ __all__ = [
     "structured",
     "to_numbers",
     "triangulate",
+    "verb",
 ]

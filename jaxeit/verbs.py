@@ -16,6 +16,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 def verb(function: F) -> F:
     """Compile ``function`` when it is called; inside another compiled function it is part of that.
 
+    A decorator, for functions of yours too: like `equinox.filter_jit`, arrays are traced and the rest is static.
+
     By itself it gets the compiler options that suit its gathers best (`compiler_options`), which
     JAX takes for whole programs only.
     """

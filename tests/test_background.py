@@ -35,6 +35,7 @@ def truth(model, uneven):
     return _log(uneven, je.conductivity(uneven))[_near(model.centroids, uneven.centroids)]
 
 
+@pytest.mark.slow
 def test_the_field_is_found_whatever_the_gain_and_without_a_reading(model, untouched, truth):
     untouched = np.where(np.arange(550) == 7, np.nan, untouched)
     found = [_log(model, fit_background(model, gain * untouched, columns=15)) for gain in (1.0, 3.0)]

@@ -71,6 +71,7 @@ def test_skins_of_one_shape_together(solver):
     _skins_are_the_loop(models)
 
 
+@pytest.mark.slow
 def test_bent_skins_together_share_one_plan():
     """Nested dissection cuts by coordinates, so plans differ; as the pattern is the same, either serves both."""
     models = [_model(sheet, SOLVERS[0], bend) for sheet, bend in zip(SHEETS, (0.0, 0.02, 0.04), strict=True)]

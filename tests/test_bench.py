@@ -115,6 +115,7 @@ def test_a_press_takes_few_solves(skin):
     assert made.solves == 2 * 9
 
 
+@pytest.mark.slow
 def test_a_scan_takes_its_readings_one_after_the_other(skin):
     """Reading m of a skewed frame is reading m of a frame taken at its own time."""
     skewed = recordings(_bench(skin, *SHEET, je.ScanSkew()), DRAFT).eit
@@ -200,6 +201,7 @@ def test_a_folder_in_the_way_is_left_alone(skin, tmp_path):
     assert (tmp_path / "s.h5.part" / "thesis.txt").exists()
 
 
+@pytest.mark.slow
 def test_blocks_do_not_show(skin, monkeypatch):
     """Histories handed from block to block are those of one run; only the draws of chance differ."""
     bench = _bench(skin, *SHEET, je.Hysteresis(), je.Creep(), je.PadLeak(time=1.0), je.GasRelaxation())
@@ -211,6 +213,7 @@ def test_blocks_do_not_show(skin, monkeypatch):
         np.testing.assert_allclose(_all(recording).values, values, rtol=0, atol=1e-9 * scale)
 
 
+@pytest.mark.slow
 def test_warmth_is_simulated_where_it_is_felt(skin):
     bench = _bench(skin, *SHEET, je.SheetTemperature(coefficient=0.01), sites=((0.06, 0.07),), temperature_rate=5.0)
     warm = recordings(bench, DRAFT).eit
@@ -253,6 +256,7 @@ def test_tips_stay_on_the_sheet(skin, change, message):
         _bench(skin, **change)
 
 
+@pytest.mark.slow
 def test_explain_names_each_effect_in_its_stage(skin):
     whole = (je.StageError(), je.PadEdgeDip(), je.ScanSkew(), je.DropOut(), je.IntermittentElectrode())
     effects = (*SHEET, *whole, je.ContactScatter(), je.PadLeak(), je.Noise(std=1e-5))
@@ -271,6 +275,7 @@ def test_explain_names_each_effect_in_its_stage(skin):
     assert sum(shares) == pytest.approx(100, abs=0.1 * len(shares))
 
 
+@pytest.mark.slow
 def test_chance_is_of_the_seed_and_of_nothing_else(skin):
     noise, sites = je.Noise(std=1e-5), ((0.06, 0.07),)
     first, again = (_all(recordings(_bench(skin, noise, sites=sites), DRAFT).eit).values for _ in range(2))

@@ -308,6 +308,7 @@ def test_smoke_of_batches(capsys):
     assert capsys.readouterr().out.count("| second process |") == 1
 
 
+@pytest.mark.slow
 def test_stability_holds_where_the_textbook_fails(tmp_path):
     """On two axes, the mildest and the hardest of each; all panels are drawn."""
     rows = stability.measure([stability.AXES[0], stability.AXES[-1]], 2)

@@ -85,6 +85,7 @@ def test_slopes_of_several_contacts_are_derivatives(finder):
     np.testing.assert_allclose(found, exact, atol=1e-9 * float(jnp.abs(exact).max()))
 
 
+@pytest.mark.slow
 def test_a_faint_gaussian_is_recovered(finder, linear, model):
     """Faint: to first order.  What is left is the table's interpolation."""
     (found,) = _find(finder, 1e-2 * linear((0.083, 0.127), 0.012))
@@ -155,6 +156,7 @@ def single(model):
     return prepare_contacts(model, noise=np.full(550, STD), most=1, columns=31, channels=channels)
 
 
+@pytest.mark.slow
 def test_batches_transformations_and_single_frames_agree(single, linear):
     frames = np.stack([0.02 * linear((0.05, 0.08), 0.01), _noise(), 0.02 * linear((0.15, 0.1), 0.02)]) + _noise(3)
     batch = single(frames[:, None])
@@ -211,6 +213,7 @@ def test_gradients_are_those_of_the_fit(single, other):
     np.testing.assert_array_equal(slope(jnp.zeros(550), jnp.ones(4)), 0)
 
 
+@pytest.mark.slow
 def test_refined_through_the_forward_map(finder, model):
     """Simulated with the same mesh and rule, the full fit must be exact where the quick one is not."""
     centre, width, height = np.array([0.064, 0.131]), 0.012, 0.9

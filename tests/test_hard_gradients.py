@@ -68,6 +68,7 @@ HOST = {
     "AbstractSurface": _GEOMETRY,
     "Cylinder": _GEOMETRY,
     "Sphere": _GEOMETRY,
+    "verb": "a decorator",
 }
 
 

@@ -296,6 +296,7 @@ def test_units_do_not_matter(hard, name, dtype, unit):
     hard("units of the readings", "times 1e-60 to 1e60, float32 1e-8 to 1e8", **{dtype: error}, beyond=said)
 
 
+@pytest.mark.slow
 def test_a_baseline_of_zero_divides_nothing(hard, model, pixels, recon, jac):
     """Four-terminal baselines run through zero: dv / v0 makes the noise of those readings all there is."""
     v0 = np.asarray(je.forward(model))

@@ -30,6 +30,7 @@ def _bump(physics, x, y, height):
     return jnp.asarray(height * (square < 0.3**2) * (np.asarray(physics.image.areas) > 0))
 
 
+@pytest.mark.slow
 def test_gauss_newton_finds_both_kinds_without_some_readings(disc):
     """Readings of a conductive and a resistive piece; a NaN is left out."""
     truth = _bump(disc, 0.45, 0.0, 2.0) + _bump(disc, -0.45, 0.0, -2.0)

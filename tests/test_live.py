@@ -224,6 +224,7 @@ def test_readings_missing_twice_are_learned_to_be_missing(calibration):
     assert len(engine._programs.learned) == 1
 
 
+@pytest.mark.slow
 def test_programs_for_one_frame_are_those_of_the_force_map(model, skin, pixels):
     """To rounding; also for frames that lack readings, whether that is new or has been learned."""
     recon, rng = je.prepare(model, basis=pixels), np.random.default_rng(0)

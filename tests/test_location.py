@@ -276,6 +276,7 @@ def session_data(skin, *, depth=True, noise=0.02, seed=0, side=8):
     )
 
 
+@pytest.mark.slow
 def test_curve_and_field_are_found_together_and_held_out_by_place(skin, geometry):
     place, data = session_data(skin)
     places = single_places(place, 4)

@@ -1,6 +1,7 @@
 """Arrays of plain channels: faults told, and one signal made of many."""
 
 import numpy as np
+import pytest
 
 from calib.curves import Affine
 from calib.response import fit_log
@@ -32,6 +33,7 @@ def test_a_lag_follows_a_step_by_its_time_constant():
     np.testing.assert_allclose(np.delete(out, 50), np.delete(-np.expm1(-(time - time[0]) / 2.0), 50), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_creep_is_learnt_and_the_second_half_predicted():
     """Bent channels that creep by 10 % over 5 s: a formula without memory leaves that."""
     rng = np.random.default_rng(2)
