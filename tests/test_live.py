@@ -526,7 +526,7 @@ def test_live_at_the_rate_of_the_paper_loses_nothing_and_does_not_grow():
     found = bench_live.watched(bench_live.made_up(), bench_live.RATE, 20.0)
     assert found["lost"] == 0
     assert found["frames"] > 1500
-    assert found["dropped"] < 0.1 * found["frames"]  # others use the machine as well
+    assert found["dropped"] < 0.05 * found["frames"]  # others use the machine as well
     assert found["latency_ms_p50"] < 10
     assert found["memory_mb_per_hour"] < 600  # 3 MB in these seconds: a frame kept would be 5 GB an hour
 
