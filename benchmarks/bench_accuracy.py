@@ -4,7 +4,6 @@ python -m benchmarks.bench_accuracy [--smoke | --draw-only]
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -305,15 +304,6 @@ def _legend(rows: list[Row]) -> list[Line2D]:
     return entries
 
 
-def stored() -> list[Row]:
-    """What this machine measured last."""
-    path = c.RESULTS / f"{c.machine()}.json"
-    results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if "accuracy" not in results:
-        raise SystemExit(f"{path} has no accuracy to draw; measure first (leave out --draw-only)")
-    return results["accuracy"]["rows"]
-
-
 def main(argv: list[str] | None = None) -> Row:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="a few small models, few repeats, nothing written")
@@ -321,7 +311,7 @@ def main(argv: list[str] | None = None) -> Row:
     args = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     if args.draw_only:
-        draw(stored(), PICTURE)
+        draw(c.stored("accuracy")["rows"], PICTURE)
         return {}
     data: Row = {"circumstances": c.circumstances()}
     data["rows"] = rows = measure(*(SMOKE if args.smoke else FULL))

@@ -4,7 +4,6 @@ python -m benchmarks.ladder [--smoke | --draw-only]
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -53,15 +52,6 @@ def draw(ladders: list[dict[str, Any]], path: Path) -> None:
         new.write_bytes(png(ladder_figure(ladders)))
 
 
-def stored() -> list[dict[str, Any]]:
-    """What this machine measured last."""
-    path = c.RESULTS / f"{c.machine()}.json"
-    results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if "ladder" not in results:
-        raise SystemExit(f"{path} has no ladder to draw; measure first (leave out --draw-only)")
-    return results["ladder"]["ladders"]
-
-
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="one skin, two coarse rungs, nothing written")
@@ -69,7 +59,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     if args.draw_only:
-        draw(stored(), PICTURE)
+        draw(c.stored("ladder")["ladders"], PICTURE)
         return {}
     data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": c.limits()}
     skins, choices = (SKINS[:1], je.few_choices()) if args.smoke else (SKINS, None)
