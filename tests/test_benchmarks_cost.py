@@ -235,7 +235,19 @@ def test_tables_of_the_readme():
         },
         "start": {"rows": [{"start": "import jaxeit", **spread}]},
     }
+    rung = {"nodes": 1681, "voltage_error": 0.0018, "difference_error": 2e-4, "image": None}
+    rung |= {name: {"median": 5.93e-3} for name in ("forward", "jacobian")}
+    image = {"localisation": 1.234e-3, "frame": {"median": 6e-5}}
+    rungs = [
+        rung | {"label": "standard", "front": True, "image": image},
+        rung | {"label": "P1, 2 mm", "front": True},
+        rung | {"label": "behind the front", "front": False},
+    ]
+    results["ladder"] = {"ladders": [{"rungs": rungs}]}
     text = {mark: table(results[section]) for mark, (section, table) in readme.COSTS.items()}
+    assert "| **standard** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 | 1.23 | 0.06 |" in text["ladder"]
+    assert "| **P1, 2 mm** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 |  |  |" in text["ladder"]
+    assert "behind the front" not in text["ladder"]
     assert "| EIDORS, onto pixels | 1,234 | 1,234 |" in text["pipeline"]
     assert "| EIDORS first order | 20 (9) | 20 (9) | not reached |" in text["to-accuracy"]
     assert "| linear, location none | not determined | 3.01 |" in text["calibration-cost"]
