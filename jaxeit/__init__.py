@@ -26,7 +26,7 @@ from .adaptive import (
 from .background import fit_background
 from .basis import BasisMap, Bumps, Elements, Picture, Pixels
 from .choices import Choice, Imaging, LadderError, Touch, few_choices, fidelity_choices, image_choices
-from .contacts import ContactFinder, ContactResult, Contacts, prepare_contacts, refine_contacts, strongest
+from .contacts import ContactFinder, ContactResult, Contacts, prepare_contacts, strongest
 from .discretise import Model, discretise, make_mesh
 from .domain import Disc, Polygon, Rectangle
 from .effects import (
@@ -108,6 +108,7 @@ from .nonlinear import IsotropicVariation, LogConductivity, Quadratic, gauss_new
 from .pneumatics import pad_response
 from .priors import GaussianSmooth, Laplace, Noser, Tikhonov, TotalVariation
 from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
+from .refine import refine_contacts
 from .regions import RegionError, Regions, find_regions
 from .rungs import Ladder, Rung
 from .scene import Scene, read_effects

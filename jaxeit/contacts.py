@@ -20,11 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 from .basis import Elements
 from .descent import STEPS, Fit, descend, ridge, scale_of
 from .discretise import Model
-from .forward import conductivity, forward
 from .gaps import gap_of
 from .inverse import require_frames
 from .jacobian import pair_jacobian
-from .responses import Nodes, Responses, nodes_of, points_of, reached, responses_of, tabulate
+from .responses import Nodes, Responses, nodes_of, reached, responses_of, tabulate
 from .verbs import verb
 from .whitening import InverseError, Whitened, Whitening, whitened_readings
 
@@ -432,7 +431,7 @@ def prepare_contacts(
         rest=put(beside.T @ found.compress),
         responses=responses_of(values, nodes, background, model.dtype),
         **{name: put(array) for name, array in _atoms(model, values, nodes).items()},
-        **{name: put(bound) for name, bound in _bounds(nodes.axes[1], nodes.axes[0], widths).items()},
+        **{name: put(bound) for name, bound in bounds_of(nodes.axes[1], nodes.axes[0], widths).items()},
         threshold=put(0),
         model_error=put(model_error),
         ratio=put(ratio),
@@ -448,14 +447,15 @@ def _slopes(model: Model, found: Whitened, sigma) -> tuple[np.ndarray, float]:
     """Whitened readings per relative change of the elements' conductivity, and its mean, S."""
     slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(found.electrodes))
     at = np.asarray(model.background if sigma is None else sigma, float)
-    return found.factor @ (np.asarray(slopes, float) * at), _mean(model, at)
+    return found.factor @ (np.asarray(slopes, float) * at), mean_of(model, at)
 
 
-def _mean(model: Model, sigma: np.ndarray) -> float:
+def mean_of(model: Model, sigma: np.ndarray) -> float:
+    """The mean conductivity of the sheet, S."""
     return float(np.average(sigma, weights=np.asarray(model.areas, float)))
 
 
-def _bounds(x, y, widths) -> dict[str, list[float]]:
+def bounds_of(x, y, widths) -> dict[str, list[float]]:
     """Of x, y, log width and strength."""
     low, high = ([np.min(x), np.min(y), np.log(widths[0]), 0], [np.max(x), np.max(y), np.log(widths[1]), np.inf])
     return {"low": low, "high": high}
@@ -528,100 +528,3 @@ def _field(square: float) -> float:
 def _falls(finder: ContactFinder, y: Float[Array, "n r"]) -> Float[Array, " n"]:
     start = jnp.zeros((0, 4), y.dtype)
     return jax.lax.map(lambda one: one @ one - finder.fit(one, finder.added(one, start)).square, y)
-
-
-def refine_contacts(
-    model: Model,
-    dv: Float[ArrayLike, " readings"],
-    contacts: Contacts,
-    *,
-    noise: Float[ArrayLike, "..."],
-    widths: tuple[float, float] = (0.003, 0.05),
-    sigma: Float[Array, " elements"] | None = None,
-    channels: Bool[ArrayLike, " readings"] | None = None,
-) -> Contacts:
-    """The contacts of one frame fitted anew through the full forward map, for use offline.
-
-    Each step of Levenberg-Marquardt solves the forward problem once; derivatives cost no further solve (`forward`).
-
-    Args:
-        dv: difference of frames, (readings,) V.
-        contacts: from a `ContactFinder`, of one frame; which are present is not looked at again.
-        noise, sigma, channels: as for `prepare_contacts`.
-        widths: bounds, m.
-
-    Raises:
-        InverseError: if shapes do not fit, or a reading that is used is not finite.
-    """
-    found = whitened_readings(model, noise, channels)
-    readings, dv, used = model.pattern.shape[0], np.asarray(dv, float), np.asarray(found.whitening.channels)
-    if dv.shape != (readings,) or contacts.present.ndim != 1:
-        raise InverseError(f"dv has shape {dv.shape}; refine one frame of {readings} readings at a time")
-    if not np.isfinite(dv[used]).all():
-        raise InverseError(f"reading {int(np.argmax(used & ~np.isfinite(dv)))} is not finite; leave its channel out")
-    count = int(contacts.present.sum())
-    if not count:
-        return contacts
-    sigma = conductivity(model) if sigma is None else jnp.asarray(sigma, model.dtype)
-    chart = np.asarray(model.chart, float)
-    points, weights = (jnp.asarray(a, model.dtype) for a in points_of(model, widths[0] * 2))
-    background = jnp.asarray(_mean(model, np.asarray(sigma, float)), model.dtype)
-    compress = jnp.asarray(found.compress, model.dtype)
-    problem = _Full(model, sigma, background, forward(model, sigma), found.whitening, compress, points, weights)
-    named = [contacts.position, jnp.log(contacts.width)[:, None], contacts.amplitude[:, None]]
-    start = jnp.concatenate(named, 1)[:count].astype(model.dtype)
-    low, high = (jnp.asarray(bound, model.dtype) for bound in _bounds(chart[:, 0], chart[:, 1], widths).values())
-    return _refined(problem, jnp.asarray(dv, model.dtype), contacts, start, low, high)
-
-
-class _Full(eqx.Module):
-    """Contacts to whitened readings, through the forward map."""
-
-    model: Model
-    sigma: Float[Array, " elements"]
-    background: Float[Array, ""]
-    untouched: Float[Array, " readings"]
-    whitening: Whitening
-    compress: Float[Array, "r k"]
-    points: Float[Array, "elements q 2"]
-    weights: Float[Array, " q"]
-
-    def white(self, dv: Float[Array, " readings"]) -> Float[Array, " r"]:
-        return self.compress @ self.whitening.sums(dv)
-
-    def linear(self, flat: Float[Array, " m"]) -> tuple[Float[Array, " r"], Float[Array, "r m"]]:
-        """Whitened readings of contacts (x, y, log width, amplitude in S), and their slopes."""
-
-        def readings(flat):
-            touched = sum(self._bump(one) for one in flat.reshape(-1, 4)) / self.background
-            return self.white(forward(self.model, self.sigma * (1 + touched)) - self.untouched)
-
-        value, push = jax.linearize(readings, flat)
-        return value, jax.vmap(push, out_axes=1)(jnp.eye(len(flat), dtype=flat.dtype))
-
-    def _bump(self, one):
-        square = jnp.sum((self.points - one[:2]) ** 2, -1)
-        return one[3] * jnp.exp(-0.5 * square * jnp.exp(-2 * one[2])) @ self.weights
-
-
-@verb
-def _refined(problem: _Full, dv, contacts: Contacts, start, low, high) -> Contacts:
-    count, y = len(start), problem.white(dv)
-    low, high = jnp.tile(low, count), jnp.tile(high, count)
-    fit = descend(problem.linear, y, jnp.clip(start.ravel(), low, high), low, high)
-    misfit = fit.square / max(len(y) - 4 * count, 1)
-    scale = scale_of(jnp.diagonal(fit.normal))
-    scaled = fit.normal * scale[:, None] * scale + ridge(y) * jnp.eye(4 * count, dtype=y.dtype)
-    whole = (scale[:, None] * cho_solve(cho_factor(scaled), jnp.diag(scale))).reshape(count, 4, count, 4)
-    own = whole[np.arange(count), :, np.arange(count)] * jnp.maximum(misfit, 1)
-    bound = ((fit.flat <= low) | (fit.flat >= high)).reshape(count, 4).any(1)
-    result = jnp.where(bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
-    return Contacts(
-        present=contacts.present,
-        position=contacts.position.at[:count].set(_round(fit.flat)[:, :2]),
-        width=contacts.width.at[:count].set(jnp.exp(_round(fit.flat)[:, 2])),
-        amplitude=contacts.amplitude.at[:count].set(_round(fit.flat)[:, 3]),
-        covariance=contacts.covariance.at[:count].set(own),
-        misfit=misfit,
-        result=contacts.result.at[:count].set(jnp.where(fit.done, result, ContactResult.NOT_CONVERGED)),
-    )

@@ -8,7 +8,8 @@ import pytest
 from scipy.stats import binom
 
 import jaxeit as je
-from jaxeit.contacts import ContactResult, prepare_contacts, refine_contacts, strongest
+from jaxeit.contacts import ContactResult, prepare_contacts, strongest
+from jaxeit.refine import refine_contacts
 from jaxeit.whitening import InverseError
 
 STD = 1e-5  # V: a signal-to-noise ratio of 60 dB
