@@ -26,7 +26,8 @@ from calib.runtime import set_up
 
 from . import _common as c
 
-WIDTHS = (0.006, 0.009, 0.012, 0.016, 0.020)
+SCENE = 0.01  # m, the spreading of the shipped scene
+WIDTHS = (0.006, 0.008, SCENE, 0.012, 0.016, 0.020)
 EIT_RATE, SCANS = 10.0, 18
 COLUMNS = {
     "localisation_quarter_mean": ("localisation, quarter, mm", 1e3),
@@ -48,8 +49,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     set_up()
     before, seeds = c.circumstances(), range(1 if args.smoke else args.seeds)
-    widths = (0.012,) if args.smoke else WIDTHS
-    several = {width: seeds if width == 0.012 else seeds[:1] for width in widths}
+    widths = (SCENE,) if args.smoke else WIDTHS
+    several = {width: seeds if width == SCENE else seeds[:1] for width in widths}
     results = {width: [figures(seed, width, args.smoke) for seed in mine] for width, mine in several.items()}
     data = {
         "seeds": len(seeds),

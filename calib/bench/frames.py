@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.polynomial.chebyshev import chebvander
 from scipy.fft import dct
 
 import jaxeit as je
@@ -35,28 +36,33 @@ class Box:
 def boxes(
     low: Float[np.ndarray, "phases d"], high: Float[np.ndarray, "phases d"], scale: Float[np.ndarray, " d"]
 ) -> tuple[list[Box], Int[np.ndarray, " phases"]]:
-    """Few boxes that hold all phases of a press, and the box of each phase.
+    """Boxes that hold all phases of a press at the least cost in points, and the box of each phase.
 
-    A phase joins a box, and widens it, if no number moves here that stands still there, and those stand alike: rest,
-    loading, hold and unloading share their points.  Phases without a sample (low above high) take the first.
+    A phase joins a box and widens it where that takes fewer points than a box of its own: rest, loading and unloading
+    share theirs, but a slide under a load that creeps does not take all loads along its way.  Phases without a
+    sample (low above high) take the first.
     """
-    slack = 1e-9 * scale
-    wide = high - low > slack
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    found: list[tuple[np.ndarray, np.ndarray]] = []
     owner = np.zeros(len(low), int)
-    for phase in np.argsort(-wide.sum(1), kind="stable"):
-        lo, hi, moves = low[phase], high[phase], wide[phase]
-        if (lo > hi).any():
+    for phase in np.argsort(-_points(low, high, scale), kind="stable"):
+        mine = low[phase], high[phase]
+        if (mine[0] > mine[1]).any():
             continue
-        for number, (a, b, moving) in enumerate(found):
-            if not (moves & ~moving).any() and ((lo >= a - slack) & (hi <= b + slack) | moving).all():
-                found[number] = np.minimum(a, lo), np.maximum(b, hi), moving
-                owner[phase] = number
-                break
-        else:
-            owner[phase] = len(found)
-            found.append((lo, hi, moves))
-    return [Box(a, np.where(moving, b, a)) for a, b, moving in found], owner
+        joined = [(np.minimum(a, mine[0]), np.maximum(b, mine[1])) for a, b in found]
+        more = [_points(*new, scale) - _points(*old, scale) for new, old in zip(joined, found, strict=True)]
+        owner[phase] = int(np.argmin([*more, _points(*mine, scale)]))
+        found[owner[phase] : owner[phase] + 1] = [[*joined, mine][owner[phase]]]
+    return [Box(a, np.where(_moves(a, b, scale), b, a)) for a, b in found], owner
+
+
+def _moves(low, high, scale):
+    return high - low > 1e-9 * scale
+
+
+def _points(low, high, scale):
+    """About how many points a box takes."""
+    share = (high - low) / np.where(scale > 0, scale, 1)
+    return np.prod(np.where(_moves(low, high, scale), _START + 14 * share, 1), -1)
 
 
 class Interpolant:
@@ -81,25 +87,26 @@ class Interpolant:
     def __call__(self, q: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
         """Frames at points, with one for each reading of a frame or one for all (m is 1)."""
         x = 2 * (q[..., self._axes] - self._low[self._axes]) / self._span[self._axes] - 1
-        angle = np.arccos(np.clip(x, -1, 1))
-        return self._together(angle[:, 0]) if q.shape[1] == 1 else self._one_by_one(angle)
+        counts = self._series.shape[:-1]
+        bases = [chebvander(np.clip(x[..., axis], -1, 1), count - 1) for axis, count in enumerate(counts)]
+        if q.shape[1] > 1 and bases:
+            return self._one_by_one(bases)
+        return self._together([basis[:, 0] for basis in bases], len(q))
 
-    def _together(self, angle):
-        basis = np.ones((len(angle), 1))
-        for axis, count in enumerate(self._series.shape[:-1]):
-            along = np.cos(angle[:, axis, None] * np.arange(count))
-            basis = (basis[:, :, None] * along[:, None]).reshape(len(angle), -1)
-        return basis @ self._series.reshape(-1, self._series.shape[-1])
+    def _together(self, bases, frames: int):
+        product = np.ones((frames, 1))
+        for basis in bases:
+            product = (product[:, :, None] * basis[:, None]).reshape(frames, -1)
+        return product @ self._series.reshape(-1, self._series.shape[-1])
 
-    def _one_by_one(self, angle):
-        counts, out = self._series.shape[:-1], np.zeros(angle.shape[:2])
-        along = [[np.cos(k * angle[..., axis]) for k in range(n)] for axis, n in enumerate(counts)]
-        for index in np.ndindex(counts):
-            term = self._series[index]
-            for axis, k in enumerate(index):
-                term = term * along[axis][k]
-            out += term
-        return out
+    def _one_by_one(self, bases):
+        *others, last = (basis.swapaxes(0, 1) for basis in bases)  # (readings, frames, terms)
+        series = np.moveaxis(self._series, -1, 0)
+        rows = np.swapaxes(series.reshape(len(series), -1, series.shape[-1]), 1, 2)
+        sums = (last @ rows).reshape(*last.shape[:2], *series.shape[1:-1])
+        for basis in reversed(others):
+            sums = np.einsum("rf...k,rfk->rf...", sums, basis)
+        return sums.T
 
 
 class _Solved:
