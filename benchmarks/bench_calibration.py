@@ -150,7 +150,7 @@ def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | N
 def errors(hybrid: Hybrid, data: PressData, places: Places) -> tuple[np.ndarray, np.ndarray]:
     """Of the total force, N: over the holds, (presses,), and of samples along the presses, (n,); NaN: not told."""
     held = hybrid.pad_forces(data.pressure, places)[0].sum(1) - data.force
-    along = Places(places.position[data.sample_press], places.weight[data.sample_press])
+    along = places[data.sample_press]
     return held, hybrid.pad_forces(data.sample_pressure.T, along)[0].sum(1) - data.sample_force
 
 

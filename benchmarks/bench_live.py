@@ -1,18 +1,27 @@
 """Live over loopback: loss, latency from a frame's last byte to its force map, growth of memory, and the highest rate.
 
 The skin is a process of its own that sends frames of 928 readings and 1,000 samples of the pads' pressures a second.
+First a soak, which is recorded as well; then the highest rate of frames that is sustained, by doubling and bisection.
 
 python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5] [--no-rates]
+
+Latency counts from when the bytes that end a frame were read; `since_due` from when the simulated device should have
+sent it: the device's own lateness, and what the bytes waited to be read, are in it.
 """
 
 import argparse
 import multiprocessing
 import os
 import sys
+import tempfile
 import threading
 import time
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import ExitStack
 from itertools import count
 from multiprocessing.synchronize import Event
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,7 +30,9 @@ import numpy as np
 import calib
 import jaxeit as je
 from calib.acquisition.device import Device, Packets, rows
+from calib.acquisition.entries import unpack_frames
 from calib.acquisition.live import Show, live
+from calib.acquisition.recorder import Log, Nowhere, kept
 from calib.acquisition.results import Result
 from calib.acquisition.setup import prepare
 
@@ -29,8 +40,9 @@ from ._common import circumstances, write
 
 RATE, PRESSURE_RATE = 100, 1000
 REST = 1.0
-TRIED = (100, 200, 400, 600, 800, 1000, 1500, 2000)
 LOST = 1e-3  # of the frames may be dropped at a rate that is sustained
+FASTEST = 6400  # Hz
+CLOSE = 1.1  # the rate that is sustained and the one that is not are not farther apart
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
@@ -43,18 +55,37 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     calibration = calib.load_calibration(args.calibration) if args.calibration else made_up()
     data: dict[str, Any] = {"circumstances": circumstances(), "readings": calibration.recon.readings}
-    data["soak"] = watched(calibration, RATE, 5.0 if args.smoke else 60 * args.minutes)
+    data["soak"] = soaked(calibration, 5.0 if args.smoke else 60 * args.minutes)
     print(data["soak"], flush=True)
     data["rates"] = []
-    for rate in () if args.no_rates else TRIED[:2] if args.smoke else TRIED:
-        row = watched(calibration, rate, 3.0 if args.smoke else 15.0)
-        data["rates"].append(row)
-        print(row, flush=True)
-        if row["dropped"] + row["lost"] > LOST * row["frames"]:
-            break
+    if not args.no_rates:
+
+        def sustains(rate: int) -> bool:
+            row = watched(calibration, rate, 3.0 if args.smoke else 15.0)
+            data["rates"].append(row)
+            print(row, flush=True)
+            return row["sustained"]
+
+        data["highest_hz"] = highest(sustains, RATE, 2 * RATE if args.smoke else FASTEST)
+        print("highest rate sustained:", data["highest_hz"], "Hz", flush=True)
     if not args.smoke:
         write("live_located" if args.calibration else "live", data)
     return data
+
+
+def highest(sustains: Callable[[int], bool], low: int, most: int) -> int:
+    """The highest rate that is sustained, 0 if not even `low`: by doubling up to `most`, then by bisection."""
+    if not sustains(low):
+        return 0
+    high = 2 * low
+    while high <= most and sustains(high):
+        low, high = high, 2 * high
+    if high > most:
+        return low
+    while high > CLOSE * low:
+        middle = (low + high) // 2
+        low, high = (middle, high) if sustains(middle) else (low, middle)
+    return low
 
 
 def made_up() -> calib.Calibration:
@@ -68,10 +99,10 @@ def made_up() -> calib.Calibration:
     return calib.Calibration(skin, recon, je.pad_masks(skin, recon), curves, none, {}, simulated=True)
 
 
-def skin_process(rates: tuple[int, int], channels: tuple[int, int], urls: Any, stop: Event) -> None:
+def skin_process(rates: tuple[int, int], channels: tuple[int, int], told: Any, stop: Event) -> None:
     """The device, until told to stop."""
     with Device([frames(number + 1, *what) for number, what in enumerate(zip(rates, channels, strict=True))]) as device:
-        urls.put(device.urls)
+        told.put((device.begin, device.urls))
         stop.wait()
 
 
@@ -85,20 +116,67 @@ def frames(number: int, rate: int, channels: int) -> Packets:
     return rows(number, times, choice)
 
 
-class Watch:
-    """Latencies, and the memory of this process once a second."""
+class Received:
+    """What arrives, on its way to a log: how many frames of each stream, and when the latest were due."""
 
-    def __init__(self) -> None:
-        self.latency: list[float] = []
-        self.memory: list[tuple[float, float]] = []
+    def __init__(self, log: Log):
+        self._log = log
+        self.counts = [0, 0]
+        self._due: OrderedDict[int, int] = OrderedDict()
+
+    @property
+    def size(self) -> int:
+        """Bytes written."""
+        return self._log.size
+
+    def append(self, stream: int, flags: int, host: int, payload: bytes) -> None:
+        """One record."""
+        self._log.append(stream, flags, host, payload)
+        if stream > 1:
+            return
+        self.counts[stream] += 1
+        ticks = unpack_frames([payload]).ticks if stream == 0 else None
+        if ticks is not None:
+            self._due.setdefault(host, int(ticks[0]))  # of those read together the earliest
+            if len(self._due) > 64:
+                self._due.popitem(last=False)
+
+    def due(self, host: int) -> int | None:
+        """When the frame that came at `host` was due, device time in us modulo 2**32."""
+        return self._due.get(host)
+
+
+class Watch:
+    """Latencies, s, and the memory of this process once a second; all room is taken at the beginning."""
+
+    def __init__(self, most: int, seconds: float, begin: int, received: Received):
+        self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
+        self._memory, self._used = np.full((int(seconds) + 60, 2), np.nan), 0
+        self._begin, self._received = begin, received
         self.last: Result | None = None
 
     def __call__(self, result: Result) -> None:
+        now, row = time.monotonic_ns(), result.number - 1
         self.last = result
-        self.latency.append(result.latency)
-        now = time.monotonic()
-        if not self.memory or now - self.memory[-1][0] >= 1.0:
-            self.memory.append((now, resident()))
+        self._latency[row] = result.latency
+        due = self._received.due(result.host)
+        if due is not None:
+            self._since_due[row] = ((now - self._begin) // 1000 - due) % 2**32 / 1e6
+        if not self._used or now / 1e9 - self._memory[self._used - 1, 0] >= 1.0:
+            self._memory[self._used] = now / 1e9, resident()
+            self._used += 1
+
+    def found(self) -> dict[str, Any]:
+        """In ms, and MB."""
+        out = spread("latency", self._latency) | spread("since_due", self._since_due)
+        memory = self._memory[: self._used]
+        return out | {"memory_mb": round(memory[-1, 1]), "memory_mb_per_hour": round(slope(memory), 1)}
+
+
+def spread(name: str, seconds: np.ndarray) -> dict[str, float]:
+    """Percentiles, ms."""
+    values = 1e3 * np.nanpercentile(seconds, [50, 99, 100])
+    return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
 
 
 def resident() -> float:
@@ -107,43 +185,61 @@ def resident() -> float:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def slope(memory: list[tuple[float, float]]) -> float:
-    """MB per hour, over the later four fifths: what start-up takes does not grow on."""
-    later = np.array(memory[len(memory) // 5 :])
+def slope(memory: np.ndarray) -> float:
+    """MB per hour, of rows (s, MB), over the later four fifths: what start-up takes does not grow on."""
+    later = memory[len(memory) // 5 :]
     return float(3600 * np.polyfit(later[:, 0] - later[0, 0], later[:, 1], 1)[0]) if len(later) > 2 else 0.0
 
 
-def watched(calibration: calib.Calibration, rate: int, seconds: float) -> dict[str, Any]:
-    """One run: what was lost, the latencies in ms, and what memory did."""
+def soaked(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
+    """One run at the rate of the paper, recorded as well: all that arrived is in the session, in order."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.h5"
+        row = watched(calibration, RATE, seconds, path)
+        with calib.open_session(path) as session:
+            streams = [session.stream(name) for name in ("eit", "pressure")]
+            row["recorded"] = [len(stream) for stream in streams]
+            row["recorded_gaps"] = [int((np.diff(np.asarray(s.seq, np.int64)) != 1).sum()) for s in streams]
+            row["complete"] = session.complete
+    return row
+
+
+def watched(calibration: calib.Calibration, rate: int, seconds: float, output: Path | None = None) -> dict[str, Any]:
+    """One run: frames and what became of them, the latencies in ms, and what memory did."""
     context = multiprocessing.get_context("spawn")
-    urls, stop = context.Queue(), context.Event()
+    told, stop = context.Queue(), context.Event()
     channels = calibration.recon.readings, len(calibration.skin.pads)
-    skin = context.Process(target=skin_process, args=((rate, PRESSURE_RATE), channels, urls, stop), daemon=True)
+    skin = context.Process(target=skin_process, args=((rate, PRESSURE_RATE), channels, told, stop), daemon=True)
     skin.start()
     try:
-        eit, pressure = urls.get(timeout=120)
-        show, watch = Show(), Watch()
-        timer = threading.Timer(seconds, show.stop.set)
-        plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
-        live(calibration, plan, sources, watch, show, rest=REST, begun=timer.start)
-        timer.cancel()
+        begin, (eit, pressure) = told.get(timeout=120)
+        with ExitStack() as stack:
+            show, received = Show(), Received(stack.enter_context(kept(output)) if output is not None else Nowhere())
+            watch = Watch(int(1.5 * rate * seconds) + 1000, seconds, begin, received)
+            timer = threading.Timer(seconds, show.stop.set)
+            plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
+            live(calibration, plan, sources, watch, show, log=received, rest=REST, begun=timer.start)
+            timer.cancel()
+            ended = time.monotonic()
+        finishing = time.monotonic() - ended
     finally:
         stop.set()
         skin.join(10)
     assert watch.last is not None, "no frame came"
-    p50, p99, worst = (1e3 * np.percentile(watch.latency, [50, 99, 100])).tolist()
+    frames, dropped = received.counts[0], watch.last.dropped
+    enough = frames > 0.98 * rate * seconds  # else the simulated skin, not the host, was too slow
     return {
         "rate_hz": rate,
         "seconds": round(seconds, 1),
-        "frames": watch.last.number,
+        "received": received.counts,
         "lost": show.lost,
-        "dropped": watch.last.dropped,
+        "dropped": dropped,
+        "shown": watch.last.number,
+        "sustained": bool(show.lost + dropped <= LOST * frames and enough),
+        "skin_kept_up": bool(enough),
         "unsearched": watch.last.unsearched,
-        "latency_ms_p50": round(p50, 3),
-        "latency_ms_p99": round(p99, 3),
-        "latency_ms_max": round(worst, 3),
-        "memory_mb": round(watch.memory[-1][1]),
-        "memory_mb_per_hour": round(slope(watch.memory), 1),
+        **watch.found(),
+        **({} if output is None else {"finishing_s": round(finishing, 1)}),
     }
 
 

@@ -4,9 +4,9 @@ python -m benchmarks.figure8 [--smoke]
 
 The shipped scene `two_contacts` (SIMULATED): press 1, press 2, release 1, release 2, three times with both tips on one
 pad and on neighbouring ones otherwise.  The calibration is of single presses on a grid over the same sheet, as a bench
-makes them: it has seen no second contact.  A contact's force is that of the force map's pixels nearest to it; a pad's
-true force that of the tips above it, so that what spreads to its neighbours counts as interference; of tips that stand
-on a border of pads only the total means something.
+makes them: it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump, and
+beside it that of the force map's pixels nearest to it.  A pad's true force is that of the tips above it, so that what
+spreads to its neighbours counts as interference; it means nothing for tips that stand on a border of pads.
 """
 
 import argparse
@@ -71,7 +71,8 @@ def _alone(bench: Bench, smoke: bool) -> Bench:
 
 
 class Forces(dict[str, np.ndarray]):
-    """What `calib.apply` writes: time (n,) s, force (n, pixels) N, pad_force (n, pads) N, centres (pixels, 2) m."""
+    """What `calib.apply` writes: time (n,) s, force (n, pixels) N, pad_force (n, pads) N, centres (pixels, 2) m,
+    contact_position (n, K, 2) m, contact_force (n, K) N."""
 
 
 def _forces(bench: Bench, folder: Path, smoke: bool) -> Forces:
@@ -83,7 +84,8 @@ def _forces(bench: Bench, folder: Path, smoke: bool) -> Forces:
     with calib.open_session(pair) as session:
         calib.apply(calibration, session, folder / "map.h5")
     arrays = calib.read_archive(folder / "map.h5", "skin-forcemap").arrays
-    return Forces({name: arrays[name] for name in ("force", "pad_force", "centres")} | {"time": arrays["time"] / 1e9})
+    kept = ("force", "pad_force", "centres", "contact_position", "contact_force")
+    return Forces({name: arrays[name] for name in kept} | {"time": arrays["time"] / 1e9})
 
 
 def _during(bench: Bench, forces: Forces, press: int) -> np.ndarray:
@@ -101,16 +103,21 @@ def _pads_under(bench: Bench, press: int) -> np.ndarray:
     return np.argmax(inside, 0)
 
 
-def _by_contact(bench: Bench, forces: Forces, press: int) -> tuple[np.ndarray, np.ndarray]:
-    """True and estimated force of each contact over a press, (n, contacts) N."""
-    rows = _during(bench, forces, press)
+def _by_contact(bench: Bench, forces: Forces, press: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each contact over a press, (n, contacts) N: true force, that of the fit's contacts, that of the map."""
+    rows, tips = _during(bench, forces, press), _tips(bench, press)
     true = moments(planned(bench), forces["time"][rows]).load
-    nearest = np.argmin(np.linalg.norm(forces["centres"][:, None] - _tips(bench, press), axis=-1), 1)
-    under = _pads_under(bench, press)
-    if len(set(under)) == len(under):  # a pad each
-        return true, forces["pad_force"][rows][:, under]
-    share = forces["force"][rows] @ (nearest[:, None] == np.arange(len(under)))
-    return true, share
+    centres = np.broadcast_to(forces["centres"], (len(true), *forces["centres"].shape))
+    shared = _to_tips(tips, forces["contact_position"][rows], forces["contact_force"][rows])
+    return true, shared, _to_tips(tips, centres, forces["force"][rows])
+
+
+def _to_tips(tips: np.ndarray, place: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Forces (n, k) at places (n, k, 2), each given to the nearest tip, (n, contacts); NaN is nowhere."""
+    far = np.linalg.norm(place[:, :, None] - tips, axis=-1)
+    nearest = np.argmin(np.nan_to_num(far, nan=np.inf), -1)
+    force = np.where(np.isfinite(far).all(-1), force, 0)
+    return (force[..., None] * (nearest[..., None] == np.arange(len(tips)))).sum(1)
 
 
 def _by_pad(bench: Bench, forces: Forces, press: int) -> tuple[np.ndarray, np.ndarray]:
@@ -123,7 +130,7 @@ def _by_pad(bench: Bench, forces: Forces, press: int) -> tuple[np.ndarray, np.nd
 
 def _figures(bench: Bench, forces: Forces, press: int) -> dict[str, Any]:
     pads, found = _by_pad(bench, forces, press)
-    contacts, shared = _by_contact(bench, forces, press)
+    contacts, shared, mapped = _by_contact(bench, forces, press)
     idle, both = ~pads.any(0), (contacts > 0.9 * contacts.max(0)).all(1)
     total = pads.sum(1)
     return {
@@ -131,6 +138,7 @@ def _figures(bench: Bench, forces: Forces, press: int) -> dict[str, Any]:
         "tips_on": _where(bench, press),
         "pad_rmse_N": _rms((found - pads)[:, ~idle]),
         "contact_rmse_N": _rms(shared - contacts),
+        "map_contact_rmse_N": _rms(mapped - contacts),
         "total_rmse_N": _rms(found.sum(1) - total),
         "total_error_of_hold_percent": float(100 * np.abs((found.sum(1) - total)[both]).mean() / total[both].mean()),
         "interference_percent": float(100 * np.abs(found[both][:, idle]).max(0).max() / total[both].mean()),
@@ -168,7 +176,7 @@ def _cases(rows: list[dict]) -> list[tuple[int, str]]:
 
 def _series(bench: Bench, forces: Forces, press: int, title: str) -> ForceSeries:
     rows, start = _during(bench, forces, press), bench.blank + press * bench.period
-    true, found = _by_contact(bench, forces, press)
+    true, found, _ = _by_contact(bench, forces, press)
     idle = sorted(set(range(len(bench.scene.skin.pads))) - set(_pads_under(bench, press).tolist()))
     others = forces["pad_force"][rows][:, idle].sum(1, keepdims=True)
     timing, late = bench.timing, bench.companions[0].delay
@@ -186,7 +194,7 @@ def _series(bench: Bench, forces: Forces, press: int, title: str) -> ForceSeries
 
 def table(rows: list[dict]) -> str:
     """Markdown."""
-    keys = [key for key in rows[0] if key not in ("press", "same_pad")]
+    keys = [key for key in rows[0] if key not in ("press", "tips_on")]
     lines = [
         "| press | tips on | " + " | ".join(key.replace("_", " ") for key in keys) + " |",
         "|---" * (2 + len(keys)) + "|",

@@ -1,6 +1,7 @@
 """Benchmarks of what accuracy costs beside solves: presses, readings, growth, start, the whole way; runs compared."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from benchmarks import (
     bench_pipeline,
     bench_protocol,
     bench_start,
-    readme,
     repeat,
+    tables,
 )
 from benchmarks.peers import eidors, pyeit
 from calib.hybrid import PressData
@@ -212,7 +213,7 @@ def test_smoke_pipeline():
 # --- tables of the README
 
 
-def test_tables_of_the_readme():
+def test_tables_of_the_pages(root):
     spread = {"median_ms": 1234.0, "min_ms": 1.0, "max_ms": 2e3}
     press = {"curve": "linear", "location": "none", "spread": "scattered", "minutes": 2.1}
     results = {
@@ -225,7 +226,18 @@ def test_tables_of_the_readme():
             "rows": [
                 {"way": "D-optimal", "readings": 40, "frames_per_s": 2500.0, "fit_mm": 0.213},
                 {"way": "at random", "readings": 40, "frames_per_s": 2500.0, "fit_mm": None},
-            ]
+            ],
+            "events": {
+                name: {"readings": 24.0, "frames_per_s": 4e3, "frames_per_s_with_switching": 2e3}
+                for name in ("rest", "first", "next")
+            },
+        },
+        "scene": {
+            "sessions": [{"scene": "ideal", "recording_s": 80, "frames": 1600, "second_s": 4.0, "times_real_time": 20}],
+            "rows": [
+                {"effects": "none"}
+                | {f"{part}_{what}": 7.0 for part in ("frame", "block") for what in ("ms", "mflop", "operations")}
+            ],
         },
         "growth": {
             "fits": [
@@ -243,11 +255,19 @@ def test_tables_of_the_readme():
         rung | {"label": "P1, 2 mm", "front": True},
         rung | {"label": "behind the front", "front": False},
     ]
-    results["ladder"] = {"ladders": [{"rungs": rungs}]}
-    text = {mark: table(results[section]) for mark, (section, table) in readme.COSTS.items()}
+    results["ladder"] = {"ladders": [{"rungs": rungs}, {"rungs": rungs[:1]}]}
+    marks = re.findall(r"<!-- end of ([\w-]+) -->", (root / "docs" / "costs.md").read_text())
+    assert set(marks) <= set(tables.TABLES)
+    page = "".join(f"<!-- {mark}: written -->\nold\n<!-- end of {mark} -->\n" for mark in (*marks, "speed"))
+    page = tables.filled(page, results)
+    assert page.count("old") == 1  # only the table of speed, whose benchmarks have not run
+    text = {mark: page.split(f"<!-- {mark}:")[1].split(f"<!-- end of {mark}")[0] for mark in marks}
     assert "| **standard** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 | 1.23 | 0.06 |" in text["ladder"]
     assert "| **P1, 2 mm** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 |  |  |" in text["ladder"]
     assert "behind the front" not in text["ladder"]
+    assert "| **standard** |" in text["ladder-chest"]
+    assert "| at rest | 24 |  |  | 4,000 | 2,000 |" in text["event-scan"]
+    assert "| none | 7 | 7 | 7 | 7 | 7 | 7 |" in text["effects"]
     assert "| EIDORS, onto pixels | 1,234 | 1,234 |" in text["pipeline"]
     assert "| EIDORS first order | 20 (9) | 20 (9) | not reached |" in text["to-accuracy"]
     assert "| linear, location none | not determined | 3.01 |" in text["calibration-cost"]
