@@ -418,4 +418,5 @@ def test_otsu_under_jit_and_vmap_keeps_its_precision(dtype):
     found = jax.jit(jax.vmap(otsu_thresholds))(values)
     assert found.dtype == dtype
     for row, each in zip(found, values, strict=True):
-        np.testing.assert_array_equal(row, otsu_thresholds(each))
+        # Programs compiled apart may round apart.
+        np.testing.assert_allclose(row, otsu_thresholds(each), rtol=0, atol=8 * np.finfo(dtype).eps)
