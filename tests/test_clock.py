@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from calib.acquisition.clock import MAX_SEGMENTS, DeviceClock, lower_hull
+from calib.acquisition.clock import MAX_SEGMENTS, NO_LATENCY, DeviceClock, latency, lower_hull
 
 MS, S = 1_000_000, 1_000_000_000
 FLOOR = 200_000  # ns, the smallest latency of all cases below: what no method can see
@@ -78,15 +78,24 @@ CASES = {
 }
 
 
+FAULTS = {"batches": "frames held back in batches", "jitter": "jitter of arrival", "a wrap": "counter of 32 bits wraps"}
+SEVERITY = {
+    "batches": "batches of 16 ms, clock off by 200 ppm, ten minutes",
+    "jitter": "16 ms, clock off by 50 ppm, one minute",
+    "a wrap": "16 ms of jitter, clock off by 50 ppm",
+}
+
+
 @pytest.mark.parametrize("name", CASES)
-def test_times_agree_with_truth(name):
+def test_times_agree_with_truth(name, hard):
     changes, bound = CASES[name]
     known = case(**changes)
     clock, unwrapped, steps, online = follow(known)
     assert not steps.any()
     assert (np.diff(unwrapped) > 0).all()
     host = aligned(clock, unwrapped, steps)
-    assert np.quantile(error(known, host), 0.95) < bound
+    p95 = np.quantile(error(known, host), 0.95)
+    assert p95 < bound
     assert error(known, host).max() < 2 * MS
     assert np.quantile(error(known, online)[-len(known) // 2 :], 0.95) < 2 * MS
     found = clock.timeline()
@@ -94,6 +103,8 @@ def test_times_agree_with_truth(name):
     assert found.tick_s == pytest.approx(1e-6, rel=0.03)
     if known.true[-1] > 30 * S and "drift" not in changes:
         assert found.skew == pytest.approx(changes.get("skew", 50e-6) / (1 - changes.get("skew", 50e-6)), abs=2e-5)
+    if name in FAULTS:
+        hard(f"fault 11: {FAULTS[name]}", SEVERITY[name], beyond=f"aligned to {p95 / 1000:.0f} µs (95 %)")
 
 
 def test_least_squares_would_not_do():
@@ -145,7 +156,7 @@ STEPS = {
 
 @pytest.mark.parametrize("bits", [32, 64])
 @pytest.mark.parametrize("name", STEPS)
-def test_a_step_of_the_clock_is_seen_and_its_times_are_right(name, bits):
+def test_a_step_of_the_clock_is_seen_and_its_times_are_right(name, bits, hard):
     known = case(seconds=120, bits=bits, start=2**33)
     half = len(known) // 2
     jump = np.array(STEPS[name] // 1000).astype("u8")  # modulo, as a counter
@@ -156,6 +167,8 @@ def test_a_step_of_the_clock_is_seen_and_its_times_are_right(name, bits):
     err = error(known, aligned(clock, unwrapped, steps))
     assert np.quantile(err, 0.95) < MS
     assert err.max() < 2 * MS
+    told = "flagged, at the frame; aligned to 1 ms (95 %) before and after"
+    hard("fault 11: the device's clock is set", ", ".join(STEPS), beyond=told)
 
 
 def test_a_restart_with_short_stretches_borrows_the_rate():
@@ -228,6 +241,39 @@ def test_nonsense_does_no_harm(seed, bits):
     clock, unwrapped, steps, _ = follow(known)
     assert (unwrapped[np.flatnonzero(steps)] >= 0).all()
     assert not clock.timeline().valid
+
+
+def pings(case, late, count=50, seed=1):
+    """Pings over a whole case, up to 5 ms on their way there, `late` to 5 ms back, and what is counted in between."""
+    rng = np.random.default_rng(seed)
+    rows = np.sort(rng.choice(len(case), count, replace=False))
+    at = case.true[rows].astype(np.int64) + 5 * S
+    sent, received = at - rng.integers(MS // 10, 5 * MS, count), at + late + rng.integers(0, 5 * MS, count)
+    return sent, received, case.ticks[rows]
+
+
+@pytest.mark.parametrize("name", ["jitter", "a wrap", "64 bits", "batches"])
+def test_pings_tell_the_smallest_latency(name, hard):
+    """Of 3 ms, beyond what no frame says; to half of the shortest round trip."""
+    known = case(**CASES[name][0])
+    known.host += 3 * MS - FLOOR
+    clock, *_ = follow(known)
+    found = latency(clock.timeline(), known.bits, *pings(known, MS // 10))
+    assert found.rtt < 3 * MS
+    assert abs(found.ns - 3 * MS) < found.rtt / 2 + CASES[name][1]
+    told = f"found to {abs(found.ns - 3 * MS) / MS:.1f} ms, stated as known to {found.rtt / 2 / MS:.1f} ms"
+    if name == "jitter":
+        hard("fault 11: latency of 3 ms of every frame", "pings of up to 10 ms", beyond=told)
+
+
+def test_without_answers_that_fit_no_latency_is_taken_off():
+    known = case()
+    timeline = follow(known)[0].timeline()
+    sent, received, ticks = pings(known, MS)
+    nothing = np.zeros(0, np.int64)
+    assert latency(timeline, 32, nothing, nothing, nothing.astype("u8")) == NO_LATENCY
+    assert latency(timeline, 32, sent, received, ticks + np.uint64(100_000_000)) == NO_LATENCY  # of another clock
+    assert latency(timeline, 32, received, sent, ticks) == NO_LATENCY
 
 
 @pytest.mark.parametrize("tick", [0, -1e-6, np.nan, 1e4])

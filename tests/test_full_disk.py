@@ -61,7 +61,7 @@ def said(*arguments):
     return done.returncode, done.stderr.splitlines()
 
 
-def test_a_recording_ends_when_the_disk_is_full_and_is_all_there(small, tmp_path):
+def test_a_recording_ends_when_the_disk_is_full_and_is_all_there(small, tmp_path, hard):
     folder = small(300)
     times = [n * S // 1000 for n in range(20_000)]
     stream = rows(2, times, (np.full(64, n, "f4") for n in range(len(times))))
@@ -80,6 +80,18 @@ def test_a_recording_ends_when_the_disk_is_full_and_is_all_there(small, tmp_path
         assert len(seq) > 500
         assert (np.diff(seq) == 1).all()
         np.testing.assert_array_equal(stream.read()[:, 0], seq)
+    told = "one line, exit 2, every record written before is recovered"
+    hard("fault 4: disk full while recording", "a file system of 300 kB", beyond=told)
+
+
+def test_a_recording_does_not_begin_in_a_folder_that_is_read_only(small, hard):
+    folder = small(300)
+    subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True, timeout=20)
+    status, lines = said("record", "--pressure", "tcp://127.0.0.1:1?channels=4", "-o", folder / "s.h5", "--wait", 1)
+    assert (status, len(lines)) == (2, 1), lines
+    assert "cannot be written" in lines[0]
+    assert os.listdir(folder) == []
+    hard("fault 4: read-only folder", "a file system mounted so", beyond="one line, exit 2, before it begins")
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Recording: the journal and what is made of it, and the recorder under every fault that could be arranged."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import threading
 import time
 from dataclasses import replace
 from itertools import count
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -16,7 +18,7 @@ import pytest
 from calib.acquisition.device import Device
 from calib.acquisition.entries import END, EVENT, PLAN, RESTARTED, Code, pack_end, pack_event, pack_frame
 from calib.acquisition.finish import finish
-from calib.acquisition.journal import MAX_PAYLOAD, Journal, JournalError, Scan
+from calib.acquisition.journal import MAX_PAYLOAD, SYNC, Journal, JournalError, Scan
 from calib.acquisition.plan import KINDS, Plan, PlanError, StreamPlan, plan_from_json
 from calib.acquisition.recorder import Orders, record
 from calib.acquisition.setup import prepare
@@ -73,7 +75,7 @@ def test_records_come_back(tmp_path):
     assert found == [(PLAN, 0, 0, PLANNED.to_json()), *records, (END, 0, 0, pack_end(True, ""))]
 
 
-def test_a_cut_at_every_byte_leaves_an_exact_prefix(tmp_path):
+def test_a_cut_at_every_byte_leaves_an_exact_prefix(tmp_path, hard):
     path = journal(tmp_path / "j", both(6))
     whole, raw = list(Scan(path)), path.read_bytes()
     ends = []  # of each record
@@ -83,6 +85,8 @@ def test_a_cut_at_every_byte_leaves_an_exact_prefix(tmp_path):
         ends.append(at)
     assert at == len(raw)
     cut = tmp_path / "cut"
+    told = "exactly the records that are whole"
+    hard("fault 2: journal cut off", f"at each of {len(raw):,} bytes", beyond=told)
     for size in range(20, len(raw) + 1):
         cut.write_bytes(raw[:size])
         scan = Scan(cut)
@@ -145,8 +149,11 @@ def test_damage_never_invents_a_record(tmp_path):
 
 
 @pytest.mark.slow
-def test_damage_never_invents_a_record_in_twenty_thousand_tries(tmp_path):
-    assert no_invention(tmp_path, 20_000, 1) > 0.9
+def test_damage_never_invents_a_record_in_twenty_thousand_tries(tmp_path, hard):
+    kept = no_invention(tmp_path, 20_000, 1)
+    assert kept > 0.9
+    told = f"no record invented, {100 * kept:.0f} % of them kept, those lost counted"
+    hard("fault 2: journal damaged", "20,000 times: bytes, stretches, pages", beyond=told)
 
 
 def test_records_of_another_journal_are_not_taken_up(tmp_path):
@@ -185,20 +192,84 @@ def test_a_journal_is_not_overwritten_nor_read_while_it_grows(tmp_path):
         out.append(0, 0, 0, bytes(MAX_PAYLOAD + 1))
 
 
-def test_what_is_written_is_on_the_disk_within_a_fifth_of_a_second(tmp_path, monkeypatch):
-    """Measured by the calls to the system, not by a power cut."""
-    ends = []
-    name = "fdatasync" if hasattr(os, "fdatasync") else "fsync"
-    monkeypatch.setattr(os, name, lambda file: ends.append((time.monotonic(), os.fstat(file).st_size)))
+class History(NamedTuple):
+    """What a journal and its syncs did, and when: records, sizes with each appended, sizes synced (s, bytes)."""
+
+    raw: bytes
+    records: list
+    appended: np.ndarray
+    synced: np.ndarray
+
+
+@pytest.fixture
+def history(tmp_path, monkeypatch):
+    """A journal of a second and a half, of about a record a ms, and what of it was brought to the disk when."""
+    name, synced, appended = "fdatasync" if hasattr(os, "fdatasync") else "fsync", [], []
+    bring = getattr(os, name)
+
+    def note(file):
+        size = os.fstat(file).st_size
+        bring(file)
+        synced.append((time.monotonic(), size))
+
+    monkeypatch.setattr(os, name, note)
+    rng = np.random.default_rng(0)
     with Journal(tmp_path / "j") as out:
-        for _ in range(10):
-            out.append(0, 0, 0, bytes(500))
-            written, size = time.monotonic(), out.size
-            time.sleep(0.4)
-            assert any(at - written < 0.3 and end >= size for at, end in ends)
-        quiet = len(ends)
+        for number in range(1000):
+            out.append(0, 0, number, rng.bytes(int(rng.integers(20, 400))))
+            appended.append((time.monotonic(), out.size))
+            time.sleep(0.0015)
+        while not synced or synced[-1][1] < out.size:
+            time.sleep(0.01)
+        quiet = len(synced)
         time.sleep(0.3)
-        assert len(ends) == quiet  # nothing to bring
+        assert len(synced) == quiet  # nothing to bring
+    raw = (tmp_path / "j").read_bytes()
+    return History(raw, list(Scan(tmp_path / "j")), np.array(appended), np.array(synced))
+
+
+def without_power(history, now, rng):
+    """What a disk holds that loses power at a time: what was synced, and of later pages any, whole, empty or old."""
+    synced = int(max(history.synced[history.synced[:, 0] <= now, 1], default=20))
+    written = int(history.appended[np.searchsorted(history.appended[:, 0], now) - 1, 1])
+    left = bytearray(history.raw[: int(rng.integers(synced, written + 1))])
+    for page in range(synced // 4096 * 4096, len(left), 4096):
+        part = slice(max(page, synced), min(page + 4096, len(left)))
+        size, kind = part.stop - part.start, rng.integers(3)
+        if kind:  # else it was brought in time
+            old = int(rng.integers(0, len(history.raw) - 4096))
+            left[part] = bytes(size) if kind == 1 else history.raw[old : old + size]
+    return bytes(left), synced
+
+
+def power_cuts(history, path, count):
+    """Cut the power over and over: what was synced is there and nothing is invented; the oldest record lost, s."""
+    rng, oldest = np.random.default_rng(1), 0.0
+    for _ in range(count):
+        now = rng.uniform(history.appended[1, 0], history.appended[-1, 0])
+        left, synced = without_power(history, now, rng)
+        path.write_bytes(left)
+        found = list(Scan(path))
+        assert {*history.records}.issuperset(found)
+        assert [r.number for r in found] == sorted({r.number for r in found})
+        must, there = int((history.appended[:, 1] <= synced).sum()), int((history.appended[:, 0] <= now).sum())
+        assert found[:must] == history.records[:must]
+        missing = sorted({*range(must, there)} - {r.number for r in found})
+        oldest = max(oldest, now - history.appended[missing[0], 0]) if missing else oldest
+    return oldest
+
+
+def test_a_power_cut_costs_what_was_not_synced(history, tmp_path):
+    assert SYNC <= 0.1
+    assert len(history.synced) >= 5
+    assert power_cuts(history, tmp_path / "cut", 50) > 0
+
+
+@pytest.mark.slow
+def test_a_thousand_power_cuts_cost_what_was_not_synced(history, tmp_path, hard):
+    oldest = power_cuts(history, tmp_path / "cut", 1000)
+    told = f"no record invented, none lost that was synced; the last {1e3 * oldest:.0f} ms lost at most"
+    hard("fault 2: power cut while recording", "1,000 cuts, any page not synced kept, empty or old", beyond=told)
 
 
 FULL = """
@@ -419,12 +490,25 @@ def expected(name, seq):
 
 RECORDER = """
 import sys
+import numpy as np
 from calib.acquisition.plan import Plan
-from calib.acquisition.recorder import Orders, record
-from calib.acquisition.sources import source
+from calib.acquisition.recorder import Intake, Orders, record
+from calib.acquisition.sources import Source, source
 from calib.cli import _signals
 import resource, signal
-eit, pressure, output, seconds, limit = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
+eit, pressure, output, seconds, limit, counts = sys.argv[1:]
+if counts:  # what is counted in a mapped file outlives the process
+    decoded, taken = np.memmap(counts, "i8", "r+", shape=(2, 7))
+    decode, take = Source.decode, Intake._take
+    def counted_decode(self, *data):
+        state, frames = decode(self, *data)
+        decoded[self.plan.number] += len(frames)
+        return state, frames
+    def counted_take(self, frame, host):
+        taken[frame.stream] += 1
+        take(self, frame, host)
+    Source.decode, Intake._take = counted_decode, counted_take
 if int(limit):
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
@@ -455,9 +539,9 @@ def device():
         yield found
 
 
-def recorder(device, output, seconds=0.0, limit=0):
-    """The recorder at work in a process of its own."""
-    command = [sys.executable, "-c", RECORDER, *device.urls, str(output), str(seconds), str(limit)]
+def recorder(device, output, seconds=0.0, limit=0, counts=""):
+    """The recorder at work in a process of its own; in the file ``counts`` it counts frames decoded and taken."""
+    command = [sys.executable, "-c", RECORDER, *device.urls, str(output), str(seconds), str(limit), str(counts)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout.readline() in ("recording\n", ""), process.communicate(timeout=20)
     return process
@@ -473,10 +557,21 @@ def sound(session):
     return {name: len(stream) for name, stream in session.streams.items()}
 
 
+class Killed(NamedTuple):
+    """A recorder killed: frames left; frames it had begun to work on, or decoded, that are lost; ms before the kill
+    that the last frame left had come."""
+
+    frames: int
+    taken: int
+    decoded: int
+    age: float
+
+
 def killed(device, folder, number, seconds):
-    """Kill a recorder after some time; how many frames were left, and how many it had received at least."""
-    output = folder / f"{number}.h5"
-    process = recorder(device, output)
+    """Kill a recorder after some time."""
+    output, counts = folder / f"{number}.h5", folder / f"{number}.counts"
+    np.zeros((2, 7), "i8").tofile(counts)
+    process = recorder(device, output, counts=counts)
     time.sleep(seconds)
     process.kill()
     process.communicate(timeout=20)
@@ -487,25 +582,36 @@ def killed(device, folder, number, seconds):
         frames = sound(session)
         last = max(int(stream.time_host[-1]) for stream in session.streams.values())
     assert summary.bytes_damaged < 8192
-    return frames, (begin - last) / 1e6
+    left = np.zeros(7, int)
+    for name, kept in frames.items():
+        left[KINDS[name].number] = kept
+    lost = np.fromfile(counts, "i8").reshape(2, 7) - left
+    assert (lost >= 0).all()
+    return Killed(frames["eit"], int(lost[1].max()), int(lost[0].max()), (begin - last) / 1e6)
 
 
 def test_a_killed_recorder_leaves_a_session(device, tmp_path):
     rng = np.random.default_rng(0)
     for number in range(3):
-        frames, age = killed(device, tmp_path, number, rng.uniform(0, 0.5))
-        assert frames["eit"] > 0
-        assert age < 2000  # what was there to the last
+        found = killed(device, tmp_path, number, rng.uniform(0, 0.5))
+        assert found.frames > 0
+        assert found.taken <= 1
+        assert found.age < 2000  # what was there to the last
 
 
 @pytest.mark.slow
-def test_a_hundred_killed_recorders_leave_sessions(device, tmp_path):
-    rng = np.random.default_rng(1)
-    for number in range(100):
-        frames, _ = killed(device, tmp_path, number, rng.uniform(0, 0.3))
-        assert frames["eit"] > 0
+def test_two_hundred_killed_recorders_leave_sessions(device, tmp_path, hard):
+    rng, found = np.random.default_rng(1), []
+    for number in range(200):
+        found.append(killed(device, tmp_path, number, rng.uniform(0, 0.3)))
+        assert found[-1].frames > 0
+        assert found[-1].taken <= 1
         for path in tmp_path.iterdir():
             path.unlink()
+    taken, decoded = max(kill.taken for kill in found), max(kill.decoded for kill in found)
+    told = f"all opened, marked not complete; lost of a stream at most {taken} frame in work, {decoded} read with it; "
+    told += f"the last one left had come {np.median([kill.age for kill in found]):.0f} ms before the kill (median)"
+    hard("fault 1: kill -9 of the recorder", "200 kills at random moments", beyond=told)
 
 
 def test_what_was_received_is_on_the_disk_when_the_recorder_is_killed(device, tmp_path):
@@ -521,32 +627,46 @@ def test_what_was_received_is_on_the_disk_when_the_recorder_is_killed(device, tm
     assert [r.host for r in Scan(path)] == list(range(500))
 
 
-def test_a_kill_while_the_session_is_made_costs_nothing(tmp_path):
-    """The session is whole or not there, and is made the next time."""
+def kills_while_finishing(folder, count):
+    """Kill who makes a session over an older one: how often the new one was there; it is whole, or the old one is."""
     records = [sample(*where) for n in range(3000) for where in ((0, n), (1, 2 * n), (1, 2 * n + 1))]
-    part = journal(tmp_path / "s.h5.part", records)
+    part, output = journal(folder / "s.h5.part", records), folder / "s.h5"
     code = "import sys; from calib.acquisition.finish import finish\nprint(1, flush=True); finish(*sys.argv[1:])"
-    rng, early = np.random.default_rng(0), 0
-    for number in range(3):
-        output = tmp_path / f"{number}.h5"
+    rng, new = np.random.default_rng(0), 0
+    for _ in range(count):
+        output.write_bytes(b"the old one")
         command = [sys.executable, "-c", code, str(part), str(output)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE)
         process.stdout.readline()
-        time.sleep(rng.uniform(0, 0.3))
+        time.sleep(rng.uniform(0, 0.4))
         process.kill()
         process.communicate(timeout=20)
-        early += not output.exists()
-        if not output.exists():
-            finish(part, output)
+        if output.read_bytes() == b"the old one":
+            continue
+        new += 1
         with open_session(output) as session:
             assert (len(session.stream("eit")), len(session.stream("pressure"))) == (3000, 6000)
-    assert early
+    finish(part, output)
+    with open_session(output) as session:
+        np.testing.assert_array_equal(session.stream("eit").read()[:, 0], np.arange(3000) % 1000)
+    return new
+
+
+def test_a_kill_while_the_session_is_made_costs_nothing(tmp_path):
+    assert kills_while_finishing(tmp_path, 3) < 3
+
+
+@pytest.mark.slow
+def test_a_hundred_kills_while_the_session_is_made_cost_nothing(tmp_path, hard):
+    new = kills_while_finishing(tmp_path, 100)
+    told = f"the old file {100 - new} times, the whole new one {new} times; made anew from the journal"
+    hard("fault 3: kill -9 while the session is made", "100 kills at random moments", beyond=told)
 
 
 @pytest.mark.parametrize(
     ("name", "planned", "status"), [("SIGINT", False, 0), ("SIGINT", True, 130), ("SIGTERM", False, 143)]
 )
-def test_a_signal_ends_a_recording_in_order(device, tmp_path, name, planned, status):
+def test_a_signal_ends_a_recording_in_order(device, tmp_path, name, planned, status, hard):
     output = tmp_path / "s.h5"
     process = recorder(device, output, 60.0 if planned else 0.0)
     process.send_signal(getattr(signal, name))
@@ -558,6 +678,8 @@ def test_a_signal_ends_a_recording_in_order(device, tmp_path, name, planned, sta
         assert session.complete == (status == 0)
         assert not session.recovered
         assert sound(session)["eit"] > 0
+    told = "a session; where more was planned not complete and exit not 0; a second signal: recovered"
+    hard("fault 4: signals while recording", "SIGINT, SIGTERM, SIGINT twice", beyond=told)
 
 
 def test_two_signals_end_it_at_once_and_it_can_be_recovered(device, tmp_path):
@@ -588,6 +710,34 @@ def test_a_disk_that_fills_up_costs_nothing_recorded(device, tmp_path):
         assert sound(session)["eit"] > 50
 
 
+@pytest.mark.parametrize("call", ["write", "fdatasync"])
+def test_a_disk_that_fails_ends_a_recording_in_order(device, tmp_path, monkeypatch, capsys, call, hard):
+    """An input/output error after some records; the journal is whole, and what is written of it stays."""
+    if not hasattr(os, call):
+        pytest.skip(f"there is no {call} here")
+    real, calls = getattr(os, call), count()
+
+    def failing(file, *data):
+        ours = part.exists() and os.path.samestat(os.fstat(file), part.stat())
+        if ours and next(calls) >= (200 if call == "write" else 3):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return real(file, *data)
+
+    part, output = tmp_path / "s.h5.part", tmp_path / "s.h5"
+    monkeypatch.setattr(os, call, failing)
+    url = f"--pressure={device.urls[1]}?channels=4"
+    assert main(["record", url, "-o", str(output), "--seconds", "30"]) == 2
+    err = capsys.readouterr().err
+    assert "cannot be written (Input/output error)" in err
+    assert str(output) in err
+    assert len(err.splitlines()) == 1
+    with open_session(output) as session:
+        assert session.complete is False
+        assert sound(session)["pressure"] > 100
+    told = "one line, exit 2, every record written before is in the session"
+    hard("fault 4: input/output error while recording", "of writing, of syncing", beyond=told)
+
+
 def test_a_recording_of_some_seconds_by_the_command_line(device, tmp_path, capsys):
     output = tmp_path / "s.h5"
     urls = [f"--pressure={device.urls[1]}?channels=4", f"--barometer={device.urls[1]}?channels=4&id=2"]
@@ -599,6 +749,25 @@ def test_a_recording_of_some_seconds_by_the_command_line(device, tmp_path, capsy
         assert (session.complete, session.recovered) == (True, False)
     assert main(["record", *urls, "-o", str(output), "--seconds", "1"]) == 2
     assert "not overwritten" in capsys.readouterr().err
+
+
+def test_a_device_that_answers_pings_is_laid_on_the_clock_of_the_host(tmp_path):
+    """In a process of this machine the truth is known: when frames were due."""
+    with Device([endless("pressure", 500)]) as device:
+        url = f"{device.urls[0]}?ping=0.05"
+        plan, sources = prepare({"pressure": url + "&channels=4"}, None)
+        summary = record(plan, sources, tmp_path / "s.h5", seconds=2.0)
+        begin = device.begin
+    (told,) = summary.streams
+    assert "less a latency of" in summary.render()
+    with open_session(tmp_path / "s.h5") as session:
+        clock, stream = session.clocks["pressure"], session.stream("pressure")
+        assert (clock.latency_ns, clock.rtt_ns) == (told.latency.ns, told.latency.rtt)
+        assert 0 < clock.rtt_ns < S
+        true = begin - plan.host_epoch + stream.time_device.astype(np.int64) * 1000
+        shift = stream.time - true
+        assert np.abs(np.median(shift)) < clock.rtt_ns / 2 + 2_000_000
+        assert sound(session)["pressure"] > 0
 
 
 def test_errors_of_the_command_line(device, tmp_path, capsys):
@@ -678,8 +847,11 @@ def resident(process):
 
 
 @pytest.mark.slow
-def test_ten_times_the_rate_for_a_minute_without_loss(tmp_path):
-    """Ten minutes of 100 frames of 928 readings and 1,000 pressures a second, in one; memory does not grow."""
+def test_ten_times_the_rate_for_a_minute_is_accounted_for(tmp_path):
+    """Ten minutes of 100 frames of 928 readings and 1,000 pressures a second, in one; memory does not grow.
+
+    What a busy machine cannot take is counted and flagged; bench_live says what is lost on a quiet one.
+    """
     names = {"eit": 1000, "pressure": 10_000}
     with Device([endless(name, rate) for name, rate in names.items()]) as device:
         process = recorder(device, tmp_path / "s.h5", 60.0)
@@ -691,7 +863,12 @@ def test_ten_times_the_rate_for_a_minute_without_loss(tmp_path):
     assert (process.returncode, err) == (0, "")
     assert used[-1] - used[1] < 3, used
     with open_session(tmp_path / "s.h5") as session:
-        for name, rate in names.items():
-            seq = session.stream(name).seq.astype(np.int64)
-            assert len(seq) > 30 * rate  # a busy machine may not even send as many as it should
-            assert (np.diff(seq) == 1).all(), out
+        assert session.complete
+        for name in names:
+            stream = session.stream(name)
+            ahead = np.diff(stream.seq.astype(np.int64))
+            assert (ahead > 0).all()
+            flagged = (stream.status()[1:] & Status.gap_before) != 0
+            np.testing.assert_array_equal(flagged, ahead > 1)
+            assert f"{name}: {len(stream):,} frames, {(ahead - 1).sum():,} lost" in out
+            np.testing.assert_array_equal(stream.read(0, 1000), expected(name, stream.seq[:1000]))

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+import tracemalloc
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,6 +20,7 @@ from calib.acquisition.wire import (
     Layout,
     Order,
     Place,
+    Pong,
     State,
     WireError,
     asked,
@@ -29,6 +31,8 @@ from calib.acquisition.wire import (
     decode_lines,
     encode,
     encode_note,
+    encode_ping,
+    encode_pong,
     encode_read,
     follow,
     part_of_scan,
@@ -199,7 +203,7 @@ def test_a_part_of_a_scan_comes_back_in_its_place(channels, dtype, bits, data):
     asked_for = np.array(data.draw(st.lists(st.booleans(), min_size=channels, max_size=channels)))
     values = np.arange(1, channels + 1).astype(dtype)
     packet = encode(1, 7, 9, values, bits)
-    rest, found = asked(b"", b"junk\0" + encode_read(1, asked_for) + b"begun")
+    rest, found, _ = asked(b"", b"junk\0" + encode_read(1, asked_for) + b"begun")
     assert rest == b"begun"
     part = part_of_scan(packet, found[1])
     (frame,) = decode({1: Layout(1, channels)}, State(), part)[1]
@@ -209,6 +213,17 @@ def test_a_part_of_a_scan_comes_back_in_its_place(channels, dtype, bits, data):
     if asked_for.sum() * values.itemsize + channels // 8 + 2 < values.nbytes:
         assert len(part) < len(packet)
     assert decode({1: Layout(1, channels + 8)}, State(joining=False), part)[0].counts.length == 1
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**64 - 1), st.integers(0, 255))
+def test_a_ping_is_answered_with_what_it_held(sent, ticks, stream):
+    _, _, ((number, echo),) = asked(b"", b"junk\0" + encode_ping(stream, sent))
+    assert (number, echo) == (stream, sent)
+    start = State(joining=False)
+    state, frames = decode({stream: Layout(stream, 1)}, start, encode_pong(number, echo, ticks))
+    assert (state.pong, frames, state.counts.dropped) == (Pong(sent, ticks), [], {})
+    other, _ = decode({(stream + 1) % 256: Layout((stream + 1) % 256, 1)}, start, encode_pong(number, echo, ticks))
+    assert (other.pong, other.counts.other) == (None, 1)
 
 
 def test_what_is_no_frame_is_not_cut():
@@ -232,10 +247,30 @@ def test_a_note_is_no_sample_and_is_kept():
 
 
 @pytest.mark.slow
-def test_a_hundred_million_random_bytes_make_no_frame():
+def test_a_hundred_million_random_bytes_make_no_frame(hard):
     counts, found = random_bytes(LAYOUTS, 100)
     assert not found
-    assert sum(counts.dropped.values()) > 250_000
+    pieces, chance = sum(counts.dropped.values()), sum(counts.dropped.values()) - counts.framing - counts.checksum
+    assert pieces > 250_000
+    told = f"no frame; of {pieces:,} pieces {chance} fit the CRC by chance, refused by version, stream or length"
+    hard("fault 8: random bytes", "1e8", beyond=told)
+
+
+@pytest.mark.slow
+def test_a_claim_of_four_gigabytes_takes_no_memory(hard):
+    """As many bytes, all of one piece that never ends."""
+    state, _ = decode(LINES, State(), encode(1, 2, 3, np.zeros(2, "f4")))
+    piece = b"\xff" * (1 << 20)
+    tracemalloc.start()
+    for _ in range(4096):
+        state, _ = decode(LINES, state, piece)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
+    _, (frame,) = decode(LINES, state, b"\0" + encode(1, 3, 4, np.zeros(2, "f4")))
+    assert frame.resync
+    told = f"dropped and counted, the next frame is read; {peak / 1e6:.1f} MB of memory"
+    hard("fault 9: a frame of 4 GiB", "all of it sent", beyond=told)
 
 
 def corrupted(count, rate, seed):
@@ -264,12 +299,14 @@ def test_frames_with_wrong_bytes_are_not_accepted():
 
 
 @pytest.mark.slow
-def test_a_million_frames_with_wrong_bytes():
+def test_a_million_frames_with_wrong_bytes(hard):
     """Those that are accepted and wrong stay below the odds of the CRC, one in 65,536 of the damaged."""
     good, wrong, counts = corrupted(1_000_000, 0.002, 1)
     assert wrong <= 5
     assert 850_000 < good < 1_000_000
     assert sum(counts.dropped.values()) > 25_000
+    told = f"{wrong} wrong ones accepted, {good:,} kept, the others counted as damaged"
+    hard("fault 8: wrong bytes", "0.2 % of those of 1e6 frames", beyond=told)
 
 
 @pytest.mark.parametrize("changes", [{"stream": 256}, {"channels": 0}, {"channels": 10**9}, {"scale": 0}, {"limit": 0}])

@@ -2,9 +2,10 @@
 
 A frame arrives late, never early: by its latency and by whatever batched it on the way. So the line of
 device against host time lies *under* the points, and the lower convex hull finds it, however large the
-jitter (Zhang, Liu and Xia, INFOCOM 2002). What remains is the smallest latency, a constant. Lines of
-one minute, joined at their middles, follow a clock whose rate drifts. Counters are unwrapped beside the
-host's clock, and a device that sets its clock or restarts begins a new segment.
+jitter (Zhang, Liu and Xia, INFOCOM 2002). What remains is the smallest latency, a constant: a device that
+answers pings tells it, to half of the shortest round trip (`latency`). Lines of one minute, joined at
+their middles, follow a clock whose rate drifts. Counters are unwrapped beside the host's clock, and a
+device that sets its clock or restarts begins a new segment.
 
 Host times are ns of a clock that is never set (`time.monotonic_ns`).
 """
@@ -26,6 +27,7 @@ _LEAP = 60 * _SECOND  # ahead of the host from one frame to the next: no device 
 _UNSURE = 0.01  # of the time elapsed, while the rate is not known
 _REJOIN = _SECOND  # what a buffer may hold back across a new connection
 _CENTURY = 3.2e18
+_LATEST = _SECOND  # an answer that says more was given by another clock
 
 
 def lower_hull(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -292,6 +294,46 @@ class Timeline:
     residual_p95: float
     valid: bool
     tick_s: float
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The smallest latency of frames, ns, known to half of the shortest round trip, ``rtt``."""
+
+    ns: float
+    rtt: float
+
+
+NO_LATENCY = Latency(0.0, 0.0)  # none was measured
+
+
+def latency(timeline: Timeline, bits: int, sent: np.ndarray, received: np.ndarray, ticks: np.ndarray) -> Latency:
+    """What is left between a timeline and the host's clock, by pings and their answers.
+
+    Args:
+        bits: of the device's counter.
+        sent, received: host times of pings and answers (n,) int64 ns; ``ticks`` (n,) u8: the counter in between.
+
+    The answer with the shortest round trip was given at its middle, to half of it. No answers, or none that
+    fits the timeline: `NO_LATENCY`.
+    """
+    best = NO_LATENCY
+    middle = sent + (received - sent) // 2
+    for stretch in timeline.stretches:
+        late = stretch.host_ns(_unwrapped(stretch, bits, middle, ticks)) - middle
+        for ns, rtt in zip(late, received - sent, strict=True):
+            if rtt > 0 and -rtt <= ns < _LATEST and (not best.rtt or rtt < best.rtt):
+                best = Latency(float(max(ns, 0)), float(rtt))
+    return best
+
+
+def _unwrapped(stretch: Stretch, bits: int, host: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Counters near `host` times, with the whole turns of a stretch; of 64 bits as they are."""
+    if bits == 64:
+        return (ticks % np.uint64(2**62)).astype(np.int64)
+    raw = (ticks % np.uint64(1 << bits)).astype(np.int64)
+    near = int(stretch.ticks[0]) + (host - int(stretch.host[0])) / stretch.tick_ns
+    return raw + (1 << bits) * np.rint((near - raw) / (1 << bits)).astype(np.int64)
 
 
 def _timeline(segments: list[_Segment], tick_ns: float, samples: int) -> Timeline:

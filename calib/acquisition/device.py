@@ -16,7 +16,7 @@ import numpy as np
 
 from .broadcast import Broadcaster, Listener, give
 from .sources import packets
-from .wire import asked, encode, part_of_scan
+from .wire import asked, encode, encode_pong, part_of_scan
 
 try:
     import tty
@@ -47,12 +47,14 @@ class _Wanted:
         self._readings: np.ndarray | None = None
         self._until = 0.0
 
-    def hear(self, listeners: Sequence[Listener]) -> None:
-        """Take in what they ask."""
+    def hear(self, listeners: Sequence[Listener], ticks: Callable[[], int]) -> None:
+        """Take in what they ask, and answer their pings with the `ticks` of the moment."""
         for listener in listeners:
-            listener.tail, found = asked(listener.tail, listener.heard())
+            listener.tail, found, pings = asked(listener.tail, listener.heard())
             for readings in found.values():
                 self._readings, self._until = readings, time.monotonic() + _OBEYED
+            if pings:
+                give([listener], [encode_pong(number, sent, ticks()) for number, sent in pings])
 
     def of(self, packet: bytes) -> bytes:
         """A frame as it is wanted."""
@@ -66,9 +68,10 @@ class Device:
 
     ``streams`` are iterators of (due time in ns, bytes), each with a TCP port of its own (0 lets the system
     choose) on `host` or, where ``ports`` holds None, a pseudo-terminal. ``speed`` may be above 1. After
-    entering, ``urls`` says where each is to be found. ``unplug`` disconnects everyone for a while; ``done`` is
-    set when everything was sent. A listener may ask for some readings of the frames (`encode_read`), which the
-    device then sends to all, until it has heard nothing for a second.
+    entering, ``urls`` says where each is to be found, and ``begin`` when it began (ns of `time.monotonic_ns`).
+    ``unplug`` disconnects everyone for a while; ``done`` is set when everything was sent. A listener may ask for some
+    readings of the frames (`encode_read`), which the device then sends to all, until it has heard nothing for a second;
+    pings are answered by the clock of recordings and of `rows` with a tick of 1 us.
     """
 
     def __init__(
@@ -88,6 +91,7 @@ class Device:
         self._threads: list[threading.Thread] = []
         self._stack = contextlib.ExitStack()
         self.urls: list[str] = []
+        self.begin = 0
         self.sent = [0] * len(streams)
         self._left = len(streams)
         self._lock = threading.Lock()
@@ -99,7 +103,7 @@ class Device:
                 name = f"device {number}"
                 self._threads.append(threading.Thread(target=run, args=(number, stream), name=name, daemon=True))
             self._stack = stack.pop_all()
-        self._begin = time.monotonic_ns()
+        self.begin = time.monotonic_ns()
         for thread in self._threads:
             thread.start()
         return self
@@ -147,11 +151,11 @@ class Device:
     def _stream(self, number: int, stream: Packets, listeners: list[Listener], meet: Callable[[], None]) -> None:
         while len(listeners) < self._wait_for and not self._stop.wait(0.005):
             meet()
-        begin = time.monotonic_ns() if self._wait_for else self._begin
+        begin = time.monotonic_ns() if self._wait_for else self.begin
         ahead, wanted = next(stream, None), _Wanted()
         while ahead is not None and not self._stop.is_set():
             meet()
-            wanted.hear(listeners)
+            wanted.hear(listeners, lambda: round((time.monotonic_ns() - begin) * self._speed / 1000))
             due: list[bytes] = []
             now = (time.monotonic_ns() - begin) * self._speed
             while ahead is not None and ahead[0] <= now and len(due) < 1000:

@@ -66,13 +66,15 @@ def _mean(rows: Sequence[np.ndarray]) -> np.ndarray:
 
 
 class Mapped(NamedTuple):
-    """Of one frame, on the host: force map (pixels,) N; of each pad force, standard error, validity, if loaded."""
+    """Of one frame, on the host: force map (pixels,) N; of each pad force, standard error, validity, if loaded; and
+    the image (pixels,) S that the map comes from."""
 
     map: np.ndarray
     force: np.ndarray
     standard_error: np.ndarray
     valid: np.ndarray
     loaded: np.ndarray
+    image: np.ndarray
 
 
 class Programs:
@@ -109,10 +111,9 @@ class Programs:
     def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> Mapped:
         """Forces of a difference frame (readings,) V and pressures (pads,) Pa, after those ``before`` (m, pads)."""
         frame, pressure = self._row(frame, 0), self._row(pressure, 1)
-        lost = ~np.isfinite(frame)
-        image = self._image_without(lost)
-        row = self._map(image(frame), pressure, places, filled(self._law, before))
-        return _unpacked(np.asarray(row), pressure.size)
+        image = self._image_without(~np.isfinite(frame))(frame)
+        row = self._map(image, pressure, places, filled(self._law, before))
+        return _unpacked(np.asarray(row), pressure.size, image[0])
 
     def _image_without(self, lost: np.ndarray) -> Callable:
         key = lost.tobytes()
@@ -153,9 +154,9 @@ def _mapped(law: ForceLaw, image, pressure, places, before):
     return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])
 
 
-def _unpacked(row: np.ndarray, pads: int) -> Mapped:
+def _unpacked(row: np.ndarray, pads: int, image: np.ndarray) -> Mapped:
     force, error, valid, loaded = row[-4 * pads :].reshape(4, pads)
-    return Mapped(row[: -4 * pads], force, error, valid > 0, loaded > 0)
+    return Mapped(row[: -4 * pads], force, error, valid > 0, loaded > 0, image)
 
 
 def _searched(law: ForceLaw, frame):
@@ -246,6 +247,7 @@ class Engine:
             valid=found.valid & ~silent,
             centre=self._centre(found.map, force > _TOUCHED * error),
             map=found.map,
+            image=found.image,
             missing=int((lost & self._used).sum()),
             dropped=dropped,
             touches=self._touches,

@@ -1,4 +1,4 @@
-"""What the records of a recording's journal hold: frames, events, the plan, the end."""
+"""What the records of a recording's journal hold: frames, events, answers to pings, the plan, the end."""
 
 import enum
 import json
@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .wire import Frame
+from .wire import Frame, Pong
 
-PLAN, EVENT, END = 0xFFFF, 0xFFFE, 0xFFFD  # stream numbers of what is not a frame
+PLAN, EVENT, END, PONG = 0xFFFF, 0xFFFE, 0xFFFD, 0xFFFC  # stream numbers of what is not a frame
 RESTARTED = 1 << 15  # beside the `Status` flags: the device's numbers began anew before this frame
 _HEAD = struct.Struct("<BxxxIQ")
 _TYPES = tuple(np.dtype(t) for t in ("<f4", "<i2", "<f8"))
+_PONG = struct.Struct("<HqQ")
 _SEQ, _TICKS, _LONG = 16, 32, 64
 
 
@@ -81,6 +82,17 @@ def unpack_event(payload: bytes) -> tuple[Code, str]:
     """What `pack_event` was given."""
     code, label = json.loads(payload)
     return Code(code), str(label)
+
+
+def pack_pong(stream: int, pong: Pong) -> bytes:
+    """A device's answer to a ping as a payload."""
+    return _PONG.pack(stream, *pong)
+
+
+def unpack_pong(payload: bytes) -> tuple[int, Pong]:
+    """What `pack_pong` was given."""
+    stream, *pong = _PONG.unpack(payload)
+    return stream, Pong(*pong)
 
 
 def pack_end(complete: bool, why: str) -> bytes:

@@ -14,13 +14,26 @@ import numpy as np
 
 from calib.session import ClockTable, SessionWriter, Status
 
-from .clock import METHOD, DeviceClock, Timeline
-from .entries import END, EVENT, PLAN, RESTARTED, Code, Frames, alike, unpack_end, unpack_event, unpack_frames
+from .clock import METHOD, NO_LATENCY, DeviceClock, Latency, Timeline, latency
+from .entries import (
+    END,
+    EVENT,
+    PLAN,
+    PONG,
+    RESTARTED,
+    Code,
+    Frames,
+    alike,
+    unpack_end,
+    unpack_event,
+    unpack_frames,
+    unpack_pong,
+)
 from .journal import JournalError, Record, Scan
 from .plan import Plan, StreamPlan, plan_from_json
 
 _ROWS = 512
-_MAX_EVENTS = 100_000
+_MAX_EVENTS = 100_000  # and answers to pings of each stream
 _HOST = "time of arrival"
 _SIMULATED = "the device says that its values are simulated"
 
@@ -37,12 +50,15 @@ class StreamSummary:
     residual_ms: float
     clock: str  # how its times were made
     note: str = ""
+    latency: Latency = NO_LATENCY
 
     def render(self) -> str:
         """One line."""
         text = f"{self.name}: {self.frames:,} frames, {self.lost:,} lost"
         if self.clock != _HOST:
             text += f"; clock {self.drift_ppm:+.1f} ppm, aligned to {self.residual_ms:.3f} ms"
+        if self.latency.rtt:
+            text += f", less a latency of {self.latency.ns / 1e6:.3f} ± {self.latency.rtt / 2e6:.3f} ms"
         text += f", {self.steps} clock step{'s' * (self.steps != 1)}" if self.steps else ""
         return text + (f"; {self.note}" if self.note else "")
 
@@ -91,7 +107,7 @@ class _Batch:
 
     def __init__(self, block: _Block, follower: "_Follower"):
         frames = unpack_frames(block.payloads)
-        self.values, self.seq = frames.values, frames.seq
+        self.values, self.seq, self.bits = frames.values, frames.seq, frames.bits
         self.host, self.flags = np.array(block.host, np.int64), np.array(block.flags)
         self.missing = follower.missing(frames.seq, self.flags)
         self.ticks, self.steps = follower.ticks(frames, self.host, self.flags)
@@ -138,6 +154,14 @@ class _Survey:
     ticking: bool = True
     first: int = 0
     last: int = 0
+    bits: int = 32
+    pongs: list[tuple[int, int, int]] = field(default_factory=list)  # sent, received, ticks
+
+    def hear(self, record: Record) -> None:
+        """One answer to a ping."""
+        _, pong = unpack_pong(record.payload)
+        if len(self.pongs) < _MAX_EVENTS:
+            self.pongs.append((pong.sent, record.host, pong.ticks))
 
     def add(self, record: Record) -> None:
         """One frame."""
@@ -157,6 +181,7 @@ class _Survey:
         self.lost += int(batch.missing.sum())
         self.types.add(batch.values.dtype.str[1:])
         self.numbered &= batch.seq is not None
+        self.bits = batch.bits
         self.ticking &= batch.ticks is not None
 
     @property
@@ -176,11 +201,19 @@ class _Survey:
         found = self.follower.clock.timeline()
         return found if found.valid else None
 
+    def latency(self, found: Timeline | None) -> Latency:
+        """By what the device answered."""
+        if found is None or not self.pongs:
+            return NO_LATENCY
+        sent, received, ticks = zip(*self.pongs, strict=True)
+        return latency(found, self.bits, np.array(sent), np.array(received), np.array(ticks, np.uint64))
+
     def summary(self, found: Timeline | None) -> StreamSummary:
         """In figures."""
         if found is not None:
             steps, drift, rest = self.follower.clock.steps, 1e6 * found.skew, found.residual_p95 / 1e6
-            return StreamSummary(self.plan.name, self.frames, self.lost, steps, drift, rest, METHOD)
+            late = self.latency(found)
+            return StreamSummary(self.plan.name, self.frames, self.lost, steps, drift, rest, METHOD, latency=late)
         note = ""
         if self.ticking and self.frames:
             ratio = self.follower.clock.timeline().tick_s
@@ -248,6 +281,8 @@ def _survey(scan: Scan, plan: Plan, progress: Progress) -> tuple[dict[int, _Surv
         progress(len(record.payload))
         if record.stream in surveys:
             surveys[record.stream].add(record)
+        elif record.stream == PONG:
+            surveys[unpack_pong(record.payload)[0]].hear(record)
         elif record.stream == EVENT:
             plan = _as_said(plan, *unpack_event(record.payload))
         elif record.stream == END:
@@ -271,6 +306,7 @@ class _StreamWriter:
 
     def __init__(self, writer: SessionWriter, survey: _Survey, found: Timeline | None, host_epoch: int):
         self._writer, self._survey, self._found, self._epoch = writer, survey, found, host_epoch
+        self._late = round(survey.latency(found).ns)
         self.name = survey.plan.name
         self._follower, self._block = _Follower(survey.plan), _Block()
         self._stretch, self._last = 0, -(2**62)
@@ -330,7 +366,7 @@ class _StreamWriter:
         out = np.zeros(len(ticks), np.int64)
         for stretch in np.unique(number):
             out[number == stretch] = self._found.stretches[stretch].host_ns(ticks[number == stretch])
-        return out
+        return out - self._late
 
     def _increasing(self, times: np.ndarray) -> np.ndarray:
         """At least 1 ns apart: frames may arrive together, and clocks may be set back."""
@@ -369,7 +405,7 @@ def _write(scan, plan, surveys, timelines, output, complete, recovered, progress
         events = _write_records(writer, scan, plan, streams, progress)
         for number, stream in streams.items():
             stream.flush()
-            _write_clock(writer, plan, surveys[number].plan, timelines[number])
+            _write_clock(writer, plan, surveys[number], timelines[number])
         events += [(time, Code.CLOCK_STEP, stream.name) for stream in streams.values() for time in stream.steps]
         if events:
             times, codes, labels = zip(*sorted(events), strict=True)
@@ -399,10 +435,11 @@ def _write_records(
     return events
 
 
-def _write_clock(writer: SessionWriter, plan: Plan, stream: StreamPlan, found: Timeline | None) -> None:
+def _write_clock(writer: SessionWriter, plan: Plan, survey: _Survey, found: Timeline | None) -> None:
     if found is None:
         return
-    host = np.concatenate([s.host for s in found.stretches]) - plan.host_epoch
+    stream, late = survey.plan, survey.latency(found)
+    host = np.concatenate([s.host for s in found.stretches]) - plan.host_epoch - round(late.ns)
     ticks = np.concatenate([s.ticks for s in found.stretches])
     table = ClockTable(
         host_ns=host,
@@ -413,5 +450,7 @@ def _write_clock(writer: SessionWriter, plan: Plan, stream: StreamPlan, found: T
         residual_p95_ns=found.residual_p95,
         valid=True,
         method=METHOD,
+        latency_ns=late.ns,
+        rtt_ns=late.rtt,
     )
     writer.set_clock(stream.name, table)

@@ -19,6 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from calib.session.storage import sync
+
 try:
     import fcntl
 except ImportError:  # Windows: nothing tells a journal that is still being written
@@ -83,6 +85,8 @@ class Journal:
         if fcntl is not None:
             with contextlib.suppress(OSError):  # some file systems know no locks
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with contextlib.suppress(OSError):  # its name too; some systems cannot sync a folder
+            sync(self.path.parent)
         return file
 
     def _problem(self, error: OSError) -> JournalError:

@@ -15,12 +15,12 @@ from typing import Protocol
 
 from calib.session import Status
 
-from .entries import END, EVENT, PLAN, RESTARTED, Code, pack_end, pack_event, pack_frame
+from .entries import END, EVENT, PLAN, PONG, RESTARTED, Code, pack_end, pack_event, pack_frame, pack_pong
 from .finish import Progress, Summary, finish
 from .journal import Journal, JournalError, Scan
 from .plan import Plan
 from .sources import Link, Source
-from .wire import Counts, Frame, Order, Place, State, follow
+from .wire import Counts, Frame, Order, Place, State, encode_ping, follow
 
 RETRY = 0.25  # s between attempts to connect
 PERIODS = 3  # of silence after which a link is opened again,
@@ -132,7 +132,11 @@ class Intake:
     def _listen(self, link: Link, stop: threading.Event) -> None:
         state, heard = State(), time.monotonic()
         began, count, patience = heard, 0, max(FIRST, self._patience(0.0, 0))
+        pinged = heard
         while not stop.is_set():
+            if self.source.ping and time.monotonic() - pinged >= self.source.ping:
+                pinged = time.monotonic()
+                self.send(encode_ping(self.source.plan.number, time.monotonic_ns()))
             data = link.read()
             host, now = time.monotonic_ns(), time.monotonic()
             if data:
@@ -140,6 +144,9 @@ class Intake:
                 self.tally.present = state.counts
                 if state.note != self._noted:
                     self._heed(state.note)
+                if state.pong is not None:
+                    self._journal.append(PONG, 0, host, pack_pong(self.number, state.pong))
+                    state = state._replace(pong=None)
                 for frame in frames:
                     self._take(frame, host)
                 if frames:
@@ -356,7 +363,7 @@ def kept(output: str | Path, tell: Callable[[str], object] = lambda line: None) 
         except BaseException as error:
             failure = error
         ended = _end(journal, "" if failure is None else str(failure) or type(failure).__name__)
-    if not any(record.stream < END for record in Scan(part)):
+    if not any(record.stream < PONG for record in Scan(part)):
         part.unlink()
     else:
         tell(_concluded(part, output, ended, lambda size: None).render())

@@ -53,6 +53,7 @@ class Result:
     | valid: pressure within the calibrated range                        | (pads,)  |      |
     | centre of the force on each pad that is touched, else NaN          | (pads, 2)| m    |
     | map: force on each pixel; it sums to the pads' forces              | (pixels,)| N    |
+    | image: change of sheet conductivity that the map comes from        | (pixels,)| S    |
     | missing: readings that were not finite, and are left out           | ()       |      |
     | dropped: frames not worked on so far                               | ()       |      |
     | touches: contacts, of a calibration that fits them                 |          |      |
@@ -67,13 +68,14 @@ class Result:
     valid: np.ndarray
     centre: np.ndarray
     map: np.ndarray
+    image: np.ndarray
     missing: int
     dropped: int
     touches: Touches = NO_TOUCHES
     unsearched: int = 0
 
     def to_json(self, *, image: bool = False) -> str:
-        """One line for other programs; ``image`` adds the map as base64 of little-endian f4."""
+        """One line for other programs; ``image`` adds map and image as base64 of little-endian f4."""
         out: dict[str, object] = {
             "number": self.number,
             "host_ns": self.host,
@@ -89,7 +91,7 @@ class Result:
             "unsearched": self.unsearched,
         }
         if image:
-            out["map"] = base64.b64encode(self.map.astype("<f4").tobytes()).decode()
+            out |= {name: base64.b64encode(getattr(self, name).astype("<f4")).decode() for name in ("map", "image")}
         return json.dumps(out, allow_nan=False)
 
 

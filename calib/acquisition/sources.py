@@ -7,8 +7,9 @@ replay://session.h5?speed=2         a recorded session, as if it came over the w
 ```
 
 Options after ``?`` describe the stream: ``format`` (binary or csv), ``rate`` (Hz), ``tick`` (s), ``scale``, ``offset``,
-``id`` (its number on the wire), ``channels``. A link waits at most `POLL` seconds, so that whoever reads from it
-can be told to stop, and raises OSError when it is lost; opening it again is up to the reader.
+``id`` (its number on the wire), ``channels``, ``ping`` (s between pings of a device that answers them). A link waits at
+most `POLL` seconds, so that whoever reads from it can be told to stop, and raises OSError when it is lost; opening
+it again is up to the reader.
 """
 
 import abc
@@ -18,6 +19,7 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -33,7 +35,7 @@ POLL = 0.1
 CONNECT = 1.0
 _PIECE = 1 << 16
 _TOLD = 1_000_000_000  # ns between notes
-_NUMBERS = {"rate", "tick", "scale", "offset", "baud", "speed"}
+_NUMBERS = {"rate", "tick", "scale", "offset", "baud", "speed", "ping"}
 _WHOLE = {"id", "channels"}
 _OPTIONS = _NUMBERS | _WHOLE | {"format"}
 _DECODERS = {"binary": decode, "csv": decode_lines}
@@ -233,6 +235,7 @@ class Source:
     format: str = "binary"
     baud: int = 115200
     speed: float = 1.0
+    ping: float = 0.0  # s; 0: the device is sent nothing
 
     def link(self) -> Link:
         """A connection, not yet open."""
@@ -247,10 +250,13 @@ class Source:
             return SerialLink(f"{parts.scheme}://{parts.netloc}{parts.path}", self.baud)
         return SerialLink(unquote(parts.netloc + parts.path), self.baud)
 
+    @cached_property
+    def _layouts(self) -> Layouts:
+        return {self.plan.number: self.plan.layout}
+
     def decode(self, state: State, data: bytes):
         """The frames that end within `data`."""
-        layouts: Layouts = {self.plan.number: self.plan.layout}
-        return _DECODERS[self.format](layouts, state, data)
+        return _DECODERS[self.format](self._layouts, state, data)
 
 
 def source(name: str, url: str, channels: int) -> Source:
@@ -276,9 +282,10 @@ def source(name: str, url: str, channels: int) -> Source:
     if format not in _DECODERS:
         raise SourceError(f"{name}: format {format!r} is not known; there are {', '.join(_DECODERS)}")
     speed, baud = float(options.get("speed", 1.0)), int(options.get("baud", 115200))
-    if not speed > 0 or not baud > 0:
-        raise SourceError(f"{name}: speed {speed}, baud {baud}; give numbers above zero")
-    return Source(plan, url, format, baud, speed)
+    ping = float(options.get("ping", 0.0))
+    if not speed > 0 or not baud > 0 or not ping >= 0:
+        raise SourceError(f"{name}: speed {speed}, baud {baud}, ping {ping}; give numbers above zero")
+    return Source(plan, url, format, baud, speed, ping)
 
 
 def _options(name: str, url: str, query: str) -> dict[str, str | float]:

@@ -8,9 +8,10 @@ far, however they were cut, and hold at most one frame's worth of them.
 import binascii
 import enum
 import json
+import operator
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,8 @@ LONGEST = 1 << 16  # bytes of a frame of that many channels, as sent
 _HEADS = {32: struct.Struct("<BBII"), 64: struct.Struct("<BBIQ")}
 _TYPES: dict[int, np.dtype] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
 _LONG_TICKS, _PART = 2, 4
-_NOTE, _READ = VERSION << 4 | 8, VERSION << 4 | 9  # messages, not samples
+_NOTE, _READ, _PING, _PONG = (VERSION << 4 | kind for kind in (8, 9, 10, 11))  # messages, not samples
+_ECHO = struct.Struct("<qQ")
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
 _TEXT_BYTES = 32  # what one number in a line may take
@@ -69,8 +71,14 @@ class Frame(NamedTuple):
     resync: bool = False
 
 
-@dataclass(frozen=True)
-class Counts:
+class Pong(NamedTuple):
+    """A device's answer to a ping: the host's ns in it, and the device's ticks when it answered."""
+
+    sent: int
+    ticks: int
+
+
+class Counts(NamedTuple):
     """How many frames were good, and how many pieces were dropped for which reason."""
 
     good: int = 0
@@ -82,23 +90,21 @@ class Counts:
     other: int = 0  # sound, but of a stream not asked for
     range: int = 0  # values that cannot be
 
-    def __add__(self, more: "Counts") -> "Counts":
-        return Counts(*(getattr(self, f.name) + getattr(more, f.name) for f in fields(Counts)))
+    def __add__(self, more: tuple[int, ...]) -> "Counts":  # type: ignore[override]
+        return Counts(*map(operator.add, self, more))
 
     @property
     def dropped(self) -> dict[str, int]:
         """Reasons that occurred, with their numbers; frames of other streams are no loss."""
-        names = [f.name for f in fields(Counts) if f.name not in ("good", "other")]
-        return {name: getattr(self, name) for name in names if getattr(self, name)}
+        return {name: n for name, n in zip(self._fields, self, strict=True) if n and name not in ("good", "other")}
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """A decoder between two pieces of input.
 
     ``tail`` has begun but not ended; ``joining`` until a first end is seen, as one joins a device in
     mid-frame; ``skipping`` to the next end after an overlong piece; ``damaged`` since the last frame;
-    ``note`` is the last thing that the device said about the stream.
+    ``note`` is the last thing that the device said about the stream, ``pong`` its last answer to a ping.
     """
 
     tail: bytes = b""
@@ -107,6 +113,7 @@ class State:
     damaged: bool = False
     counts: Counts = Counts()
     note: str = ""
+    pong: Pong | None = None
 
 
 Layouts = Mapping[int, Layout]
@@ -186,6 +193,16 @@ def encode_read(stream: int, readings: np.ndarray) -> bytes:
     return _sealed(bytes([_READ, stream]) + _bits(readings))
 
 
+def encode_ping(stream: int, sent: int) -> bytes:
+    """What a host sends at `sent`, ns, for a device to answer at once."""
+    return _sealed(bytes([_PING, stream]) + _ECHO.pack(sent, 0)[:8])
+
+
+def encode_pong(stream: int, sent: int, ticks: int) -> bytes:
+    """The answer to a ping, with the count of the clock that stamps this stream's frames."""
+    return _sealed(bytes([_PONG, stream]) + _ECHO.pack(sent, ticks % 2**64))
+
+
 def _sealed(body: bytes) -> bytes:
     return cobs_encode(body + _CRC.pack(crc16(body))) + b"\0"
 
@@ -194,18 +211,24 @@ def _bits(readings: np.ndarray) -> bytes:
     return np.packbits(np.asarray(readings, bool), bitorder="little").tobytes()
 
 
-def asked(tail: bytes, data: bytes) -> tuple[bytes, dict[int, np.ndarray]]:
-    """What a device hears: the rest that has not ended, and the readings last asked of each stream.
+def asked(tail: bytes, data: bytes) -> tuple[bytes, dict[int, np.ndarray], list[tuple[int, int]]]:
+    """What a device hears: the rest that has not ended, the readings last asked of each stream, and the pings.
 
-    Flags come in whole bytes: (n,) bool with n the number of readings, rounded up to eight.
+    Flags come in whole bytes: (n,) bool with n the number of readings, rounded up to eight; a ping is the number of
+    the stream and what is to be sent back.
     """
     *pieces, tail = (tail + data).split(b"\0")
     found: dict[int, np.ndarray] = {}
+    pings = []
     for piece in pieces:
         body = cobs_decode(piece) or b""
-        if len(body) > 4 and body[0] == _READ and crc16(body[:-2]) == _CRC.unpack(body[-2:])[0]:
+        if len(body) < 5 or crc16(body[:-2]) != _CRC.unpack(body[-2:])[0]:
+            continue
+        if body[0] == _READ:
             found[body[1]] = np.unpackbits(np.frombuffer(body[2:-2], np.uint8), bitorder="little").astype(bool)
-    return tail[-LONGEST:], found
+        elif body[0] == _PING and len(body) == 12:
+            pings.append((body[1], int.from_bytes(body[2:10], "little", signed=True)))
+    return tail[-LONGEST:], found, pings
 
 
 def part_of_scan(packet: bytes, readings: np.ndarray) -> bytes:
@@ -237,20 +260,22 @@ def decode_lines(layouts: Layouts, state: State, data: bytes) -> tuple[State, li
         raise WireError("lines of text carry no stream number; give one layout")
     if state.joining:  # the first line may be the end of one, and still look whole
         _, end, data = data.partition(b"\n")
-        state = replace(state, joining=not end)
+        state = state._replace(joining=not end)
     (layout,) = layouts.values()
     return _decode(layouts, state, data, b"\n", _line, _TEXT_BYTES * (layout.channels + 2))
 
 
 def _decode(layouts, state, data, end, parse, limit) -> tuple[State, list[Frame]]:
     *pieces, tail = (state.tail + data).split(end)
-    frames, counts, note = [], state.counts, state.note
+    frames, counts, note, pong = [], state.counts, state.note, state.pong
     joining, skipping, damaged = state.joining, state.skipping, state.damaged
     for piece in pieces:
         if piece and not skipping:  # else it is the rest of an overlong piece, which was counted
             frame, dropped = (None, Counts(overlong=1)) if len(piece) > limit else parse(layouts, piece)
             if isinstance(frame, str):
                 note = frame
+            elif isinstance(frame, Pong):
+                pong = frame
             elif frame is not None:
                 frames.append(frame._replace(resync=damaged))
                 damaged = False
@@ -261,12 +286,12 @@ def _decode(layouts, state, data, end, parse, limit) -> tuple[State, list[Frame]
     if len(tail) > limit and not skipping:
         counts += Counts(overlong=0 if joining else 1)
         skipping, damaged = True, damaged or not joining
-    counts = replace(counts, good=counts.good + len(frames))
-    return State(b"" if skipping else tail, joining, skipping, damaged, counts, note), frames
+    counts = counts._replace(good=counts.good + len(frames))
+    return State(b"" if skipping else tail, joining, skipping, damaged, counts, note, pong), frames
 
 
 _NOTHING = Counts()
-_Parsed = tuple[Frame | str | None, Counts]  # a sample, or a note
+_Parsed = tuple[Frame | str | Pong | None, Counts]  # a sample, a note, or an answer
 
 
 def _binary(layouts: Layouts, packet: bytes) -> _Parsed:
@@ -277,11 +302,19 @@ def _binary(layouts: Layouts, packet: bytes) -> _Parsed:
         return None, Counts(checksum=1)
     kind, stream = body[0], body[1]
     dtype = _TYPES.get(kind & ~(_LONG_TICKS | _PART) & 0x0F)
-    if kind != _NOTE and (kind >> 4 != VERSION or dtype is None):
+    if kind not in (_NOTE, _PONG) and (kind >> 4 != VERSION or dtype is None):
         return None, Counts(version=1)
     if stream not in layouts:
         return None, Counts(other=1)
+    if kind == _PONG:
+        return _answered(body)
     return _noted(body) if dtype is None else _sample(layouts[stream], body, dtype)
+
+
+def _answered(body: bytes) -> _Parsed:
+    if len(body) != 2 + _ECHO.size + _CRC.size:
+        return None, Counts(length=1)
+    return Pong(*_ECHO.unpack_from(body, 2)), _NOTHING
 
 
 def _noted(body: bytes) -> _Parsed:
@@ -314,8 +347,8 @@ def _sample(layout: Layout, body: bytes, dtype: np.dtype) -> _Parsed:
 def _in_range(layout: Layout, frame: Frame) -> _Parsed:
     """Values that are finite and too large were never measured; those not finite are missing."""
     if frame.values.dtype.kind == "f":
-        size = np.abs(frame.values)
-        if ((size > layout.limit / abs(layout.scale)) & (size < np.inf)).any():
+        size, limit = np.abs(frame.values), layout.limit / abs(layout.scale)
+        if not (size <= limit).all() and ((size > limit) & (size < np.inf)).any():
             return None, Counts(range=1)
     return frame, _NOTHING
 

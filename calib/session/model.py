@@ -14,7 +14,8 @@ VERSION = "1.0"
 STREAM_EXTRAS = {"time_device": "u8", "time_host": "i8", "seq": "u4"}
 """Optional per-sample arrays of a stream and their types (device ticks, monotonic ns, number)."""
 
-CLOCK_ATTRIBUTES = ("tick_s", "offset_ns", "drift_ppm", "residual_p95_ns", "valid", "method")
+_PINGED = ("latency_ns", "rtt_ns")  # only of devices that answer
+CLOCK_ATTRIBUTES = ("tick_s", "offset_ns", "drift_ppm", "residual_p95_ns", "valid", "method", *_PINGED)
 
 
 class SessionError(ValueError):
@@ -150,7 +151,8 @@ class ClockTable:
     ``host_ns`` (n,) int64 ns since the session's epoch at ``device_ticks`` (n,) uint64, unwrapped; ``tick_s``
     the nominal length of a tick (s), ``offset_ns`` the time of tick zero by the first knot, ``drift_ppm`` how
     much slower than nominal the device counts, ``residual_p95_ns`` what the lines leave, ``valid`` whether
-    the stream's times were made from them. Raises `SessionError` for knots of unequal number.
+    the stream's times were made from them; ``latency_ns`` what was taken off as the smallest latency, known to half
+    of ``rtt_ns``, the shortest round trip (both 0: not measured). Raises `SessionError` for knots of unequal number.
     """
 
     host_ns: np.ndarray
@@ -161,12 +163,14 @@ class ClockTable:
     residual_p95_ns: float
     valid: bool
     method: str
+    latency_ns: float = 0.0
+    rtt_ns: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "host_ns", np.atleast_1d(np.asarray(self.host_ns, np.int64)))
         object.__setattr__(self, "device_ticks", np.atleast_1d(np.asarray(self.device_ticks, np.uint64)))
         if self.host_ns.ndim != 1 or self.host_ns.shape != self.device_ticks.shape:
             raise SessionError("clocks: knots of unequal number; give one tick for each time")
-        numbers = (self.tick_s, self.offset_ns, self.drift_ppm, self.residual_p95_ns)
+        numbers = (self.tick_s, self.offset_ns, self.drift_ppm, self.residual_p95_ns, self.latency_ns, self.rtt_ns)
         if not np.isfinite(numbers).all():
             raise SessionError("clocks: a number is not finite; leave a clock out that was not found")

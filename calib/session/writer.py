@@ -411,8 +411,8 @@ class SessionWriter:
                 "device_ticks": (Column("u8", "1", "the device's count, unwrapped"), table.device_ticks),
             }
             group = self._write_table(parent, name, "knot", columns)
-            about = {key: getattr(table, key) for key in CLOCK_ATTRIBUTES}
-            put_attributes(group, about)
+            keys = CLOCK_ATTRIBUTES if table.rtt_ns else CLOCK_ATTRIBUTES[:-2]
+            put_attributes(group, {key: getattr(table, key) for key in keys})
 
     def _write_table(
         self, file: h5py.Group, name: str, row: str, columns: Mapping[str, tuple[Column, np.ndarray]]
