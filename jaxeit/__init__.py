@@ -72,8 +72,8 @@ from .effects import (
 )
 from .electrodes import AreaPatch, BoundaryPatch, ElectrodeError, PointElectrode, PolygonPatch, disc_resistance
 from .fidelity import Fidelity, FidelityError
-from .forward import CoatedSheet, conductivity, forward, load_spread
-from .fusion import ForceMap, FusionError, PadMasks, fuse, pad_masks
+from .forward import CoatedSheet, conductivity, forward, load_spread, rounding
+from .fusion import ContactShares, ForceMap, FusionError, PadMasks, contact_shares, fuse, pad_masks
 from .hyperparameter import (
     Discrepancy,
     GeneralisedCrossValidation,
@@ -147,6 +147,7 @@ __all__ = [
     "ContactPiezoresistance",
     "ContactResult",
     "ContactScatter",
+    "ContactShares",
     "Contacts",
     "ContinuousCoating",
     "Creep",
@@ -255,6 +256,7 @@ __all__ = [
     "coefficient_of_variation",
     "compiler_options",
     "conductivity",
+    "contact_shares",
     "disc_resistance",
     "discretise",
     "drives",
@@ -295,6 +297,7 @@ __all__ = [
     "read_text",
     "reciprocal_rows",
     "refine_contacts",
+    "rounding",
     "save_reconstructor",
     "scan_time",
     "shipped_skins",

@@ -88,7 +88,7 @@ def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None 
 
     Returns:
         (readings,) V, in the order of the protocol; none of them finite if ``sigma`` is negative anywhere, or
-        zero all around a place.
+        zero all around a place.  Where parts of the sheet hardly touch, digits are lost: `rounding` says how many.
 
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model, or the model no coat.
@@ -99,6 +99,20 @@ def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None 
 @verb
 def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Float[Array, " readings"]:
     return voltages(model, transfer(model, coefficients(model, sigma)))
+
+
+@verb
+def rounding(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None = None) -> Float[Array, " readings"]:
+    """About what rounding has done to each reading of `forward`, (readings,) V.
+
+    A reading is a potential and, of the same fields, an energy.  With fields off by e the potential is off by
+    ``A(x, e)``, and the energy by twice that and a square: they differ by the error, and by what matters less.
+    The energy is that of differences of potentials, from which a part of the sheet that hardly touches the ground
+    may be lifted as a whole.  Takes a few times as long as `forward`, whose arguments these are.
+    """
+    theta = coefficients(model, sigma)
+    x = fields(model, theta)
+    return jnp.abs(readings(model, energy(model, theta, x)) - readings(model, x.terminal))
 
 
 def voltages(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:

@@ -159,7 +159,7 @@ class TruncatedSvd(AbstractLinearMethod):
         b = precision.seen(problem.jacobian)
         u, s, vt = jnp.linalg.svd(b, full_matrices=False)
         kept = s > jnp.maximum(problem.level(b), max(b.shape) * jnp.finfo(b.dtype).eps * s[0])
-        inverse = jnp.where(kept, 1 / jnp.where(kept, s, 1), 0)
+        inverse = jnp.where(kept, 1 / s, 0)
         return precision.image((vt.T * inverse) @ (u.T @ y))
 
 
@@ -198,7 +198,7 @@ class Greit(AbstractLinearMethod):
     def image(self, problem, y):
         areas, centres = problem.picture.areas, problem.picture.centres
         square = jnp.sum((centres[:, None] - centres) ** 2, -1)
-        distance = jnp.sqrt(jnp.where(square > 0, square, 1)) * (square > 0)
+        distance = jnp.sqrt(square)
         contacts = jnp.exp(-0.5 * square / self.width**2) * (areas > 0)
         disc = jax.nn.sigmoid((self.radius - distance) / self.edge)
         mass, whole = areas @ contacts, areas @ disc
@@ -329,6 +329,7 @@ class SparseBayes(AbstractIterativeMethod):
         power = jnp.where(power > 0, power, 1)
         g = 1 / precision.values
         g = g * power / (jnp.sum(j**2 * g) / len(j))
+        least = max(1e-12, 4 * len(j) * float(jnp.finfo(j.dtype).eps)) * power  # C keeps a Cholesky factor
 
         def lower(g, s):
             return cholesky(s * jnp.eye(len(j), dtype=j.dtype) + (j * g) @ j.T, lower=True)
@@ -339,7 +340,7 @@ class SparseBayes(AbstractIterativeMethod):
             half = solve_triangular(factor, j, lower=True)
             seen, own = half.T @ solve_triangular(factor, y, lower=True), jnp.sum(half**2, 0)
             left = jnp.sum((y - j @ (g * seen)) ** 2) + s * jnp.sum(g * own)
-            return g * seen**2 / jnp.where(own > 0, own, 1), jnp.maximum(left / len(j), 1e-12 * power)
+            return g * seen**2 / jnp.where(own > 0, own, 1), jnp.maximum(left / len(j), least)
 
         g, s = jax.lax.fori_loop(0, self.steps, again, (g, problem.hyperparameter**2 * power))
         return top * g * (j.T @ cho_solve((lower(g, s), True), y))

@@ -17,9 +17,13 @@ INTRODUCTION = """\
 # Hard cases
 
 How far jaxeit has been taken, how wrong its numbers were at worst, and what a user sees there or beyond. The tests
-write this table, if they all pass:
+write this table, the slow ones too:
 
-    python -m pytest --hard-cases docs/hard-cases.md
+    python -m pytest --hard-cases docs/hard-cases.md tests/test_hard_*.py
+
+If all the tests of a run pass, it replaces the rows of the cases it came to; the other rows stay, so that the files
+may be run one by one. Without the slow tests some rows would tell of less. `python -m tests.mutations` breaks the
+guards behind these rows one at a time, in a copy, and names those that no test holds.
 
 Errors are the largest found over the whole severity reached, relative to the largest of the values compared unless the
 case says otherwise. "Naive" is the textbook form of the same computation, which the test keeps to show that it
@@ -63,7 +67,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class _Collector:
-    """Rows of the tests that passed, written once all have."""
+    """Rows of the tests that passed, written once all have, in the place of what the file says of the same cases."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -78,9 +82,10 @@ class _Collector:
         if exitstatus != pytest.ExitCode.OK:
             self.said = f"hard cases: {self.path} is left as it was, as not all tests passed"
             return
-        merged = merge(self.rows)
-        replace(self.path, INTRODUCTION + table(merged))
-        self.said = f"hard cases: {len(merged)} written to {self.path}"
+        lines = lines_of(table(merge(self.rows)))
+        known = lines_of(self.path.read_text()) if self.path.exists() else {}
+        replace(self.path, INTRODUCTION + table([]) + "".join(line for _, line in sorted((known | lines).items())))
+        self.said = f"hard cases: {len(lines)} written to {self.path}"
 
     def pytest_terminal_summary(self, terminalreporter) -> None:
         terminalreporter.write_line(self.said)
@@ -111,6 +116,12 @@ def table(rows: list[Row]) -> str:
     lines = [HEADER, ("---",) * len(HEADER)]
     lines += [(r.case, r.reached, *map(_number, (r.float64, r.float32, r.naive)), r.beyond) for r in rows]
     return "".join("| " + " | ".join(_cell(text) for text in line) + " |\n" for line in lines)
+
+
+def lines_of(text: str) -> dict[str, str]:
+    """The rows of a table in Markdown, by what their first cell says."""
+    lines = [line for line in text.splitlines(keepends=True) if line.startswith("| ")][2:]
+    return {line.split(" | ")[0]: line for line in lines}
 
 
 def _number(error: float | None) -> str:

@@ -53,6 +53,20 @@ def test_rows_of_all_workers_make_one_table(run):
     ]
 
 
+def test_a_run_replaces_the_rows_of_its_own_cases(run, tmp_path):
+    old = table(
+        [Row("angle", "9 degrees", None, None, None, "nothing"), Row("zeal", "1", None, None, None, "no \\| end")]
+    )
+    (tmp_path / "table.md").write_text("# Another introduction\n\n" + old)
+    _, path = run("-k", "slivers")
+    text = path.read_text()
+    assert text.startswith(INTRODUCTION)
+    assert text.splitlines()[-2:] == [
+        "| angle | 1 degree | – | 2e-04 | – | one error that names it |",
+        old.splitlines()[-1],
+    ]
+
+
 def test_a_run_that_failed_leaves_the_table_as_it_was(run, tmp_path):
     (tmp_path / "table.md").write_text("as it was")
     said, path = run()

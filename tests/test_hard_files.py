@@ -6,15 +6,21 @@ are loaded; a crash, a hang or an error of another kind is a failure of the test
 
 import json
 import os
+import resource
 import subprocess
 import sys
+import time
+import zlib
 
 import pytest
+from h5py import h5g
 
+from calib.session import SessionError, read_archive, write_archive
 from tests.fuzzing import MEMORY, READERS
+from tests.test_session import ARRAYS, FORCE, REFUSED_FILES, changed, everything, make, put_chunk, replace
 
 SLOW = {"session": 10_000, "calibration": 2000, "journal": 2000, "frames": 4000, "lines": 4000}
-LONGEST = 5.0  # seconds for one input; one that is refused takes milliseconds, one that is read may compile a program
+LONGEST = 60.0  # seconds for one input, of a hang; refused in milliseconds, but one that is read may compile a program
 
 
 def campaign(kinds, count, seed, folder, root, timeout):
@@ -62,3 +68,86 @@ def test_thousands_of_spoilt_inputs(kind, tmp_path, root, hard):
         "; none is read as something else" if READERS[kind].sealed else ", or what is there is read"
     )
     hard(f"spoilt input: {kind}", f"{count:,} inputs", beyond=beyond)
+
+
+DEEP, WIDE = 20_000, 100_000
+
+
+def deep(name):
+    """Groups within groups."""
+
+    def change(file):
+        group = file.require_group(name).id
+        for _ in range(DEEP):
+            group = h5g.create(group, b"a")
+
+    return change
+
+
+def wide(name):
+    """A group of that many members, of those it has and links."""
+
+    def change(file):
+        group = file.require_group(name)
+        for i in range(WIDE - len(group)):
+            group.id.links.create_soft(b"x%d" % i, b"/")
+
+    return change
+
+
+def gigabyte(file):
+    """A megabyte that unfolds a thousandfold."""
+    squeeze = zlib.compressobj(9)
+    put_chunk(file, b"".join(squeeze.compress(bytes(1 << 20)) for _ in range(1 << 10)) + squeeze.flush())
+
+
+LINKS = """external storage, soft link, external link, link cycle, virtual dataset, objects, references, compound,
+unknown filter, attribute of references"""
+HOSTILE = {
+    **{name: REFUSED_FILES[name] for name in LINKS.replace("\n", " ").split(", ")},
+    "a stream of groups 20,000 deep": (deep("streams/deep"), "/streams/deep: "),
+    "a root of 100,000 members": (wide("/"), "/: has 100,000 members"),
+    "100,000 streams": (wide("streams"), "/streams: has 100,000 members"),
+    "2.4 TB": (replace(FORCE, shape=(300_000_000_000, 1), dtype="f8"), "claims 2,400,000,000,000 bytes"),
+    "a chunk of 1 GB": (replace(FORCE, shape=(1 << 27, 1), dtype="f8", chunks=(1 << 27, 1)), "claims 1,073,741,824 b"),
+    "1 MB of gzip for 1 GB": (gigabyte, "too long"),
+}
+HOSTILE_RESULTS = {
+    "groups 20,000 deep": (deep("deep"), "/deep/a/a/a: holds too many or too deeply nested arrays"),
+    "a root of 100,000 members": (wide("/"), "/: has 100,000 members"),
+    "100,000 pads": (wide("pads"), "/pads: has 100,000 members"),
+}
+
+
+@pytest.mark.slow
+def test_hostile_files_are_refused_by_name_and_at_once(tmp_path, hard):
+    good, result = make(tmp_path / "good.h5"), tmp_path / "result.h5"
+    write_archive(result, "skin-calibration", {}, ARRAYS)
+    everything(good)  # what is imported or compiled once
+    files = [
+        *((good, everything, case) for case in HOSTILE.values()),
+        *((result, lambda path: read_archive(path, "skin-calibration"), case) for case in HOSTILE_RESULTS.values()),
+    ]
+    longest = max(_seconds(read, changed(path, tmp_path, change), said) for path, read, (change, said) in files)
+    assert longest < 10
+    hard(
+        "hostile files",
+        f"{len(files)} kinds: links, cycles, other types and filters; 20,000 deep, 100,000 wide; 1 MB for 1 GB, 2.4 TB",
+        beyond=f"one line that names the place, within {_rounded(longest)} ms here",
+    )
+
+
+def _seconds(read, path, said):
+    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
+    with pytest.raises(SessionError) as caught:
+        read(path)
+    seconds, line = time.perf_counter() - start, str(caught.value)
+    assert said in line
+    assert "\n" not in line
+    assert 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) < MEMORY / 4
+    return seconds
+
+
+def _rounded(seconds):
+    """Milliseconds, up to the next of 10, 20, 50, 100 ..."""
+    return next(ms for power in range(1, 9) for n in (1, 2, 5) if (ms := n * 10**power) >= 1000 * seconds)

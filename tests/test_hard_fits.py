@@ -10,7 +10,7 @@ import pytest
 import calib
 from calib.corrections import CorrectionError, LowPass, sample_rate
 from calib.curves import CURVES, Affine, Hysteresis, Linear, MonotonePolynomial, MonotoneSpline, Play, PowerLaw
-from calib.fit import Cauchy, FitError, FitResult, SoftL1, Squared, fit_curves
+from calib.fit import Cauchy, FitError, FitResult, Huber, SoftL1, Squared, _thin_svd, fit_curves
 from calib.presses import PressError, find_presses
 from calib.session import PressTable, SessionError, SessionWriter
 
@@ -73,6 +73,7 @@ def test_hopeless_samples_are_told_and_sound_ones_beside_them_fitted(name, dtype
         one = fits.pad(pad)
         assert FitResult(int(one.result)) in may
         assert np.isnan(one.covariance).all()
+        assert not np.isinf(one.pressure_range).any()
         assert not one.predict(np.array([0.0, 2000.0])).valid.any()
         assert ": " in one.message()
     error = max(straightness(fits, pad, row) for pad, row in enumerate(SOUND.values()))
@@ -227,6 +228,25 @@ def test_first_and_second_derivatives_are_finite_at_every_kink(name, dtype):
     for part in jax.tree.leaves(derivatives(p, at)):
         assert part.dtype == dtype
         assert np.isfinite(part).all()
+
+
+@pytest.mark.parametrize("dtype", ["f8", "f4"])
+@pytest.mark.parametrize("loss", [Cauchy(), Huber(), SoftL1(), Squared()], ids=lambda loss: type(loss).__name__)
+def test_losses_have_slopes_at_nothing_and_far_away(loss, dtype):
+    width = float(getattr(loss, "width", 1.0))
+    left = jnp.asarray([0.0, 1e-30, 1e-3 * width, width, -width, 1e8, -1e8], dtype)
+    for derive in (jax.grad, lambda f: jax.grad(jax.grad(f))):
+        slopes = jax.vmap(derive(lambda r: loss.transform(r)))(left)
+        assert np.isfinite(slopes).all()
+
+
+def test_columns_that_are_almost_alike_are_told_apart():
+    """To rounding: done once, Gram-Schmidt leaves them at an angle of rounding over their difference."""
+    x = np.linspace(0, 1, 50)
+    matrix = jnp.asarray(np.stack([np.ones(50), 1 + 1e-9 * x, 1 + 1e-9 * x**2], 1))
+    left, singular, right = _thin_svd(matrix)
+    np.testing.assert_allclose(left.T @ left, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(left * singular @ right, matrix, rtol=1e-14)
 
 
 def test_a_textbook_power_law_has_none():

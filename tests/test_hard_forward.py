@@ -1,5 +1,6 @@
 """Conductivities far apart, near zero or none, and the choice of ground, against exact arithmetic."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from jaxeit.forward import coefficients, transfer
 
 from .hard_sheet import (
     MESH,
+    PAIRS,
     by_inverse,
     by_penalty,
     by_schur_and_pinv,
@@ -101,20 +103,54 @@ def test_a_tear_in_the_middle_costs_nothing(decades, hard):
     )
 
 
-def test_between_halves_that_hardly_touch_an_error_says_how_hardly(hard):
+def test_between_halves_that_hardly_touch_digits_are_lost_and_told(hard):
     """Rounding of a row of the matrix over the conductance that is left of it; the textbook's is no better."""
-    for decades in (-3, -6, -9):
+    for decades in (-3, -6, -9, -12):
         sigma = np.where(ACROSS, _powers(decades), 1.0) * FLAT
         right = exact(sigma, CONTACTS)
         double = worst(found(sheet_model(SPARSE), sigma, CONTACTS), right)
         assert double < 1e-14 * 10.0 ** (-1.5 * decades)
+        assert 0.1 * double < _told(sigma, right) < 10 * double
         hard(
             "conductivity near zero across the whole sheet",
-            "1e-9 of the rest, of each reading",
+            "1e-12 of the rest, of each reading",
             float64=double,
             naive=worst(by_inverse(sigma, CONTACTS), right),
-            beyond="four-terminal readings through the gap are wrong from 1e-12; below rounding nothing is finite",
+            beyond="`rounding` says how wrong each reading is; below rounding nothing is finite",
         )
+
+
+def _told(sigma, right, dtype="float64"):
+    """The largest error that `rounding` tells of, relative to the reading; of all that `paired` has, in its order."""
+    model = sheet_model(SPARSE, dtype)
+    every = jnp.asarray([[*drive, *sense] for drive in PAIRS for sense in PAIRS])
+    model = eqx.tree_at(lambda m: m.pattern, model, every)
+    told = je.rounding(model, jnp.asarray(sigma, dtype))
+    return float((np.asarray(told, float) / np.abs(right.ravel())).max())
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_what_contrast_costs_is_told(dtype, hard):
+    """The worst reading's error: seldom too little of it, and then not by ten times."""
+    ratios = []
+    for sigma in (_smooth(3), _smooth(6), _random(3), np.where(TEAR, 2.0**-60, 1.0) * FLAT):
+        right = exact(sigma, CONTACTS)
+        ratios.append(_told(sigma, right, dtype) / worst(found(sheet_model(SPARSE, dtype), sigma, CONTACTS), right))
+    assert min(ratios) > 0.1
+    assert max(ratios) < 100
+    hard(
+        "what rounding has done to a reading",
+        "contrast up to 1e18, in either precision",
+        beyond="`rounding` tells the error in V: not below a tenth of the worst, nor above a hundred times it",
+    )
+
+
+def test_iterations_end_where_their_precision_does():
+    """In float32 after steps in which float64 has not come to its own end."""
+    few = je.ConjugateGradient(max_steps=34)
+    right = exact(FLAT, CONTACTS)
+    assert worst(found(sheet_model(few, "float32"), FLAT, CONTACTS), right) < 1e-4
+    assert np.isnan(found(sheet_model(few), FLAT, CONTACTS)).all()
 
 
 @pytest.mark.parametrize("decades", [-300, -30, 30, 300])

@@ -57,6 +57,7 @@ HOST = {
     "read_text": _DESCRIBES,
     "reciprocal_rows": _DESCRIBES,
     "refine_contacts": _PREPARES,
+    "rounding": "what it estimates has no direction",
     "save_reconstructor": _DESCRIBES,
     "scan_time": _DESCRIBES,
     "shipped_skins": _DESCRIBES,
@@ -138,6 +139,21 @@ def _fuse(t):
     nothing = jnp.zeros(PIXELS)
     kinks = [at(nothing, 3, 2), at(nothing, 0, 0), at(image, 0, -1), at(-image, 3, 2), at(image, jnp.nan, 2)]
     return Case(force, [at(image, 3, 2)], [*kinks, at(image.at[3].set(jnp.nan), 3, 2)])
+
+
+def _contact_shares(t):
+    """Of two contacts on two pads; alike, on a corner of a pixel, absent, of no width."""
+    half = (jnp.arange(PIXELS) < PIXELS // 2).astype(float)
+    masks = je.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
+
+    def shares(x):
+        found = je.contact_shares(x[:4].reshape(2, 2), x[4:6], x[6:], t.basis.centres, masks)
+        return jnp.append(found.part, found.share)
+
+    apart = jnp.array([0.06, 0.08, 0.14, 0.13, 0.03, 0.05, 2.0, 1.0])
+    alike = jnp.array([0.1, 0.1, 0.1, 0.1, 0.03, 0.03, 1.0, 1.0])
+    kinks = [alike, alike.at[6].set(0), alike.at[6:].set(0), alike.at[4].set(0), alike.at[0].set(jnp.nan)]
+    return Case(shares, [apart], kinks)
 
 
 def _reconstructor(t, *how, **settings):
@@ -232,6 +248,7 @@ CASES = {
     "load_spread": _load_spread,
     "jacobian": _jacobian,
     "fuse": _fuse,
+    "contact_shares": _contact_shares,
     "Reconstructor": _reconstructor,
     "IterativeReconstructor": lambda t: _reconstructor(t, je.Noser(), je.NonNegative()),
     "IterativeReconstructor, interior point": lambda t: _reconstructor(t, je.Laplace(), je.NonNegative(20)),

@@ -1,4 +1,4 @@
-"""Identities of the physics, as properties of any sheet: conductivities over six decades, contacts over fifteen.
+"""Identities as properties: of any sheet (conductivities over six decades, contacts over fifteen), mesh and recording.
 
 One program serves all examples of a test: sheets and contacts are its arguments, and the ground is too.
 """
@@ -12,10 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxeit as je
+from calib.presses import find_presses
+from calib.session import SessionWriter, open_session
 from jaxeit.forward import coefficients, transfer
 
 from .hard_sheet import MESH, paired, sheet_model
+from .hard_strip import PLACES as STRIP_PLACES
+from .hard_strip import STRIP, Unchecked, strip_error
 from .helpers import skin_of
+from .test_session import options
 
 examples = settings(max_examples=25, deadline=None, derandomize=True, database=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -138,15 +143,71 @@ def _carried(mesh, sigma, image):
     return out
 
 
+@settings(examples, max_examples=8)
+@given(seeds, st.floats(0, 0.45))
+def test_a_strip_reads_the_same_on_any_mesh(seed, much):
+    """Nodes moved by up to so much of an edge, nodes and triangles in any order, triangles from any corner."""
+    rng, mesh = np.random.default_rng(seed), je.structured(STRIP, 20, 10)
+    x, y = mesh.nodes.T
+    rim = (x == 0) | (x == STRIP.width) | (y == 0) | (y == STRIP.height)
+    held = rim | (np.linalg.norm(mesh.nodes[:, None] - np.array(STRIP_PLACES), axis=-1) < 1e-9).any(1)
+    moved = mesh.nodes + np.where(held[:, None], 0, 0.01 * much * rng.uniform(-0.5, 0.5, mesh.nodes.shape))
+    order = rng.permutation(len(moved))
+    triangles = np.argsort(order)[mesh.triangles[rng.permutation(len(mesh.triangles))]]
+    assert strip_error(Unchecked(moved[order], np.roll(triangles, int(rng.integers(3)), 1))) < 1e-11
+
+
+recordings = st.lists(st.floats(width=32), min_size=1, max_size=40)
+
+
+@settings(examples, max_examples=15)
+@given(recordings, st.integers(1, 40), st.integers(1, 40), st.integers(1, 10**12), seeds)
+def test_any_recording_comes_back_however_it_is_cut(tmp_path_factory, values, written, read, gap, seed):
+    """In any pieces; what is not finite is missing."""
+    values = np.array(values, "f4")[:, None]
+    time = np.cumsum(np.random.default_rng(seed).integers(1, gap + 1, len(values)))
+    path = tmp_path_factory.mktemp("any") / "s.h5"
+    with SessionWriter(path, **options()) as writer:
+        writer.add_stream("force", "force", units="N", channels=1, rate_hz=100)
+        for i in range(0, len(values), written):
+            writer.append("force", time[i : i + written], values[i : i + written])
+    with open_session(path) as session:
+        stream = session.streams["force"]
+        np.testing.assert_array_equal(stream.time, time)
+        found = np.concatenate([stream.read(i, i + read) for i in range(0, len(values), read)])
+        np.testing.assert_array_equal(found, np.where(np.isfinite(values), values, np.nan))
+
+
+@examples
+@given(seeds, st.integers(0, 6), st.floats(0, 0.3), st.integers(-40, 40), st.integers(-(2**61), 2**61))
+def test_presses_are_where_they_are_in_any_unit_and_on_any_clock(seed, count, lost, power, later):
+    """In order, one after the other; to the sample with forces times 2^k, and with clocks that started elsewhere."""
+    rng = np.random.default_rng(seed)
+    time = 20_000_000 * np.arange(1500) + rng.integers(0, 10_000_000, 1500)
+    force = rng.normal(0, 0.05, 1500)
+    for start in rng.uniform(1, 25, count):
+        ramp = np.clip(np.minimum(time / 1e9 - start, start + 3 - time / 1e9) / 0.3, 0, 1)
+        force += rng.uniform(1, 50) * ramp
+    force[rng.uniform(size=1500) < lost] = np.nan
+    found, other = find_presses(time, force), find_presses(time + later, 2.0**power * force)
+    edges = np.stack([found.t_press, found.t_hold0, found.t_hold1, found.t_release], 1)
+    assert (np.diff(edges.ravel()) >= 0).all()
+    there = np.stack([other.t_press, other.t_hold0, other.t_hold1, other.t_release], 1)
+    np.testing.assert_array_equal(there, edges + later)
+    assert found.reason == other.reason
+
+
 @pytest.mark.slow
 @settings(max_examples=12, deadline=None, derandomize=True, database=None)
-@given(seeds, st.integers(4, 9), st.floats(0.05, 0.2), st.floats(1.2, 2.0), st.sampled_from([1, 2]))
-def test_any_skin_and_protocol_keeps_the_identities(seed, count, edge, growth, order):
+@given(seeds, st.booleans(), st.integers(4, 9), st.floats(0.05, 0.2), st.floats(1.2, 2.0), st.sampled_from([1, 2]))
+def test_any_skin_and_protocol_keeps_the_identities(seed, askew, count, edge, growth, order):
     """Bolts at random places of a sheet of random proportions, readings between random electrodes."""
     rng = np.random.default_rng(seed)
-    sheet = je.Rectangle(*rng.uniform(0.1, 0.4, 2))
+    size = rng.uniform(0.1, 0.4, 2)
+    corners = [(0, 0), (1, 0.1), (0.9, 1), (0.1, 0.9)] * size
+    sheet = je.Polygon([tuple(c) for c in corners.tolist()]) if askew else je.Rectangle(*size.tolist())
     grid = np.stack(np.meshgrid(*(np.arange(1, 4) / 4,) * 2), -1).reshape(-1, 2)[rng.permutation(9)[:count]]
-    places = (grid + rng.uniform(-0.05, 0.05, grid.shape)) * [sheet.width, sheet.height]
+    places = (grid + rng.uniform(-0.05, 0.05, grid.shape)) * size
     bolts = [je.AreaPatch(tuple(p), 0.003, 10.0 ** rng.uniform(-9, 0)) for p in places.tolist()]
     pattern = np.array([rng.permutation(count)[:4] for _ in range(10)])
     skin = skin_of(sheet, bolts, np.concatenate([pattern, pattern[:, [2, 3, 0, 1]]]), sheet_resistance=100.0)

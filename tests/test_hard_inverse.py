@@ -1,5 +1,7 @@
 """Images at the edges of what can be computed: each beside the naive form, which fails there."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -279,6 +281,44 @@ def test_pixels_that_no_reading_sees_stay_dark_and_harm_none(hard, name):
     hard("pixels without sensitivity", "columns 0 and 1e-9", float64=0, float32=0, naive=np.nan, beyond=said)
 
 
+TO_THE_END = {
+    "not negative": (je.NonNegative(), je.Noser()),
+    "interior point": (je.NonNegative(100), je.Laplace()),
+    "variation": (je.Reweighted(), je.TotalVariation()),
+    "sparse": (je.SparseBayes(100), je.Noser()),
+}
+
+
+@pytest.mark.parametrize("name", TO_THE_END)
+def test_nothing_makes_no_image_and_what_fits_exactly_one(name):
+    """Readings of zero; and those of one pixel without noise, in many more steps than it takes."""
+    method, prior = TO_THE_END[name]
+    j = np.random.default_rng(5).normal(size=(20, SIDE**2))
+    for dtype in EPS:
+        problem = _problem(j, 0.1, prior, dtype)
+        nothing, image = (
+            np.asarray(_imaged(method, problem, y)) for y in (jnp.zeros(20, dtype), problem.jacobian[:, 14])
+        )
+        assert np.isfinite(image).all()
+        assert np.argmax(image) == 14
+        assert np.abs(nothing).max() <= (1e-6 if name == "interior point" else 0) * image.max()
+        if isinstance(method, je.NonNegative):
+            assert image.min() >= 0
+
+
+@pytest.mark.parametrize("greit", [je.Greit(), je.Greit(radius=1e-3, edge=1e-5)])
+def test_pixels_beside_the_sheet_teach_greit_nothing(greit):
+    """The image of the others is as if they were not; a disc that does not reach the sheet is no image."""
+    rng, inside = np.random.default_rng(6), np.arange(SIDE**2) < 30
+    whole = _problem(rng.normal(size=(20, SIDE**2)) * inside, 0.1)
+    whole = replace(whole, picture=replace(whole.picture, areas=whole.picture.areas * inside))
+    part = replace(whole.picture, centres=whole.picture.centres[inside], areas=whole.picture.areas[inside])
+    part, y = replace(whole, jacobian=whole.jacobian[:, inside], picture=part), jnp.asarray(rng.normal(size=20))
+    image = np.asarray(_imaged(greit, whole, y))
+    assert np.isfinite(image).all()
+    assert _error(image[inside], np.asarray(_imaged(greit, part, y))) < 1e-12
+
+
 @pytest.mark.parametrize(
     ("dtype", "unit"), [("float64", 1e60), ("float64", 1e-60), ("float32", 1e8), ("float32", 1e-8)]
 )
@@ -430,6 +470,35 @@ def test_covariances_wildly_scaled_and_singular(hard, model, pixels, weighed):
     assert common < 1e-3
     said = "an error where it is singular; provenance['rank'] where few readings say it all"
     hard("noise covariance singular or wildly scaled", "condition 5e14; units 1e-30 to 1e30", beyond=said)
+
+
+@pytest.mark.parametrize("covariance", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_channels_left_out_may_have_any_noise_and_any_reading(model, pixels, covariance):
+    """Beside a gap, and beside many."""
+    channels, noise = np.ones(550, bool), STD.copy()
+    channels[[3, 77]] = False
+    dv = np.random.default_rng(0).normal(size=(2, 550))
+    dv[0, 11] = dv[1, ::9] = np.nan
+    images = []
+    for value, reading in ((1e-6, 0.0), (0.0, np.nan), (np.nan, np.inf)):
+        noise[~channels], dv[:, ~channels] = value, reading
+        given = np.diag(noise**2) if covariance else noise
+        images.append(np.asarray(je.prepare(model, basis=pixels, noise=given, channels=channels)(dv)))
+    assert np.isfinite(images[0]).all()
+    np.testing.assert_array_equal(images, [images[0]] * 3)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1e-6, np.nan, np.inf])
+def test_a_noise_that_is_none_is_refused_by_the_number_of_its_reading(model, pixels, bad):
+    with pytest.raises(InverseError, match="the noise of reading 7 is"):
+        je.prepare(model, basis=pixels, noise=np.where(np.arange(550) == 7, bad, STD))
+
+
+@pytest.mark.parametrize("second", [[1, 1, -1, -1], [1 + 1e-3, 1, -1, -1], [0, 1, 0, -1]])
+def test_a_covariance_of_frames_that_share_next_to_nothing(second):
+    """Then the formula for the weight of the diagonal divides by next to nothing: the weight is one, not 1e6."""
+    blank = np.array([[1, 0, -1, 0] if second[0] == 0 else [1, -1, 1, -1], second]).T
+    np.testing.assert_allclose(je.noise_covariance(blank), np.diag(np.var(blank, 0, ddof=1)), rtol=1e-12)
 
 
 def test_one_channel_too_quiet_is_told(model, pixels):

@@ -10,7 +10,10 @@ import pytest
 from scipy import signal
 
 from calib.corrections import LowPass, TwoSided, window_estimate
-from calib.online import Estimate, RecursiveLeastSquares
+from calib.location import geometry_of
+from calib.online import Estimate, RecursiveLeastSquares, SensitivityTracker
+
+from .test_online import touches
 
 MU = 0.999
 TRUE = np.array([1.0, -2.0, 0.5])
@@ -193,3 +196,12 @@ def test_memory_does_not_grow_with_the_number_of_blocks():
         tracemalloc.stop()
     assert max(peaks[2:]) < 1.1 * peaks[1]
     assert peaks[1] < 20 * values.nbytes
+
+
+def test_pads_that_pull_and_images_of_nothing_teach_nothing(skin):
+    """A second contact, which the drift of a third pad below zero would hide; an image below or at zero."""
+    tracker = SensitivityTracker(geometry_of(skin), image_gain=2e4)
+    frames, _, _ = touches(tracker, np.zeros(4), 3)
+    pulled = frames.pad_force.at[1].set(jnp.array([10.0, 5.0, -6.0, 0.0]))
+    odd = frames._replace(pad_force=pulled, image_sum=frames.image_sum * jnp.array([1.0, 1.0, -1.0, 0.0]))
+    assert tracker.samples(odd)[2].tolist() == [True, False, False, False]
