@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         FittedField,
         GaussianProcess,
         PadEdge,
+        PadEdgeSize,
         Places,
         RadialBasis,
         TensorSpline,
@@ -56,7 +57,10 @@ _HOMES = {
     "evaluation": "Evaluation",
     "fit": "Cauchy FittedCurve Huber SoftL1 Squared fit_curve fit_curves",
     "hybrid": "Hybrid",
-    "location": ("Bilinear Constant FittedField GaussianProcess PadEdge Places RadialBasis TensorSpline single_places"),
+    "location": (
+        "Bilinear Constant FittedField GaussianProcess PadEdge PadEdgeSize Places RadialBasis TensorSpline "
+        "single_places"
+    ),
     "locators": "FittedContact ImageCentroid locate",
     "maps": "ForceEstimate apply force_map",
     "importers": "import_csv",

@@ -1,5 +1,6 @@
 """Calibration: from recorded sessions to the numbers that turn a skin's signals into newtons."""
 
+import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -16,7 +17,7 @@ import jaxeit as je
 from .curves import CURVES, AbstractCurve, Linear, curve_name
 from .evaluation import Evaluation, evaluate_presses
 from .fit import AbstractLoss, FitError, FitResult, FittedCurve, SoftL1
-from .hybrid import Hybrid, PressData, choose, fit_hybrid, folds_by_place, hold_out, thinned
+from .hybrid import Candidate, Hybrid, PressData, choose, fit_hybrid, folds_by_place, hold_out, thinned
 from .location import (
     FIELDS,
     AbstractField,
@@ -36,6 +37,7 @@ from .locators import (
     locator_from_numbers,
     locator_numbers,
 )
+from .loops import Loops, typical_loops
 from .measured import Measured, Processing, measure
 from .presses import dominant_pad
 from .session import Archive, Session, SessionError, read_archive, write_archive
@@ -63,6 +65,8 @@ class Calibration:
     | locator: tells that place from a frame; None with no field               |
     | baseline: the paper's curves, one slope a pad, for comparison            |
     | image_gain: force over the integral of the image, N / (S m^2), likewise  |
+    | loops: a whole press of each pad, loading and unloading                  |
+    | tried: the curves and fields that were chosen from, with held-out errors |
     """
 
     skin: je.Skin
@@ -77,6 +81,8 @@ class Calibration:
     locator: AbstractLocator | None = None
     baseline: FittedCurve | None = None
     image_gain: float = float("nan")
+    loops: Loops | None = None
+    tried: tuple[Candidate, ...] = ()
 
     @property
     def hybrid(self) -> Hybrid:
@@ -150,7 +156,8 @@ def calibrate(
     skin = skin or je.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
     curves, fields, loss = _several(curve or Linear()), _several(location), loss or SoftL1()
     progress("reading")
-    pressed = _join([measure(session, skin, processing) for session in sessions])
+    measured = [measure(session, skin, processing) for session in sessions]
+    pressed = _join(measured)
     _require_pressed(skin, pressed.data)
     progress("model and images")
     wanted = (locator or FittedContact()) if any(f is not None for f in fields) else None
@@ -158,7 +165,7 @@ def calibrate(
     progress("fitting")
     geometry = geometry_of(skin, seen.places.position.dtype if seen.places else None)
     trial = _Trial(pressed.data, geometry, seen.places, loss, folds_by_place(pressed.data.place, folds))
-    law, where, why = choose(curves, fields, pressed.data, geometry, seen.places, loss, trial.fold)
+    law, where, why, tried = choose(curves, fields, pressed.data, geometry, seen.places, loss, trial.fold)
     hybrid = trial.fit(law, where)
     _require_fits(skin, hybrid)
     baseline = hybrid.curves if _is_papers(law, where) else trial.fit(Linear(), None).curves
@@ -188,7 +195,14 @@ def calibrate(
         locator=seen.locator if hybrid.field is not None else None,
         baseline=baseline,
         image_gain=float(pressed.data.force.sum() / seen.image_sum.sum()),
+        loops=_loops(measured, pressed.data, hybrid, seen.places),
+        tried=tried,
     )
+
+
+def _loops(measured: Sequence[Measured], data: PressData, hybrid: Hybrid, places: Places | None) -> Loops:
+    gain = None if hybrid.field is None or places is None else np.exp(hybrid.log_gains(places))
+    return typical_loops(measured, _press_of_samples(measured), dominant_pad(data.pressure), gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -474,6 +488,7 @@ def _to_archive(cal: Calibration) -> tuple[dict, dict]:
         "notes": "\n".join(cal.notes),
         "image_rows": cal.recon.shape[0],
         "image_columns": cal.recon.shape[1],
+        "tried": json.dumps([candidate._asdict() for candidate in cal.tried]),
         **{f"provenance_{k}": v for k, v in cal.provenance.items()},
         **{f"evaluation_{k}": v for k, v in cal.evaluation.attributes().items()},
     }
@@ -497,6 +512,8 @@ def _to_archive(cal: Calibration) -> tuple[dict, dict]:
             arrays[f"locator/{name}"] = (array, "", "of the estimator of the place, as the library names it")
     for name, value in cal.evaluation.arrays().items():
         arrays[f"presses/{name}"] = value
+    if cal.loops is not None:
+        arrays |= {f"loops/{name}": value for name, value in cal.loops.arrays().items()}
     return attrs, {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
 
 
@@ -584,6 +601,8 @@ def _from_archive(archive: Archive) -> Calibration:
         locator=_locator_from(arrays, recon.factor.dtype) if located else None,
         baseline=_baseline_from(arrays, len(skin.pads)),
         image_gain=float(attrs.get("image_gain", "nan")),
+        loops=Loops.restore(arrays, "loops/"),
+        tried=tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
     )
 
 

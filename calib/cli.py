@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 _CURVE_NAMES = ("linear", "affine", "power", "polynomial", "spline", "play", "hysteresis", "hysteresis-spline", "auto")
-_LOCATION_NAMES = ("none", "constant", "bilinear", "rbf", "edge", "spline", "gp", "auto")
+_LOCATION_NAMES = ("none", "constant", "bilinear", "rbf", "edge", "edge-size", "spline", "gp", "auto")
 _STREAMS = ("eit", "pressure", "force", "stage", "temperature", "barometer")
 
 
@@ -196,7 +196,7 @@ def _import_args(parser: argparse.ArgumentParser) -> None:
 def _import(args: argparse.Namespace) -> int:
     from .importers import run
 
-    return run(args)
+    return run(args, _skin(args.skin))
 
 
 # --- calibrate -----------------------------------------------------------------------------------
@@ -572,6 +572,8 @@ def _live_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8765, help="of the page; 0: any; default: 8765")
     parser.add_argument("--publish", type=int, metavar="PORT", help="send results there as lines of JSON; 0: any")
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
+    text = "show results in a rerun viewer that runs there (default: 127.0.0.1:9876), or write them to FILE.rrd"
+    parser.add_argument("--rerun", nargs="?", const="127.0.0.1:9876", metavar="HOST:PORT|FILE.rrd", help=text)
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record what arrives as well")
     text = "tell the device what to read next: few readings at rest, those around a contact while there is one"
     parser.add_argument("--event-driven", action="store_true", help=text)
@@ -583,6 +585,8 @@ _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 def _live(args: argparse.Namespace) -> int:
     for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
         os.environ.setdefault(name, "1")
+    if args.rerun is not None:
+        _require_rerun()
     from .runtime import set_up
 
     set_up()
@@ -598,20 +602,26 @@ def _live(args: argparse.Namespace) -> int:
     calibration = load_calibration(args.calibration)
     plan, sources = prepare({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
     orders = Orders()
+    show = Show(stop=orders.stop)
+    also: list[Callable] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
     timer = Timer(args.seconds or 0.0, orders.give)
     timer.daemon = True
-    with _signals(orders, planned=False):
+    with _signals(orders, planned=False), ExitStack() as stack:
+        if args.rerun is not None:
+            from .acquisition.rerun_view import RerunView
+
+            also.append(stack.enter_context(RerunView(calibration, show, args.rerun)).show_result)
         if args.seconds is not None:
             timer.start()
         count = present(
             calibration,
             plan,
             sources,
-            Show(stop=orders.stop),
+            show,
             host=args.host,
             port=args.port,
             publish=args.publish,
-            also=[lambda result: print(result.to_json(), flush=True)] if args.json else [],
+            also=also,
             output=args.output,
             event_driven=args.event_driven,
             tell=lambda line: print(f"jaxeit: {line}", file=sys.stderr),
@@ -621,6 +631,13 @@ def _live(args: argparse.Namespace) -> int:
         timer.cancel()
     print(f"jaxeit: {count} frames", file=sys.stderr)
     return orders.status
+
+
+def _require_rerun() -> None:
+    from importlib.util import find_spec
+
+    if find_spec("rerun") is None:
+        raise ImportError("--rerun needs rerun: pip install 'jaxeit[viewer]'")
 
 
 def _doctor_args(parser: argparse.ArgumentParser) -> None:

@@ -252,6 +252,59 @@ def _residuals_by(
     axes.grid(alpha=0.25)
 
 
+def loops_figure(calibration: Calibration) -> "Figure":
+    """Force against pressure along one whole press of each pad, loading and unloading, with the fitted law.
+
+    The law is that of the pad times the gain at the place of the press; of a law with hysteresis, the law's own loop.
+
+    Raises:
+        ReportError: the calibration holds no presses with unloading, or matplotlib is not installed.
+    """
+    if not has_loops(calibration):
+        raise ReportError("this calibration holds no loading and unloading; calibrate from presses that were released")
+    pads = len(calibration.skin.pads)
+    columns = min(pads, 4)
+    rows = -(-pads // columns)
+    figure = _figure(9.6, 2.9 * rows + 0.7, calibration.simulated)
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for number, axes in enumerate(panels.flat):
+        if number < pads:
+            _loop_panel(axes, calibration, number)
+        else:
+            axes.set_visible(False)
+    handles = {
+        label: line for axes in panels.flat for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    for axes in panels[-1]:
+        axes.set_xlabel("pad pressure, kPa")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("force, N")
+    return figure
+
+
+def has_loops(calibration: Calibration) -> bool:
+    """Whether there is a press with loading and unloading to be drawn."""
+    loops = calibration.loops
+    return loops is not None and any(map(loops.unloads, range(len(calibration.skin.pads))))
+
+
+def _loop_panel(axes: Any, calibration: Calibration, number: int) -> None:
+    loops, fitted = calibration.loops, calibration.curves.pad(number)
+    assert loops is not None
+    pressure, force, top = loops.of(number)
+    width = "no press of its own"
+    if len(pressure):
+        law = loops.gain[number] * np.asarray(fitted.predict(jnp.asarray(pressure)).force, float)
+        for part, colour, name in ((slice(0, top + 1), _BLUE, "loading"), (slice(top, None), _RED, "unloading")):
+            axes.plot(pressure[part] / 1e3, force[part], ".-", ms=3, lw=0.8, color=colour, label=name)
+        axes.plot(pressure / 1e3, law, color="black", lw=1.3, label="fitted law")
+        found = loops.width(number)
+        width = f"loading − unloading {found:.2f} N" if np.isfinite(found) else "not unloaded"
+    axes.set_title(f"pad {number} {_plain(calibration.skin.pads[number].name)}\n{width}", fontsize=9.5)
+    axes.grid(alpha=0.25)
+
+
 def gain_figure(calibration: Calibration) -> "Figure":
     """Each pad's gain over the place pressed, and its standard error with the places from which it was fitted.
 

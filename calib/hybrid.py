@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -104,7 +105,8 @@ def nowhere(pressures: Float[Array, "n pads"], contacts: int = 1) -> Places:
     """Places of which nothing is known."""
     n, pads = pressures.shape
     position = jnp.full((n, contacts, 2), jnp.nan, pressures.dtype)
-    return Places(position, jnp.zeros((n, contacts, pads), pressures.dtype))
+    weight, none = (jnp.zeros((n, contacts, *more), pressures.dtype) for more in ((pads,), ()))
+    return Places(position, weight, none + jnp.nan, none)
 
 
 def fit_hybrid(
@@ -160,7 +162,7 @@ def _field(field, curves: FittedCurve, gain, data: PressData, geometry, places: 
     weight = np.where(use, _weights(data.force, data.place, use), 0)
     extra = bucket(len(use)) - len(use)  # presses without weight, so that compiled fits are reused
     rows = [np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (log_ratio, share, weight)]
-    wide = Places(*(jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (places.position, places.weight)))
+    wide = jax.tree.map(lambda a: jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), places)
     y, x, w = map(jnp.asarray, rows)
     return _fit_field(field, geometry, wide, y, x, w, jnp.asarray(data.reach))
 
@@ -192,12 +194,35 @@ def hold_out(
     return out
 
 
+class Candidate(NamedTuple):
+    """A curve or field that was tried, and what cross-validation over places said of it.
+
+    | meaning                                                                        | unit |
+    |--------------------------------------------------------------------------------|------|
+    | part: "curve" or "location"                                                    |      |
+    | name                                                                           |      |
+    | size: coefficients (of a curve, a pad)                                         |      |
+    | rmse: root mean square over places of the held-out error; None: not determined | N    |
+    | low, high: the same with a standard error less and more in the mean square     | N    |
+    | chosen                                                                         |      |
+    """
+
+    part: str
+    name: str
+    size: int
+    rmse: float | None
+    low: float | None
+    high: float | None
+    chosen: bool
+
+
 class Choice(NamedTuple):
-    """A curve and a field, and in words why these (empty where there was nothing to choose from)."""
+    """A curve and a field, in words why these, and all that were tried (empty where there was nothing to choose)."""
 
     curve: AbstractCurve
     field: AbstractField | None
     why: str
+    tried: tuple[Candidate, ...] = ()
 
 
 def choose(
@@ -216,37 +241,53 @@ def choose(
     chosen with the first curve; simple means few coefficients.
     """
 
-    def best(candidates, describe, size, score) -> tuple[Any, str]:
-        if len(candidates) == 1:
-            return candidates[0], ""
-        return _within_one_error(sorted(candidates, key=size), describe, score)
-
-    def field_size(field):
-        return 0 if field is None else field.size(geometry.pads)
-
     def judged(curve, field):
         return place_errors(curve, field, data, geometry, places, loss, fold)
 
-    field, why = best(fields, _field_title, field_size, lambda f: judged(curves[0], f))
-    curve, more = best(curves, curve_name, lambda c: c.size, lambda c: judged(c, field))
-    return Choice(curve, field, "; ".join(filter(None, [why, more])))
+    by_field = [_Tried(f, _field_title(f), 0 if f is None else f.size(geometry.pads)) for f in fields]
+    field, why, first = _best("location", by_field, lambda f: judged(curves[0], f))
+    by_curve = [_Tried(c, curve_name(c), c.size) for c in curves]
+    curve, more, second = _best("curve", by_curve, lambda c: judged(c, field))
+    return Choice(curve, field, "; ".join(filter(None, [why, more])), first + second)
 
 
 def _field_title(field: AbstractField | None) -> str:
     return "none" if field is None else field_name(field)
 
 
-def _within_one_error(candidates: Sequence, describe, score) -> tuple[Any, str]:
-    """The first candidate whose mean error is at most the least one plus its standard error."""
-    errors = [score(candidate) for candidate in candidates]
+class _Tried(NamedTuple):
+    """A candidate with its name and number of coefficients."""
+
+    choice: Any
+    name: str
+    size: int
+
+
+def _best(part: str, tried: Sequence[_Tried], score) -> tuple[Any, str, tuple[Candidate, ...]]:
+    """The smallest candidate whose mean error is at most the least one plus its standard error, why, and the table."""
+    if len(tried) == 1:
+        return tried[0].choice, "", ()
+    tried = sorted(tried, key=lambda one: one.size)
+    errors = [score(one.choice) for one in tried]
     means = np.array([np.mean(e) if np.isfinite(e).all() else np.inf for e in errors])
+    spread = np.array([np.std(e, ddof=1) / np.sqrt(len(e)) for e in errors])
     least = int(np.argmin(means))
-    limit = means[least] + np.std(errors[least], ddof=1) / np.sqrt(len(errors[least]))
+    limit = means[least] + spread[least]
     chosen = int(np.argmax(means <= limit))
-    said = [f"{np.sqrt(mean):.2f}" if np.isfinite(mean) else "not determined" for mean in means]
-    table = ", ".join(f"{describe(c)} {text}" for c, text in zip(candidates, said, strict=True))
-    why = f"{describe(candidates[chosen])}, the simplest within one standard error ({np.sqrt(limit):.2f} N) of the best"
-    return candidates[chosen], f"{why}; held-out RMSE over places in N: {table}"
+    table = tuple(
+        Candidate(part, one.name, one.size, *_roots(mean, error), chosen=k == chosen)
+        for k, (one, mean, error) in enumerate(zip(tried, means, spread, strict=True))
+    )
+    said = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in table)
+    why = f"{tried[chosen].name}, the simplest within one standard error ({np.sqrt(limit):.2f} N) of the best"
+    return tried[chosen].choice, f"{why}; held-out RMSE over places in N: {said}", table
+
+
+def _roots(mean: float, error: float) -> tuple[float | None, float | None, float | None]:
+    """Root of a mean square (N^2), and of one standard error less and more."""
+    if not np.isfinite(mean):
+        return None, None, None
+    return float(np.sqrt(mean)), float(np.sqrt(max(mean - error, 0))), float(np.sqrt(mean + error))
 
 
 def place_errors(curve, field, data: PressData, geometry, places, loss, fold: np.ndarray) -> np.ndarray:

@@ -6,9 +6,11 @@ A file is described by which column is its clock and which columns form which st
     jaxeit import csv states.csv --time 0:s --stream force=4:g --missing -1 \\
                       --from sensor.csv --time 0:s --stream sensor=1-15:counts -o s.h5
 
-Columns are counted from zero or named as in the header; ``1-15`` and ``0,3`` are several columns.
-Options apply to the file named before them. Nothing is resampled, filtered or filled in; what was
-left out or looks suspicious is counted in the report.
+Columns are counted from zero or named as in the header, whose units need not be repeated: of ``time (ms),x [mm]``
+the clock is ``--time time`` and the stage ``--stream stage=x``. ``1-15`` and ``0,3`` are several columns. Options apply
+to the file named before them. ``--skin`` says on which skin the streams eit and pressure were recorded; without it they
+cannot be calibrated. Nothing is resampled, filtered or filled in; what was left out or looks suspicious is counted in
+the report.
 """
 
 import argparse
@@ -17,13 +19,14 @@ import hashlib
 import itertools
 import math
 import os
+import re
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 from tqdm import tqdm
@@ -32,6 +35,9 @@ from calib.session import SessionError, SessionWriter
 from calib.session.model import printable, problem
 from calib.session.storage import file_hash
 from calib.session.units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, Unit
+
+if TYPE_CHECKING:  # a second to import, and only wanted with --skin
+    import jaxeit as je
 
 Progress = Callable[[Iterable], Iterable]
 
@@ -57,7 +63,7 @@ VARIABLE = {unit: name for name, unit in VARIABLE_UNIT.items()} | {"A": "current
 
 @dataclass(frozen=True)
 class StreamSpec:
-    """A stream to make: its name, its columns (numbers or header names), their units."""
+    """A stream to make: its name, its columns (numbers or header names), their unit (empty: the header says)."""
 
     name: str
     columns: tuple[str, ...]
@@ -66,7 +72,7 @@ class StreamSpec:
 
 @dataclass(frozen=True)
 class FileSpec:
-    """A file to read: the clock's column and unit, the streams, the numbers that mean missing."""
+    """A file to read: the clock's column and unit (empty: the header says), streams, numbers that mean missing."""
 
     path: Path
     time: str
@@ -152,21 +158,30 @@ def _file_lines(report: FileReport) -> Iterator[str]:
 
 
 def parse_time(text: str) -> tuple[str, str]:
-    """``COLUMN:UNIT`` of the clock, as ``0:ms``; raises `SessionError`."""
-    column, colon, unit = text.rpartition(":")
-    if not colon or not column or unit not in UNITS or UNITS[unit].si != "s":
+    """``COLUMN:UNIT`` of the clock, as ``0:ms``; ``COLUMN`` where the header says the unit. Raises `SessionError`."""
+    column, unit = _column_and_unit(text)
+    if not column or (unit and UNITS.get(unit, UNITS["m"]).si != "s"):
         raise SessionError(f"--time {printable(text)}: not COLUMN:UNIT; write it as 0:ms (s, us, ns)")
     return column.strip(), unit
 
 
+def _column_and_unit(text: str) -> tuple[str, str]:
+    """What stands before and after the last colon; without one there is no unit."""
+    column, colon, unit = text.rpartition(":")
+    return (column, unit.strip() or "?") if colon else (text, "")
+
+
 def parse_stream(text: str) -> StreamSpec:
-    """``NAME=COLUMNS:UNIT``, as ``force=4:g`` or ``sensor=1-15:counts``; raises `SessionError`."""
+    """``NAME=COLUMNS:UNIT``, as ``force=4:g`` or ``sensor=1-15:counts``.
+
+    Without a unit, ``NAME=COLUMNS``, the header must say it. Raises `SessionError`.
+    """
     name, equals, rest = text.partition("=")
-    columns, colon, unit = rest.rpartition(":")
+    columns, unit = _column_and_unit(rest)
     where = f"--stream {printable(text)}"
-    if not (equals and colon and name and columns):
+    if not (equals and name and columns) or unit == "?":
         raise SessionError(f"{where}: not NAME=COLUMNS:UNIT; write it as force=4:N")
-    if unit not in UNITS:
+    if unit and unit not in UNITS:
         raise SessionError(f"{where}: unit {printable(unit)!r} not known; use one of: {KNOWN_UNITS}")
     parts = tuple(itertools.chain(*(_column_range(c.strip()) for c in columns.split(","))))
     return StreamSpec(name, parts, unit)
@@ -270,10 +285,23 @@ def _numbers_found(lines: list[str], dialect: _Dialect) -> int:
     return sum(not math.isnan(_number(cell)) for cell in cells)
 
 
+_NAME_AND_UNIT = re.compile(r"(.*?)\s*(?:[(\[]\s*(.*?)\s*[)\]]|[/_,]\s*(\w+))")
+
+
+def _name_and_unit(head: str) -> tuple[str, str]:
+    """``load (N)``, ``load [N]``, ``load/N``, ``load_N`` -> load and N; the whole name where no known unit ends it."""
+    found = _NAME_AND_UNIT.fullmatch(head)
+    unit = (found[2] or found[3]) if found else ""
+    return (found[1], unit) if found and unit in UNITS else (head, "")
+
+
 def _index(path: Path, column: str, dialect: _Dialect) -> int:
-    """A column's index from its number or its header name."""
+    """A column's index from its number or its header name, the unit and the case of which may be left out."""
     if column in dialect.header:
         return dialect.header.index(column)
+    bare = [_name_and_unit(head)[0].lower() for head in dialect.header]
+    if bare.count(column.lower()) == 1:
+        return bare.index(column.lower())
     if column.isdecimal():
         if int(column) < dialect.columns:
             return int(column)
@@ -398,12 +426,13 @@ def _out_of_line(column: np.ndarray, value: float) -> bool:
 
 @dataclass(frozen=True)
 class _Loaded:
-    """One file, read: its table, its clock, and which table columns each stream has."""
+    """One file, read: its table, its clock, and which table columns and which unit each stream has."""
 
     spec: FileSpec
     table: _Table
     clock: _Clock
     places: dict[str, list[int]]
+    units: dict[str, str]
 
 
 def _load(spec: FileSpec, sort: bool, progress: Progress) -> _Loaded:
@@ -411,14 +440,29 @@ def _load(spec: FileSpec, sort: bool, progress: Progress) -> _Loaded:
     first = [line for _, line in itertools.islice(_lines(spec.path), 20)]
     dialect = _sniff(spec.path, first)
     wanted = [_index(spec.path, spec.time, dialect)]
-    places = {}
+    time_unit = spec.time_unit or _unit_of(spec.path, f"--time {printable(spec.time)}", wanted, dialect, "s")
+    places, units = {}, {}
     for stream in spec.streams:
         indices = [_index(spec.path, c, dialect) for c in stream.columns]
         places[stream.name] = list(range(len(wanted), len(wanted) + len(indices)))
+        where = f"--stream {printable(stream.name)}"
+        units[stream.name] = stream.unit or _unit_of(spec.path, where, indices, dialect)
         wanted += indices
     table = _read_table(spec.path, dialect, wanted, progress)
-    clock = _clock(spec.path, table, spec.time, UNITS[spec.time_unit], sort)
-    return _Loaded(spec, table, clock, places)
+    clock = _clock(spec.path, table, spec.time, UNITS[time_unit], sort)
+    return _Loaded(spec, table, clock, places, units)
+
+
+def _unit_of(path: Path, where: str, indices: Sequence[int], dialect: _Dialect, si: str = "") -> str:
+    """The unit that the header names for these columns; `si`: what it must be a unit of."""
+    heads = [dialect.header[i] for i in indices if i < len(dialect.header)]
+    units = {_name_and_unit(head)[1] for head in heads} or {""}
+    unit = units.pop()
+    if units or not unit or (si and UNITS[unit].si != si):
+        said = ", ".join(map(repr, heads[:4])) or "there is none"
+        what = f"no unit given, and the header does not say one for all its columns ({said})"
+        raise problem(path, where, what, f"add it after a colon, one of: {KNOWN_UNITS}")
+    return unit
 
 
 def _write_stream(writer: SessionWriter, loaded: _Loaded, spec: StreamSpec, times: np.ndarray) -> StreamReport:
@@ -429,11 +473,12 @@ def _write_stream(writer: SessionWriter, loaded: _Loaded, spec: StreamSpec, time
         where = f"columns {','.join(spec.columns)}"
         raise problem(loaded.spec.path, where, "hold no number", "check the column numbers")
     missing = np.isin(raw, loaded.spec.missing)
-    values, unit = np.where(missing, np.nan, raw), UNITS[spec.unit]
+    said = loaded.units[spec.name]
+    values, unit = np.where(missing, np.nan, raw), UNITS[said]
     variable = VARIABLE.get(unit.si, "value")
     rate = 1e9 / float(np.median(np.diff(times)))
     about: dict[str, Any] = {"units": unit.si, "channels": len(places), "rate_hz": rate}
-    long_name = f"{spec.name}, columns {', '.join(spec.columns)} in {spec.unit}"
+    long_name = f"{spec.name}, columns {', '.join(spec.columns)} in {said}"
     transport = printable(loaded.spec.path.name)
     about |= {"long_name": long_name, "clock": "recorder", "transport": transport}
     writer.add_stream(spec.name, variable, dtype="f8", **about)
@@ -481,23 +526,27 @@ def import_csv(
     epoch: datetime | None = None,
     sort: bool = False,
     license: str = "",
+    skin: "je.Skin | None" = None,
     progress: Progress = iter,
 ) -> ImportReport:
     """Write the described columns of text files as one session file.
 
     ``epoch`` (with time zone) is when the clocks read zero; clocks that count from 1970 need none.
-    ``sort`` allows rows that go back in time; ``progress`` wraps the iteration over lines, such as
-    `tqdm.tqdm`. The same files and options give the same bytes.
+    ``sort`` allows rows that go back in time; ``skin`` is what the stream eit was recorded on, with one column for each
+    reading in the order of its protocol, and the stream pressure, with one for each pad; ``progress`` wraps the
+    iteration over lines, such as `tqdm.tqdm`. The same files and options give the same bytes.
     Raises `SessionError` for what cannot be read or understood, and then writes nothing.
     """
     _check_specs(files)
+    about_skin = _described(files, skin)
     loaded = [_load(spec, sort, progress) for spec in files]
     start, zero, known = _start([f.clock for f in loaded], epoch)
     name = title or "import of " + ", ".join(printable(f.path.name) for f in files)
     about: dict[str, Any] = {"title": name, "epoch": start, "license": license}
     about["session_id"] = _session_id(files, start)
     reports = []
-    with SessionWriter(output, skin_name="", skin_toml="", **about) as writer:
+    _check_columns(loaded, skin)
+    with SessionWriter(output, **about_skin, **about) as writer:
         for one in loaded:
             times = _nanoseconds(one.spec.path, one.clock, zero)
             streams = [_write_stream(writer, one, s, times) for s in one.spec.streams]
@@ -515,6 +564,29 @@ def _check_specs(files: Sequence[FileSpec]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise SessionError(f"--stream {printable(name)}: given twice; use one name per stream")
+
+
+def _described(files: Sequence[FileSpec], skin: "je.Skin | None") -> dict[str, Any]:
+    """What the session says of the skin it was recorded on."""
+    if skin is None:
+        return {"skin_name": "", "skin_toml": ""}
+    if not any(s.name == "eit" for f in files for s in f.streams):
+        raise SessionError("--skin: no stream is called eit; name the readings' columns, as --stream eit=1-550:V")
+    protocol = skin.protocol
+    scan = {"pattern": protocol.pattern, "current": float(protocol.current), "frequency": float(protocol.frequency)}
+    return {"skin_name": skin.name, "skin_toml": skin.toml, **scan}
+
+
+def _check_columns(loaded: Sequence[_Loaded], skin: "je.Skin | None") -> None:
+    if skin is None:
+        return
+    wanted = {"eit": (len(skin.protocol.pattern), "readings a scan"), "pressure": (len(skin.pads), "pads")}
+    for one in loaded:
+        for name, places in one.places.items():
+            count, what = wanted.get(name, (len(places), ""))
+            if len(places) != count:
+                said = f"{len(places)} columns; the skin {printable(skin.name)} has {count} {what}"
+                raise problem(one.spec.path, f"--stream {printable(name)}", said, "name one column for each, in order")
 
 
 def _session_id(files: Sequence[FileSpec], start: datetime) -> str:
@@ -560,7 +632,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     grouped: dict[str, Any] = {"action": _Grouped, "default": argparse.SUPPRESS}
     parser.add_argument("format", choices=["csv"], help="kind of file")
     parser.add_argument("file", metavar="FILE", help="table of numbers, .gz allowed", **grouped)
-    text = "the clock's column and unit, as 0:ms"
+    text = "the clock's column and unit, as 0:ms; the unit may be left out where the header says it, as time (ms)"
     parser.add_argument("--time", metavar="COLUMN:UNIT", help=text, **grouped)
     text = "a stream, as force=4:N or sensor=1-15:counts; repeat for more"
     parser.add_argument("--stream", dest="streams", metavar="NAME=COLUMNS:UNIT", help=text, **grouped)
@@ -571,14 +643,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="SESSION", help="file to write")
     parser.add_argument("--title", default="", help="what was recorded")
     parser.add_argument("--license", default="", help="licence of the recording")
+    text = "what eit and pressure were recorded on: a shipped skin or a TOML file, in the order of its protocol"
+    parser.add_argument("--skin", help=text)
     parser.add_argument("--epoch", help="ISO time when the clock read zero, with zone")
     parser.add_argument("--sort", action="store_true", help="allow rows that go back in time")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Import as parsed by `add_arguments`; prints the report. Raises `SessionError`."""
+def run(args: argparse.Namespace, skin: "je.Skin | None" = None) -> int:
+    """Import as parsed by `add_arguments`, `skin` being the one named; prints the report. Raises `SessionError`."""
     files = [_file_spec(group) for group in args.groups]
-    options: dict[str, Any] = {"title": args.title, "license": args.license, "sort": args.sort}
+    options: dict[str, Any] = {"title": args.title, "license": args.license, "sort": args.sort, "skin": skin}
     options["progress"] = partial(tqdm, desc="lines", unit="", disable=None, leave=False)
     report = import_csv(files, args.output, epoch=_epoch(args.epoch), **options)
     print(report.summary())

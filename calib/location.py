@@ -33,14 +33,18 @@ from .fit import MAD_TO_SIGMA, FitResult
 class Places(eqx.Module):
     """Where frames are touched, as their images tell.
 
-    | field    | meaning                                                              | shape       | unit |
-    |----------|----------------------------------------------------------------------|-------------|------|
-    | position | of each contact, in the sheet's flat coordinates; NaN: none          | (n, K, 2)   | m    |
-    | weight   | share of each contact in what a pad carries; a row of zeros: unknown | (n, K, pads) | 1   |
+    | field     | meaning                                                              | shape        | unit |
+    |-----------|----------------------------------------------------------------------|--------------|------|
+    | position  | of each contact, in the sheet's flat coordinates; NaN: none          | (n, K, 2)    | m    |
+    | weight    | share of each contact in what a pad carries; a row of zeros: unknown | (n, K, pads) | 1    |
+    | width     | of its bump, as in `jaxeit.Contacts`; NaN: not known                 | (n, K)       | m    |
+    | amplitude | of its bump; 0: not known, or none                                   | (n, K)       | S    |
     """
 
     position: Float[Array, "n K 2"]
     weight: Float[Array, "n K pads"]
+    width: Float[Array, "n K"]
+    amplitude: Float[Array, "n K"]
 
     @property
     def known(self) -> Bool[Array, "n pads"]:
@@ -49,18 +53,19 @@ class Places(eqx.Module):
 
     def within(self, reach: Float[Array, "2 2"]) -> "Places":
         """Contacts beyond a box (lowest, highest corner) moved to its edge: no press says what lies there."""
-        return Places(jnp.clip(self.position, reach[0], reach[1]), self.weight)
+        return eqx.tree_at(lambda p: p.position, self, jnp.clip(self.position, reach[0], reach[1]))
 
     def __getitem__(self, rows) -> "Places":
         return jax.tree.map(lambda leaf: leaf[rows], self)
 
 
-def single_places(position, pads: int) -> Places:
-    """One contact a frame at (n, 2) m, for all pads; NaN: unknown."""
+def single_places(position, pads: int, width=jnp.nan, amplitude=0.0) -> Places:
+    """One contact a frame at (n, 2) m, for all pads, NaN: unknown; of its bump, if known, width and amplitude (n,)."""
     position = jnp.asarray(position)
     known = jnp.all(jnp.isfinite(position), -1)
     weight = jnp.broadcast_to(known[:, None, None], (len(position), 1, pads))
-    return Places(position[:, None], weight.astype(position.dtype))
+    bump = (jnp.broadcast_to(jnp.asarray(value, position.dtype), known.shape)[:, None] for value in (width, amplitude))
+    return Places(position[:, None], weight.astype(position.dtype), *bump)
 
 
 class Geometry(eqx.Module):
@@ -138,6 +143,7 @@ def _relative(geometry: Geometry, place):
 
 # --- fields ----------------------------------------------------------------------------------------------------------
 
+_SIZE = 0.01  # m, of a contact whose gain a correction by size leaves as it is
 _RATIOS = np.logspace(-3, 7, 41)  # prior variance of a coefficient over the variance of the noise
 
 
@@ -157,8 +163,9 @@ class AbstractField(eqx.Module):
     def shapes(self) -> Float[np.ndarray, "shapes k"]:
         """Relative prior variances of one pad's coefficients, one row for each shape that is tried."""
 
-    def features(self, geometry: Geometry, position: Float[Array, "... 2"]) -> Float[Array, "... pads m"]:
-        """Features of positions for every pad; those of a pad alone are zero for the others."""
+    def features(self, geometry: Geometry, position: Float[Array, "... 2"], width=_SIZE) -> Float[Array, "... pads m"]:
+        """Features for every pad, those of a pad alone zero for the others, of contacts at positions (m) and of widths
+        (...,) m; NaN is what a width that is not known leaves unknown."""
         own = self.basis(geometry, _on_pads(geometry, position))
         if self.shared:
             return own
@@ -202,6 +209,19 @@ class PadEdge(AbstractField):
 
     def shapes(self):
         return np.ones((1, 2 * len(self.widths)))
+
+
+class PadEdgeSize(PadEdge):
+    """`PadEdge`, and a power of the contact's estimated width: a broad contact may load a pad otherwise than a narrow
+    one of the same force. To learn it, press with tips of several diameters."""
+
+    def features(self, geometry, position, width=_SIZE):
+        edge = super().features(geometry, position)
+        size = jnp.log(jnp.asarray(width, edge.dtype) / _SIZE)
+        return jnp.concatenate([edge, jnp.broadcast_to(size[..., None, None], (*edge.shape[:-1], 1))], -1)
+
+    def shapes(self):
+        return np.ones((1, 2 * len(self.widths) + 1))
 
 
 class _Grid(AbstractField):
@@ -302,6 +322,7 @@ FIELDS: dict[str, type[AbstractField]] = {
     "bilinear": Bilinear,
     "rbf": RadialBasis,
     "edge": PadEdge,
+    "edge-size": PadEdgeSize,
     "spline": TensorSpline,
     "gp": GaussianProcess,
 }
@@ -375,7 +396,7 @@ class FittedField(eqx.Module):
         """The field at places, each pad's the mean over the contacts that load it."""
         features = pad_features(self.field, self.geometry, places.within(self.reach))
         known = places.known
-        centred = jnp.where(known[..., None], features - self.centre, 0)
+        centred = jnp.where(known[..., None] & jnp.isfinite(features), features - self.centre, 0)
         variance = jnp.einsum("npi,ij,npj->np", centred, self.covariance, centred)
         unknown = jnp.maximum(self.spread**2 - self.noise**2, 0)
         return LogGain(centred @ self.coefficients, jnp.where(known, variance, unknown))
@@ -392,9 +413,10 @@ def log_gain(fitted: FittedField, places: Places) -> LogGain:
 
 
 def pad_features(field: AbstractField, geometry: Geometry, places: Places) -> Float[Array, "n pads m"]:
-    """Features of each pad, the weighted mean over its contacts; 0 where it has none."""
+    """Features of each pad, the weighted mean over its contacts; 0 where it has none, NaN where not known."""
     present = jnp.all(jnp.isfinite(places.position), -1)
-    features = field.features(geometry, jnp.where(present[..., None], places.position, 0))
+    width = jnp.where(present, places.width, _SIZE)
+    features = field.features(geometry, jnp.where(present[..., None], places.position, 0), width)
     weight = jnp.where(present[..., None], places.weight, 0)
     total = jnp.sum(weight, 1, keepdims=True)
     return jnp.sum((weight / jnp.where(total > 0, total, 1))[..., None] * features, 1)
@@ -504,7 +526,11 @@ def fit_field(
     y = jnp.where(weight > 0, log_ratio, 0)
     loads = share * weight[:, None]
     total = jnp.sum(loads, 0)[:, None]
-    centre = jnp.einsum("np,npm->pm", loads, features) / jnp.where(total > 0, total, 1)
+    told = jnp.isfinite(features)
+    by_told = jnp.einsum("np,npm->pm", loads, told.astype(loads.dtype))
+    features = jnp.where(told, features, 0)
+    centre = jnp.einsum("np,npm->pm", loads, features) / jnp.where(by_told > 0, by_told, 1)
+    features = jnp.where(told, features, centre)  # what is not known is taken for the mean
     z = jnp.einsum("np,npm->nm", share, features - centre)
     shapes = jnp.asarray(np.tile(field.shapes(), (1, 1 if field.shared else geometry.pads)), z.dtype)
 

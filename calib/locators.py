@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 import jaxeit as je
 
@@ -24,6 +24,11 @@ class AbstractLocator(eqx.Module):
     @abc.abstractmethod
     def __call__(self, dv: Array, image: Array, recon: je.Reconstructor, masks: je.PadMasks) -> Places:
         """Places of difference frames (n, readings) V with their images (n, pixels) S."""
+
+    @property
+    def contacts(self) -> int:
+        """Most contacts it finds in a frame."""
+        return 1
 
     def single(self) -> "AbstractLocator":
         """The same for frames that are known to hold one contact: presses of a bench."""
@@ -40,9 +45,13 @@ class CentroidLocator(AbstractLocator):
 
 
 class ContactLocator(AbstractLocator):
-    """Contacts fitted to the readings; a pad's contacts weigh by their strength and by how much of them lies on it."""
+    """Contacts fitted to the readings; a pad's contacts weigh by the integrals of their bumps inside its mask."""
 
     finder: je.ContactFinder
+
+    @property
+    def contacts(self):
+        return self.finder.most
 
     def single(self):
         return ContactLocator(replace(self.finder, most=1))
@@ -53,18 +62,11 @@ class ContactLocator(AbstractLocator):
     def placed(self, found: je.Contacts, recon: je.Reconstructor, masks: je.PadMasks) -> Places:
         """`Places` of contacts that were found."""
         position = jnp.where(found.present[..., None], found.position, jnp.nan)
+        width = jnp.where(found.present, found.width, jnp.nan)
         if self.finder.most == 1:
-            return single_places(position[:, 0], masks.weights.shape[0])
-        lies = jax.vmap(lambda x, s: _lies(x, s, recon, masks))(found.position, found.width)
-        share = jnp.where(found.present, found.strength, 0)[..., None] * lies
-        return Places(position, share / jnp.maximum(share.sum(1, keepdims=True), jnp.finfo(share.dtype).tiny))
-
-
-def _lies(position, width, recon, masks) -> Float[Array, "K pads"]:
-    """How much of each bump lies on each pad."""
-    square = jnp.sum((position[:, None] - recon.centres) ** 2, -1)
-    bump = jnp.exp(-0.5 * square / jnp.where(width > 0, width, 1)[:, None] ** 2)
-    return bump @ (masks.weights * masks.areas).T / jnp.maximum(bump @ masks.areas, jnp.finfo(bump.dtype).tiny)[:, None]
+            return single_places(position[:, 0], masks.weights.shape[0], width[:, 0], found.amplitude[:, 0])
+        shares = je.contact_shares(position, width, found.amplitude, recon.centres, masks)
+        return Places(position, shares.share, width, found.amplitude)
 
 
 @je.verb

@@ -14,7 +14,7 @@ import jaxeit as je
 from .calibration import Calibration
 from .corrections import correct
 from .fit import FittedCurve, bucket
-from .hybrid import pad_forces
+from .hybrid import nowhere, pad_forces
 from .location import FittedField, Places
 from .locators import AbstractLocator
 from .measured import Processing, resting_levels
@@ -31,18 +31,24 @@ Progress = Callable[[Iterable], Iterable]
 class ForceEstimate(NamedTuple):
     """Forces on the skin, frame by frame.
 
-    | meaning                                                             | shape        | unit |
-    |---------------------------------------------------------------------|--------------|------|
-    | map: force on each pixel, with the validity of its shape            | (n, pixels)  | N    |
-    | force on each pad                                                   | (n, pads)    | N    |
-    | standard_error of a new reading: of the curve and about it          | (n, pads)    | N    |
-    | valid: pressure within the calibrated range                         | (n, pads)    |      |
+    | meaning                                                                  | shape        | unit |
+    |--------------------------------------------------------------------------|--------------|------|
+    | map: force on each pixel, its standard error, the validity of its shape  | (n, pixels)  | N    |
+    | force on each pad                                                        | (n, pads)    | N    |
+    | standard_error of a new reading: of the curve and about it               | (n, pads)    | N    |
+    | valid: pressure within the calibrated range                              | (n, pads)    |      |
+    | position of each contact found; NaN: none                                | (n, K, 2)    | m    |
+    | contact_force: its shares of the pads' forces, by its fitted bump        | (n, K)       | N    |
+
+    Contacts are found by a calibration with a correction by location; K is 0 without.
     """
 
     map: je.ForceMap
     force: Any
     standard_error: Any
     valid: Any
+    position: Any
+    contact_force: Any
 
 
 class ForceLaw(eqx.Module):
@@ -121,8 +127,20 @@ def fused(
 ) -> ForceEstimate:
     """`force_map` from images and places that are known (None: nothing known); pure."""
     force, error, valid = _pad_forces(law, pressures, places, before)
-    found = je.fuse(image, law.masks, force.astype(image.dtype), gate=gate)
-    return ForceEstimate(found, force, jnp.hypot(error, law.curves.residual_rms), valid)
+    error = jnp.hypot(error, law.curves.residual_rms)
+    numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
+    if places is None:
+        places = nowhere(pressures, 0)
+    else:
+        shares = je.contact_shares(places.position, places.width, places.amplitude, law.recon.centres, law.masks)
+    pad_force, pad_error = numbers
+    found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
+    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places))
+
+
+def _of_contacts(force: Float[Array, "n pads"], places: Places) -> Float[Array, "n K"]:
+    """Each contact's part of the pads' forces; 0 where there is none."""
+    return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), places.weight)
 
 
 def _pad_forces(law: ForceLaw, pressures, places: Places | None, before):
@@ -183,7 +201,7 @@ def apply(
     levels = resting_levels(session, calibration.skin, processing)
     eit, pressure = session.stream("eit"), session.stream("pressure")
     filters = {s.name: processing.of(s)[0] for s in (eit, pressure)}
-    recon, pads = calibration.recon, len(calibration.skin.pads)
+    recon = calibration.recon
     attrs: dict[str, str | int] = {
         "skin": calibration.skin.name,
         "session": session.name,
@@ -194,16 +212,13 @@ def apply(
         "image_columns": recon.shape[1],
         "calibration_created_utc": calibration.provenance["created_utc"],
     }
+    kinds = _rows(calibration)
     with ArchiveWriter(path, FORMAT, attrs) as writer:
         writer.add("centres", np.asarray(recon.centres), "m", "centres of the pixels")
         writer.add("areas", np.asarray(recon.areas), "m2", "areas of the pixels")
-        writer.add_rows("time", (), "ns", "since time_epoch_utc", "i8")
-        writer.add_rows("force", (recon.areas.shape[0],), "N", "force on each pixel", "f4")
-        writer.add_rows("pad_force", (pads,), "N", "force on each pad", "f8")
-        writer.add_rows("pad_force_se", (pads,), "N", "standard error of a pad's force", "f8")
-        writer.add_rows("pad_valid", (pads,), "1", "pressure in the calibrated range", "u1")
-        writer.add_rows("shape_valid", (pads,), "1", "1: shape from the image; 0: even", "u1")
-        before = np.zeros((1, pads))
+        for name, kind in kinds.items():
+            writer.add_rows(name, *kind)
+        before = np.zeros((1, len(calibration.skin.pads)))
         for first in progress(range(0, len(eit), _BLOCK)):
             span = slice(first, min(first + _BLOCK, len(eit)))
             time, frames = _corrected(eit, span, filters["eit"])
@@ -214,16 +229,47 @@ def apply(
             found = force_map(calibration, frames - levels["eit"](time), pressed, before=before)
             if calibration.curves.curve.path:
                 before = remembered(np.concatenate([before, pressed]))
-            for name, rows in (
-                ("time", time),
-                ("force", found.map.force),
-                ("pad_force", found.force),
-                ("pad_force_se", found.standard_error),
-                ("pad_valid", found.valid),
-                ("shape_valid", found.map.valid),
-            ):
-                writer.append(name, np.asarray(rows))
+            rows = _of_block(time, found)
+            for name in kinds:
+                writer.append(name, rows[name])
     return Path(path)
+
+
+def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str, str]]:
+    """What a force map file says of every frame: shape, unit, meaning and type."""
+    pixels, pads = calibration.recon.areas.shape, (len(calibration.skin.pads),)
+    rows = {
+        "time": ((), "ns", "since time_epoch_utc", "i8"),
+        "force": (pixels, "N", "force on each pixel", "f4"),
+        "force_se": (pixels, "N", "standard error of a pixel's force, for the shape as it is", "f4"),
+        "pad_force": (pads, "N", "force on each pad", "f8"),
+        "pad_force_se": (pads, "N", "standard error of a pad's force", "f8"),
+        "pad_valid": (pads, "1", "pressure in the calibrated range", "u1"),
+        "shape_valid": (pads, "1", "1: shape from the image; 0: even", "u1"),
+    }
+    if calibration.locator is None:
+        return rows
+    contacts = (calibration.locator.contacts,)
+    return rows | {
+        "contact_position": ((*contacts, 2), "m", "of each contact found; NaN: none", "f8"),
+        "contact_force": (contacts, "N", "its shares of the pads' forces", "f8"),
+    }
+
+
+def _of_block(time: np.ndarray, found: ForceEstimate) -> dict[str, np.ndarray]:
+    """Rows under the names of `_rows`."""
+    parts = {
+        "time": time,
+        "force": found.map.force,
+        "force_se": found.map.standard_error,
+        "pad_force": found.force,
+        "pad_force_se": found.standard_error,
+        "pad_valid": found.valid,
+        "shape_valid": found.map.valid,
+        "contact_position": found.position,
+        "contact_force": found.contact_force,
+    }
+    return {name: np.asarray(part) for name, part in parts.items()}
 
 
 def _corrected(stream: Stream, span: slice, corrections) -> tuple[np.ndarray, np.ndarray]:

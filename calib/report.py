@@ -16,12 +16,15 @@ from .figures import (
     ESTIMATOR_MEANING,
     curves_figure,
     gain_figure,
+    has_loops,
     localisation_figure,
+    loops_figure,
     png,
     require_matplotlib,
     sensitivity_figure,
     sensitivity_maps,
 )
+from .hybrid import Candidate
 from .location import FittedField, field_name
 from .session import replacing
 
@@ -40,8 +43,8 @@ def write_report(
     Args:
         calibration: what the page is about.
         path: of the page; for ``report.html`` the figures are ``report_localisation.png``,
-            ``report_sensitivity.png`` and ``report_curves.png``, with a correction by location also
-            ``report_gain.png``.
+            ``report_sensitivity.png`` and ``report_curves.png``, of presses that were released also
+            ``report_loops.png``, with a correction by location ``report_gain.png``.
         evaluations: of the calibration on other sessions, by name.
 
     Returns: the paths written, the page first.
@@ -93,6 +96,8 @@ def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
         _Picture("sensitivity", "Sensitivity over the sheet", png(sensitivity), *_about_sensitivity(found)),
         _Picture("curves", "Curves and force errors", png(curves), *_about_curves(calibration, evaluations)),
     ]
+    if has_loops(calibration):
+        pictures.append(_Picture("loops", "Hysteresis", png(loops_figure(calibration)), *_about_loops(calibration)))
     if calibration.field is not None:
         gain = png(gain_figure(calibration))
         pictures.append(_Picture("gain", "Gain by location", gain, *_about_gain(calibration.field)))
@@ -147,6 +152,23 @@ def _about_curves(calibration: Calibration, evaluations: Mapping[str, Evaluation
         "or more. The curve is fitted to whole presses, loading to release. Points in groups beside the curve are "
         f"places that respond differently. {_about_structure(calibration)}; a slope or bend over force asks for "
         "another curve; a trend or a step over time is drift." + _one_level(calibration.evaluation, bool(evaluations))
+    )
+    return alt, caption
+
+
+def _about_loops(calibration: Calibration) -> tuple[str, str]:
+    loops = calibration.loops
+    assert loops is not None
+    widths = [loops.width(pad) for pad in range(len(calibration.skin.pads))]
+    said = ", ".join(f"{_number(width, 2)} N" for width in widths)
+    alt = f"Force against pressure along one press of each pad; mean of loading over unloading: {said}."
+    law = "the law's own loop" if calibration.curves.curve.path else "one line for both ways, as this law has no memory"
+    caption = (
+        "Of each pad the whole press of median stiffness among those at nearly its largest force. Black is the pad's "
+        f"fitted law times the gain at that place: {law}. Look for blue above red: at the same pressure the load is "
+        "larger on the way in than on the way out, by the newtons in the titles on average; where that is more than "
+        "the errors you can bear, calibrate with --curve hysteresis or auto. A loop that is open at the hold alone is "
+        "the pad relaxing; one that does not end at zero is a baseline that moved."
     )
     return alt, caption
 
@@ -307,7 +329,25 @@ def _choice(calibration: Calibration) -> str:
     if not why:
         return ""
     about = "Chosen by cross-validation over places, each predicted by fits that had not seen it: "
-    return f"<h2>Choice of the model</h2><p>{escape(about + why)}.</p>"
+    return f"<h2>Choice of the model</h2><p>{escape(about + why)}.</p>{_tried(calibration)}"
+
+
+_PARTS = {"location": "correction by location, with the first curve", "curve": "curve, with the correction chosen"}
+
+
+def _tried(calibration: Calibration) -> str:
+    """All candidates and their errors; calibrations of before have none to show."""
+    parts = dict.fromkeys(candidate.part for candidate in calibration.tried)
+    groups = {_PARTS.get(p, p): [_candidate(c) for c in calibration.tried if c.part == p] for p in parts}
+    head = ["candidate", "coefficients", "held-out RMSE, N", "one standard error about, N", ""]
+    return _table(head, groups) if groups else ""
+
+
+def _candidate(tried: Candidate) -> tuple[str, ...]:
+    if tried.rmse is None or tried.low is None or tried.high is None:
+        return tried.name, str(tried.size), "not determined", "—", ""
+    about = f"{_number(tried.low, 2)} to {_number(tried.high, 2)}"
+    return tried.name, str(tried.size), _number(tried.rmse, 2), about, "chosen" if tried.chosen else ""
 
 
 def _localisation(found: Mapping[str, Evaluation]) -> str:

@@ -1,6 +1,7 @@
 """Fusion: the shape of the contact from the image, its force from the pads."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -37,6 +38,9 @@ class ForceMap(eqx.Module):
     | concentration: positive part of the image over its magnitude     | (..., pads)   |      |
     | discarded: negative part of the image that was cut away          | (..., pads)   | S m^2|
     | areas of the pixels                                              | (pixels,)     | m^2  |
+    | standard_error of each pixel's force; None: not asked for        | (..., pixels) | N    |
+
+    The standard error is that of the pads' forces, for the shape as it is; within a pad all pixels err together.
     """
 
     force: Float[Array, "... pixels"]
@@ -44,6 +48,7 @@ class ForceMap(eqx.Module):
     concentration: Float[Array, "... pads"]
     discarded: Float[Array, "... pads"]
     areas: Float[Array, " pixels"]
+    standard_error: Float[Array, "... pixels"] | None = None
 
     @property
     def pressure(self) -> Float[Array, "... pixels"]:
@@ -85,6 +90,59 @@ def _coverage(outline: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndar
     return np.where(share > 1e-9, np.minimum(share, 1.0), 0.0)
 
 
+class ContactShares(eqx.Module):
+    """How several contacts divide the image and the pads between them; from `contact_shares`.
+
+    | meaning                                                                                | shape            |
+    |----------------------------------------------------------------------------------------|------------------|
+    | part of each pixel's change that is each contact's; over contacts it sums to one       | (..., K, pixels) |
+    | share of each contact in each pad's force; sums to one, or zeros: no contact on the pad | (..., K, pads)   |
+    """
+
+    part: Float[Array, "... K pixels"]
+    share: Float[Array, "... K pads"]
+
+
+_ASIDE = 0.05  # part of a contact on a pad below which the contact is beside it
+
+
+def contact_shares(
+    position: Float[Array, "... K 2"],
+    width: Float[Array, "... K"],
+    amplitude: Float[Array, "... K"],
+    centres: Float[Array, "pixels 2"],
+    masks: PadMasks,
+) -> ContactShares:
+    """Shares of fitted contacts: on a pad, each has that of its bump's integral inside the pad's mask.
+
+    The bumps are Gaussian, ``a exp(-|x - x0|^2 / 2 s^2)``, as `jaxeit.Contacts` has them. A contact of which less than
+    a twentieth lies on a pad is beside it and has no share in it, unless none lies nearer.
+
+    Args:
+        position: m; anything where there is no contact.
+        width: standard deviation, m.
+        amplitude: S, or any unit that is that of all; 0 where there is no contact.
+        centres: of the pixels, m.
+        masks: from `pad_masks`.
+    """
+    there = (amplitude > 0) & jnp.all(jnp.isfinite(position), -1) & (width > 0)
+    place, size = jnp.where(there[..., None], position, 0), jnp.where(there, width, 1)[..., None]
+    square = jnp.sum((place[..., None, :] - centres) ** 2, -1)
+    log_bump = jnp.log(jnp.where(there, amplitude, 1))[..., None] - 0.5 * square / size**2
+    bump = jnp.where(there[..., None], jnp.exp(log_bump), 0)
+    inside, whole = bump @ (masks.weights * masks.areas).T, (bump @ masks.areas)[..., None]
+    lies = inside / jnp.where(whole > 0, whole, 1)
+    on = lies > _ASIDE
+    mine = jnp.where(on | ~jnp.any(on, -2, keepdims=True), inside, 0)
+    total = mine.sum(-2, keepdims=True)
+    # by logarithms: far from every contact all bumps are zero
+    part = jnp.where(there[..., None], jax.nn.softmax(jnp.where(there[..., None], log_bump, _NEVER), -2), 0)
+    return ContactShares(part, mine / jnp.where(total > 0, total, 1))
+
+
+_NEVER = -1e30  # the logarithm of nothing, without the NaN of a difference of infinities
+
+
 @eqx.filter_jit
 def fuse(
     image: Float[Array, "... pixels"],
@@ -92,6 +150,8 @@ def fuse(
     pad_forces: Float[Array, "... pads"],
     *,
     gate: float = 0.6,
+    contacts: ContactShares | None = None,
+    pad_errors: Float[Array, "... pads"] | None = None,
 ) -> ForceMap:
     """Distribute each pad's force over its part of the image.
 
@@ -106,6 +166,10 @@ def fuse(
         masks: from `pad_masks`.
         pad_forces: (..., pads) N.
         gate: least concentration of a valid image, 0.5 to 1.
+        contacts: from `contact_shares`. A valid pad with two contacts or more then has each contact's share of its
+            force on that contact's part of the image, which blurs and may hide the weaker one. Default: what the
+            image says.
+        pad_errors: standard errors of the pads' forces, (..., pads) N, for those of the map.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -126,11 +190,35 @@ def fuse(
     known = jnp.isfinite(forces)
     valid = (concentration >= gate) & ~missing & known & (forces > 0)
 
-    shape = jnp.where(valid[..., None], jnp.maximum(mass, 0)[..., None, :], masks.areas)
-    part = masks.weights * shape
+    seen = jnp.maximum(mass, 0)
+    shape = seen[..., None, :] if contacts is None else seen[..., None, :] * _balance(seen, masks, contacts)
+    part = masks.weights * jnp.where(valid[..., None], shape, masks.areas)
     whole = part.sum(-1, keepdims=True)
     part = part / jnp.where(whole > 0, whole, 1)
     force = (part * jnp.where(known, forces, 0)[..., None]).sum(-2)
     silent = (~known).astype(mass.dtype) @ masks.weights > 0  # NaN last: it spreads in no sum, and in no derivative
     force = jnp.where(silent, jnp.nan, force)
-    return ForceMap(force, valid, concentration, discarded, masks.areas)
+    error = None if pad_errors is None else _root((part**2 * (pad_errors**2)[..., None]).sum(-2))
+    return ForceMap(force, valid, concentration, discarded, masks.areas, error)
+
+
+def _root(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root, with a gradient of zero (not NaN) at zero."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def _balance(
+    seen: Float[Array, "... pixels"], masks: PadMasks, contacts: ContactShares
+) -> Float[Array, "... pads pixels"]:
+    """What the image over each pad is to be multiplied with for its contacts to have their shares; 1 for a single one.
+
+    A contact that the image does not show at all leaves its share to the others.
+    """
+    mass = (seen[..., None, :] * contacts.part) @ masks.weights.T
+    there = (contacts.share > 0) & (mass > 0)
+    several = there.sum(-2) > 1
+    ratio = jnp.where(there, contacts.share / jnp.where(there, mass, 1), 0)
+    total = mass.sum(-2)
+    relative = ratio * jnp.where(several, total, 1)[..., None, :]
+    factor = jnp.swapaxes(relative, -1, -2) @ contacts.part
+    return jnp.where(several[..., None], factor, 1)

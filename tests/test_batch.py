@@ -238,6 +238,26 @@ def test_the_command_spawns_workers_and_says_what_failed(made, bundled, tmp_path
 
 
 @pytest.mark.slow
+def test_workers_of_dask_do_the_same(bundled, tmp_path):
+    """Processes of a cluster: results as by a batch here, a session that fails named, nothing done twice."""
+    distributed = pytest.importorskip("distributed")
+    names = [str(shutil.copy(bundled[0], tmp_path / f"s{i}.h5")) for i in range(2)] + [str(bundled[1])]
+    options = {"basis": je.Pixels(20), "fidelity": je.Fidelity.draft()}
+    plan = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    with (
+        distributed.LocalCluster(processes=True, **plan) as workers,
+        cluster.dask_executor(workers.scheduler_address) as executor,
+    ):
+        outcomes = batch.calibrate_many(names, tmp_path / "out", executor=executor, **options)
+        again = batch.calibrate_many(names, tmp_path / "out", executor=executor, **options)
+    assert [bool(o.reason) for o in outcomes] == [False, False, True]
+    assert [o.skipped for o in again] == [True, True, False]
+    assert sorted(os.listdir(tmp_path / "out")) == ["s0.h5", "s1.h5"]
+    assert outcomes[0].summary == outcomes[1].summary == again[0].summary
+    np.testing.assert_allclose(outcomes[0].summary["presses"], 225)
+
+
+@pytest.mark.slow
 def test_a_session_that_kills_its_worker_is_named_and_the_rest_complete(made, bundled, tmp_path, monkeypatch):
     """The pool breaks; who held the lock is tried alone, and named when that breaks too."""
     folder, out = tmp_path / "many", tmp_path / "out"

@@ -1,8 +1,11 @@
 """From a simulated bench to newtons and back, and what is said when something is wrong."""
 
+import multiprocessing
+import time
 from dataclasses import replace
 from datetime import datetime
 
+import equinox as eqx
 import h5py
 import jax
 import jax.numpy as jnp
@@ -12,12 +15,16 @@ import pytest
 import calib
 import jaxeit as je
 from calib.bench import Bench, Timing, simulate
-from calib.calibration import _background, _to_archive
-from calib.curves import play
+from calib.calibration import _background, _to_archive, press_data
+from calib.curves import curve_name, play
 from calib.evaluation import render_table
+from calib.hybrid import fit_hybrid
+from calib.location import Places, geometry_of
 from calib.locators import locator_from_numbers, locator_numbers
-from calib.maps import remembered
+from calib.maps import fused, law_of, remembered
 from calib.measured import measure
+
+from .kill_worker import write_all, write_for_ever
 
 SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
 EFFECTS = (
@@ -52,6 +59,13 @@ def calibration(grid):
         return calib.calibrate([session], basis=je.Pixels(20), fidelity=je.Fidelity.draft())
 
 
+@pytest.fixture(scope="session")
+def pressed(skin, grid):
+    """What curves are fitted to."""
+    with calib.open_session(grid) as session:
+        return press_data([measure(session, skin)])[0]
+
+
 def test_recovers_the_pads(calibration):
     """Without effects in the pads, force = pressure x area wherever the whole load is on one pad."""
     slope = np.asarray(calibration.curves.parameters)[:, 0]
@@ -81,9 +95,10 @@ def test_saved_and_loaded_it_is_the_same(calibration, folder):
 
 
 @pytest.mark.parametrize("curve", [calib.PowerLaw(), calib.Affine()], ids=lambda c: type(c).__name__)
-def test_every_curve_survives_the_file(grid, folder, curve):
-    with calib.open_session(grid) as session:
-        found = calib.calibrate([session], curve=curve, basis=je.Pixels(20), fidelity=je.Fidelity.draft())
+def test_every_curve_survives_the_file(calibration, pressed, folder, curve):
+    curves = fit_hybrid(curve, None, pressed, geometry_of(calibration.skin), None, calib.SoftL1()).curves
+    assert (np.asarray(curves.result) == 0).all()
+    found = replace(calibration, curves=curves, provenance=calibration.provenance | {"curve": curve_name(curve)})
     found.save(folder / "one.h5")
     pressures = np.linspace(0, 2000, 7)[:, None] * np.ones(4)
     again = calib.load_calibration(folder / "one.h5").pad_forces(pressures)
@@ -178,6 +193,24 @@ def test_force_maps_sum_to_the_pads_and_know_their_limits(calibration):
         calib.force_map(calibration, np.zeros((2, 3)), pressures)
 
 
+def test_contacts_share_what_their_pad_carries(located):
+    """By the integrals of their bumps; one across the border of two pads has its part of both."""
+    law, recon = law_of(located), located.recon
+    position = jnp.array([[[0.03, 0.05], [0.075, 0.05]], [[0.1, 0.05], [jnp.nan, jnp.nan]]])
+    width, amplitude = jnp.array([[0.01, 0.01], [0.01, jnp.nan]]), jnp.array([[3.0, 1.0], [1.0, 0.0]])
+    share = je.contact_shares(position, width, amplitude, recon.centres, located.masks).share
+    image = jnp.exp(-0.5 * jnp.sum((position[:, :1] - recon.centres) ** 2, -1) / 0.03**2)
+    pressures = jnp.array([[1600.0, 0.0, 0.0, 0.0], [500.0, 500.0, 0.0, 0.0]])
+    found = eqx.filter_jit(fused)(law, image, pressures, Places(position, share, width, amplitude), None, 0.6)
+    np.testing.assert_allclose(found.map.force.sum(1), found.force.sum(1), rtol=1e-12)
+    np.testing.assert_allclose(found.contact_force.sum(1), found.force.sum(1), rtol=1e-12)
+    ratio = np.asarray(found.contact_force)[0] / np.asarray(found.force)[0, 0]
+    np.testing.assert_allclose(ratio, [0.75, 0.25], atol=0.01)
+    assert found.contact_force[1, 1] == 0
+    assert found.map.standard_error.shape == (2, 400)
+    assert calib.force_map(located, np.zeros((1, 550)), pressures[:1]).contact_force.shape == (1, 1)
+
+
 def test_evaluate_on_another_session(calibration, skin, folder):
     sites = np.array([[0.05, 0.05], [0.15, 0.14]])
     path = simulate(bench(skin, sites, seed=7), folder / "other.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
@@ -203,6 +236,8 @@ def test_apply_writes_the_force_of_every_frame(calibration, grid, folder):
     assert pads[held].sum() == pytest.approx(20.0, rel=0.1)
     assert archive.arrays["shape_valid"][held].any()
     assert np.abs(pads[:8].sum(1)).max() < 0.5  # the blank
+    np.testing.assert_allclose(archive.arrays["force_se"].sum(1), archive.arrays["pad_force_se"].sum(1), rtol=1e-5)
+    assert "contact_force" not in archive.arrays  # without a correction by location no contact is looked for
 
 
 def test_a_failed_apply_leaves_no_file(calibration, grid, folder):
@@ -216,6 +251,44 @@ def test_a_failed_apply_leaves_no_file(calibration, grid, folder):
         calib.apply(calibration, session, out, progress=break_off)
     assert not out.exists()
     assert not list(folder.glob("*never*"))
+
+
+KILLS = 100
+
+
+@pytest.mark.slow
+def test_100_kills_leave_the_old_result_or_a_complete_new_one(calibration, tmp_path):
+    """Of the calibration and of each file of its report; what a kill leaves beside them is hidden."""
+    known, ready = {}, []
+    for mark in ("old", "new"):
+        (tmp_path / mark).mkdir()
+        ready.append(tmp_path / f"{mark}.h5")
+        replace(calibration, notes=(mark,)).save(ready[-1])
+        start = time.monotonic()
+        write_all(calib.load_calibration(ready[-1]), tmp_path / mark)
+        cycle = 2 * (time.monotonic() - start)
+        for path in (tmp_path / mark).iterdir():
+            known.setdefault(path.name, []).append(path.read_bytes())
+    out, rng, halves = tmp_path / "out", np.random.default_rng(0), 0
+    out.mkdir()
+    context = multiprocessing.get_context("forkserver")  # a fork before JAX has threads: 100 starts in a minute
+    context.set_forkserver_preload(["tests.kill_worker"])
+    for _ in range(KILLS):
+        begun = context.Event()
+        worker = context.Process(target=write_for_ever, args=(ready, out, begun))
+        worker.start()
+        assert begun.wait(120)
+        time.sleep(rng.uniform(0, cycle))
+        worker.kill()
+        worker.join()
+        for path in out.iterdir():
+            if path.name.startswith("."):
+                halves += 1
+                path.unlink()
+            else:
+                assert path.read_bytes() in known[path.name], path.name
+    assert sorted(p.name for p in out.iterdir()) == sorted(known)
+    assert halves > 0  # some of the kills did come in the middle of a file
 
 
 def test_the_same_bench_makes_the_same_file(skin, folder):

@@ -103,3 +103,56 @@ def test_shapes_that_do_not_fit_are_refused(skin, pixels, masks):
     away = replace(skin.pads[0], outline=np.array([[1.0, 1.0], [1.1, 1.0], [1.1, 1.1]]))
     with pytest.raises(je.FusionError, match="lower left"):
         je.pad_masks(replace(skin, pads=(away,)), pixels)
+
+
+# --- several contacts on one pad -----------------------------------------------------------------
+
+PLACES = jnp.array([[0.03, 0.05], [0.075, 0.05]])  # both on pad 0
+WIDTHS = jnp.array([0.009, 0.012])
+
+
+def _shares(pixels, masks, amplitudes, places=PLACES):
+    return je.contact_shares(places, WIDTHS, jnp.asarray(amplitudes), pixels.centres, masks)
+
+
+def test_contacts_share_a_pad_by_the_integrals_of_their_bumps_inside_it(pixels, masks):
+    shares = _shares(pixels, masks, [2.0, 1.0])
+    integral = np.array([2.0, 1.0]) * np.asarray(WIDTHS) ** 2
+    np.testing.assert_allclose(shares.share[:, 0], integral / integral.sum(), rtol=0.02)  # the pad's edge cuts a little
+    np.testing.assert_allclose(np.asarray(shares.share).sum(0), 1, rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(shares.part).sum(0), 1, rtol=1e-12)
+    beside = _shares(pixels, masks, [2.0, 1.0], PLACES.at[1].set(jnp.array([0.15, 0.05])))
+    np.testing.assert_allclose(np.asarray(beside.share)[:, :2], np.eye(2), atol=1e-12)  # each on a pad of its own
+    alone = _shares(pixels, masks, [2.0, 0.0], PLACES.at[1].set(jnp.nan))
+    np.testing.assert_array_equal(alone.share[1], 0)
+    assert not np.asarray(_shares(pixels, masks, [0.0, 0.0]).share).any()
+
+
+def test_each_contact_has_its_share_of_the_map_whatever_the_image_shows_of_it(pixels, masks):
+    """The image shows both alike; the fit knows that the first is twice as strong."""
+    image = _bump(pixels, PLACES[0]) + _bump(pixels, PLACES[1])
+    shares, forces = _shares(pixels, masks, [3.0, 1.0]), jnp.array([12.0, 3.0, 0.0, 0.0])
+    fmap = je.fuse(image, masks, forces, contacts=shares)
+    np.testing.assert_allclose(_per_pad(fmap, masks), forces, rtol=1e-12)
+    on_pad = np.asarray(masks.weights[0]) * np.asarray(fmap.force)
+    np.testing.assert_allclose(np.asarray(shares.part) @ on_pad, 12 * np.asarray(shares.share[:, 0]), rtol=0.05)
+    plain = je.fuse(image, masks, forces)
+    assert float(shares.part[0] @ (masks.weights[0] * plain.force)) == pytest.approx(6, abs=0.2)  # what the image says
+    slope = jax.grad(lambda a: je.fuse(image, masks, forces, contacts=_shares(pixels, masks, a)).force[150])
+    assert np.isfinite(np.asarray(slope(jnp.array([3.0, 1.0])))).all()
+
+
+@pytest.mark.parametrize("amplitudes", [[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]])
+def test_one_contact_or_none_leaves_the_map_as_the_image_has_it(pixels, masks, amplitudes):
+    image, forces = _bump(pixels, PLACES[0], 0.03), jnp.array([12.0, 3.0, -1.0, jnp.nan])
+    found = je.fuse(image, masks, forces, contacts=_shares(pixels, masks, amplitudes))
+    np.testing.assert_array_equal(found.force, je.fuse(image, masks, forces).force)
+
+
+def test_errors_of_the_pads_become_those_of_their_pixels(pixels, masks):
+    image, forces, errors = _bump(pixels, (0.05, 0.05)), jnp.array([12.0, 0.0, 3.0, 7.0]), jnp.array([1.2, 0.5, 0.3, 0])
+    found = je.fuse(image, masks, forces, pad_errors=errors)
+    np.testing.assert_allclose(_per_pad(replace(found, force=found.standard_error), masks), errors, rtol=1e-12)
+    mine = np.asarray(masks.weights[0]) > 0
+    np.testing.assert_allclose(np.asarray(found.standard_error)[mine], 0.1 * np.asarray(found.force)[mine], rtol=1e-12)
+    assert je.fuse(image, masks, forces).standard_error is None

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import jaxeit as je
 from calib.importers import (
     ImportReport,
     _file_spec,
@@ -87,6 +88,52 @@ def test_columns_by_name_and_range_from_gzip(tmp_path: Path) -> None:
     grams = np.arange(5.0)[:, None] + [2, 0]
     np.testing.assert_allclose(stream(tmp_path, "p"), grams * 9.80665e-3)
     np.testing.assert_array_equal(stream(tmp_path, "q"), np.arange(5.0)[:, None] + [0, 1, 2])
+
+
+HEADERS = {
+    "time (ms),x (mm),y (mm),load (g)": ",",
+    "Time [ms];X [mm];Y [mm];Load [g]": ";",
+    "time/ms\tx/mm\ty/mm\tload/g": "\t",
+    "time_ms,x_mm,y_mm,load_g": ",",
+}
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_units_in_the_header_need_not_be_repeated(header: str, tmp_path: Path) -> None:
+    rows = [HEADERS[header].join(row) for row in (("0", "10", "-5", "100"), ("10", "11", "-6", "200"))]
+    path = table(tmp_path, "\n".join([header, *rows]))
+    load(path, "--time", "time", "--stream", "stage=x,y", "--stream", "force=load", folder=tmp_path)
+    np.testing.assert_allclose(stream(tmp_path, "stage"), [[0.010, -0.005], [0.011, -0.006]])
+    np.testing.assert_allclose(stream(tmp_path, "force")[:, 0], [0.1 * 9.80665, 0.2 * 9.80665])
+    with open_session(tmp_path / "s.h5") as s:
+        np.testing.assert_array_equal(s.streams["stage"].time, [0, 10_000_000])
+        assert s.streams["stage"].variable == "position"
+    with pytest.raises(SessionError, match="does not say one for all"):
+        load(path, "--time", "time", "--stream", "both=x,load", folder=tmp_path)
+
+
+def test_the_skin_and_its_protocol_go_with_the_readings(skin: je.Skin, tmp_path: Path) -> None:
+    count = len(skin.protocol.pattern)
+    rows = "".join(",".join(map(str, [i, *range(count + 4)])) + "\n" for i in range(3))
+    spec = [str(table(tmp_path, rows)), "--time", "0:s"]
+    pads = f"pressure={count + 1}-{count + 4}:kPa"
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+
+    def brought(*words: str) -> None:
+        run(parser.parse_args(["csv", *spec, *words, "-o", str(tmp_path / "s.h5"), "--skin", "testbed"]), skin)
+
+    brought("--stream", f"eit=1-{count}:V", "--stream", pads)
+    with open_session(tmp_path / "s.h5") as s:
+        assert (s.skin_name, s.skin_toml) == (skin.name, skin.toml)
+        np.testing.assert_array_equal(s.pattern, skin.protocol.pattern)
+    for words, said in (
+        (["--stream", pads], "no stream is called eit"),
+        (["--stream", f"eit=1-{count - 1}:V"], f"{count - 1} columns; the skin testbed has {count} readings"),
+        (["--stream", f"eit=1-{count}:V", "--stream", "pressure=1-3:Pa"], "3 columns; the skin testbed has 4 pads"),
+    ):
+        with pytest.raises(SessionError, match=said):
+            brought(*words)
 
 
 def test_files_keep_their_own_options_and_share_one_epoch(tmp_path: Path) -> None:
@@ -178,6 +225,8 @@ def test_run_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture) ->
         (["--time", "0:ms", "--stream", "f=1:N", "--stream", "f=2:N"], "given twice"),
         (["--time", "0:ms", "--stream", "../f=1:N"], "cannot be used"),
         (["--time", "0:mm", "--stream", "f=1:N"], "--time 0:mm"),
+        (["--time", "0", "--stream", "f=1:N"], "no unit given"),
+        (["--time", "0:ms", "--stream", "f=1"], "add it after a colon"),
         (["--time", "0:ms", "--stream", "f=1:stone"], "use one of"),
     ],
 )
@@ -217,13 +266,13 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         load(tmp_path / "none.csv", "--time", "0:s", "--stream", "f=1:N", folder=tmp_path)
 
 
-@pytest.mark.parametrize("text", ["0", ":ms", "0:", "0:N", ""])
+@pytest.mark.parametrize("text", [":ms", "0:", "0:N", "0:f:", ""])
 def test_clocks_must_be_column_and_unit(text: str) -> None:
     with pytest.raises(SessionError, match="COLUMN:UNIT"):
         parse_time(text)
 
 
-@pytest.mark.parametrize("text", ["f", "f=1", "=1:N", "f=:N", "f=5-1:N", "f=1-9999999:N"])
+@pytest.mark.parametrize("text", ["f", "f=1:", "=1:N", "f=:N", "f=5-1:N", "f=1-9999999:N"])
 def test_streams_must_be_name_columns_unit(text: str) -> None:
     with pytest.raises(SessionError, match="write it as"):
         parse_stream(text)

@@ -24,8 +24,9 @@ ORDER = [
 ]  # fmt: skip
 BENCH = [
     "session", "units", "corrections", "presses", "curves", "fit", "response", "smooth", "taxels", "location",
-    "locators", "hybrid", "splits", "online", "measured", "evaluation", "calibration", "maps", "acquisition", "bench",
-    "check", "importers", "logs", "figures", "ladder_figure", "report", "runtime", "workers", "batch", "cluster", "cli",
+    "locators", "hybrid", "splits", "online", "measured", "loops", "evaluation", "calibration", "maps",
+    "acquisition", "bench", "check", "importers", "logs", "figures", "ladder_figure", "report", "runtime", "workers",
+    "batch", "cluster", "cli",
 ]  # fmt: skip
 
 

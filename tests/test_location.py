@@ -17,6 +17,7 @@ from calib.location import (
     FIELDS,
     Constant,
     PadEdge,
+    PadEdgeSize,
     Places,
     RadialBasis,
     default_field,
@@ -170,6 +171,25 @@ def test_coefficients_are_those_of_every_prior_weighed_by_its_evidence(geometry)
     np.testing.assert_allclose(float(found.noise) ** 2, weight @ np.array(variances), rtol=1e-6)
 
 
+def test_a_known_dependence_on_the_size_of_the_contact_is_found(skin, geometry):
+    """Gain falls with the square root of the estimated width, beside the dip at the edges."""
+    place, rng = grid(), np.random.default_rng(2)
+    width = np.exp(rng.uniform(np.log(0.006), np.log(0.03), len(place)))
+    y = dip(skin, place) - 0.5 * np.log(width / 0.01) + rng.normal(0, 0.02, len(place))
+    places = single_places(place, 4, width, 1.0)
+    found = fit(PadEdgeSize(), geometry, places, *press_rows(place, y))
+    assert found.result == FitResult.SUCCESS
+    error = float(np.sqrt(found.covariance[-1, -1]))
+    assert 0 < error < 0.02
+    assert abs(float(found.coefficients[-1]) + 0.5) < 4 * error
+    blind = fit(PadEdgeSize(), geometry, single_places(place, 4), *press_rows(place, y))
+    assert 3 * float(found.noise) < float(blind.noise)
+    assert blind.coefficients[-1] == 0  # no width was known
+    both = single_places(np.repeat([[0.05, 0.05]], 2, 0), 4, np.array([np.nan, np.exp(np.log(width).mean())]), 1.0)
+    mean = np.asarray(log_gain(found, both).mean)[:, 0]
+    assert mean[0] == pytest.approx(mean[1], abs=0.1)  # of a width that is not known, the gain of the mean one
+
+
 def test_no_field_is_found_where_there_is_none(geometry):
     place = grid()
     noise = np.random.default_rng(1).normal(0, 0.05, len(place))
@@ -218,7 +238,8 @@ def test_two_contacts_on_one_pad_share_its_gain_by_their_weights(fitted):
     _, _, found = fitted
     a, b = np.array([0.015, 0.05]), np.array([0.06, 0.05])
     alone = np.asarray(log_gain(found, single_places(np.stack([a, b]), 4)).mean)[:, 0]
-    both = Places(jnp.asarray([[a, b]]), jnp.asarray([[[0.25, 0, 0, 0], [0.75, 0, 0, 0]]]))
+    weight = jnp.asarray([[[0.25, 0, 0, 0], [0.75, 0, 0, 0]]])
+    both = Places(jnp.asarray([[a, b]]), weight, jnp.full((1, 2), 0.01), jnp.ones((1, 2)))
     mean = np.asarray(log_gain(found, both).mean)[0]
     assert mean[0] == pytest.approx(0.25 * alone[0] + 0.75 * alone[1])
     assert (mean[1:] == 0).all()

@@ -114,7 +114,8 @@ def test_only_single_confident_contacts_teach(tracker):
     valid[4] = False
     force[5] *= 0.01
     weight = np.broadcast_to(np.asarray(frames.places.weight), (6, 2, 4))
-    odd = Touched(frames.image_sum, Places(jnp.asarray(position), jnp.asarray(weight)), force, error, valid)
+    places = Places(jnp.asarray(position), jnp.asarray(weight), jnp.full((6, 2), 0.01), jnp.ones((6, 2)))
+    odd = Touched(frames.image_sum, places, force, error, valid)
     _, _, use = follow_frames(tracker, tracker.start(), odd)
     assert use.tolist() == [True, False, False, False, False, False]
 

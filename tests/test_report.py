@@ -22,11 +22,14 @@ from calib.figures import (
     force_series_figure,
     gain_figure,
     localisation_figure,
+    loops_figure,
     png,
     sensitivity_figure,
 )
 from calib.fit import FittedCurve
+from calib.hybrid import Candidate
 from calib.location import FittedField, PadEdge, geometry_of, log_gain, single_places
+from calib.loops import Loops
 from calib.report import write_report
 from calib.splits import Split
 
@@ -141,7 +144,7 @@ def written(calibration, tmp_path_factory):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Figures that cost nothing, for tests of the page alone."""
-    for name in ("localisation_figure", "sensitivity_figure", "curves_figure", "gain_figure"):
+    for name in ("localisation_figure", "sensitivity_figure", "curves_figure", "gain_figure", "loops_figure"):
         monkeypatch.setattr(report, name, lambda *_, **__: None)
     monkeypatch.setattr(report, "png", lambda _: b"picture")
 
@@ -263,6 +266,55 @@ def test_the_choice_and_its_reason_are_told(calibration, located, no_pictures, t
         "none 3.02, edge 0.91" in page_of(located, tmp_path).split("<h2>Choice of the model</h2>")[1].split("</p>")[0]
     )
     assert "Choice of the model" not in page_of(calibration, tmp_path)
+
+
+def test_all_candidates_are_told_with_their_errors(located, no_pictures, tmp_path):
+    tried = (
+        Candidate("location", "none", 0, 3.02, 2.9, 3.1, False),
+        Candidate("location", "edge", 6, 0.91, 0.85, 0.99, True),
+        Candidate("curve", "linear", 1, None, None, None, False),
+    )
+    page = page_of(replace(located, tried=tried), tmp_path).split("<h2>Choice of the model</h2>")[1].split("<h2>")[0]
+    cells = re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", page)
+    rows = {cells[i]: cells[i + 1 : i + 5] for i in range(len(cells)) if cells[i] in ("none", "edge", "linear")}
+    assert rows["none"] == ["0", "3.02", "2.90 to 3.10", ""]
+    assert rows["edge"] == ["6", "0.91", "0.85 to 0.99", "chosen"]
+    assert rows["linear"] == ["1", "not determined", "—", ""]
+
+
+def looped(calibration, lag=0.5, back=True):
+    """A press to 20 N on every pad but the last, whose force is ahead of the law on the way in and behind on the way
+    back; or held for ever."""
+    force = np.r_[np.linspace(0, 20, 21), np.linspace(20, 0, 21)][: 42 if back else 21]
+    ahead = lag * np.where(np.arange(len(force)) < 21, 1, -1) * (force > 0) * (force < 20)
+    pressure = np.tile((force - ahead) / SLOPE, (4, 1))
+    pressure[3] = np.nan
+    return replace(calibration, loops=Loops(pressure, np.tile(force, (4, 1)), np.array([1, 1, 1.5, np.nan])))
+
+
+def test_loading_and_unloading_are_drawn_with_the_law_at_that_place(calibration):
+    known = looped(calibration)
+    assert known.loops.width(0) == pytest.approx(1.0, abs=0.1)
+    assert np.isnan(known.loops.width(3))
+    first, _, third, last = loops_figure(known).axes
+    loading, unloading, law = first.lines
+    np.testing.assert_allclose(loading.get_xdata().max(), 2)  # kPa
+    assert (unloading.get_ydata()[0], unloading.get_ydata()[-1]) == (20, 0)
+    np.testing.assert_allclose(law.get_ydata(), 1e3 * SLOPE * law.get_xdata())
+    np.testing.assert_allclose(third.lines[2].get_ydata(), 1.5 * law.get_ydata())
+    assert "loading − unloading 0.93 N" in first.get_title()
+    assert not last.lines
+    assert "no press of its own" in last.get_title()
+
+
+def test_hysteresis_has_its_picture_where_presses_were_released(calibration, no_pictures, tmp_path):
+    page, *pictures = write_report(looped(calibration), tmp_path / "page.html")
+    assert "page_loops.png" in [p.name for p in pictures]
+    assert "mean of loading over unloading: 0.93 N, 0.93 N, 0.93 N, —" in page.read_text(encoding="utf-8")
+    for none in (calibration, looped(calibration, back=False)):
+        assert "Hysteresis" not in page_of(none, tmp_path)
+        with pytest.raises(ReportError, match="no loading and unloading"):
+            loops_figure(none)
 
 
 def test_a_correction_by_location_is_drawn_and_told(located, no_pictures, tmp_path):
