@@ -1,4 +1,4 @@
-"""A live show for rerun (https://rerun.io), which robotics people already use: the optional extra ``rerun``.
+"""A live show for rerun (https://rerun.io), which robotics people already use: the optional extra ``viewer``.
 
 Map, image and contacts are drawn on pixels, as rerun's flat views are; forces are series, one for each pad. A thread of
 its own does the work, so that no frame waits for it: forces of every frame, pictures of the newest.
