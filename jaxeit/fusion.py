@@ -106,6 +106,7 @@ class ContactShares(eqx.Module):
 _ASIDE = 0.05  # part of a contact on a pad below which the contact is beside it
 
 
+@eqx.filter_jit
 def contact_shares(
     position: Float[Array, "... K 2"],
     width: Float[Array, "... K"],

@@ -1,3 +1,4 @@
+import gc
 import os
 from pathlib import Path
 
@@ -11,6 +12,10 @@ import pytest
 import jaxeit as je
 
 pytest_plugins = ["tests.hard_cases"]
+
+# What is imported stays: looking through it for garbage, again and again, is a twentieth of the time of the suite.
+gc.freeze()
+gc.set_threshold(100_000, 50, 100)
 
 jax.config.update("jax_enable_x64", True)
 # Programs compiled once serve all later tests, and the next run.

@@ -185,6 +185,7 @@ def test_a_run_that_was_killed_goes_on_and_gives_the_same_file(skin, tmp_path, m
     assert {p.name for p in tmp_path.iterdir()} == {"whole.h5", "cut.h5"}
 
 
+@pytest.mark.slow
 def test_the_remains_of_another_scene_are_not_used(skin, tmp_path):
     first, second = (_bench(skin, *SHEET, sites=((x, 0.07),)) for x in (0.06, 0.1))
     with pytest.raises(_Killed):

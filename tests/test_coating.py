@@ -272,6 +272,7 @@ def _pressed(model):
     return np.asarray(je.forward(model, je.conductivity(model, pressure)) - je.forward(model))
 
 
+@pytest.mark.slow
 def test_a_coarser_metal_costs_little():
     """The mesh of the metal, which `discretise` makes coarser, against one as fine as the sheet's."""
     scene, fidelity = je.Scene(_bolted(150.0), COAT), je.Fidelity(edge_length=0.07, solver=Dense())

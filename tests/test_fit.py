@@ -111,6 +111,7 @@ def test_squared_loss_is_the_closed_form_with_its_covariance():
     assert (int(got.n), int(got.rank), int(got.n_groups)) == (N, 2, 0)
 
 
+@pytest.mark.slow
 def test_grouped_covariance_is_cr2_written_out():
     pressure, force = (a[0] for a in pads(outliers=False))
     force = force + np.repeat(np.random.default_rng(1).normal(0, 1, PRESSES), N // PRESSES)

@@ -242,6 +242,7 @@ def _bolts_apart(contact, segments, order):
     return je.discretise(je.Scene(skin), fidelity)
 
 
+@pytest.mark.slow
 def test_a_resolved_bolt_has_the_resistance_of_the_closed_form():
     """Transfer length 0.55 mm, triangles of 0.4 mm: the area integral is resolved."""
     contact = 3e-5

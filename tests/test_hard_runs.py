@@ -198,6 +198,7 @@ def test_memory_does_not_grow_with_the_number_of_blocks():
     assert peaks[1] < 20 * values.nbytes
 
 
+@pytest.mark.slow
 def test_pads_that_pull_and_images_of_nothing_teach_nothing(skin):
     """A second contact, which the drift of a third pad below zero would hide; an image below or at zero."""
     tracker = SensitivityTracker(geometry_of(skin), image_gain=2e4)

@@ -319,6 +319,7 @@ def test_curve_and_field_are_found_together_and_held_out_by_place(skin, geometry
     np.testing.assert_array_equal(again[fold == 0], held[fold == 0])
 
 
+@pytest.mark.slow
 def test_the_simplest_within_one_standard_error_is_chosen_and_says_why(skin, geometry):
     for depth, name in ((True, "edge"), (False, "none")):
         place, data = session_data(skin, depth=depth)
