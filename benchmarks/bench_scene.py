@@ -35,7 +35,9 @@ LEFT_OUT = (je.IndentationSpreading, je.HomogenisedIslands, je.ContinuousCoating
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="coarse, one scene; writes nothing")
-    parser.add_argument("--sessions-only", action="store_true", help="the second table alone")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--programs-only", action="store_true", help="the first table; the second stays as it was")
+    only.add_argument("--sessions-only", action="store_true", help="the second table; the first stays as it was")
     parser.add_argument("--presets", nargs="*", default=list(presets()), metavar="NAME")
     args = parser.parse_args(argv)
     set_up()
@@ -45,10 +47,11 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     before = c.circumstances()
     rows = [] if args.sessions_only else programs(fidelity, smoke=args.smoke)
     print(_table(rows))
-    sessions = [simulated(name, fidelity) for name in names]
+    sessions = [] if args.programs_only else [simulated(name, fidelity) for name in names]
     print(_table(sessions))
-    data = ({"rows": rows} if rows else {}) | {"sessions": sessions, "edge_length": fidelity.edge_length}
-    data = c.closed(data | {"circumstances": before})
+    new = {name: table for name, table in (("rows", rows), ("sessions", sessions)) if table}
+    old = c.stored("scene") if args.programs_only or args.sessions_only else {}
+    data = c.closed(old | new | {"edge_length": fidelity.edge_length, "circumstances": before})
     if not args.smoke:
         print(c.write("scene", data))
     return data
@@ -86,7 +89,8 @@ def programs(fidelity: je.Fidelity, *, smoke: bool) -> list[dict[str, Any]]:
 
 
 def _programs(bare: je.Model, effects: tuple[fx.AbstractEffect, ...]) -> dict[str, Any]:
-    model = eqx.tree_at(lambda m: m.effects, bare, effects, is_leaf=lambda x: x is bare.effects)
+    laid = fx.laid(effects, bare.centroids)  # as a simulation does, once for all frames
+    model = eqx.tree_at(lambda m: m.effects, bare, laid, is_leaf=lambda x: x is bare.effects)
     block = jnp.ones((ROWS, 1)) * jnp.asarray(je.forward(bare))
     pads, load = jnp.ones((ROWS, 4)), jnp.ones((ROWS, 1))
     one = _measured("frame", frame, model, jnp.asarray(20.0))
