@@ -20,6 +20,7 @@ from scipy.fft import dct
 import jaxeit as je
 
 _START, _MOST = 3, 65  # points along an axis
+_WHOLE = 17  # that the whole range of a number takes, about
 _AT_ONCE = 16  # points handed to the device together
 
 Solve = Callable[[Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
@@ -62,7 +63,7 @@ def _moves(low, high, scale):
 def _points(low, high, scale):
     """About how many points a box takes."""
     share = (high - low) / np.where(scale > 0, scale, 1)
-    return np.prod(np.where(_moves(low, high, scale), _START + 14 * share, 1), -1)
+    return np.prod(np.where(_moves(low, high, scale), _START + (_WHOLE - _START) * share, 1), -1)
 
 
 class Interpolant:
