@@ -1,10 +1,14 @@
 """Nested dissection of a graph, on the host: which unknown belongs to which separator.
 
 The unknowns are halved at the median of a coordinate; those of one half that touch the other form
-a separator, and each half is treated alike (George 1973).  All parts of one depth are cut together,
-so the work is a few sorts per depth.  The result is a complete binary tree in heap numbering: 1 is
-the root separator, 2 t and 2 t + 1 are the halves below t, and the deepest nodes are the leaves.
+a separator, and each half is treated alike (George 1973).  Of a few such cuts each part takes that of the
+least quotient, unknowns cut out over those of the smaller half, for the fronts of one level are padded to
+the largest.  All parts of one depth are cut together, so the work is a few sorts per depth.  The result is
+a complete binary tree in heap numbering: 1 is the root separator, 2 t and 2 t + 1 are the halves below t,
+and the deepest nodes are the leaves.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -23,9 +27,10 @@ def dissect(pattern: Pattern, leaf_size: int) -> tuple[np.ndarray, int]:
     edges = np.stack([pattern.rows, pattern.cols])[:, pattern.rows != pattern.cols]
     part = np.ones(pattern.n, np.int64)
     free = placed.copy()
+    axes = _axes(coords, placed)
     for _ in range(depth):
         edges = edges[:, free[edges].all(0) & (part[edges[0]] == part[edges[1]])]
-        side, cut = _best_halves(part, free, coords, edges)
+        side, cut = _best_halves(part, free, axes, edges)
         free &= ~cut
         part = np.where(free, 2 * part + side, part)
     return part, depth
@@ -66,63 +71,81 @@ def _distances(graph: csr_array, start: int) -> np.ndarray:
     return np.where(np.isfinite(steps), steps, graph.shape[0])
 
 
+class Axis(NamedTuple):
+    """A coordinate in whole steps of a billionth of its extent, (n,), and the unknowns in its order, (n,)."""
+
+    steps: np.ndarray
+    order: np.ndarray
+
+
+def _axes(coords: np.ndarray, placed: np.ndarray) -> list[Axis]:
+    finite = np.where(placed[:, None], coords, 0)
+    steps = np.rint(finite / (np.abs(finite).max(initial=0) or 1) * 1e9).astype(np.int64)
+    return [Axis(column, np.argsort(column, kind="stable")) for column in steps.T]
+
+
 def _best_halves(
-    part: np.ndarray, free: np.ndarray, coords: np.ndarray, edges: np.ndarray
+    part: np.ndarray, free: np.ndarray, axes: list[Axis], edges: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Side of each unknown and whether it is cut out, along each part's cheapest coordinate."""
-    tries = [_halve(part, free, coords, edges, axis) for axis in range(coords.shape[1])]
-    parts = int(part.max()) + 1
-    costs = np.stack([np.bincount(part[cut], minlength=parts) for _, cut in tries])
+    """Side of each unknown and whether it is cut out, by each part's cheapest cut."""
+    tries = [(side, cut) for axis in axes for side in _halves(part, free, axis) for cut in _least_covers(side, edges)]
+    costs = np.stack([_quotient(part, free, side, cut) for side, cut in tries])
     best = np.argmin(costs, axis=0)[part]
     pick = np.arange(part.size)
     sides, cuts = (np.stack(column) for column in zip(*tries, strict=True))
     return sides[best, pick], cuts[best, pick]
 
 
-def _halve(
-    part: np.ndarray, free: np.ndarray, coords: np.ndarray, edges: np.ndarray, axis: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Halve every part at the median of one coordinate (ties by the others); cut a least cover."""
-    others = [coords[:, k] for k in range(coords.shape[1]) if k != axis]
-    order = np.lexsort([*others, coords[:, axis], part, ~free])[: np.count_nonzero(free)]
+def _quotient(part: np.ndarray, free: np.ndarray, side: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Of each part: unknowns cut out, over those left on the smaller side."""
+    parts, rest = int(part.max()) + 1, free & ~cut
+    left, right = (np.bincount(part[rest & (side == s)], minlength=parts) for s in (0, 1))
+    smaller = np.minimum(left, right)
+    return np.where(smaller > 0, np.bincount(part[cut], minlength=parts) / np.maximum(smaller, 1), np.inf)
+
+
+def _halves(part: np.ndarray, free: np.ndarray, axis: Axis) -> list[np.ndarray]:
+    """Sides of every part about the median of one coordinate: with what lies there on either side, or,
+    where nothing but the median does, on the first."""
+    order = axis.order[free[axis.order]]
+    order = order[np.argsort(part[order], kind="stable")]
     sizes = np.bincount(part[order], minlength=int(part.max()) + 1)
     first = np.cumsum(sizes) - sizes
-    rank = np.arange(order.size) - first[part[order]]
-    side = np.zeros(part.size, np.int64)
-    side[order] = 2 * rank >= sizes[part[order]]
-    return side, _least_cover(side, edges)
+    middle = axis.steps[order[np.minimum(first + np.maximum(sizes - 1, 0) // 2, order.size - 1)]][part]
+    beyond, from_there = axis.steps > middle, axis.steps >= middle
+    tied = np.count_nonzero((beyond != from_there)[order]) > np.count_nonzero(sizes)
+    return [beyond, from_there] if tied else [beyond]
 
 
-def _least_cover(side: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """The fewest unknowns that touch every edge between the sides (König's theorem).
+def _least_covers(side: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
+    """The fewest unknowns that touch every edge between the sides, taken from one side or the other.
 
-    Given a maximum matching, let Z be what alternating paths reach from the unmatched unknowns of
-    side 0; the cover is side 0 without Z and side 1 within Z.
+    König's theorem: given a maximum matching, let Z be what alternating paths reach from the unmatched
+    unknowns of one side; a cover is that side without Z and the other within Z.
     """
-    n = side.size
     crossing = edges[:, side[edges[0]] != side[edges[1]]]
-    swap = side[crossing[0]] == 1
-    low, high = np.where(swap, crossing[::-1], crossing)
-    graph = csr_array((np.ones(low.size, bool), (low, high)), shape=(n, n))
+    ends, places = np.unique(crossing, return_inverse=True)
+    low, high = np.where(side[crossing[0]], places.reshape(2, -1)[::-1], places.reshape(2, -1))
+    graph = csr_array((np.ones(low.size, bool), (low, high)), shape=(ends.size, ends.size))
     partner = maximum_bipartite_matching(graph, perm_type="column")
-    touched = np.zeros(n, bool)
-    touched[low] = True
-    reached = _alternating_reach(graph, partner, touched & (partner < 0))
-    cover = touched & ~reached
-    cover[high] = reached[high]
-    return cover
+    mate = np.full(ends.size, -1)
+    mate[partner[partner >= 0]] = np.flatnonzero(partner >= 0)
+    covers = []
+    for mine, to, back, there in ((~side[ends], partner, mate, graph), (side[ends], mate, partner, graph.T.tocsr())):
+        reached = _alternating_reach(there, back, mine & (to < 0))
+        cover = np.zeros(side.size, bool)
+        cover[ends] = mine != reached
+        covers.append(cover)
+    return covers
 
 
-def _alternating_reach(graph: csr_array, partner: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Everything on alternating paths from start: any edge to side 1, its matched edge back."""
-    mate = np.full(start.size, -1)
-    matched = np.flatnonzero(partner >= 0)
-    mate[partner[matched]] = matched
+def _alternating_reach(graph: csr_array, mate: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Everything on alternating paths from start: any edge to the other side, its matched edge back."""
     reached, frontier = start.copy(), np.flatnonzero(start)
     while frontier.size:
-        high = np.unique(graph[frontier].indices)
-        high = high[~reached[high]]
-        reached[high] = True
-        frontier = mate[high][mate[high] >= 0]
+        beyond = np.unique(graph[frontier].indices)
+        beyond = beyond[~reached[beyond]]
+        reached[beyond] = True
+        frontier = mate[beyond][mate[beyond] >= 0]
         reached[frontier] = True
     return reached
