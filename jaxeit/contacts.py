@@ -29,7 +29,7 @@ from .whitening import InverseError, Whitened, Whitening, whitened_readings
 
 _LONGEST = 0.04  # half length of an oblong contact, m
 _RIPPLE = 0.1  # of the strongest contact's strength: what is less is none
-_FIRST = 4  # steps from each start, of which only the best goes on
+_FIRST = 4  # steps from each start; the best goes on first
 _TRIALS = 512  # noise frames that set the threshold
 
 
@@ -249,12 +249,28 @@ class ContactFinder(eqx.Module):
                 return _padded(self.fit(y, best), self.most)
             starts = jnp.stack([best, self._split(y, theta)])
             tried = jax.vmap(lambda start: self.fit(y, start, steps=_FIRST))(starts)
-            best = _round(tried.flat[jnp.argmin(tried.square)])
             # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
             hope = fit.square / (1 + (0.5 * (n - 1) * self.ratio) ** 2)
-            return _padded(self.fit(y, best, hope), self.most)
+            return _padded(self._finished(y, tried, hope), self.most)
 
         return fitted
+
+    def _finished(self, y, tried: Fit, hope) -> Fit:
+        """The best of some fits begun, finished; the next too if it leaves more than noise and model error may."""
+        order = jnp.argsort(tried.square)
+        allowed = 2 * len(y) + self.model_error**2 * (y @ y)
+
+        def going(state):
+            k, best = state
+            return (k == 0) | (k < len(order)) & (best.square > allowed)
+
+        def again(state):
+            k, best = state
+            fit = self.fit(y, _round(tried.flat[order[k]]), hope)
+            return k + 1, jax.tree.map(lambda new, old: jnp.where(fit.square < best.square, new, old), fit, best)
+
+        begun = jax.tree.map(lambda leaf: leaf[order[0]], tried)
+        return jax.lax.while_loop(going, again, (0, begun._replace(square=jnp.full_like(begun.square, jnp.inf))))[1]
 
     def added(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
         """One contact more: the atom that explains most of what is left."""
