@@ -339,10 +339,11 @@ def prepare(
 @eqx.filter_jit
 def _build(problem: Problem, method: AbstractLinearMethod, found: Whitened, noise_is_known: bool) -> Reconstructor:
     compress = jnp.asarray(found.compress, problem.jacobian.dtype)
+    image, followed = one_step(problem, problem.precision(), compress)
     return Reconstructor(
-        factor=method.image(problem, compress),
+        factor=image if isinstance(method, OneStep) else method.image(problem, compress),
         variance=method.variance(problem) if noise_is_known else jnp.full_like(problem.picture.areas, jnp.inf),
-        predict=compress.T @ one_step(problem, problem.precision(), compress)[1],
+        predict=compress.T @ followed,
         whitening=found.whitening,
         picture=problem.picture,
         provenance=Provenance(),
