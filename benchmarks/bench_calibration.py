@@ -23,6 +23,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import calib
+import jaxeit as je
 from calib.calibration import press_data
 from calib.figures import png
 from calib.fit import FitResult
@@ -42,6 +43,12 @@ SIDE = 15  # of the pool's grid
 CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib.PowerLaw()}
 FIELDS = {"none": None, "pad edge": calib.PadEdge()}
 RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))
+SMOKE = {
+    "location": calib.Bilinear(nodes=2, shared=True),
+    "locator": calib.ImageCentroid("half"),
+    "fidelity": je.Fidelity.draft(),
+    "folds": 2,
+}
 
 LINES = {"scattered": "-", "grid": "--", "random": ":"}
 
@@ -69,9 +76,10 @@ class Pool:
     elsewhere: Places
 
 
-def pool() -> Pool:
+def pool(**settings: Any) -> Pool:
+    """Places as `calibrate` with these settings tells them."""
     with calib.open_session(SESSIONS / "testbed_grid.h5") as session:
-        calibration = calib.calibrate([session], location=calib.PadEdge())
+        calibration = calib.calibrate([session], **{"location": calib.PadEdge()} | settings)
         found = calib.measure(session, calibration.skin)
         data, dv, position = press_data([found])
         seconds = float(np.median(np.diff(found.presses.t_press))) * 1e-9
@@ -104,12 +112,14 @@ def on_grid(position: np.ndarray, side: int) -> np.ndarray:
 
 
 def scattered(position: np.ndarray, count: int) -> np.ndarray:
-    """(presses,) true for ``count`` of them, each the nearest left to the next point of the sequence."""
+    """(presses,) true for ``count`` of them, each the nearest left to the next point of the sequence; what lies half a
+    spacing from the rim or less goes there."""
     low, high = position.min(0), position.max(0)
     step = 1 / 1.32471795724474602596 ** np.arange(1, 3)  # of the plastic number
     chosen = np.zeros(len(position), bool)
     for k in range(count):
-        away = np.linalg.norm(position - (low + (high - low) * ((0.5 + k * step) % 1)), axis=1)
+        part = np.clip(0.5 + (1 + count**-0.5) * ((0.5 + k * step) % 1 - 0.5), 0, 1)
+        away = np.linalg.norm(position - (low + (high - low) * part), axis=1)
         chosen[np.where(chosen, np.inf, away).argmin()] = True
     return chosen
 
@@ -139,7 +149,9 @@ def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | N
     """None where the presses do not determine it."""
     curve, field = CURVES[recipe[0]], FIELDS[recipe[1]]
     places = None if field is None else pool.places
-    hybrid = fit_hybrid(curve, field, at_levels(pool.data, levels), pool.geometry, places, calib.SoftL1(), use=use)
+    pressed = pool.position[use]
+    data = replace(at_levels(pool.data, levels), reach=np.stack([pressed.min(0), pressed.max(0)]))
+    hybrid = fit_hybrid(curve, field, data, pool.geometry, places, calib.SoftL1(), use=use)
     results = [np.asarray(hybrid.curves.result), *([] if hybrid.field is None else [np.asarray(hybrid.field.result)])]
     return hybrid if all((found == FitResult.SUCCESS).all() for found in results) else None
 
@@ -307,7 +319,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         draw(c.stored("calibration_cost"), PICTURE)
         return {}
     data: dict[str, Any] = {"circumstances": c.circumstances()}
-    found = pool()
+    found = pool(**SMOKE) if args.smoke else pool()
     sides, draws, recipes = ((5, 15), 1, RECIPES[1:2]) if args.smoke else (SIDES, DRAWS, RECIPES)
     data["presses"] = list(by_presses(found, sides, draws, recipes))
     data["levels"] = [] if args.smoke else list(by_levels(found, LEVELS, (36, 100)))

@@ -51,10 +51,6 @@ class Places(eqx.Module):
         """Whether a pad is known to be touched somewhere."""
         return jnp.sum(self.weight, 1) > 0
 
-    def within(self, reach: Float[Array, "2 2"]) -> "Places":
-        """Contacts beyond a box (lowest, highest corner) moved to its edge: no press says what lies there."""
-        return eqx.tree_at(lambda p: p.position, self, jnp.clip(self.position, reach[0], reach[1]))
-
     def __getitem__(self, rows) -> "Places":
         return jax.tree.map(lambda leaf: leaf[rows], self)
 
@@ -163,10 +159,12 @@ class AbstractField(eqx.Module):
     def shapes(self) -> Float[np.ndarray, "shapes k"]:
         """Relative prior variances of one pad's coefficients, one row for each shape that is tried."""
 
-    def features(self, geometry: Geometry, position: Float[Array, "... 2"], width=_SIZE) -> Float[Array, "... pads m"]:
-        """Features for every pad, those of a pad alone zero for the others, of contacts at positions (m) and of widths
-        (...,) m; NaN is what a width that is not known leaves unknown."""
-        own = self.basis(geometry, _on_pads(geometry, position))
+    def features(
+        self, geometry: Geometry, place: Float[Array, "... pads 2"], width=_SIZE
+    ) -> Float[Array, "... pads m"]:
+        """Features for every pad, those of a pad alone zero for the others, of contacts at places on each pad (m) and
+        of widths (...,) m; NaN is what a width that is not known leaves unknown."""
+        own = self.basis(geometry, place)
         if self.shared:
             return own
         apart = own[..., None, :] * jnp.eye(geometry.pads, dtype=own.dtype)[:, :, None]
@@ -175,6 +173,13 @@ class AbstractField(eqx.Module):
     def size(self, pads: int) -> int:
         """Number of coefficients."""
         return self.shapes().shape[1] * (1 if self.shared else pads)
+
+
+def _cubic(z):
+    """The cubic B-spline at z knots from its middle."""
+    z = jnp.abs(z)
+    inner = 2 / 3 - z**2 + z**3 / 2
+    return jnp.where(z < 1, inner, jnp.maximum(2 - z, 0) ** 3 / 6)
 
 
 class Constant(AbstractField):
@@ -192,36 +197,41 @@ class Constant(AbstractField):
 class PadEdge(AbstractField):
     """Distance to the walls: a pad is stiff at its edges, and part of a load beyond the sheet's rim is lost.
 
-    For each width w, the sum of exp(-distance / w) over the sides of the pad, and exp(-distance to the rim / w). Walls
-    are alike, so pads share the coefficients and a few dozen presses suffice.
+    Bumps (cubic B-splines) in octaves of distance, the n-th where distance is (2^n - 1) `width`, summed over the sides
+    of the pad; and the same of the distance to the rim. A coefficient is of one distance: where no press lies its prior
+    holds. Walls are alike, so pads share the coefficients and a few dozen presses suffice.
     """
 
-    widths: Float[Array, " widths"] = eqx.field(converter=jnp.asarray, default=(8e-3, 16e-3, 32e-3))
+    width: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=8e-3)
+    bumps: int = eqx.field(static=True, default=4)
     shared: bool = eqx.field(static=True, default=True)
 
     def basis(self, geometry, place):
-        widths = self.widths.astype(place.dtype)
         real = jnp.any(geometry.start != geometry.end, -1)
         to_sides = _distance(_nearest(place, geometry.start, geometry.end), place[..., None, :])
         to_rim = _distance(_nearest(place, geometry.rim[:, 0], geometry.rim[:, 1]), place[..., None, :]).min(-1)
-        sides = jnp.sum(jnp.where(real[..., None], jnp.exp(-to_sides[..., None] / widths), 0), -2)
-        return jnp.concatenate([sides, jnp.exp(-to_rim[..., None] / widths)], -1)
+        sides = jnp.sum(jnp.where(real[..., None], self._near(to_sides), 0), -2)
+        return jnp.concatenate([sides, self._near(to_rim)], -1)
+
+    def _near(self, distance):
+        octaves = jnp.log2(1 + distance / self.width.astype(distance.dtype))
+        return _cubic(octaves[..., None] - jnp.arange(self.bumps))
 
     def shapes(self):
-        return np.ones((1, 2 * len(self.widths)))
+        return np.ones((1, 2 * self.bumps))
 
 
 class PadEdgeSize(PadEdge):
     """`PadEdge`, and a power of the contact's estimated width: a broad contact may load a pad otherwise than a narrow
     one of the same force. To learn it, press with tips of several diameters."""
 
-    def features(self, geometry, position, width=_SIZE):
-        edge = super().features(geometry, position)
+    def features(self, geometry, place, width=_SIZE):
+        edge = super().features(geometry, place)
         size = jnp.log(jnp.asarray(width, edge.dtype) / _SIZE)
         return jnp.concatenate([edge, jnp.broadcast_to(size[..., None, None], (*edge.shape[:-1], 1))], -1)
 
     def shapes(self):
-        return np.ones((1, 2 * len(self.widths) + 1))
+        return np.ones((1, 2 * self.bumps + 1))
 
 
 class _Grid(AbstractField):
@@ -278,9 +288,7 @@ class TensorSpline(_Grid):
         return np.linspace(-1 - pitch, 1 + pitch, self.nodes + 2), pitch
 
     def _bump(self, z):
-        z = jnp.abs(z)
-        inner = 2 / 3 - z**2 + z**3 / 2
-        return jnp.where(z < 1, inner, jnp.maximum(2 - z, 0) ** 3 / 6)
+        return _cubic(z)
 
 
 def _floats(values) -> tuple[float, ...]:
@@ -346,8 +354,8 @@ def restored(kind: type[AbstractField], settings: Mapping[str, np.ndarray]) -> A
 
 
 def _setting(value: np.ndarray):
-    """A static setting as Python's own number or tuple; what is an array stays one."""
-    if value.ndim == 0:
+    """A static setting as Python's own number; what is an array stays one."""
+    if value.ndim == 0 and value.dtype.kind in "bui":
         return bool(value) if value.dtype.kind in "bu" else int(value)
     return jnp.asarray(value)
 
@@ -362,29 +370,32 @@ class LogGain(NamedTuple):
     variance: Array
 
 
+_BORNE = 1 / 3  # share of a press from which on it tells of a pad
+
+
 class FittedField(eqx.Module):
     """A field with its numbers and their honesty.
 
-    | field        | meaning                                                            | shape     | unit |
-    |--------------|--------------------------------------------------------------------|-----------|------|
-    | field        | the choice                                                         |           |      |
-    | geometry     | of the skin                                                        |           |      |
-    | coefficients | of the centred features                                            | (m,)      | 1    |
-    | covariance   | of the coefficients, posterior                                     | (m, m)    | 1    |
-    | reach        | corners of the box that was pressed; beyond, the field stays level | (2, 2)    | m    |
-    | centre       | mean features of each pad's presses: there log-gain is zero        | (pads, m) | 1    |
-    | noise        | scatter of single presses about the field, in log force            | ()        | 1    |
-    | spread       | scatter of single presses about no field, in log force             | ()        | 1    |
-    | evidence     | log of the largest marginal likelihood, over that of no field      | ()        | 1    |
-    | n            | presses used, those at one place counted as one                    | ()        |      |
-    | result       | a `FitResult`; anything but 0 means: no correction                 | ()        |      |
+    | field        | meaning                                                            | shape        | unit |
+    |--------------|--------------------------------------------------------------------|--------------|------|
+    | field        | the choice                                                         |              |      |
+    | geometry     | of the skin                                                        |              |      |
+    | coefficients | of the centred features                                            | (m,)         | 1    |
+    | covariance   | of the coefficients, posterior                                     | (m, m)       | 1    |
+    | reach        | corners of the box of each pad that was pressed; beyond: `log_gain`| (pads, 2, 2) | m    |
+    | centre       | mean features of each pad's presses: there log-gain is zero        | (pads, m)    | 1    |
+    | noise        | scatter of single presses about the field, in log force            | ()           | 1    |
+    | spread       | scatter of single presses about no field, in log force             | ()           | 1    |
+    | evidence     | log of the largest marginal likelihood, over that of no field      | ()           | 1    |
+    | n            | presses used, those at one place counted as one                    | ()           |      |
+    | result       | a `FitResult`; anything but 0 means: no correction                 | ()           |      |
     """
 
     field: AbstractField
     geometry: Geometry
     coefficients: Float[Array, " m"]
     covariance: Float[Array, "m m"]
-    reach: Float[Array, "2 2"]
+    reach: Float[Array, "pads 2 2"]
     centre: Float[Array, "pads m"]
     noise: Float[Array, ""]
     spread: Float[Array, ""]
@@ -393,13 +404,20 @@ class FittedField(eqx.Module):
     result: Int[Array, ""]
 
     def log_gain(self, places: Places) -> LogGain:
-        """The field at places, each pad's the mean over the contacts that load it."""
-        features = pad_features(self.field, self.geometry, places.within(self.reach))
-        known = places.known
-        centred = jnp.where(known[..., None] & jnp.isfinite(features), features - self.centre, 0)
-        variance = jnp.einsum("npi,ij,npj->np", centred, self.covariance, centred)
+        """The field at places, each pad's the mean over the contacts that load it.
+
+        Beyond what was pressed it stays level; its variance there is that of a field that goes on, and the square
+        of what lies between the two.
+        """
+        held, there = (self._centred(places, reach) for reach in (self.reach, None))
+        between = (there - held) @ self.coefficients
+        variance = jnp.einsum("npi,ij,npj->np", there, self.covariance, there) + between**2
         unknown = jnp.maximum(self.spread**2 - self.noise**2, 0)
-        return LogGain(centred @ self.coefficients, jnp.where(known, variance, unknown))
+        return LogGain(held @ self.coefficients, jnp.where(places.known, variance, unknown))
+
+    def _centred(self, places: Places, reach) -> Float[Array, "n pads m"]:
+        features = pad_features(self.field, self.geometry, places, reach)
+        return jnp.where(places.known[..., None] & jnp.isfinite(features), features - self.centre, 0)
 
     def message(self) -> str:
         """What became of the fit, for a person."""
@@ -412,14 +430,38 @@ def log_gain(fitted: FittedField, places: Places) -> LogGain:
     return fitted.log_gain(places)
 
 
-def pad_features(field: AbstractField, geometry: Geometry, places: Places) -> Float[Array, "n pads m"]:
-    """Features of each pad, the weighted mean over its contacts; 0 where it has none, NaN where not known."""
+def pad_features(
+    field: AbstractField, geometry: Geometry, places: Places, reach: Float[Array, "*pads 2 2"] | None = None
+) -> Float[Array, "n pads m"]:
+    """Features of each pad, the weighted mean over its contacts; 0 where it has none, NaN where not known.
+
+    Contacts beyond a pad's `reach` (lowest, highest corner) count as at its edge.
+    """
     present = jnp.all(jnp.isfinite(places.position), -1)
     width = jnp.where(present, places.width, _SIZE)
-    features = field.features(geometry, jnp.where(present[..., None], places.position, 0), width)
+    place = _on_pads(geometry, jnp.where(present[..., None], places.position, 0))
+    held = place if reach is None else jnp.clip(place, reach[..., 0, :], reach[..., 1, :])
+    features = field.features(geometry, held, width)
     weight = jnp.where(present[..., None], places.weight, 0)
     total = jnp.sum(weight, 1, keepdims=True)
     return jnp.sum((weight / jnp.where(total > 0, total, 1))[..., None] * features, 1)
+
+
+def _pressed(field: AbstractField, geometry: Geometry, places: Places, share, reach) -> Float[Array, "pads 2 2"]:
+    """Corners of the box of each pad, within `reach`, that presses support: those of which it carried a good part.
+
+    What spills over from a press beside a pad lies at its edge but says little of the gain there: a field that is free
+    there would take it for whatever else ails the press. Pads that share a field share their support.
+    """
+    place = _relative(geometry, _on_pads(geometry, places.position))
+    sound = jnp.isfinite(place) & (places.weight > 0)[..., None] & (share >= _BORNE)[:, None, :, None]
+    over = (0, 1, 2) if field.shared else (0, 1)
+    low, high = jnp.min(jnp.where(sound, place, jnp.inf), over), jnp.max(jnp.where(sound, place, -jnp.inf), over)
+    none = low > high
+    low, high = jnp.where(none, -1, low), jnp.where(none, 1, high)
+    corner, far = geometry.start.min(1), geometry.start.max(1)
+    box = (corner[:, None] + far[:, None] + (far - corner)[:, None] * jnp.stack([low, high], -2)) / 2
+    return jnp.stack([jnp.maximum(box[:, 0], reach[0]), jnp.minimum(box[:, 1], reach[1])], 1)
 
 
 class _Whitened(NamedTuple):
@@ -518,12 +560,13 @@ def fit_field(
       weight: of each press; 0 leaves it out, k presses at one place have 1 / k each, as their scatter is the place's.
       reach: lowest and highest corner of the box within which was pressed, m.
     """
-    features = pad_features(field, geometry, places.within(reach))
     finite = jnp.isfinite(log_ratio) & jnp.all(jnp.isfinite(share), -1)
     known = jnp.all(places.known | (share <= 0), -1)
     weight = jnp.where(finite & known, weight, 0)
     share = jnp.where(finite[:, None], share, 0)
     y = jnp.where(weight > 0, log_ratio, 0)
+    reach = _pressed(field, geometry, places, jnp.where(weight[:, None] > 0, share, 0), reach)
+    features = pad_features(field, geometry, places, reach)
     loads = share * weight[:, None]
     total = jnp.sum(loads, 0)[:, None]
     told = jnp.isfinite(features)

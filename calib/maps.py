@@ -38,9 +38,10 @@ class ForceEstimate(NamedTuple):
     | standard_error of a new reading: of the curve and about it               | (n, pads)    | N    |
     | valid: pressure within the calibrated range                              | (n, pads)    |      |
     | position of each contact found; NaN: none                                | (n, K, 2)    | m    |
-    | contact_force: its shares of the pads' forces, by its fitted bump        | (n, K)       | N    |
+    | contact_force: its shares of the forces on pads that it lies on          | (n, K)       | N    |
 
-    Contacts are found by a calibration with a correction by location; K is 0 without.
+    Contacts are found by a calibration with a correction by location; K is 0 without. A pad shares its force between
+    them by the parts of their fitted bumps on it; what pads beside all contacts seem to bear is noise or crosstalk.
     """
 
     map: je.ForceMap
@@ -135,12 +136,24 @@ def fused(
         shares = je.contact_shares(places.position, places.width, places.amplitude, law.recon.centres, law.masks)
     pad_force, pad_error = numbers
     found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
-    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places))
+    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(law, force, places))
 
 
-def _of_contacts(force: Float[Array, "n pads"], places: Places) -> Float[Array, "n K"]:
-    """Each contact's part of the pads' forces; 0 where there is none."""
-    return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), places.weight)
+_BESIDE = 0.1  # part of a contact on a pad up to which it lies beside the pad
+
+
+def _of_contacts(law: ForceLaw, force: Float[Array, "n pads"], places: Places) -> Float[Array, "n K"]:
+    """Each contact's part of the forces of pads that it lies on; 0 where there is none."""
+    part = _part_on_pads(places, law.recon, law.masks)
+    on = (part > _BESIDE) | jnp.all(part <= _BESIDE, -1, keepdims=True) | jnp.isnan(part)
+    return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), jnp.where(on, places.weight, 0))
+
+
+def _part_on_pads(places: Places, recon: je.Reconstructor, masks: je.PadMasks) -> Float[Array, "n K pads"]:
+    """Part of the integral of each contact's bump that lies on each pad; NaN where there is no contact, or no width."""
+    square = jnp.sum((places.position[:, :, None] - recon.centres) ** 2, -1)
+    bump = jnp.exp(-0.5 * square / places.width[..., None] ** 2)
+    return bump @ (masks.weights * recon.areas).T / (bump @ recon.areas)[..., None]
 
 
 def _pad_forces(law: ForceLaw, pressures, places: Places | None, before):
@@ -252,7 +265,7 @@ def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str
     contacts = (calibration.locator.contacts,)
     return rows | {
         "contact_position": ((*contacts, 2), "m", "of each contact found; NaN: none", "f8"),
-        "contact_force": (contacts, "N", "its shares of the pads' forces", "f8"),
+        "contact_force": (contacts, "N", "its shares of the forces on pads that it lies on", "f8"),
     }
 
 
