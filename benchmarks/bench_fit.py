@@ -1,11 +1,12 @@
 """What calibrating costs: a session of 225 presses end to end, many sessions by workers, and the fits alone.
 
-python -m benchmarks.bench_fit [--sessions 100] [--workers 1 2] [--smoke]
+python -m benchmarks.bench_fit [--sessions 24] [--workers 1 2] [--smoke]
 
 end to end: the bundled session, each stage apart, in a process whose programs are compiled already; and the same in the
 first call, which compiles (or reads the cache of compiled programs).
-many: copies of the bundled session through `calib.calibrate_many`, sessions per minute for each number of workers,
-the start of the workers included; results are new every time.
+many: copies of the bundled session through `calib.calibrate_many`, sessions per minute for each number of workers, the
+start of the workers included, and after each has done its first; results are new every time. Workers are renewed after
+16 sessions each: give --sessions 100 to see a long batch.
 fits: every pad's power law through all of its samples with the same robust loss, the same scale of residuals and the
 same start, by `calib.fit_curves` (all pads in one compiled call) and by `scipy.optimize.least_squares`, pad by pad,
 with an exact Jacobian as users write it; parameters must agree to 1e-5 before a clock is read.
@@ -41,7 +42,7 @@ AGREE = 1e-5
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sessions", type=int, default=100)
+    parser.add_argument("--sessions", type=int, default=24)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--smoke", action="store_true", help="coarse, two sessions, one worker; writes nothing")
     args = parser.parse_args(argv)
@@ -82,9 +83,14 @@ def stages(options: dict[str, Any]) -> dict[str, float]:
 
 
 def batch(sessions: int, workers: int, options: dict[str, Any]) -> dict[str, Any]:
-    """Sessions per minute, and what it comes to per session and worker."""
+    """Sessions per minute, all in all and once every worker is warm, and what it comes to per session and worker."""
+    ended: list[float] = []
+
+    def tell(outcome: calib.Outcome) -> None:
+        ended.append(time.perf_counter())
+
     with _copies(sessions) as (paths, out):
-        spent, outcomes = c.seconds(lambda: calib.calibrate_many(paths, out, jobs=workers, **options))
+        spent, outcomes = c.seconds(lambda: calib.calibrate_many(paths, out, jobs=workers, tell=tell, **options))
     failed = [outcome.reason for outcome in outcomes if outcome.reason]
     if failed:
         raise SystemExit(f"{len(failed)} sessions failed: {failed[0]}")
@@ -94,6 +100,7 @@ def batch(sessions: int, workers: int, options: dict[str, Any]) -> dict[str, Any
         "sessions": sessions,
         "seconds": round(spent, 2),
         "sessions_per_minute": round(60 * sessions / spent, 2),
+        "warm_sessions_per_minute": round(60 * (sessions - workers) / max(ended[-1] - ended[workers - 1], 1e-9), 2),
         "median_session_s": round(float(np.median(each)), 3),
     }
 

@@ -93,7 +93,7 @@ def calibrate_many(
         paths: of session files.
         out: a folder, made if need be; sessions that are done there already are skipped.
         executor: what runs the work; default: a pool of spawned processes with one thread of computation each.
-            `distributed.Client(address).get_executor()` is one too; its workers must see the same files.
+            `distributed.Client(address).get_executor(pure=False)` is one too; its workers must see the same files.
         jobs: processes of the default pool; default: one a core.
         report: write ``out/NAME.html`` too.
         tell: told of each session as it ends.

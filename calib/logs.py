@@ -1,6 +1,7 @@
 """Logs of force and a signal without EIT: one curve per log, tested on what it has not seen."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,31 +9,84 @@ import numpy as np
 from .curves import AbstractCurve, curve_name
 from .fit import FitError
 from .presses import resample
-from .response import LogFit, fit_log, time_split
+from .response import BlendChannels, LogFit, fit_log, time_split
 from .session import Session, Stream, write_archive
+from .smooth import SmoothChannels
 
 FORMAT = "pressure-force-curves"
 _NOT_SIGNALS = ("force", "stage", "temperature", "barometer")
+_WAYS = (BlendChannels(), SmoothChannels())  # of making one signal, in N, of several channels
 
 
-def fit_session(session: Session, curve: AbstractCurve | Sequence[AbstractCurve]) -> LogFit:
+@dataclass(frozen=True, eq=False)
+class SessionFit:
+    """The fit of a session's log, and the unit of the signal that its curve turns into force."""
+
+    fit: LogFit
+    unit: str
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the curve's parameters."""
+        return tuple(unit.replace("Pa", self.unit) for unit in self.fit.fitted.curve.units)
+
+
+def fit_session(session: Session, curve: AbstractCurve | Sequence[AbstractCurve]) -> SessionFit:
     """Fit force against the session's signal on its first half; the second half is held out.
 
     The signal is the stream "pressure", or the only one that is not a force, a place or the weather;
     it is interpolated to the times of the force. Of several curves the one is taken that, fitted on the first half of
-    the first half, predicts the rest of it best: the second half has no say.
+    the first half, predicts the rest of it best: the second half has no say. So is with it, of several channels, the
+    way to make one signal of them: a static blend, or a Gaussian process that knows of creep.
 
     Raises:
         SessionError, FitError: if a stream is missing or nothing can be fitted.
     """
     force, signal = session.stream("force"), _signal(session)
-    values = resample(signal.time, signal.read(), force.time)
-    loads = force.read()[:, 0]
+    log = _Log(force.time, resample(signal.time, signal.read(), force.time), force.read()[:, 0])
+    unit = "N" if signal.channels > 1 else _unit(signal)
     if isinstance(curve, AbstractCurve):
-        return fit_log(curve, force.time, values, loads)
-    first, _ = time_split(force.time)
-    tried = [fit_log(c, force.time[first], values[first], loads[first]).held_out.rmse for c in curve]
-    return fit_log(curve[int(np.argmin(np.nan_to_num(tried, nan=np.inf)))], force.time, values, loads)
+        return SessionFit(fit_log(curve, log.time, log.values, log.force), unit)
+    return SessionFit(_best(log, curve), unit)
+
+
+def _unit(signal: Stream) -> str:
+    return "count" if signal.variable == "counts" else signal.unit
+
+
+@dataclass(frozen=True, eq=False)
+class _Log:
+    """Times (n,) ns, values (n, channels) and force (n,) N."""
+
+    time: np.ndarray
+    values: np.ndarray
+    force: np.ndarray
+
+    def first(self) -> "_Log":
+        """Its first half."""
+        rows, _ = time_split(self.time)
+        return _Log(self.time[rows], self.values[rows], self.force[rows])
+
+    def signal(self, way) -> tuple[np.ndarray, str]:
+        """One of all channels, made of the first half, and what it is made of."""
+        if way is None:
+            return self.values, "channel 0"
+        rows, _ = time_split(self.time)
+        known = rows & np.isfinite(self.values).all(1) & np.isfinite(self.force)
+        return way(self.time, self.values, np.where(known, self.force, np.nan), None)
+
+
+def _best(log: _Log, curves: Sequence[AbstractCurve]) -> LogFit:
+    """By the second half of the first half, and then fitted on the whole of it."""
+    half = log.first()
+    tried = []
+    for way in _WAYS if log.values.shape[1] > 1 else (None,):
+        signal, _ = half.signal(way)
+        errors = [fit_log(c, half.time, signal, half.force).held_out.rmse for c in curves]
+        tried.append((float(np.nanmin([*errors, np.inf])), int(np.argmin(np.nan_to_num(errors, nan=np.inf))), way))
+    _, chosen, way = min(tried, key=lambda one: one[0])
+    signal, source = log.signal(way)
+    return replace(fit_log(curves[chosen], log.time, signal, log.force), source=source)
 
 
 def _signal(session: Session) -> Stream:
@@ -47,14 +101,15 @@ def _signal(session: Session) -> Stream:
     return session.streams[left[0]]
 
 
-def render_log(name: str, fit: LogFit) -> str:
+def render_log(name: str, found: SessionFit) -> str:
     """The fit as lines for a terminal."""
+    fit = found.fit
     curve, held = fit.fitted.curve, fit.held_out
     numbers = zip(
         curve.names,
         np.asarray(fit.fitted.parameters),
         np.asarray(fit.fitted.standard_errors),
-        curve.units,
+        found.units,
         strict=True,
     )
     terms = ", ".join(f"{n} {v:.4g} +- {e:.2g} {u}" for n, v, e, u in numbers)
@@ -67,17 +122,17 @@ def render_log(name: str, fit: LogFit) -> str:
     )
 
 
-def save_logs(fits: Mapping[str, LogFit], path: str | Path) -> None:
+def save_logs(fits: Mapping[str, SessionFit], path: str | Path) -> None:
     """Write the curves of several logs, whole or not at all."""
     arrays: dict = {}
-    for number, (name, fit) in enumerate(fits.items()):
+    for number, (name, found) in enumerate(fits.items()):
         at = f"logs/{number}/"
-        fitted = fit.fitted
+        fit, fitted = found.fit, found.fit.fitted
         arrays |= {
             at + "name": (np.array([name]), "", "session"),
             at + "curve": (np.array([curve_name(fitted.curve)]), "", "law"),
             at + "source": (np.array([fit.source]), "", "what the signal is made of"),
-            at + "parameters": (np.asarray(fitted.parameters), "", ", ".join(fitted.curve.units)),
+            at + "parameters": (np.asarray(fitted.parameters), "", ", ".join(found.units)),
             at + "covariance": (np.asarray(fitted.covariance), "", "of the parameters"),
             at + "held_out_rmse": (np.array([fit.held_out.rmse]), "N", "on the second half"),
         }

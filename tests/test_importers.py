@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from calib.curves import Linear
 from calib.importers import (
     ImportReport,
     _file_spec,
@@ -20,6 +21,7 @@ from calib.importers import (
     run,
     sentinel_warnings,
 )
+from calib.logs import fit_session, render_log
 from calib.session import SessionError, Status, file_hash, open_session
 
 REAL = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -313,3 +315,17 @@ def test_eflesh(tmp_path: Path) -> None:
     expected = np.where(load_cell == -1, np.nan, load_cell * 9.80665e-3)
     np.testing.assert_allclose(stream(tmp_path, "force")[:, 0], expected)
     assert stream(tmp_path, "sensor").shape == (3600, 15)
+
+
+def test_the_slope_of_a_log_is_in_the_unit_of_its_signal(tmp_path: Path) -> None:
+    t = np.arange(0, 20, 0.05)
+    force = 5 * (1 - np.cos(t))
+    rows = np.column_stack([t, force, 200 * force, np.sin(t)])
+    path = tmp_path / "log.csv"
+    np.savetxt(path, rows, delimiter=",")
+    for columns, unit in (("2:counts", "N/count"), ("2:mV", "N/V"), ("2-3:counts", "N/N")):
+        load(path, "--time", "0:s", "--stream", "force=1:N", "--stream", f"signal={columns}", folder=tmp_path)
+        with open_session(tmp_path / "s.h5") as s:
+            found = fit_session(s, Linear())
+        assert found.units == (unit,)
+        assert f" {unit}\n" in render_log("log", found)

@@ -79,23 +79,26 @@ def test_sign_of_the_change_at_every_labelled_electrode(tank, method):
     assert not wrong
 
 
-LOGS = {
-    # name: import options, curve, largest held-out error in N
-    **{
-        f"pneumatic_actuator/{name}.csv.gz": (["--stream", "pressure=5:bar", "--stream", "force=6:N"], "affine", limit)
+PRESSURE = ["--stream", "pressure=5:bar", "--stream", "force=6:N"]
+SCALE = ["--stream", "force=4:g", "--missing", "-1"]
+EFLESH = "eflesh/20250401_014340_probe/states.csv"
+LOGS = [
+    # name, import options, curve, largest held-out error in N
+    *(
+        (f"pneumatic_actuator/{name}.csv.gz", PRESSURE, "affine", limit)
         for name, limit in (("Circle_1bar", 1.6), ("Circle_5bar", 1.4), ("O-ring257_3bar", 1.5), ("Stadium_1bar", 2.2))
-    },
-    "eflesh/20250401_014340_probe/states.csv": (["--stream", "force=4:g", "--missing", "-1"], "affine", 0.5),
-}
+    ),
+    (EFLESH, SCALE, "affine", 0.5),
+    (EFLESH, SCALE, "auto", 0.36),
+]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LOGS)
-def test_logs_of_others_are_imported_and_fitted(name, tmp_path, capsys):
+@pytest.mark.parametrize(("name", "streams", "curve", "limit"), LOGS)
+def test_logs_of_others_are_imported_and_fitted(name, streams, curve, limit, tmp_path, capsys):
     path = DATA / name
     if not path.exists():
         pytest.skip(f"{name} is not at hand; set JAXEIT_REAL_DATA to its folder")
-    streams, curve, limit = LOGS[name]
     session, clock = tmp_path / "log.h5", "0:s" if "eflesh" in name else "0:ms"
     more = []
     if "eflesh" in name:
@@ -110,3 +113,4 @@ def test_logs_of_others_are_imported_and_fitted(name, tmp_path, capsys):
     if "eflesh" in name:
         assert "1,740 values declared missing" in imported
         assert "1740 samples without a force" in printed
+        assert "N/Pa" not in printed
