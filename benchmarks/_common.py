@@ -29,7 +29,7 @@ from .peers import eidors
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
 SIZES = (30, 60, 120, 240)  # cells a side, multiples of 10: the electrodes are nodes
-SMOKE = (30,)
+SMOKE = (10,)
 SIDE, PITCH, MARGIN = 0.2, 0.04, 0.02
 AGREE = 1e-9
 
@@ -202,7 +202,7 @@ def run(
     ``measure`` gives lists of rows, each with the work that they did.
     """
     parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("--smoke", action="store_true", help="smallest size, few repeats, nothing written")
+    parser.add_argument("--smoke", action="store_true", help="a tiny size, few repeats, nothing written")
     parser.add_argument("--no-memory", action="store_true", help="skip each tool's peak memory at the largest size")
     parser.add_argument("--largest", type=int, default=SIZES[-1], help="most cells a side")
     parser.add_argument("--section", default=section, help="name of this run among the results")

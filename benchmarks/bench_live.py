@@ -38,6 +38,7 @@ from calib.acquisition.results import Result
 from calib.acquisition.setup import prepare
 
 from ._common import circumstances, write
+from .memory import growth, resident
 
 RATE, PRESSURE_RATE = 100, 1000
 REST = 1.0
@@ -152,10 +153,11 @@ class Received:
 class Watch:
     """Latencies, s, and the memory of this process once a second; all room is taken at the beginning."""
 
-    def __init__(self, most: int, seconds: float, begin: int, received: Received):
+    def __init__(self, rate: int, seconds: float, begin: int, received: Received):
+        most = int(1.5 * rate * seconds) + 1000
         self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
         self._memory, self._used = np.full((int(seconds) + 60, 2), np.nan), 0
-        self._begin, self._received = begin, received
+        self._rate, self._begin, self._received = rate, begin, received
         self.last: Result | None = None
 
     def __call__(self, result: Result) -> None:
@@ -173,7 +175,7 @@ class Watch:
         """In ms, and MB."""
         out = spread("latency", self._latency) | spread("since_due", self._since_due)
         memory = self._memory[: self._used]
-        return out | {"memory_mb": round(memory[-1, 1]), "memory_mb_per_hour": round(slope(memory), 1)}
+        return out | {"memory_mb": round(memory[-1, 1])} | grown(memory, self._rate)
 
 
 def spread(name: str, seconds: np.ndarray) -> dict[str, float]:
@@ -182,16 +184,18 @@ def spread(name: str, seconds: np.ndarray) -> dict[str, float]:
     return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
 
 
-def resident() -> float:
-    """MB, of this process."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
+    """By how much memory grows in an hour of frames at the rate of the paper, MB, and the standard error of that.
 
-
-def slope(memory: np.ndarray) -> float:
-    """MB per hour, of rows (s, MB), over the later four fifths: what start-up takes does not grow on."""
-    later = memory[len(memory) // 5 :]
-    return float(3600 * np.polyfit(later[:, 0] - later[0, 0], later[:, 1], 1)[0]) if len(later) > 2 else 0.0
+    Nothing where a run was too short to tell.
+    """
+    found, share = growth(memory), RATE / rate
+    if not np.isfinite(found.error):
+        return {}
+    return {
+        "memory_mb_per_hour": round(found.slope * share, 2),
+        "memory_mb_per_hour_error": round(found.error * share, 2),
+    }
 
 
 @contextmanager
@@ -228,7 +232,7 @@ def tenfold(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
         "recorded": [stream.frames for stream in summary.streams],
         "lost": [stream.lost for stream in summary.streams],
         "complete": summary.complete,
-        "memory_mb_per_hour": round(slope(recorded), 1),
+        **grown(recorded, rates[0]),
     }
 
 
@@ -250,7 +254,7 @@ def watched(calibration: calib.Calibration, rate: int, seconds: float, output: P
     with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
         with ExitStack() as stack:
             show, received = Show(), Received(stack.enter_context(kept(output)) if output is not None else Nowhere())
-            watch = Watch(int(1.5 * rate * seconds) + 1000, seconds, begin, received)
+            watch = Watch(rate, seconds, begin, received)
             timer = threading.Timer(seconds, show.stop.set)
             plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
             live(calibration, plan, sources, watch, show, log=received, rest=REST, begun=timer.start)

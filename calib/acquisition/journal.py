@@ -5,8 +5,8 @@ stream, flags, time of arrival, payload, CRC-32. The sum covers a random number 
 record of another journal passes. What is cut off or overwritten later is skipped by looking for the next
 marker; nothing is believed that does not fit its sum, and numbers must rise.
 
-A killed program loses what it had not yet written, less than one frame per stream; a power cut loses
-at most the last `SYNC` seconds and what the disk takes to sync.
+A killed program loses what it had not yet written: the frame in work, and those that came with it in one read; a
+power cut loses at most the last `SYNC` seconds and what the disk takes to sync.
 """
 
 import contextlib

@@ -33,7 +33,7 @@ from .wire import Layouts, State, decode, decode_lines, encode, encode_note
 
 POLL = 0.1
 CONNECT = 1.0
-_PIECE = 1 << 16
+PIECE = 1 << 16  # bytes of a read at most: what a recorder that is killed may have read and not written
 _TOLD = 1_000_000_000  # ns between notes
 _NUMBERS = {"rate", "tick", "scale", "offset", "baud", "speed", "ping"}
 _WHOLE = {"id", "channels"}
@@ -89,7 +89,7 @@ class TcpLink(Link):
         """What has come, after waiting for at most `POLL` s."""
         assert self._socket is not None
         try:
-            data = self._socket.recv(_PIECE)
+            data = self._socket.recv(PIECE)
         except TimeoutError:
             return b""
         if not data:
@@ -136,7 +136,7 @@ class SerialLink(Link):
         assert self._port is not None
         try:
             data = self._port.read(1)
-            return data + self._port.read(min(self._port.in_waiting, _PIECE)) if data else data
+            return data + self._port.read(min(self._port.in_waiting, PIECE)) if data else data
         except TypeError as error:  # pyserial, when the port is closed by another thread
             raise OSError(None, "the port was closed") from error
 
@@ -176,7 +176,7 @@ class ReplayLink(Link):
         wait = self._start + self._next[0] / self._speed - time.monotonic_ns()
         time.sleep(min(max(wait / 1e9, 0.0), POLL))
         now, out, size = (time.monotonic_ns() - self._start) * self._speed, [], 0
-        while self._next is not None and self._next[0] <= now and size < _PIECE:
+        while self._next is not None and self._next[0] <= now and size < PIECE:
             out.append(self._next[1])
             size += len(out[-1])
             self._next = next(self._packets, None)
