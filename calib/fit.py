@@ -311,7 +311,7 @@ def _cluster_covariance(left, psi, dpsi, group, n_groups):
     leverage = jax.ops.segment_sum(left[:, :, None] * left[:, None, :], group, n_groups)
     values, vectors = jax.lax.map(jnp.linalg.eigh, leverage)
     decided = values > 1 - 1e-3
-    root = jax.lax.rsqrt(jnp.where(decided, 1.0, 1 - values))
+    root = jax.lax.rsqrt(1 - values)
     adjusted = jnp.einsum("gij,gj,gkj,gk->gi", vectors, root, vectors, score)
     steepness, axes = jnp.linalg.eigh(left.T @ (left * dpsi[:, None]))
     bread = axes / steepness @ axes.T
@@ -346,7 +346,7 @@ def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_gro
         inner, enough = _cluster_covariance(left, psi, dpsi, samples.group, n_groups)
     else:
         inner, enough = _iid_covariance(left, psi, dpsi, samples.valid), jnp.array(True)
-    back = right.T / jnp.where(singular > tiny, singular, jnp.nan)
+    back = right.T / singular
     units = jax.jacfwd(curve.bound)(free, scale) @ back
     return units @ inner @ units.T, rank, enough
 
@@ -442,7 +442,7 @@ def fit_samples(
         covariance=jnp.where(failed, jnp.nan, covariance),
         pressure_range=jnp.where(n > 0, limits, jnp.nan),
         scale=jnp.where(unusable, jnp.nan, spread),
-        residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / jnp.maximum(n - k, 1))),
+        residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / (n - k))),
         n=n,
         n_missing=jnp.sum(~present),
         n_groups=groups,

@@ -87,7 +87,7 @@ def pad_masks(skin: Skin, image: Reconstructor | BasisMap) -> PadMasks:
 def _coverage(outline: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     outlines = np.broadcast_to(outline, (len(low), *outline.shape))
     share = overlap_areas(outlines, low, high) / np.prod(high - low, -1)
-    return np.where(share > 1e-9, np.minimum(share, 1.0), 0.0)
+    return np.where(share > 1e-9, share, 0.0)
 
 
 class ContactShares(eqx.Module):

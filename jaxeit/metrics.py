@@ -190,7 +190,7 @@ def _greit_figures(image, centres, areas, target, centre):
     top = jnp.max(image, -1, keepdims=True)
     seen = top[..., 0] > 0
     lit = jnp.where(image >= top / 4, areas, 0)
-    area = jnp.where(seen, lit.sum(-1), 1)
+    area = lit.sum(-1)
     middle = lit @ centres / area[..., None]
     outside = jnp.sum((centres - middle[..., None, :]) ** 2, -1) >= area[..., None] / jnp.pi
     negative = jnp.minimum(image, 0) @ areas

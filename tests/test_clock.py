@@ -104,7 +104,7 @@ def test_times_agree_with_truth(name, hard):
     if known.true[-1] > 30 * S and "drift" not in changes:
         assert found.skew == pytest.approx(changes.get("skew", 50e-6) / (1 - changes.get("skew", 50e-6)), abs=2e-5)
     if name in FAULTS:
-        hard(f"fault 11: {FAULTS[name]}", SEVERITY[name], beyond=f"aligned to {p95 / 1000:.0f} µs (95 %)")
+        hard(f"fault 11: {FAULTS[name]}", SEVERITY[name], beyond=f"aligned to {p95 / 1000:.2g} µs (95 %)")
 
 
 def test_least_squares_would_not_do():

@@ -81,7 +81,8 @@ def test_power_law_is_zero_with_finite_gradients_at_and_below_zero(dtype, expone
     assert force.dtype == dtype
     assert (force[:3] == 0).all()
     assert force[4] > 0
-    for part in (*slopes, jax.jit(jax.hessian(curve))(params, pressure[2])):
+    back = jax.jit(jax.vmap(jax.grad(curve.inverse, (0, 1)), (None, 0)))(params, jnp.array([-5.0, 0.0, 2.0], dtype))
+    for part in (*slopes, *back, jax.jit(jax.hessian(curve))(params, pressure[2])):
         assert np.isfinite(part).all()
 
 
@@ -130,6 +131,11 @@ def test_resistant_line_is_exact_on_a_line():
     x = jnp.linspace(-3.0, 9.0, 31)
     slope, intercept = resistant_line(x, 2.5 * x - 1, jnp.ones(31, bool))
     np.testing.assert_allclose([slope, intercept], [2.5, -1.0], rtol=1e-12)
+
+
+def test_resistant_line_is_none_where_both_thirds_have_one_median():
+    x, y = jnp.array([0.0, 0, 0, 0, 1]), jnp.array([0.0, 1, 2, 3, 9])
+    assert np.isnan(resistant_line(x, y, jnp.ones(5, bool))).all()
 
 
 @pytest.mark.parametrize("curve", [PowerLaw(), MonotonePolynomial(), MonotoneSpline(), Play(), Hysteresis()])

@@ -97,12 +97,14 @@ def test_batches_and_gradients(pixels, masks):
     assert np.asarray(fmap).shape == (2, pixels.size)
 
 
-def test_shapes_that_do_not_fit_are_refused(skin, pixels, masks):
+def test_shapes_that_do_not_fit_are_refused(skin, model, pixels, masks):
     with pytest.raises(je.FusionError, match="400 pixels and 4 pads"):
         je.fuse(jnp.zeros(10), masks, jnp.zeros(4))
     away = replace(skin.pads[0], outline=np.array([[1.0, 1.0], [1.1, 1.0], [1.1, 1.1]]))
     with pytest.raises(je.FusionError, match="lower left"):
         je.pad_masks(replace(skin, pads=(away,)), pixels)
+    with pytest.raises(je.FusionError, match=r"basis=Pixels"):
+        je.pad_masks(skin, je.Elements().on(model))
 
 
 # --- several contacts on one pad -----------------------------------------------------------------

@@ -9,8 +9,34 @@ import pytest
 
 import calib
 from calib.corrections import CorrectionError, LowPass, sample_rate
-from calib.curves import CURVES, Affine, Hysteresis, Linear, MonotonePolynomial, MonotoneSpline, Play, PowerLaw
-from calib.fit import Cauchy, FitError, FitResult, Huber, SoftL1, Squared, _thin_svd, fit_curves
+from calib.curves import (
+    CURVES,
+    Affine,
+    Hysteresis,
+    Linear,
+    MonotonePolynomial,
+    MonotoneSpline,
+    Play,
+    PowerLaw,
+    scale_of,
+)
+from calib.fit import (
+    Cauchy,
+    FitError,
+    FitResult,
+    Huber,
+    SoftL1,
+    Squared,
+    _cluster_covariance,
+    _fill,
+    _iid_covariance,
+    _kept,
+    _residuals,
+    _spread,
+    _thin_svd,
+    fit_curves,
+    gather,
+)
 from calib.presses import PressError, find_presses
 from calib.session import PressTable, SessionError, SessionWriter
 
@@ -88,6 +114,12 @@ def test_hopeless_samples_are_told_and_sound_ones_beside_them_fitted(name, dtype
         **{"float64" if dtype == "f8" else "float32": error},
         beyond="that pad's result and its reason, covariance NaN, predictions not valid; its neighbours the same bits",
     )
+
+
+def test_a_slope_that_no_number_holds_is_told():
+    fits = fitted(Linear(), [(1e-200 * P, 1e200 * F), (P, F)])
+    assert fits.result.tolist()[:2] == [FitResult.NOT_FINITE, FitResult.SUCCESS]
+    assert np.isnan(fits.parameters[0]).all()
 
 
 # --- outliers ---------------------------------------------------------------------------------------------------------
@@ -240,6 +272,53 @@ def test_losses_have_slopes_at_nothing_and_far_away(loss, dtype):
         assert np.isfinite(slopes).all()
 
 
+def test_samples_that_only_fill_up_have_no_slope():
+    """Not forwards and not backwards, as solvers with iterations inside go."""
+    samples = jax.tree.map(lambda leaf: leaf[0], _fill(gather([[1000.0, 2000.0]], [[4.0, 8.0]])[0]))
+    scale = scale_of(samples.pressure, samples.force, samples.valid)
+    slope = jax.grad(lambda free: jnp.sum(_residuals(free, Linear(), samples, scale, 1.0)))(jnp.zeros(1))
+    assert len(samples.valid) > 2
+    assert np.isfinite(slope).all()
+
+
+def test_the_scatter_of_exact_samples_is_above_zero_and_of_others_theirs():
+    def scatter(force):
+        samples = jax.tree.map(lambda leaf: leaf[0], _fill(gather([[1.0, 2.0, 4.0]], [force])[0]))
+        return _spread(jnp.zeros(1), Linear(), samples, scale_of(*[jnp.asarray([1.0, 2.0, 4.0])] * 2, jnp.ones(3) > 0))
+
+    assert 0 < scatter([1.0, 2.0, 4.0]) < 1e-5
+    assert float(scatter([2.0, 1.0, 5.0])) == pytest.approx(1.4826, rel=1e-4)
+
+
+def test_a_pressure_is_held_through_a_gap():
+    there = jnp.array([False, True, False, True])
+    np.testing.assert_array_equal(_kept(jnp.array([np.nan, 1, np.nan, 3]), there), [0, 1, 1, 3])
+
+
+def test_presses_that_alone_decide_or_are_outweighed_by_outliers_are_too_few():
+    even, alone, ones = jnp.full((8, 1), 8**-0.5), jnp.eye(8)[:, :1], jnp.ones(8)
+    for left, dpsi, enough in ((even, ones, True), (alone, ones, False), (even, ones.at[4:].set(-1), False)):
+        assert bool(_cluster_covariance(left, ones, dpsi, jnp.arange(8), 8)[1]) == enough
+
+
+def test_the_covariance_of_independent_samples_is_hubers():
+    """Written out, for one parameter; the last sample is not one."""
+    dpsi, valid = jnp.array([1.0, 1, 1, 1, 1, 1, 0, 0, 0]), jnp.arange(9) < 8
+    mean, scatter = 0.75, 0.1875
+    expected = ((1 + scatter / (8 * mean**2)) / mean) ** 2 * 8 / 7
+    found = _iid_covariance(valid[:, None] * 8**-0.5, valid * 1.0, dpsi, valid)
+    np.testing.assert_allclose(found, [[expected]], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_slope_from_one_press_among_many_is_told():
+    """All presses at one level but one, which alone decides the slope: no scatter says how well."""
+    level = np.where(np.arange(N) < N // 8, 3000.0, 1000.0)
+    fits = fit_curves(Affine(), level[None], SLOPE * level[None] + F - SLOPE * P, groups=np.arange(N) // (N // 8))
+    assert fits.result.tolist() == [FitResult.SINGULAR]
+    assert np.isnan(fits.covariance).all()
+
+
 def test_columns_that_are_almost_alike_are_told_apart():
     """To rounding: done once, Gram-Schmidt leaves them at an angle of rounding over their difference."""
     x = np.linspace(0, 1, 50)
@@ -247,6 +326,9 @@ def test_columns_that_are_almost_alike_are_told_apart():
     left, singular, right = _thin_svd(matrix)
     np.testing.assert_allclose(left.T @ left, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(left * singular @ right, matrix, rtol=1e-14)
+    empty = matrix.at[:, 1].set(0)
+    left, singular, right = _thin_svd(empty)
+    np.testing.assert_allclose(left * singular @ right, empty, atol=1e-14)
 
 
 def test_a_textbook_power_law_has_none():

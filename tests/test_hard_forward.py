@@ -205,6 +205,16 @@ def test_any_ground_gives_the_same_readings(hard):
     )
 
 
+@pytest.mark.slow
+def test_a_ground_amid_the_sheet_costs_fewer_digits(model):
+    """At the rim, where the matrix may have its largest entries, a ground sees twice the resistance and more."""
+    single = jax.tree.map(lambda a: a.astype(jnp.float32) if eqx.is_inexact_array(a) else a, model)
+    anywhere = eqx.tree_at(lambda m: m.system.ground_weight, single, jnp.ones_like(single.system.ground_weight))
+    right = np.asarray(je.forward(model))
+    amid, other = (np.linalg.norm(np.asarray(je.forward(m), float) - right) for m in (single, anywhere))
+    assert amid < 0.7 * other
+
+
 def test_small_changes_in_float32_are_linearised(hard):
     """A change of 1e-4 in a corner: the derivative has four digits where the difference of readings has one."""
     bump = np.where((X > 6) & (Y > 2), 2.0**-13, 0.0)

@@ -51,6 +51,7 @@ def test_light_touches_are_not_blown_up(hard, pixels, masks, height):
     force = np.asarray(fmap.force)
     assert np.isfinite(force).all()
     assert (force >= 0).all()
+    assert np.isfinite(fmap.concentration).all()
     error = np.abs(force @ np.asarray(masks.weights).T / FORCES - 1).max()
     assert error < 1e-12
     printed = [_inflation(equation_4(image, masks, FORCES), masks, FORCES) for image in images]
@@ -158,6 +159,15 @@ def test_a_mask_of_nothing_divides_nothing(pixels, masks):
     part = np.asarray(empty.weights) * np.asarray(image)
     with np.errstate(invalid="ignore"):
         assert not np.isfinite(part / part.sum(1, keepdims=True)).all()
+
+
+def test_a_pixel_that_misses_the_sheet_has_no_pressure_and_no_slope():
+    def pressure(force):
+        none = jnp.zeros(1)
+        return je.ForceMap(force, none > 0, none, none, areas=jnp.array([2.0, 0.0])).pressure
+
+    np.testing.assert_array_equal(pressure(jnp.array([1.0, 0.0])), [0.5, 0])
+    np.testing.assert_array_equal(jax.jacobian(pressure)(jnp.array([1.0, 0.0])), [[0.5, 0], [0, 0]])
 
 
 @pytest.mark.parametrize("place", [(0.1, 0.05), (0.1, 0.1), (0.0999999, 0.1), (0.0, 0.1), (0.2, 0.2)])

@@ -190,3 +190,9 @@ def test_electrodes_that_share_the_sheet_are_refused(hard):
         with pytest.raises(ValueError, match=r"electrode 0 .* electrode 1 .*; move them apart"):
             je.discretise(je.Scene(skin_of(SHEET, [bolt, other], [[0, 1, 0, 1]])))
     hard("overlapping or coincident electrodes", "any", beyond="an error that names both")
+
+
+@pytest.mark.parametrize(("wrong", "said"), [({"order": 7}, "give one of"), ({"interpolation": 0.5}, "give 0 to 0.1")])
+def test_settings_of_a_mesh_that_cannot_be_are_refused(wrong, said):
+    with pytest.raises(je.FidelityError, match=f"{next(iter(wrong))} is .*; {said}"):
+        je.Fidelity(**wrong)

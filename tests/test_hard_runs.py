@@ -202,7 +202,13 @@ def test_memory_does_not_grow_with_the_number_of_blocks():
 def test_pads_that_pull_and_images_of_nothing_teach_nothing(skin):
     """A second contact, which the drift of a third pad below zero would hide; an image below or at zero."""
     tracker = SensitivityTracker(geometry_of(skin), image_gain=2e4)
-    frames, _, _ = touches(tracker, np.zeros(4), 3)
-    pulled = frames.pad_force.at[1].set(jnp.array([10.0, 5.0, -6.0, 0.0]))
-    odd = frames._replace(pad_force=pulled, image_sum=frames.image_sum * jnp.array([1.0, 1.0, -1.0, 0.0]))
-    assert tracker.samples(odd)[2].tolist() == [True, False, False, False]
+    frames, _, _ = touches(tracker, np.zeros(5), 3)
+    pulled = frames.pad_force.at[1].set(jnp.array([10.0, 5.0, -6.0, 0.0])).at[4].set(0)
+    image_sum = frames.image_sum * jnp.array([1.0, 1.0, -1.0, 0.0, 1.0])
+    odd = frames._replace(pad_force=pulled, image_sum=image_sum, standard_error=frames.standard_error.at[4].set(0))
+    features, targets, use = tracker.samples(odd)
+    assert use.tolist() == [True, False, False, False, False]
+    assert np.isfinite(features).all()
+    assert np.isfinite(targets).all()
+    rounded = Estimate(tracker.start().theta, -1e-20 * jnp.eye(len(tracker.start().theta)))
+    assert not np.asarray(tracker.forces(rounded, odd.image_sum, odd.places)[1]).any()

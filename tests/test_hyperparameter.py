@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.hyperparameter import Spectrum
 
 STD = 2e-6
 
@@ -108,6 +109,12 @@ def test_the_corner_of_the_l_curve_bends_most(model, coarse, jac, frames, held):
         return abs(np.arctan2(ax * by - ay * bx, ax * bx + ay * by)) / np.hypot(*(after - before))
 
     assert turn(h) > max(turn(3 * h), turn(h / 3))
+
+
+def test_where_the_l_curve_stands_still_it_does_not_bend():
+    """As in float32 at small values, where the image does not change any more: 0 / 0 would be chosen."""
+    squares, y = jnp.array([100, 0], jnp.float32), jnp.array([[1, 1e-3]], jnp.float32)
+    assert je.LCurve(y).choose(Spectrum(squares, jnp.eye(2, dtype=y.dtype), None, None), lambda y: y) > 1e-3
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("inf")])

@@ -14,6 +14,7 @@ from scipy.signal import fftconvolve
 
 import jaxeit as je
 from jaxeit.metrics import (
+    ESTIMATORS,
     GreitFigures,
     MetricError,
     greit_figures,
@@ -165,6 +166,14 @@ def test_nothing_positive_is_not_a_number_but_its_neighbours_are(patchy, batch):
     assert np.isfinite(found[0]).all()
     assert np.isnan(found[1:, 1:]).all()
     assert np.isfinite(found[:, 0]).all()
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_where_nothing_is_positive_there_is_no_place(patchy, name):
+    images = np.stack([np.zeros(256), -np.linspace(1, 2, 256), np.arange(256) == np.argmax(patchy.areas)])
+    found = ESTIMATORS[name](jnp.asarray(images, float), patchy)
+    assert np.isnan(found[:2]).all()
+    np.testing.assert_allclose(found[2], patchy.centres[np.argmax(patchy.areas)])
 
 
 def test_figures_under_jit_vmap_and_grad(patchy, batch):

@@ -7,6 +7,8 @@ import pytest
 
 import jaxeit as je
 
+from .helpers import square_model
+
 PENALTIES = {
     "variation": lambda picture: je.IsotropicVariation(),
     "Laplace": lambda picture: je.Quadratic(je.Laplace().precision(jnp.ones((1, picture.size)), picture), 3.0),
@@ -87,3 +89,32 @@ def test_what_fits_already_is_left_alone(physics):
     readings = physics.voltages(jnp.zeros(144))
     found = je.gauss_newton(physics, je.IsotropicVariation(), readings, jnp.full(550, 1e-6))
     assert np.abs(found).max() < 1e-6
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    """Six electrodes, 32 triangles, 16 pixels."""
+    points = [(0.05, 0.05), (0.15, 0.05), (0.15, 0.15), (0.05, 0.15), (0.1, 0.1), (0.1, 0.0)]
+    model = square_model(points, je.adjacent(6), 4)
+    return je.LogConductivity(model, je.Pixels(4).on(model), model.background[0])
+
+
+@pytest.mark.slow
+def test_readings_not_finite_or_of_unknown_noise_are_left_out(tiny):
+    readings = tiny.voltages(0.1 * jnp.cos(jnp.arange(16.0)))
+    std = jnp.full(len(readings), 1e-3 * float(jnp.std(readings)))
+    images = [
+        je.gauss_newton(tiny, je.IsotropicVariation(weight=1.0), *given, steps=2)
+        for given in ((readings.at[2].set(jnp.nan), std), (readings.at[2].set(1e9), std.at[2].set(jnp.nan)))
+    ]
+    assert np.isfinite(images[0]).all()
+    np.testing.assert_array_equal(images[1], images[0])
+
+
+@pytest.mark.slow
+def test_a_step_that_overshoots_is_halved(tiny):
+    """A whole one would multiply the voltages by exp(18) here, where exp(3) is right."""
+    readings = tiny.voltages(jnp.full(16, -3.0))
+    std = jnp.full(len(readings), 1e-3 * float(jnp.std(readings)))
+    found = je.gauss_newton(tiny, je.IsotropicVariation(weight=1e-3, ridge=1e-6), readings, std)
+    np.testing.assert_allclose(found, -3, atol=0.05)

@@ -50,6 +50,8 @@ def test_a_sample_that_is_not_finite_changes_nothing():
     for features, target in (([np.nan, 1.0], 1.0), ([1.0, 1.0], np.inf)):
         state, _ = follow(rls, start, np.array([features]), np.array([target]))
         assert eqx.tree_equal(state, start)
+    alone = rls.start(jnp.ones(1), 1.0)  # here its news would be infinite, and so more than nothing
+    assert eqx.tree_equal(rls.update(alone, jnp.array([np.inf]), jnp.array(1.0)), alone)
 
 
 @pytest.fixture(scope="module")

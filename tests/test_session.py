@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from calib.session import (
     ArchiveWriter,
+    ClockTable,
     PressTable,
     Session,
     SessionError,
@@ -539,6 +540,16 @@ def short_pattern(file: h5py.File) -> None:
     replace("device/eit_protocol/pattern", data=PATTERN[:2])(file)
 
 
+def no_stream(file: h5py.File) -> None:
+    del file["streams"]
+    file.create_group("streams")
+
+
+def two_variables(file: h5py.File) -> None:
+    del file["streams/force"].attrs["signal"]
+    file["streams/force/other"] = 1.0
+
+
 FORCE = "streams/force/force"
 PLAIN = {"chunks": None, "compression": None, "fletcher32": False}
 REFUSED_FILES: dict[str, tuple[Callable[[h5py.File], None], str]] = {
@@ -587,6 +598,12 @@ REFUSED_FILES: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "many attributes": (many_attributes, "attributes, the limit is 256"),
     "large attribute": (attribute("/", "title", np.bytes_("x" * 5_000_000)), "5,000,000 bytes"),
     "not UTF-8": (attribute("/", "title", np.bytes_(b"\xff\xfe")), "is not UTF-8"),
+    "stream as numbers": (link("streams/force", np.zeros(3)), "is a dataset where a group belongs"),
+    "numbers as stream": (lambda f: (f.pop(FORCE), f.create_group(FORCE)), "is a group where a dataset"),
+    "a type alone": (link("streams/force", np.dtype("f8")), "is neither group nor dataset"),
+    "no stream at all": (no_stream, "holds no stream"),
+    "no word on the variable": (two_variables, "does not say which variable it holds"),
+    "endless texts": (replace("presses/reason", data=np.full(2, b"x" * 100_000)), "holds texts of 100,000 bytes"),
 }
 
 
@@ -717,6 +734,39 @@ def test_names_that_lead_elsewhere_are_refused(name: str, tmp_path: Path) -> Non
 def test_objects_are_refused(values: np.ndarray, tmp_path: Path) -> None:
     with pytest.raises(SessionError, match="give numbers or texts"):
         write_archive(tmp_path / "a.h5", "x", {}, {"a": (values, "1", "")})
+
+
+@pytest.mark.parametrize(
+    ("knots", "tick", "words"), [(2, 1e-6, "knots of unequal number"), (3, np.nan, "a number is not finite")]
+)
+def test_a_clock_must_be_sound(knots: int, tick: float, words: str) -> None:
+    with pytest.raises(SessionError, match=words):
+        ClockTable(np.arange(3), np.arange(knots), tick, 0.0, 0.0, 0.0, True, "")
+
+
+@pytest.mark.parametrize(
+    ("attrs", "put", "words"),
+    [
+        ({}, lambda w: w.append("b", [1.0]), "b: was not declared; call add_rows first"),
+        ({}, lambda w: w.add_rows("b", (), "1", dtype=bool), "b: bool rows; use dtype u1"),
+        ({}, lambda w: (w.add_rows("b", (2,), "1"), w.append("b", [1.0])), r"b: rows of shape \(1,\); give"),
+        ({"a": None}, lambda w: None, "a: is a NoneType; give a text or a number"),
+        ({"a": "x\0"}, lambda w: None, "a: is a text that cannot be stored"),
+        ({"complete": True}, lambda w: None, r"attributes \['complete'\] are taken; use other names"),
+    ],
+)
+def test_what_an_archive_does_not_take_is_refused(attrs: dict, put: Callable, words: str, tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=words), ArchiveWriter(tmp_path / "a.h5", "x", attrs) as writer:
+        put(writer)
+    assert os.listdir(tmp_path) == []
+
+
+def test_writers_are_to_be_opened(tmp_path: Path) -> None:
+    writers = ArchiveWriter(tmp_path / "a.h5", "x", {}), SessionWriter(tmp_path / "s.h5", **options())
+    puts = lambda w: w.add("a", 1.0, "1"), lambda w: w.add_stream("a", "force", units="N", channels=1, rate_hz=1)
+    for writer, put in zip(writers, puts, strict=True):
+        with pytest.raises(SessionError, match="is not open; use it as `with"):
+            put(writer)
 
 
 def deep(file: h5py.File) -> None:

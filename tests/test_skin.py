@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.toml import read_text
 
 TEXT = importlib.resources.files("jaxeit").joinpath("skins/testbed.toml").read_text()
 
@@ -145,3 +146,11 @@ def test_adjacent_never_senses_what_it_drives():
     assert pattern.shape == (32 * 29, 4)
     assert (pattern[:, :2, None] != pattern[:, None, 2:]).all()
     assert (je.reciprocal_rows(pattern) >= 0).all()
+
+
+def test_what_is_not_text_or_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(je.TomlError, match=r"cannot be read \(.*\); check the name and the folder"):
+        read_text(tmp_path)
+    (tmp_path / "skin.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(je.TomlError, match=r"skin\.toml: is not text; give a TOML file"):
+        read_text(tmp_path / "skin.toml")

@@ -391,6 +391,24 @@ def test_iteration_that_does_not_converge_is_nan():
     assert np.isnan(found).all()
 
 
+def test_iteration_leaves_a_column_of_zeros_alone():
+    matrix, coords = square_sheet(9, 1, np.ones(2))
+    pattern, values = as_pattern(matrix, coords)
+    rhs = np.stack([np.ones(pattern.n), np.zeros(pattern.n)], 1)
+    found = solution(ConjugateGradient(), pattern, values, rhs)
+    assert relative(found[:, 0], splu(matrix).solve(rhs[:, 0])) < 1e-8
+    assert not found[:, 1].any()
+
+
+def test_iteration_does_not_mind_the_units_of_unknowns():
+    matrix, coords = square_sheet(9, 1, np.ones(2))
+    unit = sp.diags_array(10.0 ** np.random.default_rng(3).uniform(-4, 4, matrix.shape[0]))
+    pattern, values = as_pattern((unit @ matrix @ unit).tocsc(), coords)
+    rhs = np.ones((pattern.n, 1))
+    found = unit @ solution(ConjugateGradient(), pattern, values, unit @ rhs)
+    assert relative(found, splu(matrix).solve(rhs)) < 1e-8
+
+
 def test_single_precision_factors_reach_double_accuracy_in_a_few_steps():
     matrix, coords = square_sheet(20, 1, np.ones(9))
     pattern, values = as_pattern(matrix, coords)

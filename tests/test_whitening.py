@@ -101,6 +101,7 @@ def test_a_frame_without_any_reading_is_no_image_and_no_nan(noisy):
 def test_leaving_out_nothing_or_everything(noisy):
     recon = noisy[0]
     np.testing.assert_allclose(recon.without(np.zeros(550, bool)).matrix, recon.matrix, atol=1e-12)
+    assert not recon.without(np.arange(550) < 3).whitening.weight[:3].any()
     with pytest.raises(je.InverseError, match="nothing to reconstruct"):
         recon.without(np.ones(550, bool))
     with pytest.raises(je.InverseError, match="550 readings"):
