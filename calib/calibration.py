@@ -528,7 +528,7 @@ def _field_arrays(found: FittedField) -> dict[str, tuple]:
 _FIELD_FIELDS = {
     "coefficients": ("1", "of the centred features, in log gain"),
     "covariance": ("1", "of the coefficients"),
-    "reach": ("m", "lowest and highest corner of the box that was pressed"),
+    "reach": ("m", "lowest and highest corner of the box of each pad that was pressed"),
     "centre": ("1", "mean features of each pad's presses"),
     "noise": ("1", "scatter of single presses about the field, in log force"),
     "spread": ("1", "scatter of single presses about no field, in log force"),
