@@ -16,13 +16,11 @@ them, waits, and two programs that do so in two threads of Python may wait for e
 
 import abc
 import enum
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
@@ -221,41 +219,10 @@ def predict_pads(fitted: FittedCurve, pressures: Float[Array, "pads n"], toleran
     return eqx.filter_vmap(lambda f, p: f.predict(p, tolerance))(fitted, pressures)
 
 
-class TypedTrustRegion(optx.AbstractSearch):
-    """`optimistix.ClassicalTrustRegion` whose step size has the type of the parameters.
-
-    Optimistix starts it in the default type, so that float32 samples could not be fitted with 64-bit numbers on.
-    """
-
-    inner: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion()
-
-    def init(self, y, f_info_struct):
-        state = self.inner.init(y, f_info_struct)
-        return jax.tree.map(lambda leaf: leaf.astype(y.dtype), state)
-
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        return self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state)
-
-
-def _silent(**_):
-    """Print nothing."""
-
-
-class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """Levenberg-Marquardt for free parameters of order one, where normal equations by Cholesky are safe and quick."""
-
-    rtol: float
-    atol: float
-    norm: Callable = optx.max_norm
-    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Normal(lx.Cholesky()))
-    search: TypedTrustRegion = TypedTrustRegion()
-    verbose: Callable = _silent
-
-
-def default_solver(dtype) -> LevenbergMarquardt:
+def default_solver(dtype) -> je.LevenbergMarquardt:
     """The solver with tolerances that `dtype` can reach."""
     tol = 1e-9 if dtype == jnp.float64 else 1e-4
-    return LevenbergMarquardt(tol, tol)
+    return je.LevenbergMarquardt(tol, tol)
 
 
 def _residuals(free, curve: AbstractCurve, samples: Samples, scale: Scale, spread):

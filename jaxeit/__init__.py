@@ -104,7 +104,8 @@ from .metrics import (
     otsu_thresholds,
     structural_similarity,
 )
-from .nonlinear import IsotropicVariation, LogConductivity, Quadratic, gauss_newton
+from .nonlinear import IsotropicVariation, LogConductivity, Quadratic, gauss_newton, least_squares_image
+from .optimise import LevenbergMarquardt
 from .pneumatics import pad_response
 from .priors import GaussianSmooth, Laplace, Noser, Tikhonov, TotalVariation
 from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
@@ -186,6 +187,7 @@ __all__ = [
     "LadderError",
     "Laplace",
     "LevelCentroid",
+    "LevenbergMarquardt",
     "LoadCellError",
     "LoadSpreading",
     "LogConductivity",
@@ -279,6 +281,7 @@ __all__ = [
     "jacobian",
     "ktc_score",
     "ladder",
+    "least_squares_image",
     "load_reconstructor",
     "load_skin",
     "load_spread",

@@ -1,6 +1,7 @@
-"""Images by the full forward map: Gauss-Newton on the logarithm of the conductivity.
+"""Images by the full forward map: the logarithm of the conductivity, in several steps.
 
-For absolute readings, or changes too large for one linear step.  A difference of frames is imaged by adding it to the
+For absolute readings, or changes too large for one linear step: `gauss_newton` with any penalty, `least_squares_image`
+with a quadratic one and any least-squares solver of optimistix.  A difference of frames is imaged by adding it to the
 voltages that the model gives for the reference: ``readings = physics.voltages(0) + dv``.
 """
 
@@ -8,6 +9,7 @@ from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
+import optimistix as optx
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
@@ -15,6 +17,7 @@ from .basis import BasisMap, Picture
 from .discretise import Model
 from .forward import forward
 from .jacobian import jacobian
+from .optimise import LevenbergMarquardt
 from .priors import AbstractPrecision
 
 
@@ -120,8 +123,7 @@ def gauss_newton(
     Each step takes the Jacobian and the penalty's matrix anew, and is halved until the sum falls; it ends where the sum
     falls by less than ``tolerance`` of itself. Readings that are not finite are left out.
     """
-    used = jnp.isfinite(readings) & jnp.isfinite(std)
-    weight, readings = jnp.where(used, 1 / std, 0), jnp.where(used, readings, 0)
+    weight, readings = _weighed(readings, std)
     x = jnp.zeros(physics.image.size, readings.dtype)
     value = _objective(physics, penalty, readings, weight, x)
     for _ in range(steps):
@@ -132,6 +134,12 @@ def gauss_newton(
         if not before - value > tolerance * before:
             break
     return x
+
+
+def _weighed(readings, std):
+    """One over the noise, 0 where a reading or its noise is not finite, and readings that are."""
+    used = jnp.isfinite(readings) & jnp.isfinite(std)
+    return jnp.where(used, 1 / std, 0), jnp.where(used, readings, 0)
 
 
 @eqx.filter_jit
@@ -146,3 +154,54 @@ def _direction(physics, penalty, readings, weight, x):
     missed = weight * (readings - physics.voltages(x))
     r = penalty.matrix(physics.image.picture, x)
     return cho_solve(cho_factor(j.T @ j + r), j.T @ missed - r @ x)
+
+
+def least_squares_image(
+    physics: LogConductivity,
+    penalty: Quadratic,
+    readings: Float[Array, " readings"],
+    std: Float[Array, " readings"],
+    *,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+    steps: int = 64,
+) -> Float[Array, " basis"]:
+    """argmin over x of ``|(readings - voltages(x)) / std|^2 / 2 + penalty(x)``, from x = 0, by `optimistix`.
+
+    For ``z = strength^1/2 Gamma x`` with ``R = Gamma^T Gamma`` this is a sum of squares. Readings that are not finite
+    are left out.
+
+    Args:
+        solver: of optimistix; default: `LevenbergMarquardt`, to a millionth (float32: a thousandth).
+        steps: at most.
+
+    Returns:
+        (basis,); NaN throughout if the solver did not converge.
+    """
+    weight, readings = _weighed(jnp.asarray(readings), jnp.asarray(std))
+    tolerance = 1e-6 if readings.dtype == jnp.float64 else 1e-3
+    return _solved(physics, penalty, readings, weight, solver or LevenbergMarquardt(tolerance, tolerance), steps)
+
+
+@eqx.filter_jit
+def _solved(physics, penalty, readings, weight, solver, steps):
+    def image(z):
+        return penalty.precision.image(z) / jnp.sqrt(jnp.asarray(penalty.strength, z.dtype))
+
+    def residual(z, _):
+        return weight * (readings - _voltages(image(z), physics)), z
+
+    start = jnp.zeros(physics.image.size, readings.dtype)
+    found: optx.Solution = optx.least_squares(residual, solver, start, max_steps=steps, throw=False)
+    return jnp.where(found.result == optx.RESULTS.successful, image(found.value), jnp.nan)
+
+
+@eqx.filter_custom_jvp
+def _voltages(x, physics):
+    return physics.voltages(x)
+
+
+@_voltages.def_jvp
+def _voltages_jvp(primals, tangents):
+    """By the Jacobian: a solver that asks for all columns would else make them one by one."""
+    x, physics = primals
+    return physics.voltages(x), physics.slopes(x) @ tangents[0]

@@ -273,7 +273,10 @@ CASES = {
 }
 # Compiled by a dozen programs: seconds each.
 SLOW = {name for name in CASES if name.startswith(("Iterative", "Reconstructor", "jacobian", "Log", "conductivity"))}
-ELSEWHERE = {"ContactFinder": "below, and in tests/test_contacts.py"}
+ELSEWHERE = {
+    "ContactFinder": "below, and in tests/test_contacts.py",
+    "least_squares_image": "in tests/test_nonlinear.py",
+}
 
 
 def test_every_verb_is_listed():

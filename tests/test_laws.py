@@ -19,7 +19,7 @@ ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise", "forward",
     "pneumatics", "basis", "jacobian", "whitening", "gaps", "priors", "methods", "hyperparameter", "inverse", "store",
-    "responses", "descent", "contacts", "refine", "nonlinear", "background", "fusion", "metrics", "regions",
+    "responses", "descent", "contacts", "refine", "optimise", "nonlinear", "background", "fusion", "metrics", "regions",
     "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
 BENCH = [

@@ -118,3 +118,40 @@ def test_a_step_that_overshoots_is_halved(tiny):
     std = jnp.full(len(readings), 1e-3 * float(jnp.std(readings)))
     found = je.gauss_newton(tiny, je.IsotropicVariation(weight=1e-3, ridge=1e-6), readings, std)
     np.testing.assert_allclose(found, -3, atol=0.05)
+
+
+def _tiny_penalty(tiny):
+    picture = tiny.image.picture
+    return je.Quadratic(je.Laplace(floor=0.1).precision(jnp.ones((1, picture.size)), picture), 20.0)
+
+
+def test_optimistix_ends_where_gauss_newton_does(tiny):
+    readings = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0)))
+    std, penalty = jnp.full(len(readings), 1e-3 * float(jnp.std(readings))), _tiny_penalty(tiny)
+    for given in (readings, readings.at[2].set(jnp.nan)):
+        found = je.least_squares_image(tiny, penalty, given, std)
+        again = je.gauss_newton(tiny, penalty, given, std, steps=30, tolerance=1e-12)
+        np.testing.assert_allclose(found, again, atol=1e-4)
+        assert np.abs(found).max() > 0.3
+
+
+@pytest.mark.slow
+def test_such_an_image_has_derivatives(tiny):
+    readings = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0)))
+    std, penalty = jnp.full(len(readings), 1e-3 * float(jnp.std(readings))), _tiny_penalty(tiny)
+    along = jnp.asarray(np.random.default_rng(0).normal(size=len(readings))) * std
+
+    def image(given):
+        return je.least_squares_image(tiny, penalty, given, std)
+
+    _, slope = jax.jvp(image, (readings,), (along,))
+    change = (image(readings + 0.01 * along) - image(readings - 0.01 * along)) / 0.02
+    np.testing.assert_allclose(slope, change, atol=1e-4 * np.abs(change).max())
+    back = jax.grad(lambda given: jnp.sum(image(given) ** 2))(readings) @ along
+    assert float(back) == pytest.approx(float(2 * image(readings) @ slope), rel=1e-4)
+
+
+def test_an_image_that_did_not_converge_is_not_given(tiny):
+    readings = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0)))
+    found = je.least_squares_image(tiny, _tiny_penalty(tiny), readings, jnp.full(len(readings), 1e-6), steps=1)
+    assert np.isnan(found).all()
