@@ -159,6 +159,10 @@ class AbstractField(eqx.Module):
     def shapes(self) -> Float[np.ndarray, "shapes k"]:
         """Relative prior variances of one pad's coefficients, one row for each shape that is tried."""
 
+    def supported(self, low: Float[Array, "... 2"], high: Float[Array, "... 2"]) -> tuple[Array, Array]:
+        """The box of which presses tell that lie in this one, both in half widths of a pad from its middle."""
+        return low, high
+
     def features(
         self, geometry: Geometry, place: Float[Array, "... pads 2"], width=_SIZE
     ) -> Float[Array, "... pads m"]:
@@ -212,6 +216,11 @@ class PadEdge(AbstractField):
         to_rim = _distance(_nearest(place, geometry.rim[:, 0], geometry.rim[:, 1]), place[..., None, :]).min(-1)
         sides = jnp.sum(jnp.where(real[..., None], self._near(to_sides), 0), -2)
         return jnp.concatenate([sides, self._near(to_rim)], -1)
+
+    def supported(self, low, high):
+        """As far from the middle on every side: one wall tells of the others."""
+        farthest = jnp.max(jnp.maximum(-low, high), -1, keepdims=True)
+        return jnp.broadcast_to(-farthest, low.shape), jnp.broadcast_to(farthest, high.shape)
 
     def _near(self, distance):
         octaves = jnp.log2(1 + distance / self.width.astype(distance.dtype))
@@ -458,7 +467,7 @@ def _pressed(field: AbstractField, geometry: Geometry, places: Places, share, re
     over = (0, 1, 2) if field.shared else (0, 1)
     low, high = jnp.min(jnp.where(sound, place, jnp.inf), over), jnp.max(jnp.where(sound, place, -jnp.inf), over)
     none = low > high
-    low, high = jnp.where(none, -1, low), jnp.where(none, 1, high)
+    low, high = field.supported(jnp.where(none, -1, low), jnp.where(none, 1, high))
     corner, far = geometry.start.min(1), geometry.start.max(1)
     box = (corner[:, None] + far[:, None] + (far - corner)[:, None] * jnp.stack([low, high], -2)) / 2
     return jnp.stack([jnp.maximum(box[:, 0], reach[0]), jnp.minimum(box[:, 1], reach[1])], 1)
