@@ -1,5 +1,5 @@
-"""Write the tables of the README and docs/costs.md: accuracy and its picture from the bundled session, others from
-results/.
+"""Write the tables of the README, docs/costs.md and docs/live.md: accuracy and its picture from the bundled session,
+others from results/.
 
 python -m benchmarks.readme
 """
@@ -15,6 +15,7 @@ from calib.session import replacing
 from .tables import evaluation, filled, replaced
 
 ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", ROOT / "docs" / "costs.md", ROOT / "docs" / "live.md")
 MEASURED = ROOT / "benchmarks" / "results" / "2-core-x86.json"
 
 
@@ -24,7 +25,7 @@ def main() -> None:
         calibration = calib.calibrate([session], location=calib.PadEdge())
     results = evaluation(calibration.evaluation.summary())
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
-    for page in (ROOT / "README.md", ROOT / "docs" / "costs.md"):
+    for page in PAGES:
         text = filled(replaced(page.read_text(encoding="utf-8"), "results", results), measured)
         with replacing(page) as new:
             new.write_text(text, encoding="utf-8")

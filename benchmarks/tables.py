@@ -207,6 +207,37 @@ def _effects(results: dict) -> str:
     return _markdown(["effects", *columns.values()], rows)
 
 
+def _live(results: dict) -> str:
+    """What came over loopback, and when it was shown."""
+    soak, tenfold = results["soak"], results["tenfold"]
+    best = next(row for row in results["rates"] if row["rate_hz"] == results["highest_hz"])
+    heads = ["run", "frames", "lost", "dropped", *(f"latency {p}, ms" for p in ("p50", "p99", "max"))]
+    heads += ["beyond the scan, p99, ms", "memory, MB an hour"]
+    rows = [
+        _live_row(f"live and recorded, {soak['rate_hz']} Hz, {soak['seconds'] / 60:.0f} min", soak),
+        _live_row(f"live, highest rate sustained: {best['rate_hz']} Hz", best),
+        [
+            f"recorded, {tenfold['rate_hz']} Hz, {tenfold['seconds'] / 60:.0f} min",
+            f"{tenfold['recorded'][0]:,}",
+            f"{tenfold['lost'][0]:,}",
+            *[""] * 5,
+            _grown(tenfold),
+        ],
+    ]
+    return _markdown(heads, rows)
+
+
+def _live_row(label: str, row: dict) -> list[str]:
+    cells = [f"{row['received'][0]:,}", f"{row['lost']:,}", f"{row['dropped']:,}"]
+    cells += [_figures(row[f"latency_ms_{p}"]) for p in ("p50", "p99", "max")]
+    return [label, *cells, _figures(row["since_due_ms_p99"]), _grown(row)]
+
+
+def _grown(row: dict) -> str:
+    name = "memory_mb_per_hour"
+    return f"{row[name]:.2f} ± {row[f'{name}_error']:.2f}" if name in row else ""
+
+
 def _markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
@@ -231,4 +262,5 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "effects": (("scene",), _effects),
     "growth": (("growth",), _growth),
     "start": (("start",), _start),
+    "live": (("live",), _live),
 }

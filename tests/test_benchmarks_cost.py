@@ -298,7 +298,16 @@ def test_tables_of_the_pages(root):
         rung | {"label": "behind the front", "front": False},
     ]
     results["ladder"] = {"ladders": [{"rungs": rungs}, {"rungs": rungs[:1]}]}
-    marks = re.findall(r"<!-- end of ([\w-]+) -->", (root / "docs" / "costs.md").read_text())
+    run = {"rate_hz": 100, "seconds": 600.0, "received": [60000, 600000], "lost": 0, "dropped": 3}
+    run |= {f"{what}_ms_{p}": 1.234 for what in ("latency", "since_due") for p in ("p50", "p99", "max")}
+    results["live"] = {
+        "soak": run | {"memory_mb_per_hour": 0.123, "memory_mb_per_hour_error": 0.456},
+        "tenfold": {"rate_hz": 1000, "seconds": 60.0, "recorded": [59999, 1], "lost": [1, 0]},
+        "rates": [run, run | {"rate_hz": 400}],
+        "highest_hz": 400,
+    }
+    pages = [(root / "docs" / name).read_text() for name in ("costs.md", "live.md")]
+    marks = re.findall(r"<!-- end of ([\w-]+) -->", "".join(pages))
     assert set(marks) <= set(tables.TABLES)
     page = "".join(f"<!-- {mark}: written -->\nold\n<!-- end of {mark} -->\n" for mark in (*marks, "speed"))
     page = tables.filled(page, results)
@@ -317,3 +326,8 @@ def test_tables_of_the_pages(root):
     assert "| at random |  |" in text["measurement-cost"]
     assert "| forward by nodes | 961 to 3,721 | 1.2 | 1 to 1.5 | 1.2 |" in text["growth"]
     assert "| import jaxeit | 1.23 |" in text["start"]
+    assert (
+        "| live and recorded, 100 Hz, 10 min | 60,000 | 0 | 3 | 1.23 | 1.23 | 1.23 | 1.23 | 0.12 ±"
+        in text["live"]
+    )
+    assert "| recorded, 1000 Hz, 1 min | 59,999 | 1 |" in text["live"]
