@@ -98,15 +98,16 @@ class Problem:
 
 
 def compiled(verb: Callable, model: je.Model, *extra: Any, options: Mapping[str, Any] | None = None) -> Callable:
-    """``verb(model, sigma, *extra)`` under one jit, with compiler options; a function of sigma."""
+    """``verb(model, sigma, *extra)`` under one jit, with compiler options, else as `je.bind`; a function of sigma."""
     leaves, rest = eqx.partition((model, extra), eqx.is_array)
+    flat, structure = jax.tree.flatten(leaves)
 
-    def program(leaves, sigma):
-        model, extra = eqx.combine(leaves, rest)
+    def program(flat, sigma):
+        model, extra = eqx.combine(jax.tree.unflatten(structure, flat), rest)
         return verb(model, sigma, *extra)
 
     run = jax.jit(program, compiler_options=dict(options) if options else None)
-    return lambda sigma: jax.block_until_ready(run(leaves, sigma))
+    return lambda sigma: jax.block_until_ready(run(flat, sigma))
 
 
 def as_tool(run: Callable, dtype: str = "float64") -> Tool:

@@ -302,7 +302,7 @@ def prepare(
     method, prior = method or OneStep(), prior or Noser()
     found = whitened_readings(model, noise, channels)
     problem = Problem(
-        jacobian=jnp.asarray(found.factor, model.dtype) @ pair_jacobian(model, sigma, image, found.electrodes),
+        jacobian=pair_jacobian(model, sigma, image, found.electrodes, jnp.asarray(found.factor, model.dtype)),
         readings=jnp.sum(found.whitening.channels).astype(model.dtype),
         hyperparameter=jnp.asarray(jnp.nan, model.dtype),
         prior=prior,
@@ -312,14 +312,14 @@ def prepare(
     _check_range(chosen, method, model.dtype)
     problem = replace(problem, hyperparameter=jnp.asarray(chosen, model.dtype))
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
-    recon = _build(problem, linear, found, noise is not None)
+    recon, followed = _build(problem, linear, found, noise is not None)
     if not np.isfinite(recon.factor).all():
         raise InverseError(
             "the reconstruction matrix is not finite: the conductivity must be positive, and the noise, in V, within "
             f"the range of {model.dtype}"
         )
     settings = {"method": repr(method), "prior": repr(prior), "hyperparameter": repr(chosen)}
-    about = Provenance({"jaxeit": _VERSION, **settings, "rank": _rank(found, recon), **(provenance or {})})
+    about = Provenance({"jaxeit": _VERSION, **settings, "rank": _rank(found, followed), **(provenance or {})})
     if isinstance(method, AbstractIterativeMethod):
         eqx.filter_eval_shape(
             method.image, problem, problem.jacobian[:, 0]
@@ -337,10 +337,13 @@ def prepare(
 
 
 @eqx.filter_jit
-def _build(problem: Problem, method: AbstractLinearMethod, found: Whitened, noise_is_known: bool) -> Reconstructor:
+def _build(
+    problem: Problem, method: AbstractLinearMethod, found: Whitened, noise_is_known: bool
+) -> tuple[Reconstructor, Float[Array, "r k"]]:
+    """The reconstructor, and what a one-step image predicts for the whitened readings, per pair sum."""
     compress = jnp.asarray(found.compress, problem.jacobian.dtype)
     image, followed = one_step(problem, problem.precision(), compress)
-    return Reconstructor(
+    recon = Reconstructor(
         factor=image if isinstance(method, OneStep) else method.image(problem, compress),
         variance=method.variance(problem) if noise_is_known else jnp.full_like(problem.picture.areas, jnp.inf),
         predict=compress.T @ followed,
@@ -348,6 +351,7 @@ def _build(problem: Problem, method: AbstractLinearMethod, found: Whitened, nois
         picture=problem.picture,
         provenance=Provenance(),
     )
+    return recon, followed
 
 
 def _chosen(hyperparameter, problem: Problem, found: Whitened, noise_is_known: bool) -> float:
@@ -369,9 +373,9 @@ def _check_range(hyperparameter: float, method, dtype: np.dtype) -> None:
         )
 
 
-def _rank(found: Whitened, recon: Reconstructor) -> str:
-    followed = np.sum(found.factor * (found.factor @ np.asarray(recon.predict, float)))
-    return f"{followed:.3g} of {len(found.factor)}"
+def _rank(found: Whitened, followed: Float[Array, "r k"]) -> str:
+    """``tr(J Q)``: with E and C of `whitening` it is the trace of ``(J Q E) C^T``."""
+    return f"{np.sum(found.factor * np.asarray(followed, float)):.3g} of {len(found.factor)}"
 
 
 def _whiten(found: Whitened, dtype: np.dtype, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... r"]:

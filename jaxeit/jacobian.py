@@ -68,10 +68,16 @@ def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: Basi
 
 @verb
 def pair_jacobian(
-    model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap, electrodes: Int[ArrayLike, "k 2"]
-) -> Float[Array, "k basis"]:
-    """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S; see `whitening`."""
-    return _pair_slopes(model, sigma, image, electrodes).T
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    electrodes: Int[ArrayLike, "k 2"],
+    mixed: Float[Array, "r k"] | None = None,
+) -> Float[Array, "k basis"] | Float[Array, "r basis"]:
+    """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S, or of mixtures of them; see
+    `whitening`."""
+    slopes = _pair_slopes(model, sigma, image, electrodes).T
+    return slopes if mixed is None else mixed @ slopes
 
 
 def _pair_slopes(

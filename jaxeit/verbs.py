@@ -1,7 +1,7 @@
 """How public functions are compiled."""
 
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -11,6 +11,7 @@ from jax.core import Tracer, eval_context
 from jax.extend.core import get_opaque_trace_state
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
 
 def verb(function: F) -> F:
@@ -33,6 +34,25 @@ def verb(function: F) -> F:
         return (inner if _is_traced(args, kwargs) else outer())(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def bind(function: Callable[..., T], *first: Any) -> Callable[..., T]:
+    """``function(*first, ...)`` as one compiled function of the rest, which must be arrays or pytrees of them.
+
+    For calls from a loop in Python: a model is many arrays, and looking through them anew takes longer than the forward
+    solution of a small one. What of ``first`` is no array is static, as for `verb`. ::
+
+        voltages = je.bind(je.forward, model)
+        voltages(sigma)
+    """
+    leaves, static = eqx.partition(first, eqx.is_array)
+    flat, structure = jax.tree.flatten(leaves)
+
+    @partial(jax.jit, compiler_options=compiler_options())
+    def program(flat, rest):
+        return function(*eqx.combine(jax.tree.unflatten(structure, flat), static), *rest)
+
+    return lambda *rest: program(flat, rest)
 
 
 def _is_traced(*values: Any) -> bool:

@@ -326,8 +326,5 @@ def test_tables_of_the_pages(root):
     assert "| at random |  |" in text["measurement-cost"]
     assert "| forward by nodes | 961 to 3,721 | 1.2 | 1 to 1.5 | 1.2 |" in text["growth"]
     assert "| import jaxeit | 1.23 |" in text["start"]
-    assert (
-        "| live and recorded, 100 Hz, 10 min | 60,000 | 0 | 3 | 1.23 | 1.23 | 1.23 | 1.23 | 0.12 ±"
-        in text["live"]
-    )
+    assert "| live and recorded, 100 Hz, 10 min | 60,000 | 0 | 3 | 1.23 | 1.23 | 1.23 | 1.23 | 0.12 ±" in text["live"]
     assert "| recorded, 1000 Hz, 1 min | 59,999 | 1 |" in text["live"]

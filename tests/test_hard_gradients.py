@@ -27,6 +27,7 @@ _PREPARES = (
 )
 HOST = {
     "adjacent": _DESCRIBES,
+    "bind": "what it is given has",
     "choose_readings": _PREPARES,
     "compiler_options": _DESCRIBES,
     "discretise": _GEOMETRY,

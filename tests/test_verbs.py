@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxeit as je
@@ -46,3 +47,10 @@ def test_options_that_xla_does_not_know_are_left_out(first_call, monkeypatch):
 
 def test_options_are_asked_for_inside_a_program(first_call):
     assert float(jax.jit(lambda x: x + len(je.compiler_options()))(1.0)) >= 1.0
+
+
+def test_a_bound_function_is_that_of_what_is_left(model):
+    halved = 0.5 * model.background
+    voltages = je.bind(je.forward, model)
+    np.testing.assert_allclose(voltages(halved), je.forward(model, halved), rtol=1e-12)
+    np.testing.assert_allclose(voltages(np.asarray(halved)), 2 * voltages(), rtol=1e-9)
