@@ -136,24 +136,19 @@ def fused(
         shares = je.contact_shares(places.position, places.width, places.amplitude, law.recon.centres, law.masks)
     pad_force, pad_error = numbers
     found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
-    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(law, force, places))
+    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places, shares))
 
 
 _BESIDE = 0.1  # part of a contact on a pad up to which it lies beside the pad
 
 
-def _of_contacts(law: ForceLaw, force: Float[Array, "n pads"], places: Places) -> Float[Array, "n K"]:
+def _of_contacts(force: Float[Array, "n pads"], places: Places, shares: je.ContactShares | None) -> Float[Array, "n K"]:
     """Each contact's part of the forces of pads that it lies on; 0 where there is none."""
-    part = _part_on_pads(places, law.recon, law.masks)
-    on = (part > _BESIDE) | jnp.all(part <= _BESIDE, -1, keepdims=True) | jnp.isnan(part)
-    return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), jnp.where(on, places.weight, 0))
-
-
-def _part_on_pads(places: Places, recon: je.Reconstructor, masks: je.PadMasks) -> Float[Array, "n K pads"]:
-    """Part of the integral of each contact's bump that lies on each pad; NaN where there is no contact, or no width."""
-    square = jnp.sum((places.position[:, :, None] - recon.centres) ** 2, -1)
-    bump = jnp.exp(-0.5 * square / places.width[..., None] ** 2)
-    return bump @ (masks.weights * recon.areas).T / (bump @ recon.areas)[..., None]
+    weight = places.weight
+    if shares is not None:
+        on = (shares.lies > _BESIDE) | jnp.all(shares.lies <= _BESIDE, -1, keepdims=True)
+        weight = jnp.where(on, weight, 0)
+    return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)
 
 
 def _pad_forces(law: ForceLaw, pressures, places: Places | None, before):

@@ -97,10 +97,12 @@ class ContactShares(eqx.Module):
     |----------------------------------------------------------------------------------------|------------------|
     | part of each pixel's change that is each contact's; over contacts it sums to one       | (..., K, pixels) |
     | share of each contact in each pad's force; sums to one, or zeros: no contact on the pad | (..., K, pads)   |
+    | lies: part of each contact that lies on each pad; zeros where there is none            | (..., K, pads)   |
     """
 
     part: Float[Array, "... K pixels"]
     share: Float[Array, "... K pads"]
+    lies: Float[Array, "... K pads"]
 
 
 _ASIDE = 0.05  # part of a contact on a pad below which the contact is beside it
@@ -138,7 +140,7 @@ def contact_shares(
     total = mine.sum(-2, keepdims=True)
     # by logarithms: far from every contact all bumps are zero
     part = jnp.where(there[..., None], jax.nn.softmax(jnp.where(there[..., None], log_bump, _NEVER), -2), 0)
-    return ContactShares(part, mine / jnp.where(total > 0, total, 1))
+    return ContactShares(part, mine / jnp.where(total > 0, total, 1), lies)
 
 
 _NEVER = -1e30  # the logarithm of nothing, without the NaN of a difference of infinities
