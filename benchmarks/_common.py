@@ -15,7 +15,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,16 +97,9 @@ class Problem:
 
 
 def compiled(verb: Callable, model: je.Model, *extra: Any, options: Mapping[str, Any] | None = None) -> Callable:
-    """``verb(model, sigma, *extra)`` under one jit, with compiler options, else as `je.bind`; a function of sigma."""
-    leaves, rest = eqx.partition((model, extra), eqx.is_array)
-    flat, structure = jax.tree.flatten(leaves)
-
-    def program(flat, sigma):
-        model, extra = eqx.combine(jax.tree.unflatten(structure, flat), rest)
-        return verb(model, sigma, *extra)
-
-    run = jax.jit(program, compiler_options=dict(options) if options else None)
-    return lambda sigma: jax.block_until_ready(run(flat, sigma))
+    """``verb(model, sigma, *extra)`` under one jit, with no compiler options but these; a function of sigma."""
+    run = je.bind(lambda model, extra, sigma: verb(model, sigma, *extra), model, extra, options=options or {})
+    return lambda sigma: jax.block_until_ready(run(sigma))
 
 
 def as_tool(run: Callable, dtype: str = "float64") -> Tool:

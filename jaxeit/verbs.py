@@ -1,6 +1,6 @@
 """How public functions are compiled."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial, wraps
 from typing import Any, TypeVar
 
@@ -36,7 +36,7 @@ def verb(function: F) -> F:
     return call  # type: ignore[return-value]
 
 
-def bind(function: Callable[..., T], *first: Any) -> Callable[..., T]:
+def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | None = None) -> Callable[..., T]:
     """``function(*first, ...)`` as one compiled function of the rest, which must be arrays or pytrees of them.
 
     For calls from a loop in Python: a model is many arrays, and looking through them anew takes longer than the forward
@@ -44,11 +44,14 @@ def bind(function: Callable[..., T], *first: Any) -> Callable[..., T]:
 
         voltages = je.bind(je.forward, model)
         voltages(sigma)
+
+    Args:
+        options: for XLA; default: `compiler_options`.
     """
     leaves, static = eqx.partition(first, eqx.is_array)
     flat, structure = jax.tree.flatten(leaves)
 
-    @partial(jax.jit, compiler_options=compiler_options())
+    @partial(jax.jit, compiler_options=compiler_options() if options is None else dict(options))
     def program(flat, rest):
         return function(*eqx.combine(jax.tree.unflatten(structure, flat), static), *rest)
 
