@@ -25,7 +25,6 @@ from functools import partial
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -39,6 +38,7 @@ from .mesh import Mesh, triangulate
 from .scene import Scene
 from .skin import Skin
 from .solvers import AbstractLinearSolver, AbstractPlan, Pattern, default_solver
+from .solvers._base import on_device
 
 # Edges of a coat's mesh over those of the sheet's.  The potential of the metal is a thousandth of what a
 # touch does at 0.1 ohm; that thousandth is then right to 3 %.
@@ -216,7 +216,7 @@ def _mesh(skin: Skin, footprints: list[Footprint], fidelity: Fidelity, coarser: 
 def _put(values: np.ndarray | Array, dtype: np.dtype) -> Array:
     """An array on the device: numbers in the model's precision, indices as 32-bit integers."""
     floating = np.issubdtype(np.asarray(values).dtype, np.floating)
-    return jnp.asarray(values, dtype if floating else np.int32)
+    return on_device(values, dtype if floating else np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +307,7 @@ def _system(
     system = System(
         dofs=put(dofs),
         slopes=put(space.slopes),
-        sheet=tuple(Entries(put(element), put(weight)) for element, weight in sheet),
+        sheet=tuple(Entries(on_device(element, np.uint32), put(weight)) for element, weight in sheet),
         contact_dofs=put(contact_dofs),
         contact_mass=put(contact_mass),
         contact_electrode=put(contact_electrode),

@@ -59,7 +59,15 @@ def index_arrays(pattern: Pattern) -> dict[str, Int[Array, "..."]]:
     places = np.flatnonzero(pattern.rows == pattern.cols)
     diagonal[pattern.rows[places]] = places
     arrays = {"rows": pattern.rows, "cols": pattern.cols, "diagonal": diagonal, "root": pattern.root}
-    return {name: jnp.asarray(array) for name, array in arrays.items()}
+    return {name: on_device(array, np.uint32) for name, array in arrays.items()}
+
+
+def on_device(values: np.ndarray | Array, dtype: Any) -> Array:
+    """An array of this type; `jnp.asarray` would compile a program for nearly every shape.
+
+    Indices are best without a sign: XLA adds the length to those below zero, at every place that looks something up.
+    """
+    return jax.device_put(np.array(values, dtype))
 
 
 def _check_entries(n: int, rows: np.ndarray, cols: np.ndarray) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from math import gcd, prod
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale
+from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale, on_device
 from ._dissection import dissect
 from ._fronts import Level, lay_out
 
@@ -41,6 +41,12 @@ _SUBTREE = 6000
 # Multiplications up to which jaxlib does a stack of LAPACK calls at once.  A larger stack it spreads over
 # its threads while the caller, one of them, waits; as many such callers as threads wait for ever (0.10.2).
 _IN_PLACE = 200_000
+
+# Parts of a level that are written out one after the other; more are done in a loop, which copies in and out.
+_MOST_PARTS = 8
+
+
+T = TypeVar("T")
 
 
 class LevelPlan(eqx.Module):
@@ -147,7 +153,7 @@ class NestedDissection(AbstractLinearSolver):
 
 
 def _index(array: np.ndarray) -> Int[Array, "..."]:
-    return jnp.asarray(array, jnp.int32)
+    return on_device(array, np.uint32)
 
 
 def _level_plan(level: Level) -> LevelPlan:
@@ -189,13 +195,41 @@ def _swept(
     """Eliminate these levels, the last one first: the update of what is above, and what is kept."""
     fronts: list[Front] = []
     for level in reversed(levels):
-        pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
-        among = _taken(values, level.among) + _extended(level, update, pivots, pivots)
-        beside = _taken(values, level.beside) + _extended(level, update, pivots, boundary)
-        w, front = _eliminate(among, beside)
+        parts = _parts(level)
+        w, front = lax.platform_dependent(
+            level, values, update, cpu=partial(_panels, parts=parts), default=partial(_panels, parts=1)
+        )
         fronts.append(front)
-        update = _extended(level, update, boundary, boundary) - _square(w, w)
+        update = _updated(level, update, _square(w, w))
     return update, tuple(fronts[::-1]) if keep else ()
+
+
+def _parts(level: LevelPlan) -> int:
+    """Into how many parts to cut a level, so that no part needs a loop (`_portioned`); 1 if these were too many."""
+    count, pivots, boundary = level.beside.shape
+    parts = count // _portion(count, pivots, boundary)
+    return parts if pivots <= _WIDEST and parts <= _MOST_PARTS else 1
+
+
+def _panels(
+    level: LevelPlan, values: Array, update: Float[Array, "mc b b"], parts: int
+) -> tuple[Float[Array, "m p b"], Front]:
+    """W of every front of a level, and what is to be kept: gathered and eliminated part by part."""
+    if parts > 1:
+        cut = partial(_cut, parts=parts)
+        done = [_panels(*piece, 1) for piece in zip(cut(level), [values] * parts, cut(update), strict=True)]
+        return jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *done)
+    pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
+    among = _taken(values, level.among) + _extended(level, update, pivots, pivots)
+    beside = _taken(values, level.beside) + _extended(level, update, pivots, boundary)
+    return _eliminate(among, beside)
+
+
+def _cut(tree: T, parts: int) -> list[T]:
+    """Every array of the tree along its leading axis."""
+    arrays, structure = jax.tree.flatten(tree)
+    pieces = zip(*(jnp.split(array, parts) for array in arrays), strict=True)
+    return [jax.tree.unflatten(structure, piece) for piece in pieces]
 
 
 def _square(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
@@ -211,13 +245,30 @@ def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, co
     places, size = level.down, updates.shape[1]
     fronts, children, _ = places.shape
     updates = updates.reshape(fronts, children, size, size)
-    front = jnp.arange(fronts, dtype=jnp.int32)[:, None, None]
+    front = jnp.arange(fronts, dtype=jnp.uint32)[:, None, None]
     shape = fronts, *(len(range(places.shape[2])[part]) for part in (rows, columns))
     spread = (
         updates[:, c].at[front, places[:, c, rows, None], places[:, c, None, columns]].get(mode="promise_in_bounds")
         for c in range(children)
     )
     return sum(spread, jnp.zeros(shape, updates.dtype))
+
+
+def _updated(level: LevelPlan, updates: Float[Array, "mc b b"], less: Float[Array, "m i i"]) -> Float[Array, "m i i"]:
+    """What the children's updates add to the boundary, less `less`.
+
+    A sum over an axis is computed once, where XLA would do a sum of two terms anew for each that looks something up in
+    it: with the terms looked up in turn, three times as many.
+    """
+    places, size = level.down[..., level.pivots :], updates.shape[1]
+    fronts, children, _ = places.shape
+    if not children:
+        return -less
+    updates = updates.reshape(fronts, children, size, size)
+    front = jnp.arange(fronts, dtype=jnp.uint32)[:, None, None, None]
+    child = jnp.arange(children, dtype=jnp.uint32)[:, None, None]
+    spread = updates.at[front, child, places[..., :, None], places[..., None, :]].get(mode="promise_in_bounds")
+    return jnp.sum(spread - less[:, None] / children, 1)
 
 
 def _along(array: Array, places: Int[Array, "..."], axis: int) -> Array:
@@ -235,6 +286,12 @@ def _eliminate(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> t
     across, beyond = w1[:, :, : p - h], w1[:, :, p - h :]
     w2, second = _eliminate(among[:, h:, h:] - _square(across, across), beside[:, h:] - _square(across, beyond))
     return jnp.concatenate([beyond, w2], 1), first + second
+
+
+def _portion(count: int, pivots: int, columns: int) -> int:
+    """How many of so many matrices are done at once, `_IN_PLACE`."""
+    work = max(1, pivots**2 * max(pivots, columns))
+    return gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // work))))
 
 
 def _portioned(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -255,9 +312,8 @@ def _portioned(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @custom_vmap
     def stacked(*stacks):
-        count = stacks[0].shape[0]
-        work = max(1, stacks[0].shape[1] ** 2 * max(stack.shape[2] for stack in stacks))
-        portion = gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // work))))
+        count, pivots, _ = stacks[0].shape
+        portion = _portion(count, pivots, max(stack.shape[2] for stack in stacks))
         return lax.platform_dependent(
             stacks,
             cpu=partial(in_portions, portion=portion),
