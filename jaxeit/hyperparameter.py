@@ -64,7 +64,8 @@ class AbstractHyperparameter(eqx.Module):
             whiten: takes frames, (..., readings) V, to whitened ones, (..., k).
 
         Raises:
-            HyperparameterError: if none in 1e-4 to 100 will do.
+            HyperparameterError: if none in 1e-4 to 100 will do, or frames hold no change, or readings that are used and
+                not finite.
         """
 
 
@@ -82,7 +83,7 @@ class GeneralisedCrossValidation(AbstractHyperparameter):
 
     def choose(self, spectrum, whiten):
         tried, filters = spectrum.filters()
-        residual = _residuals(spectrum, filters, whiten(self.frames))
+        residual = _residuals(spectrum, filters, _changes(self.frames, whiten))
         m = len(spectrum.squares)
         freedom = m - jnp.sum(spectrum.squares * filters, 1)
         return float(tried[int(jnp.argmin(m * residual / freedom**2))])
@@ -100,9 +101,9 @@ class LCurve(AbstractHyperparameter):
 
     def choose(self, spectrum, whiten):
         tried, filters = spectrum.filters()
-        y = whiten(self.frames) @ spectrum.vectors
-        size = jnp.einsum("hk,...k->h", spectrum.squares * filters**2, y**2)
-        x, z = (np.log(np.asarray(v)) for v in (_residuals(spectrum, filters, whiten(self.frames)), size))
+        y = _changes(self.frames, whiten)
+        size = jnp.einsum("hk,...k->h", spectrum.squares * filters**2, (y @ spectrum.vectors) ** 2)
+        x, z = (np.log(np.asarray(v)) for v in (_residuals(spectrum, filters, y), size))
         (x1, z1), (x2, z2) = _slopes(x, z), _slopes(*_slopes(x, z))
         curvature = (x1 * z2 - x2 * z1) / np.maximum(x1**2 + z1**2, 1e-30) ** 1.5
         inner = slice(4, -4)  # the ends of the range have one-sided slopes
@@ -130,7 +131,7 @@ class Discrepancy(AbstractHyperparameter):
 
     def choose(self, spectrum, whiten):
         tried, filters = spectrum.filters()
-        y = whiten(self.frames)
+        y = _changes(self.frames, whiten)
         frames = y.size // y.shape[-1]
         residual = _residuals(spectrum, filters, y) / (frames * len(spectrum.squares))
         within = np.flatnonzero(np.asarray(residual) <= self.factor**2)
@@ -156,7 +157,8 @@ class NoiseFigure(AbstractHyperparameter):
         tried, filters = spectrum.filters()
         picture, areas = spectrum.problem.picture, spectrum.problem.picture.areas
         middle = jnp.sum(picture.centres * areas[:, None], 0) / jnp.sum(areas)
-        y = spectrum.problem.jacobian[:, jnp.argmin(jnp.sum((picture.centres - middle) ** 2, 1))]
+        square = jnp.sum((picture.centres - middle) ** 2, 1)
+        y = spectrum.problem.jacobian[:, jnp.argmin(jnp.where(areas > 0, square, jnp.inf))]
         image = spectrum.gained @ (filters * (y @ spectrum.vectors)).T
         noise = jnp.sqrt(filters**2 @ (areas @ spectrum.gained**2))
         signal = jnp.sqrt(areas @ image**2)
@@ -165,6 +167,18 @@ class NoiseFigure(AbstractHyperparameter):
         if not within.size:
             raise HyperparameterError(f"noise figure: none as low as {self.target}; the least is {figure.min():.3g}")
         return float(tried[within[0]])
+
+
+def _changes(frames: Float[Array, "... readings"], whiten) -> Float[Array, "... k"]:
+    """Whitened frames, which must say something."""
+    y = whiten(frames)
+    bad = np.flatnonzero(~np.isfinite(y).all(-1))
+    if bad.size:
+        todo = "leave it out, or the channel by prepare(..., channels=...)"
+        raise HyperparameterError(f"frame {bad[0]} of those to choose by holds a reading that is not finite; {todo}")
+    if not np.any(y):
+        raise HyperparameterError("the frames to choose by hold no change; give differences, at least one of a touch")
+    return y
 
 
 def _residuals(spectrum: Spectrum, filters, y) -> Float[Array, " h"]:

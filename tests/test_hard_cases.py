@@ -9,6 +9,7 @@ import textwrap
 import pytest
 
 from .hard_cases import INTRODUCTION, Row, merge, table, worst
+from .mutations import MUTANTS, Mutant, misfits
 
 SUITE = """
     import pytest
@@ -85,3 +86,12 @@ def test_rows_of_a_case_merge_to_the_worst_in_any_order():
     assert merge(rows) == merge(rows[::-1]) == merged
     assert table(merged).splitlines()[-1] == "| b | 1e3; 1e4 | 1e-09 | 1e-03 | not finite | an error |"
     assert worst([None]) is None
+
+
+def test_every_guard_to_break_stands_where_its_list_says():
+    assert misfits(MUTANTS) == []
+    rotten = Mutant("jaxeit/forward.py", "no such text", "", "test_forward test_none", "no_such_test")
+    assert [line.split(": ")[0] for line in misfits([rotten, rotten._replace(file="none.py", tests="test_none")])] == [
+        *("jaxeit/forward.py", "test_none.py", "test_forward test_none"),
+        *("none.py", "test_none.py", "test_none"),
+    ]

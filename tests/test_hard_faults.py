@@ -7,6 +7,9 @@ import sys
 
 import pytest
 
+from calib import cluster
+from calib.session import SessionError
+
 THREADS = """
 import faulthandler, sys, threading, time
 faulthandler.dump_traceback_later(int(sys.argv[1]), exit=True)
@@ -120,3 +123,13 @@ def test_without_network_the_same_input_gives_the_same_json(root, bundled, tmp_p
         "calibrate, evaluate and check in processes that cannot connect",
         beyond="the same JSON byte for byte; a report that asks nothing of others",
     )
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(monkeypatch):
+    def silent(*_, **__):
+        raise OSError("timed out\nafter 10 s")
+
+    monkeypatch.setattr(cluster, "Client", silent)
+    said = r"^tcp://x:1: no Dask scheduler answers there \(timed out after 10 s\); start one: dask scheduler$"
+    with pytest.raises(SessionError, match=said), cluster.dask_executor("tcp://x:1"):
+        pass

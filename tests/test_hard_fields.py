@@ -15,6 +15,7 @@ from calib.location import (
     _distance,
     _nearest,
     _of_shape,
+    _pressed,
     _project,
     _Whitened,
     fit_field,
@@ -61,6 +62,35 @@ def test_a_contact_that_is_not_known_has_an_uncertainty_and_no_gain(geometry):
     gain = log_gain(fitted, single_places(np.full((1, 2), np.nan), 4))
     assert not np.asarray(gain.mean).any()
     assert not np.asarray(gain.variance).any()
+
+
+def test_a_pad_that_no_press_tells_of_is_bounded_by_the_reach_alone(geometry):
+    """The press pins its own pad to where it was; the three others it says nothing of."""
+    reach = jnp.array([[0.01, 0.01], [0.19, 0.19]])
+    box = np.asarray(_pressed(RadialBasis(), geometry, single_places(ONE, 4), jnp.array([[1.0, 0, 0, 0]]), reach))
+    corners = np.stack([geometry.start.min(1), geometry.start.max(1)], 1)
+    np.testing.assert_allclose(box[0], np.repeat(ONE, 2, 0))
+    np.testing.assert_allclose(box[1:], np.clip(corners[1:], *reach))
+
+
+def test_one_wall_tells_of_the_others():
+    low, high = PadEdge().supported(jnp.array([-0.5, 0.1]), jnp.array([0.2, 0.8]))
+    np.testing.assert_array_equal([low, high], [[-0.8, -0.8], [0.8, 0.8]])
+
+
+def test_what_a_field_would_go_on_to_is_part_of_its_uncertainty_beyond_what_was_pressed(geometry):
+    """The square of what lies between level and going on; nothing else where the coefficients are known exactly."""
+    size, zero = len(PadEdge().shapes()[0]), jnp.zeros(())
+    box = jnp.broadcast_to(jnp.array([[0.03, 0.03], [0.06, 0.06]]), (4, 2, 2))
+    rest = (zero, zero + 1, zero, zero, jnp.zeros((), jnp.int32))  # noise, spread, evidence, n, result
+    known = FittedField(
+        PadEdge(), geometry, jnp.arange(1.0, size + 1), jnp.zeros((size, size)), box, jnp.zeros((4, size)), *rest
+    )
+    places = single_places(np.array([[0.045, 0.045], [0.005, 0.045]]), 4)
+    there = FEATURES(PadEdge(), geometry, places) @ known.coefficients
+    gain = log_gain(known, places)
+    np.testing.assert_allclose(gain.variance[:, 0], [0, float((there - gain.mean)[1, 0]) ** 2], atol=1e-12)
+    assert gain.variance[1, 0] > 1e-3
 
 
 def test_a_pad_without_presses_leaves_the_others_their_levels():

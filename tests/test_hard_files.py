@@ -12,11 +12,15 @@ import sys
 import time
 import zlib
 
+import numpy as np
 import pytest
 from h5py import h5g
 
+import jaxeit as je
+from calib.bench import write_data_set
+from calib.calibration import load_calibration
 from calib.session import SessionError, read_archive, write_archive
-from tests.fuzzing import MEMORY, READERS
+from tests.fuzzing import MEMORY, READERS, calibration, reconstructor
 from tests.test_session import ARRAYS, FORCE, REFUSED_FILES, changed, everything, make, put_chunk, replace
 
 SLOW = {"session": 10_000, "calibration": 2000, "journal": 2000, "frames": 4000, "lines": 4000}
@@ -151,3 +155,41 @@ def _seconds(read, path, said):
 def _rounded(seconds):
     """Milliseconds, up to the next of 10, 20, 50, 100 ..."""
     return next(ms for power in range(1, 9) for n in (1, 2, 5) if (ms := n * 10**power) >= 1000 * seconds)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calibrated")
+    calibration(folder)
+    return folder / "good.h5"
+
+
+def test_numbers_of_another_kind_are_refused_by_name(tmp_path):
+    reconstructor(tmp_path)
+    with np.load(tmp_path / "good.npz") as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "bad.npz", **arrays | {"factor": arrays["factor"].astype(int)})
+    with pytest.raises(je.StoreError, match="factor: is of type int64; it must be"):
+        je.load_reconstructor(tmp_path / "bad.npz")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda f: f.pop("pads/parameters"), "pads/parameters: missing from the calibration"),
+        (
+            replace("pads/parameters", data=np.zeros((3, 2))),
+            r"fit each other \(.* float64 of shape \(3, 2\), not numbers",
+        ),
+        (replace("image/factor", data=np.zeros((4, 6), int)), "image/factor: is of type int64; it must be"),
+    ],
+)
+def test_calibrations_whose_numbers_do_not_fit_are_refused(calibrated, tmp_path, change, said):
+    with pytest.raises(SessionError, match=rf"^changed\.h5: .*{said}.*; calibrate again$"):
+        load_calibration(changed(calibrated, tmp_path, change))
+
+
+def test_of_nothing_no_file_is_made(skin, tmp_path):
+    with pytest.raises(ValueError, match="0 x 41 places in 11 steps make no data set; give one place and two steps"):
+        write_data_set(skin, tmp_path / "d.h5", columns=0)
+    assert not os.listdir(tmp_path)

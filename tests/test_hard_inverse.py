@@ -326,15 +326,48 @@ def test_what_may_not_be_negative_is_not_before_its_end_either():
     assert np.asarray(_imaged(je.NonNegative(1), problem, jnp.asarray(rng.normal(size=20)))).min() == 0
 
 
-def test_newton_does_not_go_in_circles():
-    """As it does here with full steps, for ever; forty of its own reach the image of an active-set method."""
-    rng = np.random.default_rng(0)
-    j, y = rng.normal(size=(20, SIDE**2)), rng.normal(size=20)
-    problem = _problem(j, 0.01)
+def _by_nnls(problem, y):
+    """By an active-set method."""
     precision = problem.precision()
     root = np.sqrt(problem.strength(precision.solve(problem.jacobian.T)) * precision.values)
-    exact = nnls(np.concatenate([j, np.diag(root)]), np.append(y, np.zeros(SIDE**2)))[0]
-    assert _error(_imaged(je.NonNegative(), problem, jnp.asarray(y)), exact) < 1e-9
+    return nnls(np.concatenate([problem.jacobian, np.diag(root)]), np.append(y, np.zeros(SIDE**2)))[0]
+
+
+def _by_whole_steps(problem, y):
+    """Forty steps of Newton's method, which end after a few or never."""
+    j, precision = np.asarray(problem.jacobian), problem.precision()
+    weight = np.asarray(problem.strength(precision.solve(problem.jacobian.T)) * precision.values)
+    above = np.ones(SIDE**2, bool)
+    for _ in range(40):
+        left = np.linalg.solve(np.eye(len(j)) + j * (above / weight) @ j.T, y)
+        above = j.T @ left > 0
+    return np.maximum(j.T @ left / weight, 0)
+
+
+def test_what_may_not_be_negative_ends_at_any_lambda(hard):
+    """Newton's method alone takes hundreds of steps at 1e-3, with a line search; without one it goes in circles."""
+    j, ys = _spread(20, 1e-3)[0], np.random.default_rng(0).normal(size=(3, 20))
+    cases = [(_problem(j, h), y) for h in np.logspace(-5, 2, 8) for y in ys]
+    single = [(_problem(j, h, dtype="float32"), y) for h in (0.02, 1, 100) for y in ys]
+
+    def error(problem, y):
+        return _error(_imaged(je.NonNegative(), problem, jnp.asarray(y, problem.jacobian.dtype)), _by_nnls(problem, y))
+
+    worst, worst32 = max(error(*case) for case in cases), max(error(*case) for case in single)
+    whole = max(_error(_by_whole_steps(*case), _by_nnls(*case)) for case in cases)
+    assert worst < 1e-5
+    assert worst32 < 1e-2
+    assert whole > 1
+    reached, said = "lambda 1e-5 to 100 (float32: 0.02)", "below 5e-7 (float32: 1e-2) an error that names the range"
+    hard("images that may not be negative", reached, float64=worst, float32=worst32, naive=whole, beyond=said)
+
+
+def test_a_sheet_around_a_hole_has_a_noise_figure():
+    """In whose middle no reading sees anything: the nearest place on the sheet is taken."""
+    hole = np.isin(np.arange(SIDE**2), [14, 15, 20, 21])
+    problem = _problem(np.random.default_rng(7).normal(size=(20, SIDE**2)) * ~hole, 1, je.Tikhonov())
+    problem = replace(problem, picture=replace(problem.picture, areas=problem.picture.areas * ~hole))
+    assert 1e-4 < je.NoiseFigure(1).choose(spectrum(problem), None) < 100
 
 
 @pytest.mark.parametrize("prior", [je.Tikhonov(), je.GaussianSmooth(0.03)])

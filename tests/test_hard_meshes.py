@@ -196,3 +196,9 @@ def test_electrodes_that_share_the_sheet_are_refused(hard):
 def test_settings_of_a_mesh_that_cannot_be_are_refused(wrong, said):
     with pytest.raises(je.FidelityError, match=f"{next(iter(wrong))} is .*; {said}"):
         je.Fidelity(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"columns": 0}, {"rows": 2001}])
+def test_pixels_that_cannot_be_are_refused(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; give 1 to 2000 pixels"):
+        je.Pixels(**wrong)

@@ -40,8 +40,8 @@ def held(model):
     return u[:, :275]
 
 
-def chosen(model, coarse, how):
-    recon = je.prepare(model, basis=coarse, noise=np.full(550, STD), hyperparameter=how)
+def chosen(model, coarse, how, channels=None):
+    recon = je.prepare(model, basis=coarse, noise=np.full(550, STD), hyperparameter=how, channels=channels)
     return float(recon.provenance["hyperparameter"])
 
 
@@ -115,6 +115,18 @@ def test_where_the_l_curve_stands_still_it_does_not_bend():
     """As in float32 at small values, where the image does not change any more: 0 / 0 would be chosen."""
     squares, y = jnp.array([100, 0], jnp.float32), jnp.array([[1, 1e-3]], jnp.float32)
     assert je.LCurve(y).choose(Spectrum(squares, jnp.eye(2, dtype=y.dtype), None, None), lambda y: y) > 1e-3
+
+
+@pytest.mark.parametrize("choice", [je.GeneralisedCrossValidation, je.LCurve, je.Discrepancy])
+def test_frames_that_say_nothing_choose_nothing(model, coarse, frames, choice):
+    """No change at all; a reading that is not finite, unless its channel is left out."""
+    with pytest.raises(je.HyperparameterError, match="hold no change; give differences, at least one of a touch"):
+        chosen(model, coarse, choice(0 * frames))
+    used = np.arange(550) != 7
+    bad = np.where(used, frames, np.nan)
+    with pytest.raises(je.HyperparameterError, match=r"frame 0 .* not finite; leave it out, or the channel by"):
+        chosen(model, coarse, choice(bad))
+    assert chosen(model, coarse, choice(bad), used) == chosen(model, coarse, choice(frames), used) > 1e-4
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("inf")])

@@ -264,8 +264,11 @@ def test_files_that_are_no_tables(content: bytes, said: str, tmp_path: Path) -> 
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(SessionError, match=r"none\.csv: file: does not exist"):
-        load(tmp_path / "none.csv", "--time", "0:s", "--stream", "f=1:N", folder=tmp_path)
+    for name, said in {"none.csv": r"none\.csv: file: does not exist", "x" * 300: r"\(File name too long\)"}.items():
+        with pytest.raises(SessionError, match=said):
+            load(tmp_path / name, "--time", "0:s", "--stream", "f=1:N", folder=tmp_path)
+    with pytest.raises(SessionError, match="no file given; name one"):
+        import_csv([], tmp_path / "s.h5")
 
 
 @pytest.mark.parametrize("text", [":ms", "0:", "0:N", "0:f:", ""])

@@ -454,9 +454,16 @@ def test_nothing_recorded_is_said(tmp_path):
 # --- what the session file says of clocks --------------------------------------------------------
 
 
+def fewer_knots(clock):
+    knots = clock["host_ns"][1:]
+    del clock["host_ns"]
+    clock.create_dataset("host_ns", data=knots, chunks=True, fletcher32=True)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (fewer_knots, r"^s\.h5: /clocks/eit: knots of unequal number; give one tick for each time"),
         (lambda g: g.move("host_ns", "other"), "host_ns: missing"),
         (lambda g: g.attrs.modify("drift_ppm", np.nan), "drift_ppm"),
         (lambda g: g.__setitem__("host_ns", h5py.SoftLink("/device")) if g.move("host_ns", "x") is None else 0, "soft"),

@@ -420,12 +420,22 @@ def test_other_files_are_refused(kind: str, words: str, tmp_path: Path) -> None:
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     assert "does not exist" in refusal(tmp_path / "none.h5")
     assert "is a folder" in refusal(tmp_path)
+    with pytest.raises(SessionError, match=r"cannot be read \(File name too long\); check"):
+        open_session(tmp_path / ("x" * 300))
 
 
 def test_half_a_file_is_refused(good: Path, tmp_path: Path) -> None:
     path = tmp_path / "s.h5"
     path.write_bytes(good.read_bytes()[:20_000])
     assert "truncated: 20,000 of" in refusal(path)
+
+
+@pytest.mark.parametrize(("at", "byte", "words"), [(9, 4, "unusual HDF5 header"), (11, 1, "was never closed")])
+def test_an_unusual_header_is_refused(at: int, byte: int, words: str, good: Path, tmp_path: Path) -> None:
+    raw = bytearray(good.read_bytes())
+    raw[at] = byte
+    (tmp_path / "s.h5").write_bytes(raw)
+    assert words in refusal(tmp_path / "s.h5")
 
 
 def test_foreign_and_old_hdf5_is_refused(tmp_path: Path) -> None:
@@ -603,6 +613,10 @@ REFUSED_FILES: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "a type alone": (link("streams/force", np.dtype("f8")), "is neither group nor dataset"),
     "no stream at all": (no_stream, "holds no stream"),
     "no word on the variable": (two_variables, "does not say which variable it holds"),
+    "no shape": (link(FORCE, h5py.Empty("f4")), "has no shape or too many dimensions"),
+    "chunks of 4 bytes": (replace(FORCE, shape=(1 << 21, 1), dtype="f4", chunks=(1, 1)), "has 2,097,152 chunks"),
+    "table of two columns": (replace("presses/x", data=np.zeros((2, 2))), "of shape (2, 2); write shape (rows)"),
+    "truth in words": (replace("truth/site", data=np.full(2, b"x")), "holds 2 bytes of |S1, not numbers"),
     "endless texts": (replace("presses/reason", data=np.full(2, b"x" * 100_000)), "holds texts of 100,000 bytes"),
 }
 
@@ -721,6 +735,13 @@ def test_rows_may_be_written_and_read_in_pieces(tmp_path: Path) -> None:
         force = reader.arrays["force"]
         assert (force.shape, force.units) == ((700, 6, 50), "N")
         np.testing.assert_array_equal(force.read(100, 555), rows[100:555])
+
+
+def test_what_does_not_fit_into_memory_is_read_in_slices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_archive(tmp_path / "a.h5", "x", {}, {"a": (np.zeros(100), "1", "")})
+    monkeypatch.setattr("calib.session.archive.MAX_READ_BYTES", 799)
+    with pytest.raises(SessionError, match="holds 800 bytes; read it in slices with open_archive"):
+        read_archive(tmp_path / "a.h5", "x")
 
 
 @pytest.mark.parametrize("name", ["../a", "/a", "a//b", "dim_3", "a/b/c/d/e", "é", ""])

@@ -299,6 +299,25 @@ def test_nothing_is_sent_to_who_is_not_there():
     for url in ("tcp://127.0.0.1:1", "serial:///dev/none"):
         with pytest.raises(OSError, match="not connected"):
             source("pressure", url, 4).link().write(b"x")
+    with pytest.raises(OSError, match="ReplayLink only talks"):
+        ReplayLink("none.h5", intake.source.plan).write(b"x")
+
+
+def test_a_port_of_no_kind_is_an_os_error():
+    with pytest.raises(OSError, match="none://x: invalid URL"):
+        SerialLink("none://x").open()
+
+
+@posix
+def test_a_port_closed_by_another_is_an_os_error():
+    with Device([ramp(1)], [None]) as device:
+        link = source("pressure", device.urls[0], 4).link()
+        link.open()
+        ours, link._port.fd = link._port.fd, None  # as pyserial leaves it, in the midst of a read
+        with pytest.raises(OSError, match="the port was closed"):
+            link.read()
+        link._port.fd = ours
+        link.close()
 
 
 # --- faults on the line --------------------------------------------------------------------------

@@ -315,7 +315,8 @@ class _Truth(Mapping[str, np.ndarray]):
         node = _needed(self._node, name, self._node.dataset(name))
         array = GuardedArray(node)
         if array.nbytes > MAX_TRUTH_BYTES or array.dtype.kind == "S":
-            raise node.error(f"holds {array.nbytes:,} bytes of {array.dtype}", SCHEMA)
+            what = f"holds {array.nbytes:,} bytes of {array.dtype}, not numbers of at most {MAX_TRUTH_BYTES:,} bytes"
+            raise node.error(what, SCHEMA)
         unit = _unit(node, "")
         values = array.read()
         return values if unit == Unit(unit.si) else values * unit.factor + unit.offset
@@ -429,7 +430,8 @@ def _clock(node: Node) -> ClockTable:
             **numbers,
         )
     except SessionError as error:
-        raise SessionError(f"{printable(node.path.name)}: /{error}") from None
+        what = str(error).removeprefix("clocks: ")
+        raise SessionError(f"{printable(node.path.name)}: {node.where}: {what}") from None
 
 
 def _column(node: Node, name: str, dtype: str) -> np.ndarray | tuple[str, ...]:
