@@ -5,6 +5,10 @@ from pathlib import Path
 # Before JAX is imported, and for the processes that tests start: half of the suite's time was XLA at work on programs
 # that run once. `make slow` compiles as users do.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+# Nobody reads where in Python each operation of a program comes from: 100 frames of every one, unless told otherwise.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+# There is a worker a core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest

@@ -10,7 +10,7 @@ from scipy.stats import skew
 import jaxeit as je
 from jaxeit import effects as fx
 
-from .helpers import sheet_of, square_model
+from .helpers import compiled, sheet_of, square_model
 from .histories import after
 
 SMALL = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.12)]
@@ -33,6 +33,10 @@ def _with(model, *effects):
 def _scene(*effects):
     """The bare sheet with these effects, with room for what they need."""
     return square_model(SMALL, [[0, 1, 2, 3]], 10, effects=effects)
+
+
+def _with_needs(effect):
+    return _scene(effect, *NEEDS.get(type(effect), ()))
 
 
 def _everything(model, key):
@@ -61,20 +65,37 @@ def _history(model, family, series, key, stream=None):
     return fx.history(mine, series, fx.history_start(mine, series[0]), line)[0]
 
 
-def _program(model):
-    return eqx.filter_jit(_everything).lower(model, jax.random.key(0)).compile().compiled.as_text()
+def _program():
+    """`_everything`, to be compiled, and a list with an entry for each time that it is traced."""
+    traces = []
+
+    def run(model, key):
+        traces.append(1)
+        return _everything(model, key)
+
+    return compiled(run), traces
+
+
+def _text(run, model):
+    return run.lower(model, jax.random.key(0)).compile().compiled.as_text()
 
 
 @pytest.fixture(scope="module")
-def bare_program(bare):
-    return _program(bare)
+def bare_text(bare):
+    return _text(_program()[0], bare)
+
+
+@pytest.fixture(scope="module")
+def programs():
+    """One for each effect, which the two tests of it share: what is compiled for its text is then called."""
+    return {name: _program() for name in IDS}
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=IDS)
-def test_an_effect_is_in_the_program_if_and_only_if_it_is_listed(bare, bare_program, effect):
-    name, others = type(effect).__name__, NEEDS.get(type(effect), ())
-    assert f"/{name}/" not in bare_program
-    assert f"/{name}/" in _program(_scene(effect, *others))
+def test_an_effect_is_in_the_program_if_and_only_if_it_is_listed(bare_text, programs, effect):
+    name = type(effect).__name__
+    assert f"/{name}/" not in bare_text
+    assert f"/{name}/" in _text(programs[name][0], _with_needs(effect))
 
 
 def test_no_effects_leave_no_trace(bare):
@@ -101,18 +122,12 @@ def _operations(jaxpr):
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=IDS)
-def test_a_new_parameter_retraces_nothing(effect):
-    traces = []
-
-    @eqx.filter_jit
-    def run(model, key):
-        traces.append(1)
-        return _everything(model, key)
-
+def test_a_new_parameter_retraces_nothing(programs, effect):
+    run, traces = programs[type(effect).__name__]
     key = jax.random.key(0)
-    run(_scene(effect), key)
+    run(_with_needs(effect), key)
     changed = jax.tree.map(lambda leaf: leaf + 1 if eqx.is_array(leaf) else leaf, effect)
-    run(_scene(changed), key)
+    run(_with_needs(changed), key)
     assert len(traces) == 1
 
 
