@@ -25,7 +25,6 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 import calib
@@ -36,6 +35,7 @@ from calib.acquisition.live import Show, live
 from calib.acquisition.recorder import Log, Nowhere, kept, record
 from calib.acquisition.results import Result
 from calib.acquisition.setup import prepare
+from calib.runtime import set_up_live
 
 from ._common import circumstances, write
 from .memory import growth, resident
@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--calibration", help="default: one made up for the chest skin, without correction by place")
     parser.add_argument("--no-rates", action="store_true", help="leave out the search for the highest rate")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    set_up_live()
     calibration = calib.load_calibration(args.calibration) if args.calibration else made_up()
     data: dict[str, Any] = {"circumstances": circumstances(), "readings": calibration.recon.readings}
     data["soak"] = soaked(calibration, 5.0 if args.smoke else 60 * args.minutes)

@@ -587,9 +587,9 @@ def _live(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, "1")
     if args.rerun is not None:
         _require_rerun()
-    from .runtime import set_up
+    from .runtime import set_up_live
 
-    set_up()
+    set_up_live()
     from threading import Timer
 
     from .acquisition.live import Show

@@ -28,7 +28,8 @@ _TOUCHED = 3.0  # times its standard error: a force that is there
 _STALE = 0.1  # s, after which contacts are fitted even if a frame is lost to it
 _FORGOTTEN = 0.3  # s, after which they say nothing about the present frame
 _GATE = 0.6
-_KEPT = 16  # reconstructions kept for frames that lack the same readings again, 4 MB each
+_KEPT = 16  # reconstructions kept for frames that lack the same readings again, 2 MB each
+_IMAGED = "float32"  # what images are made in, of matrices built in float64: half the memory to go through
 
 
 class Arrival(NamedTuple):
@@ -83,7 +84,7 @@ class Programs:
 
     def __init__(self, law: ForceLaw):
         self._law = law
-        self._image = law.recon.on_host()
+        self._image = law.recon.astype(_IMAGED).on_host()
         self._cut: OrderedDict[bytes, Callable] = OrderedDict()
         self._dtypes = law.recon.factor.dtype, law.curves.parameters.dtype
         self._map = _compiled(lambda *a: _mapped(law, *a))  # its numbers built in: a call has a third of the overhead
@@ -110,10 +111,9 @@ class Programs:
 
     def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> Mapped:
         """Forces of a difference frame (readings,) V and pressures (pads,) Pa, after those ``before`` (m, pads)."""
-        frame, pressure = self._row(frame, 0), self._row(pressure, 1)
         image = self._image_without(~np.isfinite(frame))(frame)
-        row = self._map(image, pressure, places, filled(self._law, before))
-        return _unpacked(np.asarray(row), pressure.size, image[0])
+        row = self._map(image[None], self._row(pressure, 1), places, filled(self._law, before))
+        return _unpacked(np.asarray(row), pressure.size, image)
 
     def _image_without(self, lost: np.ndarray) -> Callable:
         key = lost.tobytes()
@@ -135,7 +135,7 @@ class Programs:
         used = np.asarray(self._law.recon.channels)
         if lost.tobytes() in self._cut or (lost | ~used).all():
             return
-        self._cut[lost.tobytes()] = self._law.recon.without(lost & used).on_host()
+        self._cut[lost.tobytes()] = self._law.recon.without(lost & used).astype(_IMAGED).on_host()
         if len(self._cut) > _KEPT:
             self._cut.popitem(last=False)
 
@@ -149,6 +149,7 @@ def _compiled(function: Callable) -> Callable:
 
 def _mapped(law: ForceLaw, image, pressure, places, before):
     """`Mapped` in one row: one transfer."""
+    image = image.astype(law.recon.factor.dtype)
     found = fused(law, image, pressure, places if law.field is not None else None, before, _GATE)
     parts = found.map.force, found.force, found.standard_error, found.valid, is_loaded(law, pressure)
     return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])
