@@ -14,10 +14,11 @@ import numpy as np
 
 import jaxeit as je
 
+from .choice import Candidate
 from .curves import CURVES, AbstractCurve, Linear, curve_name
 from .evaluation import Evaluation, evaluate_presses
 from .fit import AbstractLoss, FitError, FitResult, FittedCurve, SoftL1
-from .hybrid import Candidate, Hybrid, PressData, choose, fit_hybrid, folds_by_place, hold_out, thinned
+from .hybrid import Hybrid, PressData, choose, fit_hybrid, folds_by_place, hold_out, thinned
 from .location import (
     FIELDS,
     AbstractField,
@@ -256,7 +257,9 @@ def _look(
     image = recon(jnp.asarray(pressed.dv, recon.factor.dtype))
     found, places, note = None, None, ""
     if choice is not None:
-        sigma, note = _background(model, pressed.untouched, pressed.channels)
+        sigma = None
+        if choice.looks_through_sheet:
+            sigma, note = _background(model, pressed.untouched, pressed.channels)
         found = choice.prepare(model, pressed.noise, pressed.channels, sigma)
         places = locate(found.single(), pressed.dv, recon, masks, image)
     image_sum = np.asarray(je.image_sum(image, recon.areas), float)

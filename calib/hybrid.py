@@ -9,7 +9,8 @@ give the same numbers but neither the evidence nor the sandwich over places.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 
+from .choice import Candidate, Tried, simplest
 from .curves import AbstractCurve, curve_name
 from .fit import AbstractLoss, FitResult, FittedCurve, Prediction, bucket, fit_curves, predict_pads
 from .location import AbstractField, FittedField, Geometry, Places, field_name, fit_field, log_gain
@@ -57,6 +59,13 @@ class PressData:
     def sample_place(self) -> np.ndarray:
         """Number of the place of each sample, (n,)."""
         return self.place[self.sample_press]
+
+    @cached_property
+    def own(self) -> np.ndarray:
+        """Each pad's samples in `mask`, those that are missing, and others that fill up, (pads, m) in order of time."""
+        wanted = self.mask | ~(np.isfinite(self.sample_pressure) & np.isfinite(self.sample_force))
+        most = wanted.sum(1).max(initial=0)
+        return np.argsort(~wanted, axis=1, kind="stable")[:, :most]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +145,18 @@ def fit_hybrid(
 
 
 def _curves(curve, data: PressData, gain: np.ndarray, use: np.ndarray, loss) -> FittedCurve:
-    """Each pad's curve through forces over gains, each with the noise that the division left it."""
+    """Each pad's curve through forces over gains, each with the noise that the division left it.
+
+    A curve that forgets is given no presses but the pad's own: of four pads, a quarter of the work.
+    """
+    rows = np.broadcast_to(np.arange(len(data.sample_force)), data.mask.shape) if curve.path else data.own
+    pressure, mask, gain = (np.take_along_axis(a, rows, 1) for a in (data.sample_pressure, data.mask, gain))
     return fit_curves(
         curve,
-        data.sample_pressure,
-        data.sample_force * np.exp(-gain),
-        mask=data.mask & use[data.sample_press],
-        groups=data.sample_place,
+        pressure,
+        data.sample_force[rows] * np.exp(-gain),
+        mask=mask & use[data.sample_press][rows],
+        groups=data.sample_place[rows],
         sigma=np.exp(-gain),
         loss=loss,
     )
@@ -194,28 +208,6 @@ def hold_out(
     return out
 
 
-class Candidate(NamedTuple):
-    """A curve or field that was tried, and what cross-validation over places said of it.
-
-    | meaning                                                                        | unit |
-    |--------------------------------------------------------------------------------|------|
-    | part: "curve" or "location"                                                    |      |
-    | name                                                                           |      |
-    | size: coefficients (of a curve, a pad)                                         |      |
-    | rmse: root mean square over places of the held-out error; None: not determined | N    |
-    | low, high: the same with a standard error less and more in the mean square     | N    |
-    | chosen                                                                         |      |
-    """
-
-    part: str
-    name: str
-    size: int
-    rmse: float | None
-    low: float | None
-    high: float | None
-    chosen: bool
-
-
 class Choice(NamedTuple):
     """A curve and a field, in words why these, and all that were tried (empty where there was nothing to choose)."""
 
@@ -237,57 +229,22 @@ def choose(
     """The simplest field, then the simplest curve, whose held-out error is within one standard error of the least.
 
     The error is the mean over places of the mean square over a press's samples, so that all loads of a ramp count,
-    predicted by fits that never saw the place (one-standard-error rule: Breiman et al. 1984, 3.4.3). The field is
-    chosen with the first curve; simple means few coefficients.
+    predicted by fits that never saw the place (see `simplest`). The field is chosen with the first curve; simple means
+    few coefficients.
     """
 
     def judged(curve, field):
         return place_errors(curve, field, data, geometry, places, loss, fold)
 
-    by_field = [_Tried(f, _field_title(f), 0 if f is None else f.size(geometry.pads)) for f in fields]
-    field, why, first = _best("location", by_field, lambda f: judged(curves[0], f))
-    by_curve = [_Tried(c, curve_name(c), c.size) for c in curves]
-    curve, more, second = _best("curve", by_curve, lambda c: judged(c, field))
+    by_field = [Tried(f, _field_title(f), 0 if f is None else f.size(geometry.pads)) for f in fields]
+    field, why, first = simplest("location", by_field, lambda f: judged(curves[0], f), "places")
+    by_curve = [Tried(c, curve_name(c), c.size) for c in curves]
+    curve, more, second = simplest("curve", by_curve, lambda c: judged(c, field), "places")
     return Choice(curve, field, "; ".join(filter(None, [why, more])), first + second)
 
 
 def _field_title(field: AbstractField | None) -> str:
     return "none" if field is None else field_name(field)
-
-
-class _Tried(NamedTuple):
-    """A candidate with its name and number of coefficients."""
-
-    choice: Any
-    name: str
-    size: int
-
-
-def _best(part: str, tried: Sequence[_Tried], score) -> tuple[Any, str, tuple[Candidate, ...]]:
-    """The smallest candidate whose mean error is at most the least one plus its standard error, why, and the table."""
-    if len(tried) == 1:
-        return tried[0].choice, "", ()
-    tried = sorted(tried, key=lambda one: one.size)
-    errors = [score(one.choice) for one in tried]
-    means = np.array([np.mean(e) if np.isfinite(e).all() else np.inf for e in errors])
-    spread = np.array([np.std(e, ddof=1) / np.sqrt(len(e)) for e in errors])
-    least = int(np.argmin(means))
-    limit = means[least] + spread[least]
-    chosen = int(np.argmax(means <= limit))
-    table = tuple(
-        Candidate(part, one.name, one.size, *_roots(mean, error), chosen=k == chosen)
-        for k, (one, mean, error) in enumerate(zip(tried, means, spread, strict=True))
-    )
-    said = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in table)
-    why = f"{tried[chosen].name}, the simplest within one standard error ({np.sqrt(limit):.2f} N) of the best"
-    return tried[chosen].choice, f"{why}; held-out RMSE over places in N: {said}", table
-
-
-def _roots(mean: float, error: float) -> tuple[float | None, float | None, float | None]:
-    """Root of a mean square (N^2), and of one standard error less and more."""
-    if not np.isfinite(mean):
-        return None, None, None
-    return float(np.sqrt(mean)), float(np.sqrt(max(mean - error, 0))), float(np.sqrt(mean + error))
 
 
 def place_errors(curve, field, data: PressData, geometry, places, loss, fold: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ A choice (`FittedContact`, `ImageCentroid`) is prepared with a model into a loca
 
 import abc
 from dataclasses import dataclass, fields, replace
-from typing import Any, get_type_hints
+from typing import Any, ClassVar, get_type_hints
 
 import equinox as eqx
 import jax
@@ -75,7 +75,9 @@ def _located(locator, dv, image, recon, masks) -> Places:
 
 
 class AbstractLocatorChoice(abc.ABC):
-    """How the place of a contact is to be estimated."""
+    """How the place of a contact is to be estimated; `looks_through_sheet`: `prepare` makes use of `sigma`."""
+
+    looks_through_sheet: ClassVar[bool] = True
 
     @abc.abstractmethod
     def prepare(
@@ -91,6 +93,8 @@ class ImageCentroid(AbstractLocatorChoice):
 
     Raises: `ValueError` for a name that `jaxeit.ESTIMATORS` has not.
     """
+
+    looks_through_sheet: ClassVar[bool] = False
 
     estimator: str = "half"
 

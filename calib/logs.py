@@ -2,28 +2,35 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from .curves import AbstractCurve, curve_name
+from .choice import Tried, simplest
+from .curves import AbstractCurve, Linear, curve_name
 from .fit import FitError
 from .presses import resample
 from .response import BlendChannels, LogFit, fit_log, time_split
 from .session import Session, Stream, write_archive
 from .smooth import SmoothChannels
 
+Way = BlendChannels | SmoothChannels | None
+"""To make one signal of several channels; None: there is but one."""
+
 FORMAT = "pressure-force-curves"
 _NOT_SIGNALS = ("force", "stage", "temperature", "barometer")
-_WAYS = (BlendChannels(), SmoothChannels())  # of making one signal, in N, of several channels
+_WAYS = {"blend": BlendChannels(), "Gaussian process": SmoothChannels()}  # one signal, in N, of several channels
+_STRETCHES = 10  # of time, over which errors are compared
 
 
 @dataclass(frozen=True, eq=False)
 class SessionFit:
-    """The fit of a session's log, and the unit of the signal that its curve turns into force."""
+    """The fit of a session's log, the unit of the signal that its curve turns into force, and why this curve."""
 
     fit: LogFit
     unit: str
+    why: str = ""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -35,9 +42,10 @@ def fit_session(session: Session, curve: AbstractCurve | Sequence[AbstractCurve]
     """Fit force against the session's signal on its first half; the second half is held out.
 
     The signal is the stream "pressure", or the only one that is not a force, a place or the weather;
-    it is interpolated to the times of the force. Of several curves the one is taken that, fitted on the first half of
-    the first half, predicts the rest of it best: the second half has no say. So is with it, of several channels, the
-    way to make one signal of them: a static blend, or a Gaussian process that knows of creep.
+    it is interpolated to the times of the force. Of several curves one is chosen (see `simplest`) by how each, fitted
+    on the first half of the first half, predicts stretches of the rest of it: the second half has no say. So is before
+    it, of several channels, the way to make one signal of them: a static blend, or a Gaussian process that knows of
+    creep.
 
     Raises:
         SessionError, FitError: if a stream is missing or nothing can be fitted.
@@ -47,7 +55,8 @@ def fit_session(session: Session, curve: AbstractCurve | Sequence[AbstractCurve]
     unit = "N" if signal.channels > 1 else _unit(signal)
     if isinstance(curve, AbstractCurve):
         return SessionFit(fit_log(curve, log.time, log.values, log.force), unit)
-    return SessionFit(_best(log, curve), unit)
+    fit, why = _chosen(log, curve)
+    return SessionFit(fit, unit, why)
 
 
 def _unit(signal: Stream) -> str:
@@ -67,7 +76,7 @@ class _Log:
         rows, _ = time_split(self.time)
         return _Log(self.time[rows], self.values[rows], self.force[rows])
 
-    def signal(self, way) -> tuple[np.ndarray, str]:
+    def signal(self, way: Way) -> tuple[np.ndarray, str]:
         """One of all channels, made of the first half, and what it is made of."""
         if way is None:
             return self.values, "channel 0"
@@ -75,18 +84,26 @@ class _Log:
         known = rows & np.isfinite(self.values).all(1) & np.isfinite(self.force)
         return way(self.time, self.values, np.where(known, self.force, np.nan), None)
 
+    def errors(self, curve: AbstractCurve, signal: np.ndarray) -> np.ndarray:
+        """Mean square errors on stretches of its second half, N^2, of a curve fitted on the first."""
+        predicted = fit_log(curve, self.time, signal, self.force).predicted
+        _, rest = time_split(self.time)
+        rest &= np.isfinite(self.force) & np.isfinite(signal.reshape(len(rest), -1)).all(1)
+        return np.array([np.mean(part**2) for part in np.array_split((predicted - self.force)[rest], _STRETCHES)])
 
-def _best(log: _Log, curves: Sequence[AbstractCurve]) -> LogFit:
-    """By the second half of the first half, and then fitted on the whole of it."""
+
+def _chosen(log: _Log, curves: Sequence[AbstractCurve]) -> tuple[LogFit, str]:
+    """By the second half of the first half, and then fitted on the whole of it; and why."""
     half = log.first()
-    tried = []
-    for way in _WAYS if log.values.shape[1] > 1 else (None,):
-        signal, _ = half.signal(way)
-        errors = [fit_log(c, half.time, signal, half.force).held_out.rmse for c in curves]
-        tried.append((float(np.nanmin([*errors, np.inf])), int(np.argmin(np.nan_to_num(errors, nan=np.inf))), way))
-    _, chosen, way = min(tried, key=lambda one: one[0])
+    ways = _WAYS if log.values.shape[1] > 1 else {"channel": None}
+    made = cache(lambda way: half.signal(way)[0])
+    tried = [Tried(way, name, order) for order, (name, way) in enumerate(ways.items())]
+    way, why, _ = simplest("channels", tried, lambda way: half.errors(Linear(), made(way)), "stretches of time")
+    tried = [Tried(curve, curve_name(curve), curve.size) for curve in curves]
+    curve, more, _ = simplest("curve", tried, lambda curve: half.errors(curve, made(way)), "stretches of time")
     signal, source = log.signal(way)
-    return replace(fit_log(curves[chosen], log.time, signal, log.force), source=source)
+    fit = replace(fit_log(curve, log.time, signal, log.force), source=source)
+    return fit, "; ".join(filter(None, [why, more]))
 
 
 def _signal(session: Session) -> Stream:
@@ -113,8 +130,9 @@ def render_log(name: str, found: SessionFit) -> str:
         strict=True,
     )
     terms = ", ".join(f"{n} {v:.4g} +- {e:.2g} {u}" for n, v, e, u in numbers)
+    why = f"  chosen: {found.why}\n" if found.why else ""
     return (
-        f"{name}: {curve_name(curve)} curve of {fit.source}: {fit.fitted.message()}\n"
+        f"{name}: {curve_name(curve)} curve of {fit.source}: {fit.fitted.message()}\n{why}"
         f"  {terms}\n"
         f"  force RMSE: first half (fitted) {fit.train.rmse:.3f} N, second half (held out) "
         f"{held.rmse:.3f} N = {held.percent_full_scale:.1f} % of full scale, {held.n} samples\n"

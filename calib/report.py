@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from .calibration import Calibration
+from .choice import Candidate
 from .evaluation import CALIBRATED, METHODS, Evaluation
 from .figures import (
     ESTIMATOR_MEANING,
@@ -24,7 +25,6 @@ from .figures import (
     sensitivity_figure,
     sensitivity_maps,
 )
-from .hybrid import Candidate
 from .location import FittedField, field_name
 from .session import replacing
 

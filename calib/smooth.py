@@ -21,6 +21,14 @@ _STEPS = 60
 _JITTER = 1e-8
 
 
+class _Found(NamedTuple):
+    evidence: float
+    directions: int
+    hyper: np.ndarray
+    inputs: np.ndarray
+    size: float
+
+
 @dataclass(frozen=True)
 class SmoothChannels:
     """For `fit_log`: one signal in N of all channels by a Gaussian process, creep included.
@@ -38,7 +46,8 @@ class SmoothChannels:
         """Signal (n,) N at all times (ns), from the samples (n, channels) whose force (n,) is finite."""
         del curve
         train = np.isfinite(force)
-        tried = [self._tried(time, signals, force, train, k) for k in self.directions if k <= signals.shape[1]]
+        inputs = _inputs(np.asarray(time, float) / 1e9, signals, train, max(self.directions), self.lags)
+        tried = [self._tried(inputs, force, train, k) for k in self.directions if k <= signals.shape[1]]
         best = max(tried, key=lambda found: found.evidence)
         whole = np.isfinite(best.inputs).all(1)
         out = np.full(len(force), np.nan)
@@ -46,32 +55,30 @@ class SmoothChannels:
         lags = f", lags of {' and '.join(f'{lag:g}' for lag in self.lags)} s" if self.lags else ""
         return out, f"{signals.shape[1]} channels along {best.directions} directions{lags}"
 
-    def _tried(self, time, signals, force, train, directions: int) -> "_Found":
-        inputs = _inputs(np.asarray(time, float) / 1e9, signals, train, directions, self.lags)
-        rows = np.flatnonzero(train)[:: max(train.sum() // _MOST, 1)]
+    def _tried(self, inputs: np.ndarray, force, train, directions: int) -> _Found:
+        """The hyperparameters of largest evidence; directions left out are zero, so that all share a program."""
+        kept = inputs * (np.arange(inputs.shape[1]) < len(self.lags) + directions)
+        rows = np.flatnonzero(train)[_spread(int(train.sum()), _MOST)]
         size = float(np.std(force[train]))
-        cost = partial(_cost_and_slope, jnp.asarray(inputs[rows]), jnp.asarray(force[rows] / size))
-        start = np.r_[np.zeros(inputs.shape[1]), 0.0, -1.0, np.log(0.03**2)]
+        cost = partial(_cost_and_slope, jnp.asarray(kept[rows]), jnp.asarray(force[rows] / size))
+        start = np.r_[np.zeros(kept.shape[1]), 0.0, -1.0, np.log(0.03**2)]
         found = minimize(lambda h: tuple(np.asarray(part, float) for part in cost(h)), start, jac=True,
-                         method="L-BFGS-B", bounds=[(-7, 7)] * inputs.shape[1] + [(-12, 12)] * 2 + [(-16, 2)],
+                         method="L-BFGS-B", bounds=[(-7, 7)] * kept.shape[1] + [(-12, 12)] * 2 + [(-16, 2)],
                          options={"maxiter": _STEPS})  # fmt: skip
-        return _Found(-float(found.fun), directions, found.x, inputs, size)
+        return _Found(-float(found.fun), directions, found.x, kept, size)
 
 
-class _Found(NamedTuple):
-    evidence: float
-    directions: int
-    hyper: np.ndarray
-    inputs: np.ndarray
-    size: float
+def _spread(n: int, most: int) -> np.ndarray:
+    """At most `most` of the numbers below n, evenly."""
+    return np.linspace(0, n - 1, min(n, most)).astype(int)
 
 
 def _inputs(time, signals, train, directions: int, lags) -> np.ndarray:
-    """Principal components over their largest value, and the first one's distance from its lags, (n, inputs)."""
+    """How far the first principal component is from its lags, and all over their largest value, (n, inputs)."""
     axes = np.linalg.svd(signals[train], full_matrices=False)[2][:directions]
     along = signals @ axes.T
     along = along / np.abs(along[train]).max(0)
-    return np.column_stack([along, *(along[:, 0] - lagged(time, along[:, 0], lag) for lag in lags)])
+    return np.column_stack([*(along[:, 0] - lagged(time, along[:, 0], lag) for lag in lags), along])
 
 
 def lagged(time: np.ndarray, signal: np.ndarray, lag: float) -> np.ndarray:

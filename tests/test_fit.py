@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize
 
+from calib.choice import Tried, simplest
 from calib.curves import Affine, Linear, PowerLaw
 from calib.fit import (
     Cauchy,
@@ -442,3 +443,31 @@ def test_eflesh_is_fitted_without_its_missing_rows():
     assert fit.missing == 1740
     assert fit.held_out.rmse < 0.5
     assert fit_log(Affine(), states[:, 0], channels, force, channels=BestChannel()).held_out.rmse < 1.0
+
+
+# --- choosing among candidates ---------------------------------------------------------------------------------------
+
+
+def test_the_simplest_of_those_that_are_as_good_is_chosen_and_said():
+    """Mean squares 9, 4.2, 4 +- 0.6 and one fit that failed: the second is within a standard error of the least."""
+    squares = {"plain": [9.0, 9.0, 9.0], "bent": [4.2, 4.2, 4.2], "free": [3.0, 4.0, 5.0], "failed": [0.1, np.nan, 0.1]}
+    tried = [Tried(name, name, size) for size, name in ((9, "free"), (1, "plain"), (2, "failed"), (4, "bent"))]
+    chosen, why, table = simplest("curve", tried, lambda name: np.array(squares[name]), "places")
+    assert chosen == "bent"
+    assert [(one.name, one.chosen) for one in table] == [
+        ("plain", False), ("failed", False), ("bent", True), ("free", False),
+    ]  # fmt: skip
+    assert table[0].rmse == 3.0
+    assert table[1].rmse is None
+    spread = 1 / np.sqrt(3)
+    np.testing.assert_allclose(table[3][3:6], np.sqrt([4, 4 - spread, 4 + spread]))
+    assert why.startswith(
+        "bent, the simplest within one standard error (2.14 N) of the best; held-out RMSE over places"
+    )
+    assert "failed not determined" in why
+    squares["bent"] = [4.7, 4.7, 4.7]
+    assert simplest("curve", tried, lambda name: np.array(squares[name]), "places")[0] == "free"
+
+
+def test_where_there_is_no_choice_nothing_is_scored():
+    assert simplest("curve", [Tried(1, "one", 1)], lambda _: pytest.fail("scored"), "places") == (1, "", ())

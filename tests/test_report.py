@@ -13,6 +13,7 @@ import pytest
 import jaxeit as je
 from calib import figures, report
 from calib.calibration import Calibration
+from calib.choice import Candidate
 from calib.curves import Linear
 from calib.evaluation import Evaluation
 from calib.figures import (
@@ -27,7 +28,6 @@ from calib.figures import (
     sensitivity_figure,
 )
 from calib.fit import FittedCurve
-from calib.hybrid import Candidate
 from calib.location import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.loops import Loops
 from calib.report import write_report
