@@ -153,9 +153,10 @@ def fits(repeats: int) -> dict[str, Any]:
 
 
 def _ours(data: PressData, curve: calib.PowerLaw | None = None):
-    return fit_curves(
-        curve or calib.PowerLaw(), data.sample_pressure, data.sample_force, mask=data.mask, groups=data.sample_place
-    )
+    rows = data.own  # as `calibrate` gives them
+    pressure, mask = (np.take_along_axis(a, rows, 1) for a in (data.sample_pressure, data.mask))
+    force, groups = data.sample_force[rows], data.sample_place[rows]
+    return fit_curves(curve or calib.PowerLaw(), pressure, force, mask=mask, groups=groups)
 
 
 def _theirs(data: PressData, pad: int, reference: float, scale: float) -> np.ndarray:

@@ -7,7 +7,9 @@ rate of frames that is sustained, by doubling and bisection.
 python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5] [--no-rates]
 
 Latency counts from when the bytes that end a frame were read; `since_due` from when the simulated device should have
-sent it: the device's own lateness, and what the bytes waited to be read, are in it.
+sent it: the device's own lateness, and what the bytes waited to be read, are in it. `woken` is how late a process wakes
+that does nothing but sleep from one hundredth of a second to the next, at the same time: no program on this machine can
+promise less.
 """
 
 import argparse
@@ -213,6 +215,33 @@ def device(calibration: calib.Calibration, rates: tuple[int, int]) -> Iterator[t
         skin.join(10)
 
 
+@contextmanager
+def metronome() -> Iterator[dict[str, float]]:
+    """Filled on leaving: how late a process that only sleeps was woken in between."""
+    context = multiprocessing.get_context("spawn")
+    told, stop, found = context.Queue(), context.Event(), {}
+    sleeper = context.Process(target=sleeping, args=(told, stop), daemon=True)
+    sleeper.start()
+    try:
+        told.get(timeout=120)
+        yield found
+    finally:
+        stop.set()
+        found |= spread("woken", told.get(timeout=10))
+        sleeper.join(10)
+
+
+def sleeping(told: Any, stop: Event) -> None:
+    """Sleep to the next hundredth of a second until told to stop; then say how late each waking was, s."""
+    told.put(None)
+    late, due = [], time.monotonic()
+    while not stop.is_set():
+        due = max(due + 0.01, time.monotonic())
+        time.sleep(max(0.0, due - time.monotonic()))
+        late.append(time.monotonic() - due)
+    told.put(np.array(late))
+
+
 def tenfold(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
     """A recording at ten times the rate of the paper: frames, those lost, and what memory did."""
     rates, memory = (10 * RATE, 10 * PRESSURE_RATE), np.full((int(10 * seconds) + 1000, 2), np.nan)
@@ -254,7 +283,7 @@ def watched(calibration: calib.Calibration, rate: int, seconds: float, output: P
     with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
         with ExitStack() as stack:
             show, received = Show(), Received(stack.enter_context(kept(output)) if output is not None else Nowhere())
-            watch = Watch(rate, seconds, begin, received)
+            watch, woken = Watch(rate, seconds, begin, received), stack.enter_context(metronome())
             timer = threading.Timer(seconds, show.stop.set)
             plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
             live(calibration, plan, sources, watch, show, log=received, rest=REST, begun=timer.start)
@@ -275,6 +304,7 @@ def watched(calibration: calib.Calibration, rate: int, seconds: float, output: P
         "skin_kept_up": bool(enough),
         "unsearched": watch.last.unsearched,
         **watch.found(),
+        **woken,
         **({} if output is None else {"finishing_s": round(finishing, 1)}),
     }
 

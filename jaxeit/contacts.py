@@ -28,7 +28,9 @@ from .verbs import verb
 from .whitening import InverseError, Whitened, Whitening, whitened_readings
 
 _LONGEST = 0.04  # half length of an oblong contact, m
-_RIPPLE = 0.1  # of the strongest contact's strength: what is less is none
+_RIPPLE = 0.1  # of the strongest contact's strength: what is less is none,
+_CLEAR = 10.0  # unless without it this many times as much is left
+_APART = 0.05  # of an atom's square that another does not explain: less are no pair to start from
 _FIRST = 4  # steps from each start; the best goes on first
 _TRIALS = 512  # noise frames that set the threshold
 
@@ -119,6 +121,7 @@ class ContactFinder(eqx.Module):
     | rest: what whitened readings have beside them                             | (r', k)      |       |
     | responses                                                                 |              |       |
     | atoms: unit responses of the greedy start, and their x, y, log width      | (b, r), (b, 3) |     |
+    | alike: products of the atoms                                              | (b, b)       | 1     |
     | low, high: bounds of x, y, log width, strength                            | (4,), (4,)   |       |
     | threshold: fall of chi-square that noise alone seldom makes               | ()           |       |
     | model_error: part of the signal that a bump may fail to explain           | ()           | 1     |
@@ -134,6 +137,7 @@ class ContactFinder(eqx.Module):
     atoms: Float[Array, "b r"]
     starts: Float[Array, "b 3"]
     norms: Float[Array, " b"]
+    alike: Float[Array, "b b"]
     low: Float[Array, "4"]
     high: Float[Array, "4"]
     threshold: Float[Array, ""]
@@ -198,7 +202,7 @@ class ContactFinder(eqx.Module):
             fit = found.fit
             going = going & self._explains(y, fit.square, jnp.zeros_like(fit.square), n)
             more = jax.lax.cond(going, self._another(y, n), lambda fit: fit, fit)
-            going = going & self._explains(y, fit.square, more.square, n) & self._distinct(_round(more.flat)[:n])
+            going = going & self._explains(y, fit.square, more.square, n) & self._distinct(more, fit, n)
             if n == 2:
                 found, going = jax.lax.cond(
                     going, self._two_or_oblong(y), lambda found, _: (found, jnp.asarray(False)), found, more
@@ -212,13 +216,15 @@ class ContactFinder(eqx.Module):
         missing = jnp.maximum(self.model_error**2 * (y @ y), ((n - 1) * self.ratio) ** 2 * after) if n > 1 else 0
         return before - after > self.threshold + missing
 
-    def _distinct(self, theta):
-        """Whether contacts lie apart, and none is but a ripple of the strongest."""
-        i, j = np.triu_indices(len(theta), 1)
+    def _distinct(self, more: Fit, fewer: Fit, n: int):
+        """Whether contacts lie apart, and none is but a ripple of the strongest, which explains little."""
+        theta = _round(more.flat)[:n]
+        i, j = np.triu_indices(n, 1)
         distance = jnp.sum((theta[i, :2] - theta[j, :2]) ** 2, 1)
         width, strength = jnp.exp(theta[:, 2]), theta[:, 3]
         apart = jnp.all(distance > (self.separation * 0.5 * (width[i] + width[j])) ** 2)
-        return apart & jnp.all(strength > _RIPPLE * jnp.max(strength))
+        clear = fewer.square > _CLEAR * more.square
+        return apart & (clear | jnp.all(strength > _RIPPLE * jnp.max(strength)))
 
     def _two_or_oblong(self, y):
         """Whether two contacts explain clearly more than one oblong contact; if not, what that one says of one."""
@@ -247,7 +253,7 @@ class ContactFinder(eqx.Module):
             best = self.added(y, theta)
             if n == 1:
                 return _padded(self.fit(y, best), self.most)
-            starts = jnp.stack([best, self._split(y, theta)])
+            starts = jnp.stack([best, self._split(y, theta), *([self._pair(y)] if n == 2 else [])])
             tried = jax.vmap(lambda start: self.fit(y, start, steps=_FIRST))(starts)
             # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
             hope = fit.square / (1 + (0.5 * (n - 1) * self.ratio) ** 2)
@@ -274,11 +280,28 @@ class ContactFinder(eqx.Module):
 
     def added(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
         """One contact more: the atom that explains most of what is left."""
-        left = y - self.response(theta)[0] if len(theta) else y
-        gain = self.atoms @ jax.lax.cond(self.whole, lambda left: left, lambda left: self.root @ left, left)
+        gain = self.atoms @ self._seen(y - self.response(theta)[0] if len(theta) else y)
         best = jnp.argmax(gain)
         strength = jnp.maximum(gain[best], 0) / self.norms[best]
         return jnp.concatenate([theta, jnp.append(self.starts[best], strength)[None]])
+
+    def _seen(self, response):
+        return jax.lax.cond(self.whole, lambda r: r, lambda r: self.root @ r, response)
+
+    def _pair(self, y):
+        """Two contacts: the atoms that explain most together.
+
+        Two of one strength may look most like one between them, from which neither is found.
+        """
+        gain = self.atoms @ self._seen(y)
+        rest = 1 - self.alike**2
+        apart = rest > _APART
+        strength = (gain[:, None] - self.alike * gain) / jnp.where(apart, rest, 1)  # of the first of each pair
+        fine = apart & (strength > 0) & (strength.T > 0)
+        best = jnp.argmax(jnp.where(fine, strength * gain[:, None] + strength.T * gain, 0))
+        pair = jnp.stack(jnp.divmod(best, len(gain)))
+        strengths = jnp.maximum(strength[pair, pair[::-1]], 0) / self.norms[pair]
+        return jnp.concatenate([self.starts[pair], strengths[:, None]], 1)
 
     def _split(self, y, theta):
         """One contact more: the strongest in two, along the best of four directions."""
@@ -406,7 +429,8 @@ def prepare_contacts(
     """Everything that does not depend on the frame, done once.
 
     Contacts are added one by one, each number fitted anew by Levenberg-Marquardt from two starts (the bump that
-    explains most of what is left; the strongest contact in two halves), for as long as
+    explains most of what is left; the strongest contact in two halves), two from a third (the two bumps that explain
+    most together), for as long as
 
     - chi-square falls by more than noise alone makes it fall in a part ``false_alarm`` of blank frames.  The largest
       fall over all places and widths follows ``P(fall > z^2) = 1 - exp(-N (z^2 - 1) exp(-z^2 / 2))``, the Euler
@@ -416,7 +440,7 @@ def prepare_contacts(
       costs must not become a contact;
     - and two explain as much more than one oblong contact, a row of four bumps, does (an edge is not two contacts);
     - and all contacts are further apart than ``separation`` times their mean width, and none is below a tenth of the
-      strongest.
+      strongest, unless ten times as much is left without it.
 
     Args:
         noise: standard deviation of each reading, (readings,) V, or their covariance, (readings, readings) V^2.
@@ -504,7 +528,8 @@ def _atoms(model: Model, values: np.ndarray, nodes: Nodes) -> dict[str, np.ndarr
     responses, starts = values[i, j, level], np.stack([x[j], y[i], log_width[level]], 1)
     norms = np.linalg.norm(responses, axis=1)
     kept = (norms > 1e-3 * norms.max()) & _on_sheet(model, starts[:, :2])
-    return {"atoms": responses[kept] / norms[kept, None], "norms": norms[kept], "starts": starts[kept]}
+    atoms = responses[kept] / norms[kept, None]
+    return {"atoms": atoms, "norms": norms[kept], "starts": starts[kept], "alike": atoms @ atoms.T}
 
 
 def _on_sheet(model: Model, places: np.ndarray) -> np.ndarray:

@@ -299,7 +299,7 @@ def test_tables_of_the_pages(root):
     ]
     results["ladder"] = {"ladders": [{"rungs": rungs}, {"rungs": rungs[:1]}]}
     run = {"rate_hz": 100, "seconds": 600.0, "received": [60000, 600000], "lost": 0, "dropped": 3}
-    run |= {f"{what}_ms_{p}": 1.234 for what in ("latency", "since_due") for p in ("p50", "p99", "max")}
+    run |= {f"{what}_ms_{p}": 1.234 for what in ("latency", "since_due", "woken") for p in ("p50", "p99", "max")}
     results["live"] = {
         "soak": run | {"memory_mb_per_hour": 0.123, "memory_mb_per_hour_error": 0.456},
         "tenfold": {"rate_hz": 1000, "seconds": 60.0, "recorded": [59999, 1], "lost": [1, 0]},
@@ -326,5 +326,8 @@ def test_tables_of_the_pages(root):
     assert "| at random |  |" in text["measurement-cost"]
     assert "| forward by nodes | 961 to 3,721 | 1.2 | 1 to 1.5 | 1.2 |" in text["growth"]
     assert "| import jaxeit | 1.23 |" in text["start"]
-    assert "| live and recorded, 100 Hz, 10 min | 60,000 | 0 | 3 | 1.23 | 1.23 | 1.23 | 1.23 | 0.12 ±" in text["live"]
+    assert (
+        "| live and recorded, 100 Hz, 10 min | 60,000 | 0 | 3 | 1.23 | 1.23 | 1.23 | 1.23 | 1.23 | 0.12 ±"
+        in text["live"]
+    )
     assert "| recorded, 1000 Hz, 1 min | 59,999 | 1 |" in text["live"]

@@ -23,7 +23,7 @@ ORDER = [
     "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
 BENCH = [
-    "session", "units", "corrections", "presses", "curves", "fit", "response", "smooth", "taxels", "location",
+    "session", "units", "choice", "corrections", "presses", "curves", "fit", "response", "smooth", "taxels", "location",
     "locators", "hybrid", "splits", "online", "measured", "loops", "evaluation", "calibration", "maps",
     "acquisition", "bench", "check", "importers", "logs", "figures", "ladder_figure", "report", "runtime", "workers",
     "batch", "cluster", "cli",
