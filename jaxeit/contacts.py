@@ -28,8 +28,7 @@ from .verbs import verb
 from .whitening import InverseError, Whitened, Whitening, whitened_readings
 
 _LONGEST = 0.04  # half length of an oblong contact, m
-_RIPPLE = 0.1  # of the strongest contact's strength: what is less is none,
-_CLEAR = 10.0  # unless without it this many times as much is left
+_RIPPLE = 0.1  # of the strongest contact's strength: what is less is none
 _APART = 0.05  # of an atom's square that another does not explain: less are no pair to start from
 _FIRST = 4  # steps from each start; the best goes on first
 _TRIALS = 512  # noise frames that set the threshold
@@ -202,7 +201,7 @@ class ContactFinder(eqx.Module):
             fit = found.fit
             going = going & self._explains(y, fit.square, jnp.zeros_like(fit.square), n)
             more = jax.lax.cond(going, self._another(y, n), lambda fit: fit, fit)
-            going = going & self._explains(y, fit.square, more.square, n) & self._distinct(more, fit, n)
+            going = going & self._explains(y, fit.square, more.square, n) & self._distinct(_round(more.flat)[:n])
             if n == 2:
                 found, going = jax.lax.cond(
                     going, self._two_or_oblong(y), lambda found, _: (found, jnp.asarray(False)), found, more
@@ -216,15 +215,13 @@ class ContactFinder(eqx.Module):
         missing = jnp.maximum(self.model_error**2 * (y @ y), ((n - 1) * self.ratio) ** 2 * after) if n > 1 else 0
         return before - after > self.threshold + missing
 
-    def _distinct(self, more: Fit, fewer: Fit, n: int):
-        """Whether contacts lie apart, and none is but a ripple of the strongest, which explains little."""
-        theta = _round(more.flat)[:n]
-        i, j = np.triu_indices(n, 1)
+    def _distinct(self, theta):
+        """Whether contacts lie apart, and none is but a ripple of the strongest."""
+        i, j = np.triu_indices(len(theta), 1)
         distance = jnp.sum((theta[i, :2] - theta[j, :2]) ** 2, 1)
         width, strength = jnp.exp(theta[:, 2]), theta[:, 3]
         apart = jnp.all(distance > (self.separation * 0.5 * (width[i] + width[j])) ** 2)
-        clear = fewer.square > _CLEAR * more.square
-        return apart & (clear | jnp.all(strength > _RIPPLE * jnp.max(strength)))
+        return apart & jnp.all(strength > _RIPPLE * jnp.max(strength))
 
     def _two_or_oblong(self, y):
         """Whether two contacts explain clearly more than one oblong contact; if not, what that one says of one."""
@@ -253,27 +250,37 @@ class ContactFinder(eqx.Module):
             best = self.added(y, theta)
             if n == 1:
                 return _padded(self.fit(y, best), self.most)
-            starts = jnp.stack([best, self._split(y, theta), *([self._pair(y)] if n == 2 else [])])
+            starts = jnp.stack([best, self._split(y, theta)])
             tried = jax.vmap(lambda start: self.fit(y, start, steps=_FIRST))(starts)
             # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
             hope = fit.square / (1 + (0.5 * (n - 1) * self.ratio) ** 2)
-            return _padded(self._finished(y, tried, hope), self.most)
+            return _padded(self._finished(y, tried, hope, n), self.most)
 
         return fitted
 
-    def _finished(self, y, tried: Fit, hope) -> Fit:
-        """The best of some fits begun, finished; the next too if it leaves more than noise and model error may."""
+    def _finished(self, y, tried: Fit, hope, n: int) -> Fit:
+        """The best of some fits begun, finished, or the first of the others that leaves no more than noise and model
+        error may: where none does, something else is wrong, and it is not for more contacts to explain.
+
+        For two contacts the last is that from the best pair of atoms. Noise leaves a chi-square, and seldom four of its
+        standard deviations more than its mean.
+        """
         order = jnp.argsort(tried.square)
-        allowed = 2 * len(y) + self.model_error**2 * (y @ y)
+        allowed = len(y) + 4 * np.sqrt(2 * len(y)) + self.model_error**2 * (y @ y)
+        most = len(order) + (n == 2)
 
         def going(state):
             k, best = state
-            return (k == 0) | (k < len(order)) & (best.square > allowed)
+            return (k == 0) | (k < most) & (best.square > allowed)
 
         def again(state):
             k, best = state
-            fit = self.fit(y, _round(tried.flat[order[k]]), hope)
-            return k + 1, jax.tree.map(lambda new, old: jnp.where(fit.square < best.square, new, old), fit, best)
+            start = _round(tried.flat[order[jnp.minimum(k, len(order) - 1)]])
+            if n == 2:
+                start = jax.lax.cond(k < len(order), lambda: start, lambda: self._pair(y))
+            fit = self.fit(y, start, hope)
+            better = (k == 0) | (fit.square <= allowed)
+            return k + 1, jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, best)
 
         begun = jax.tree.map(lambda leaf: leaf[order[0]], tried)
         return jax.lax.while_loop(going, again, (0, begun._replace(square=jnp.full_like(begun.square, jnp.inf))))[1]
@@ -429,8 +436,8 @@ def prepare_contacts(
     """Everything that does not depend on the frame, done once.
 
     Contacts are added one by one, each number fitted anew by Levenberg-Marquardt from two starts (the bump that
-    explains most of what is left; the strongest contact in two halves), two from a third (the two bumps that explain
-    most together), for as long as
+    explains most of what is left; the strongest contact in two halves), two where both end badly from a third (the two
+    bumps that explain most together), for as long as
 
     - chi-square falls by more than noise alone makes it fall in a part ``false_alarm`` of blank frames.  The largest
       fall over all places and widths follows ``P(fall > z^2) = 1 - exp(-N (z^2 - 1) exp(-z^2 / 2))``, the Euler
@@ -440,7 +447,7 @@ def prepare_contacts(
       costs must not become a contact;
     - and two explain as much more than one oblong contact, a row of four bumps, does (an edge is not two contacts);
     - and all contacts are further apart than ``separation`` times their mean width, and none is below a tenth of the
-      strongest, unless ten times as much is left without it.
+      strongest.
 
     Args:
         noise: standard deviation of each reading, (readings,) V, or their covariance, (readings, readings) V^2.
