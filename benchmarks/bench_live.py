@@ -201,34 +201,38 @@ def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
 
 
 @contextmanager
-def device(calibration: calib.Calibration, rates: tuple[int, int]) -> Iterator[tuple[int, list[str]]]:
-    """The simulated skin in a process of its own: when it began, ns, and where its streams are."""
+def beside(target: Callable[..., None], *args: Any) -> Iterator[tuple[Any, Event]]:
+    """A process of its own that runs ``target(*args, told, stop)``: its queue, and the event that ends it."""
     context = multiprocessing.get_context("spawn")
     told, stop = context.Queue(), context.Event()
-    channels = calibration.recon.readings, len(calibration.skin.pads)
-    skin = context.Process(target=skin_process, args=(rates, channels, told, stop), daemon=True)
-    skin.start()
+    process = context.Process(target=target, args=(*args, told, stop), daemon=True)
+    process.start()
     try:
-        yield told.get(timeout=120)
+        yield told, stop
     finally:
         stop.set()
-        skin.join(10)
+        process.join(10)
+
+
+@contextmanager
+def device(calibration: calib.Calibration, rates: tuple[int, int]) -> Iterator[tuple[int, list[str]]]:
+    """The simulated skin: when it began, ns, and where its streams are."""
+    channels = calibration.recon.readings, len(calibration.skin.pads)
+    with beside(skin_process, rates, channels) as (told, _):
+        yield told.get(timeout=120)
 
 
 @contextmanager
 def metronome() -> Iterator[dict[str, float]]:
     """Filled on leaving: how late a process that only sleeps was woken in between."""
-    context = multiprocessing.get_context("spawn")
-    told, stop, found = context.Queue(), context.Event(), {}
-    sleeper = context.Process(target=sleeping, args=(told, stop), daemon=True)
-    sleeper.start()
-    try:
+    found: dict[str, float] = {}
+    with beside(sleeping) as (told, stop):
         told.get(timeout=120)
-        yield found
-    finally:
-        stop.set()
-        found |= spread("woken", told.get(timeout=10))
-        sleeper.join(10)
+        try:
+            yield found
+        finally:
+            stop.set()
+            found |= spread("woken", told.get(timeout=10))
 
 
 def sleeping(told: Any, stop: Event) -> None:
