@@ -200,7 +200,8 @@ def _swept(
             level, values, update, cpu=partial(_panels, parts=parts), default=partial(_panels, parts=1)
         )
         fronts.append(front)
-        update = _updated(level, update, _square(w, w))
+        boundary = slice(level.pivots, None)
+        update = jnp.sum(_spread(level, update, boundary, boundary), 1) - _square(w, w)
     return update, tuple(fronts[::-1]) if keep else ()
 
 
@@ -220,8 +221,8 @@ def _panels(
         done = [_panels(*piece, 1) for piece in zip(cut(level), [values] * parts, cut(update), strict=True)]
         return jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *done)
     pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
-    among = _taken(values, level.among) + _extended(level, update, pivots, pivots)
-    beside = _taken(values, level.beside) + _extended(level, update, pivots, boundary)
+    among = _taken(values, level.among) + jnp.sum(_spread(level, update, pivots, pivots), 1)
+    beside = _taken(values, level.beside) + jnp.sum(_spread(level, update, pivots, boundary), 1)
     return _eliminate(among, beside)
 
 
@@ -240,35 +241,19 @@ def _taken(values: Array, places: Int[Array, "..."]) -> Array:
     return values.at[places].get(mode="promise_in_bounds")
 
 
-def _extended(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Float[Array, "m i j"]:
-    """Sum of the children's updates, each at its places, in these rows and columns of the fronts."""
+def _spread(level: LevelPlan, updates: Float[Array, "mc b b"], rows: slice, columns: slice) -> Float[Array, "m c i j"]:
+    """The children's updates, each at its places, in these rows and columns of the fronts.
+
+    To be summed over the children by `jnp.sum`: XLA does that once, where it would do a sum of two terms anew for each
+    that looks something up in it, and so three times as many when the terms are looked up in turn.
+    """
     places, size = level.down, updates.shape[1]
     fronts, children, _ = places.shape
     updates = updates.reshape(fronts, children, size, size)
-    front = jnp.arange(fronts, dtype=jnp.uint32)[:, None, None]
-    shape = fronts, *(len(range(places.shape[2])[part]) for part in (rows, columns))
-    spread = (
-        updates[:, c].at[front, places[:, c, rows, None], places[:, c, None, columns]].get(mode="promise_in_bounds")
-        for c in range(children)
-    )
-    return sum(spread, jnp.zeros(shape, updates.dtype))
-
-
-def _updated(level: LevelPlan, updates: Float[Array, "mc b b"], less: Float[Array, "m i i"]) -> Float[Array, "m i i"]:
-    """What the children's updates add to the boundary, less `less`.
-
-    A sum over an axis is computed once, where XLA would do a sum of two terms anew for each that looks something up in
-    it: with the terms looked up in turn, three times as many.
-    """
-    places, size = level.down[..., level.pivots :], updates.shape[1]
-    fronts, children, _ = places.shape
-    if not children:
-        return -less
-    updates = updates.reshape(fronts, children, size, size)
     front = jnp.arange(fronts, dtype=jnp.uint32)[:, None, None, None]
     child = jnp.arange(children, dtype=jnp.uint32)[:, None, None]
-    spread = updates.at[front, child, places[..., :, None], places[..., None, :]].get(mode="promise_in_bounds")
-    return jnp.sum(spread - less[:, None] / children, 1)
+    at = front, child, places[..., rows, None], places[..., None, columns]
+    return updates.at[at].get(mode="promise_in_bounds")
 
 
 def _along(array: Array, places: Int[Array, "..."], axis: int) -> Array:
