@@ -9,6 +9,7 @@ longest time of one (s), the growth of memory (bytes), and the first inputs that
 import contextlib
 import io
 import json
+import math
 import pickle
 import resource
 import sys
@@ -27,9 +28,10 @@ import numpy as np
 
 import calib
 import jaxeit as je
+from calib.acquisition.entries import END, EVENT, PLAN, PONG, Code, pack_event, pack_pong
 from calib.acquisition.finish import finish
-from calib.acquisition.journal import JournalError
-from calib.acquisition.wire import Layout, State, cobs_encode, crc16, decode, decode_lines, encode
+from calib.acquisition.journal import Journal, JournalError, Scan
+from calib.acquisition.wire import Layout, Pong, State, cobs_encode, crc16, decode, decode_lines, encode
 from calib.bench import load_bench
 from calib.calibration import Calibration
 from calib.cli import main as command
@@ -205,6 +207,67 @@ def repacked(raw: bytes, rng: np.random.Generator) -> bytes:
     return out.getvalue()
 
 
+ODD = (-1, 0, 10**30, 1e308, math.nan, "x", "9999-12-31T23:59:59+00:00", "\0", "\ud800", "x" * 70_000, None, True, [])
+ODD = (*ODD, [[]], [None], {"a": [1]}, {"simulated": [1], "seed": 10**30}, [[2**40] * 4] * 3, [1e308] * 3)
+TEXTS = ("null", "{}", "[true]", "[5, []]", "[99, 0]", "[" * 100_000, "9" * 5000, "\0", "")
+ENTRIES = (0, 1, 2, 7, 0x8000, PONG, END, EVENT, PLAN)
+TIMES = (-(2**63), -1, 0, 2**62, 2**63 - 1)
+
+
+def resealed(raw: bytes, rng: np.random.Generator) -> bytes:
+    """A sound journal with records changed, left out or repeated, every sum and number right."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "read").write_bytes(raw)
+        records = [record[1:] for record in Scan(Path(folder, "read"))]
+        for _ in range(int(rng.integers(1, 5))):
+            _unlike(records, rng)
+        with Journal(Path(folder, "written")) as out:
+            for record in records:
+                out.append(*record)
+        return Path(folder, "written").read_bytes()
+
+
+def _unlike(records: list[tuple[int, int, int, bytes]], rng: np.random.Generator) -> None:
+    few = [i for i, record in enumerate(records) if record[0] >= PONG]  # beside many frames
+    places = few if few and rng.integers(2) else range(len(records))
+    at = places[int(rng.integers(len(places)))]
+    stream, flags, host, payload = records[at]
+    kind = rng.integers(8)
+    if kind == 0:
+        stream = ENTRIES[int(rng.integers(len(ENTRIES)))]
+    elif kind == 1:
+        flags = int(rng.integers(1 << 16))
+    elif kind == 2:
+        host = [*TIMES, host + 10**12][int(rng.integers(len(TIMES) + 1))]
+    elif kind == 3:
+        records.insert(int(rng.integers(len(records))), records[at])
+    elif payload[:1] in (b"{", b"[") and len(payload) < 10_000:
+        payload = _said(json.loads(payload), rng).encode()
+    elif kind == 4:
+        payload = damaged(payload, rng)
+    else:  # the head of a frame, or an answer to a ping
+        data = bytearray(payload)
+        data[int(rng.integers(min(16, len(data))))] = int(rng.integers(256))
+        payload = bytes(data)
+    records[at : at + 1] = [(stream, flags, host, payload)] if rng.integers(9) or len(records) == 1 else []
+
+
+def _said(table: Any, rng: np.random.Generator) -> str:
+    """Another text in the place of one in JSON; mostly the same with one value changed."""
+    if rng.integers(6) == 0:
+        return TEXTS[int(rng.integers(len(TEXTS)))]
+    if not isinstance(table, (dict, list)) or not table:
+        return json.dumps(ODD[int(rng.integers(len(ODD)))])
+    places = [(table, key) for key in (table if isinstance(table, dict) else range(len(table)))]
+    for inner, key in list(places):
+        if isinstance(inner[key], list) and inner[key] and isinstance(inner[key][0], dict):
+            places += [(stream, name) for stream in inner[key] for name in stream] * 2
+    inner, key = places[int(rng.integers(len(places)))]
+    odd = ODD[int(rng.integers(len(ODD)))]
+    inner[key] = json.dumps(odd) if key == 1 and isinstance(odd, dict) else odd
+    return json.dumps(table)
+
+
 class Trap:
     """An object whose unpickling would be seen."""
 
@@ -306,6 +369,15 @@ def recording(folder: Path) -> bytes:
     return journal(folder / "good.h5.part", both(20)).read_bytes()
 
 
+def full_recording(folder: Path) -> bytes:
+    """With events, what a simulated device says and answers to pings."""
+    seconds = 8 * 10**9
+    about = pack_event(Code.SIMULATED, json.dumps({"simulated": True, "scene": "a scene", "seed": 3}))
+    pongs = [(PONG, 0, seconds + n * 10**8, pack_pong(n % 2, Pong(seconds + n * 10**8 - 10**6, n))) for n in range(4)]
+    events = [(EVENT, 0, seconds, pack_event(Code.CONNECTED, "tcp://x")), (EVENT, 0, seconds, about)]
+    return journal(folder / "full.h5.part", [*events, *both(20), *pongs]).read_bytes()
+
+
 LAYOUTS = {1: Layout(1, 4, limit=1e3)}
 
 
@@ -366,7 +438,11 @@ def read_journal(path: Path, _: bytes):
         finish(path, out, recovered=True)
     finally:
         _nothing_left(path.parent, {path.name, "out.h5"})
-    with open_session(out) as found:
+    with contextlib.ExitStack() as stack:
+        try:
+            found = stack.enter_context(open_session(out))
+        except SessionError as error:
+            raise AssertionError(f"written, but not to be opened: {error}") from error
         for stream in found.streams.values():
             assert len(stream.time) == len(stream.read()) == len(stream.status())
     out.unlink()
@@ -408,6 +484,7 @@ READERS = {
     "scene": Reader(bench_texts, edited, read_bench, (ValueError,), False),
     "table": Reader(table, cells, read_table, (SessionError,), False),
     "journal": Reader(recording, damaged, read_journal, (JournalError, SessionError), False),
+    "hostile journal": Reader(full_recording, resealed, read_journal, (JournalError, SessionError), False),
     "frames": Reader(frames, damaged, read_frames, (), False),
     "lines": Reader(lines, cells, read_lines, (), False),
 }
@@ -419,7 +496,7 @@ def run(kind: str, count: int, seed: int, folder: Path) -> dict:
     raw = reader.original(folder)
     work = folder / "work"
     work.mkdir()
-    path = work / f"input{'.npz' if 'reconstructor' in kind else '.part' if kind == 'journal' else '.h5'}"
+    path = work / f"input{'.npz' if 'reconstructor' in kind else '.part' if 'journal' in kind else '.h5'}"
     path.write_bytes(raw)
     whole = reader.read(path, raw)  # the sound one compiles what there is to compile
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

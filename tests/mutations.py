@@ -506,6 +506,39 @@ MUTANTS = [
         ("jnp.maximum(box[:, 0], reach[0])", "box[:, 0]", "a_pad_that_no_press"),
         ("farthest = jnp.max(jnp.maximum(-low, high), -1, keepdims=True)", "return low, high", "one_wall_tells"),
     ),
+    *of(
+        "calib/acquisition/entries.py",
+        "test_recorder",
+        ("if not size or len(payload) != _HEAD.size + channels * size:", "if False:", "records_of_another"),
+        ("if abs(host) >= 2**62:", "if False:", "records_of_another"),
+        ("if len(payload) != _PONG.size:", "if False:", "records_of_another"),
+        ("except (ValueError, RecursionError) as error:", "except ValueError as error:", "records_of_another"),
+        ("if not isinstance(pair, list) or len(pair) != 2:", "if False:", "records_of_another"),
+        ('.encode(errors="replace").decode().replace("\\0", "?")', "", "what_a_device_says"),
+    ),
+    *of(
+        "calib/acquisition/plan.py",
+        "test_recorder",
+        ("if not _is(value, declared[name]):", "if False:", "a_plan_no_session"),
+        ('len(raw) > MAX_ATTRIBUTE_BYTES or b"\\0" in raw', 'b"\\0" in raw', "a_plan_no_session"),
+        ('or b"\\0" in raw or', "or", "a_plan_no_session"),
+        ("or raw.decode() != getattr(self, name)", "", "a_plan_no_session"),
+        ("abs(number) >= 2**62", "False", "a_plan_no_session"),
+        ("len(row) != 4 or min(row)", "min(row)", "a_plan_no_session"),
+        ("or max(row) >= 1 << 15", "", "a_plan_no_session"),
+        ("if self.simulated and (self.scene is None or self.seed is None):", "if False:", "a_plan_no_session"),
+    ),
+    *of(
+        "calib/acquisition/finish.py",
+        "test_recorder",
+        ("if number in surveys:", "if True:", "an_answer_of"),
+        ("isinstance(seed, int) and abs(seed) < 2**62", "isinstance(seed, int)", "what_a_device_says"),
+    ),
+    *of(
+        "calib/acquisition/wire.py",
+        "test_wire",
+        ("except (ValueError, RecursionError):", "except ValueError:", "a_note_is_no_sample"),
+    ),
 ]
 
 

@@ -23,7 +23,7 @@ from calib.session import SessionError, read_archive, write_archive
 from tests.fuzzing import MEMORY, READERS, calibration, reconstructor
 from tests.test_session import ARRAYS, FORCE, REFUSED_FILES, changed, everything, make, put_chunk, replace
 
-SLOW = {"session": 10_000, "calibration": 2000, "journal": 2000, "frames": 4000, "lines": 4000}
+SLOW = {"session": 10_000, "calibration": 2000, "journal": 5000, "hostile journal": 5000, "frames": 4000, "lines": 4000}
 LONGEST = 60.0  # seconds for one input, of a hang; refused in milliseconds, but one that is read may compile a program
 
 

@@ -1,6 +1,7 @@
 """Recording: the journal and what is made of it, and the recorder under every fault that could be arranged."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -17,14 +18,25 @@ import pytest
 
 from benchmarks.memory import Growth, growth, resident
 from calib.acquisition.device import Device
-from calib.acquisition.entries import END, EVENT, PLAN, RESTARTED, Code, pack_end, pack_event, pack_frame
+from calib.acquisition.entries import (
+    END,
+    EVENT,
+    PLAN,
+    PONG,
+    RESTARTED,
+    Code,
+    pack_end,
+    pack_event,
+    pack_frame,
+    pack_pong,
+)
 from calib.acquisition.finish import finish
 from calib.acquisition.journal import MAX_PAYLOAD, SYNC, Journal, JournalError, Scan
 from calib.acquisition.plan import KINDS, Plan, PlanError, StreamPlan, plan_from_json
 from calib.acquisition.recorder import Orders, record
 from calib.acquisition.setup import prepare
 from calib.acquisition.sources import PIECE, source
-from calib.acquisition.wire import Frame, encode
+from calib.acquisition.wire import Frame, Pong, encode
 from calib.cli import main
 from calib.session import SessionError, Status, open_session
 
@@ -316,6 +328,32 @@ def test_what_is_no_plan_is_refused(text):
         plan_from_json(text)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"title": 5}, "title: is a int"),
+        ({"title": "a\0"}, "title: is a text that cannot be stored"),
+        ({"title": "\ud800"}, "title: is a text that cannot be stored"),
+        ({"skin_toml": "x" * 300_000}, "skin_toml: is a text that cannot be stored"),
+        ({"epoch": "never"}, "never"),
+        ({"host_epoch": 10**30}, "host_epoch 10+ or seed None: too large"),
+        ({"seed": 2**62}, "too large; keep below 2.62"),
+        ({"current": "1"}, "current: is a str"),
+        ({"current": True}, "current: is a bool"),
+        ({"current": float("nan")}, "current: is a float"),
+        ({"current": 10**400}, "too large"),
+        ({"pattern": [[0, 1, 2, 2**15]] * 3}, "pattern: names impossible electrodes"),
+        ({"pattern": [[0, 1, 2]] * 3}, "pattern: names impossible electrodes"),
+        ({"pattern": [[0.5, 1, 2, 3]] * 3}, "pattern: is a tuple"),
+        ({"simulated": True}, "scene: a simulated recording does not say how"),
+    ],
+)
+def test_a_plan_no_session_can_hold_is_refused(changes, words):
+    table = json.loads(PLANNED.to_json()) | changes
+    with pytest.raises(JournalError, match=rf"^journal: its description cannot be read \(.*{words}"):
+        plan_from_json(json.dumps(table).encode())
+
+
 def test_plans_must_be_sound():
     eit = PLANNED.streams[0]
     for streams, words in (((), "none"), ((eit, eit), "once"), ((replace(eit, channels=2),), "pattern of 3 rows")):
@@ -325,6 +363,8 @@ def test_plans_must_be_sound():
         StreamPlan("smell", 1)
     with pytest.raises(PlanError, match="above zero"):
         replace(eit, tick=0.0)
+    with pytest.raises(PlanError, match="title: is a text that cannot be stored; use at most 262,144 bytes of Unicode"):
+        replace(PLANNED, title="\udcff")  # as a name of a file may be
 
 
 # --- journal to session --------------------------------------------------------------------------
@@ -449,6 +489,56 @@ def test_nothing_recorded_is_said(tmp_path):
     with pytest.raises(JournalError, match="description is damaged"):
         finish(tmp_path / "k", tmp_path / "s.h5")
     assert not (tmp_path / "s.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "scene", "seed"),
+    [
+        ({"scene": "a scene", "seed": 3}, "a scene", 3),
+        ({"scene": "a\0\ud800b" + "x" * 5000, "seed": 10**30}, "a??b" + "x" * 996, 0),
+        ({"scene": [], "seed": -3.5}, "not told by the device", 0),
+    ],
+)
+def test_what_a_device_says_of_itself_never_costs_the_recording(tmp_path, said, scene, seed):
+    about = (EVENT, 0, 8 * S, pack_event(Code.SIMULATED, json.dumps({"simulated": True} | said)))
+    _, session = finished(tmp_path, [about, (EVENT, 0, 8 * S, pack_event(Code.NOTE, "\0\ud800")), *both()])
+    with session as s:
+        assert (s.simulated, s.scene, s.seed) == (True, scene, seed)
+        assert s.events.label[0] == "??"
+        assert len(s.stream("eit")) == 40
+
+
+BAD_FRAME = bytearray(sample(0, 3)[3])
+BAD_FRAME[0] |= 15
+
+
+@pytest.mark.parametrize(
+    ("record", "words"),
+    [
+        ((0, 0, 9 * S, b""), "is no frame of 3 readings"),
+        ((1, 0, 9 * S, sample(0, 3)[3]), "is no frame of 2 readings"),
+        ((0, 0, 9 * S, bytes(BAD_FRAME)), "is no frame of 3 readings"),
+        ((0, 0, 2**62, sample(0, 3)[3]), "came at an impossible time, 4611686018427387904 ns"),
+        ((EVENT, 0, 9 * S, b"[" * 50_000), "is no event: not JSON"),
+        ((EVENT, 0, 9 * S, b"[4]"), "is no event: not a pair"),
+        ((EVENT, 0, 9 * S, b'[99, "x"]'), "is no event that is known"),
+        ((EVENT, 0, 9 * S, b'[5, "{"]'), "says in what is not JSON that values are simulated"),
+        ((END, 0, 9 * S, b"null"), "is no end: not a pair"),
+        ((PONG, 0, 9 * S, b"1"), "is no answer to a ping"),
+        ((PONG, 0, 9 * S, pack_pong(0, Pong(-(2**63), 1))), "came at an impossible time, -9223372036854775808 ns"),
+    ],
+)
+def test_records_of_another_making_are_refused_by_number(tmp_path, record, words):
+    """Their sums are right, so they are no damage."""
+    with pytest.raises(JournalError, match=rf"^s\.h5\.part: record 61 {words}; use the jaxeit that wrote it$"):
+        finished(tmp_path, [*both(20), record])
+    assert os.listdir(tmp_path) == ["s.h5.part"]
+
+
+def test_an_answer_of_an_unknown_stream_is_left_out(tmp_path):
+    _, session = finished(tmp_path, [*both(), (PONG, 0, 9 * S, pack_pong(7, Pong(8 * S, 1)))])
+    with session as s:
+        assert {*s.clocks} == {"eit", "pressure"}
 
 
 # --- what the session file says of clocks --------------------------------------------------------

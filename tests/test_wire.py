@@ -237,7 +237,7 @@ def test_a_note_is_no_sample_and_is_kept():
     state, found = decode({2: Layout(2, 4)}, State(), packets)
     assert (json.loads(state.note), len(found)) == ({"seed": 1}, 1)
     assert (state.counts.good, state.counts.other, state.counts.dropped) == (1, 1, {})
-    for text in (b"[1]", b"{", b"\xff"):
+    for text in (b"[1]", b"{", b"\xff", b"[" * 50_000):
         body = b"\x18\x02" + text
         bad = cobs_encode(body + crc16(body).to_bytes(2, "little")) + b"\0"
         after, _ = decode({2: Layout(2, 4)}, state, bad)

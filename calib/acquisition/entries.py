@@ -5,9 +5,11 @@ import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from .journal import JournalError
 from .wire import Frame, Pong
 
 PLAN, EVENT, END, PONG = 0xFFFF, 0xFFFE, 0xFFFD, 0xFFFC  # stream numbers of what is not a frame
@@ -16,6 +18,7 @@ _HEAD = struct.Struct("<BxxxIQ")
 _TYPES = tuple(np.dtype(t) for t in ("<f4", "<i2", "<f8"))
 _PONG = struct.Struct("<HqQ")
 _SEQ, _TICKS, _LONG = 16, 32, 64
+_LABEL = 1000  # letters of what a device or a system said
 
 
 class Code(enum.IntEnum):
@@ -45,6 +48,20 @@ class Frames:
     ticks: np.ndarray | None
     bits: int
     values: np.ndarray
+
+
+def check_frame(payload: bytes, channels: int) -> None:
+    """Raises `JournalError` for what `pack_frame` makes of no frame of so many channels."""
+    kind = payload[0] if payload else 0
+    size = _TYPES[kind & 15].itemsize if kind & 15 < len(_TYPES) else 0
+    if not size or len(payload) != _HEAD.size + channels * size:
+        raise JournalError(f"is no frame of {channels} readings")
+
+
+def check_time(host: int) -> None:
+    """Raises `JournalError` for ns so large that two of them may not fit 64 bits."""
+    if abs(host) >= 2**62:
+        raise JournalError(f"came at an impossible time, {host} ns")
 
 
 def alike(payload: bytes) -> tuple[int, int]:
@@ -80,8 +97,11 @@ def pack_event(code: Code, label: str) -> bytes:
 
 def unpack_event(payload: bytes) -> tuple[Code, str]:
     """What `pack_event` was given."""
-    code, label = json.loads(payload)
-    return Code(code), str(label)
+    code, label = _pair(payload, "event")
+    try:
+        return Code(code), str(label)
+    except ValueError as error:
+        raise JournalError("is no event that is known") from error
 
 
 def pack_pong(stream: int, pong: Pong) -> bytes:
@@ -91,7 +111,10 @@ def pack_pong(stream: int, pong: Pong) -> bytes:
 
 def unpack_pong(payload: bytes) -> tuple[int, Pong]:
     """What `pack_pong` was given."""
+    if len(payload) != _PONG.size:
+        raise JournalError("is no answer to a ping")
     stream, *pong = _PONG.unpack(payload)
+    check_time(pong[0])
     return stream, Pong(*pong)
 
 
@@ -102,5 +125,20 @@ def pack_end(complete: bool, why: str) -> bytes:
 
 def unpack_end(payload: bytes) -> tuple[bool, str]:
     """What `pack_end` was given."""
-    complete, why = json.loads(payload)
+    complete, why = _pair(payload, "end")
     return bool(complete), str(why)
+
+
+def _pair(payload: bytes, what: str) -> list[Any]:
+    try:
+        pair = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise JournalError(f"is no {what}: not JSON") from error
+    if not isinstance(pair, list) or len(pair) != 2:
+        raise JournalError(f"is no {what}: not a pair")
+    return pair
+
+
+def storable(text: object) -> str:
+    """As a text that fits a session: without what is not Unicode, zeros, or more than a thousand letters."""
+    return str(text)[:_LABEL].encode(errors="replace").decode().replace("\0", "?")

@@ -24,6 +24,9 @@ from .entries import (
     Code,
     Frames,
     alike,
+    check_frame,
+    check_time,
+    storable,
     unpack_end,
     unpack_event,
     unpack_frames,
@@ -31,6 +34,7 @@ from .entries import (
 )
 from .journal import JournalError, Record, Scan
 from .plan import Plan, StreamPlan, plan_from_json
+from .wire import Pong
 
 _ROWS = 512
 _MAX_EVENTS = 100_000  # and answers to pings of each stream
@@ -157,14 +161,14 @@ class _Survey:
     bits: int = 32
     pongs: list[tuple[int, int, int]] = field(default_factory=list)  # sent, received, ticks
 
-    def hear(self, record: Record) -> None:
+    def hear(self, pong: Pong, host: int) -> None:
         """One answer to a ping."""
-        _, pong = unpack_pong(record.payload)
         if len(self.pongs) < _MAX_EVENTS:
-            self.pongs.append((pong.sent, record.host, pong.ticks))
+            self.pongs.append((pong.sent, host, pong.ticks))
 
     def add(self, record: Record) -> None:
         """One frame."""
+        check_frame(record.payload, self.plan.channels)
         if not self.block.takes(record.payload):
             self.flush()
         self.block.add(record)
@@ -279,14 +283,21 @@ def _survey(scan: Scan, plan: Plan, progress: Progress) -> tuple[dict[int, _Surv
     surveys = {number: _Survey(stream, _Follower(stream)) for number, stream in enumerate(plan.streams)}
     for record in scan:
         progress(len(record.payload))
-        if record.stream in surveys:
-            surveys[record.stream].add(record)
-        elif record.stream == PONG:
-            surveys[unpack_pong(record.payload)[0]].hear(record)
-        elif record.stream == EVENT:
-            plan = _as_said(plan, *unpack_event(record.payload))
-        elif record.stream == END:
-            end = unpack_end(record.payload)
+        try:
+            check_time(record.host)
+            if record.stream in surveys:
+                surveys[record.stream].add(record)
+            elif record.stream == PONG:
+                number, pong = unpack_pong(record.payload)
+                if number in surveys:
+                    surveys[number].hear(pong, record.host)
+            elif record.stream == EVENT:
+                plan = _as_said(plan, *unpack_event(record.payload))
+            elif record.stream == END:
+                end = unpack_end(record.payload)
+        except JournalError as error:  # its sum is right: no damage, but not of this program's making
+            todo = "use the jaxeit that wrote it"
+            raise JournalError(f"{scan.path.name}: record {record.number:,} {error}; {todo}") from error
     for survey in surveys.values():
         survey.flush()
     return surveys, end, plan
@@ -296,9 +307,13 @@ def _as_said(plan: Plan, code: Code, label: str) -> Plan:
     """A plan of what is simulated, if a device said that its values are."""
     if code is not Code.SIMULATED or plan.simulated:
         return plan
-    said = json.loads(label)
-    scene, seed = str(said.get("scene") or "not told by the device"), said.get("seed")
-    return replace(plan, simulated=True, scene=scene, seed=seed if isinstance(seed, int) else 0)
+    try:
+        said = json.loads(label)
+    except (ValueError, RecursionError) as error:
+        raise JournalError("says in what is not JSON that values are simulated") from error
+    scene, seed = (said.get("scene"), said.get("seed")) if isinstance(said, dict) else (None, None)
+    known = isinstance(seed, int) and abs(seed) < 2**62
+    return replace(plan, simulated=True, scene=storable(scene or "not told by the device"), seed=seed if known else 0)
 
 
 class _StreamWriter:
@@ -430,7 +445,7 @@ def _write_records(
             broken.discard(record.stream)
         elif record.stream == EVENT and len(events) < _MAX_EVENTS:
             code, label = unpack_event(record.payload)
-            label = _SIMULATED if code is Code.SIMULATED else label  # the scene is told once, for the file
+            label = _SIMULATED if code is Code.SIMULATED else storable(label)  # the scene is told once, for the file
             events.append((record.host - plan.host_epoch, code, label))
     return events
 

@@ -1,12 +1,16 @@
 """What is to be recorded: the session's facts and its streams, also as the text a journal begins with."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+from calib.session.guard import MAX_ATTRIBUTE_BYTES
 
 from .journal import JournalError
 from .wire import Layout
@@ -61,8 +65,9 @@ class StreamPlan:
         if self.number < 0:
             object.__setattr__(self, "number", self.kind.number)
         numbers = (self.rate, self.scale, self.offset, self.tick)
-        if not np.isfinite(numbers).all() or self.rate < 0 or self.tick <= 0:
-            raise PlanError(f"{self.name}: rate {self.rate} Hz, tick {self.tick} s; give numbers above zero")
+        if not np.isfinite(numbers).all() or self.rate < 0 or not 1e-12 <= self.tick < 1e3:
+            said = f"rate {self.rate} Hz, tick {self.tick} s"
+            raise PlanError(f"{self.name}: {said}; give numbers above zero, and a tick of 1e-12 to 1e3 s")
         self.layout  # noqa: B018  refuses channels, scale and number
 
     @property
@@ -112,13 +117,27 @@ class Plan:
         names = [stream.name for stream in self.streams]
         if not names or len({*names}) < len(names):
             raise PlanError(f"streams {', '.join(names) or 'none'}; name each of them once, at least one")
-        moment = datetime.fromisoformat(self.epoch)
-        if moment.tzinfo is None:
+        if datetime.fromisoformat(self.epoch).tzinfo is None:
             raise PlanError(f"epoch {self.epoch}: has no time zone")
+        self._fits_a_session()
         eit = [s.channels for s in self.streams if s.name == "eit"]
         if eit and (self.pattern is None or len(self.pattern) != eit[0]):
             rows = "no pattern" if self.pattern is None else f"a pattern of {len(self.pattern)} rows"
             raise PlanError(f"eit: {eit[0]} readings beside {rows}; give the skin whose protocol is measured")
+
+    def _fits_a_session(self) -> None:
+        """Or the recording would be made in vain."""
+        for name in [f.name for f in fields(self) if isinstance(getattr(self, f.name), str)]:
+            raw = getattr(self, name).encode(errors="replace")
+            if len(raw) > MAX_ATTRIBUTE_BYTES or b"\0" in raw or raw.decode() != getattr(self, name):
+                limit = f"use at most {MAX_ATTRIBUTE_BYTES:,} bytes of Unicode, none of them zero"
+                raise PlanError(f"{name}: is a text that cannot be stored; {limit}")
+        if any(len(row) != 4 or min(row) < 0 or max(row) >= 1 << 15 for row in self.pattern or ()):
+            raise PlanError("pattern: names impossible electrodes; give four of each reading, counted from 0")
+        if any(abs(number) >= 2**62 for number in (self.host_epoch, self.seed or 0)):
+            raise PlanError(f"host_epoch {self.host_epoch} or seed {self.seed}: too large; keep below 2^62")
+        if self.simulated and (self.scene is None or self.seed is None):
+            raise PlanError("scene: a simulated recording does not say how; give scene and seed")
 
     @property
     def moment(self) -> datetime:
@@ -136,9 +155,31 @@ def plan_from_json(text: bytes) -> Plan:
         table: dict[str, Any] = json.loads(text)
         if table.pop("format") != _FORMAT or table.pop("version") != 1:
             raise JournalError("journal: of another format or version; use the jaxeit that wrote it")
-        table["streams"] = tuple(StreamPlan(**stream) for stream in table["streams"])
+        table["streams"] = tuple(_typed(StreamPlan, stream) for stream in table["streams"])
         for name in ("pattern", "offset"):
             table[name] = table[name] and tuple(tuple(v) if isinstance(v, list) else v for v in table[name])
-        return Plan(**{f.name: table[f.name] for f in fields(Plan)})
-    except (KeyError, TypeError, AttributeError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise JournalError(f"journal: its description cannot be read ({error})") from error
+        return _typed(Plan, {f.name: table[f.name] for f in fields(Plan)})
+    except JournalError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        why = " ".join(str(error).split())[:200]
+        raise JournalError(f"journal: its description cannot be read ({why})") from error
+
+
+def _typed(kind: type, table: dict[str, Any]) -> Any:
+    """An object of fields whose types are those it declares."""
+    declared = get_type_hints(kind)
+    for name, value in table.items():
+        if not _is(value, declared[name]):
+            raise TypeError(f"{name}: is a {type(value).__name__}")
+    return kind(**table)
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if isinstance(kind, UnionType):
+        return any(_is(value, one) for one in get_args(kind))
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple) and all(_is(one, get_args(kind)[0]) for one in value)
+    if kind in (int, float):
+        return type(value) in (int, kind) and math.isfinite(value)
+    return isinstance(value, kind)

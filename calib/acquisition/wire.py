@@ -322,7 +322,7 @@ def _noted(body: bytes) -> _Parsed:
         text = body[2:-2].decode()
         if isinstance(json.loads(text), dict):
             return text, _NOTHING
-    except ValueError:
+    except (ValueError, RecursionError):  # of too many brackets
         pass
     return None, Counts(framing=1)
 
