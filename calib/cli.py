@@ -127,8 +127,8 @@ def _serve(path: str) -> int:
         names = [name for name in ("eit", "pressure", "force") if name in session.streams]
     with Device([recording(path, [name], rounds=10**6) for name in names]) as device:
         where = " ".join(f"--{name} {url}" for name, url in zip(names, device.urls, strict=True))
-        print(f"serving {path}, SIMULATED; in another terminal: jaxeit record {where} -o session.h5", flush=True)
         with suppress(KeyboardInterrupt):
+            print(f"serving {path}, SIMULATED; in another terminal: jaxeit record {where} -o session.h5", flush=True)
             threading.Event().wait()
     return 0
 

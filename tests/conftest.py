@@ -1,5 +1,6 @@
 import gc
 import os
+import signal
 from pathlib import Path
 
 # Before JAX is imported, and for the processes that tests start: half of the suite's time was XLA at work on programs
@@ -16,6 +17,9 @@ import pytest
 import jaxeit as je
 
 pytest_plugins = ["tests.hard_cases"]
+
+# What a shell runs in the background ignores this, and so would the processes that tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What is imported stays: looking through it for garbage, again and again, is a twentieth of the time of the suite.
 gc.freeze()

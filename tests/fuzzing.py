@@ -243,9 +243,9 @@ def _unlike(records: list[tuple[int, int, int, bytes]], rng: np.random.Generator
         records.insert(int(rng.integers(len(records))), records[at])
     elif payload[:1] in (b"{", b"[") and len(payload) < 10_000:
         payload = _said(json.loads(payload), rng).encode()
-    elif kind == 4:
+    elif kind == 4 and payload:
         payload = damaged(payload, rng)
-    else:  # the head of a frame, or an answer to a ping
+    elif payload:  # the head of a frame, or an answer to a ping
         data = bytearray(payload)
         data[int(rng.integers(min(16, len(data))))] = int(rng.integers(256))
         payload = bytes(data)

@@ -155,18 +155,10 @@ def test_simulate_says_what_it_needs(words, message, capsys):
     assert said.count("\n") == 1
 
 
-SERVING = """
-import signal, sys
-from calib.cli import main
-signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
-sys.exit(main(sys.argv[1:]))
-"""
-
-
 def test_a_scene_served_as_a_device(presses_file, tmp_path):
     """A session that is there is played at local ports until interrupted; what listens there gets frames."""
     path = shutil.copy(presses_file, tmp_path / "s.h5")
-    command = [sys.executable, "-c", SERVING, "simulate", "ideal", "-o", str(path), "--serve"]
+    command = [sys.executable, "-m", "calib.cli", "simulate", "ideal", "-o", str(path), "--serve"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
         try:
             said = serving.stdout.readline()

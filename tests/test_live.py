@@ -522,10 +522,13 @@ def test_a_served_skin_listens_on_this_machine_only(bundled):
     session = next(path for path in bundled if "presses" in path.name)
     command = [sys.executable, "-m", "calib.cli", "simulate", "ideal", "-o", str(session), "--serve"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
-        assert "serving" in serving.stdout.readline()
-        found = listening(serving.pid)
-        serving.send_signal(signal.SIGINT)
-        assert serving.wait(20) == 0
+        try:
+            assert "serving" in serving.stdout.readline()
+            found = listening(serving.pid)
+            serving.send_signal(signal.SIGINT)
+            assert serving.wait(20) == 0
+        finally:
+            serving.kill()
     assert len(found) == 3
     assert all(address.startswith("0100007F:") for address in found)
 

@@ -595,7 +595,6 @@ from calib.acquisition.recorder import Intake, Orders, record
 from calib.acquisition.sources import Source, source
 from calib.cli import _signals
 import resource, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
 eit, pressure, output, seconds, limit, counts = sys.argv[1:]
 if counts:  # what is counted in a mapped file outlives the process
     decoded, taken = np.memmap(counts, "i8", "r+", shape=(2, 7))
