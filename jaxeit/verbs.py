@@ -2,16 +2,24 @@
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial, wraps
+from itertools import chain
+from math import prod
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer, eval_context
 from jax.extend.core import get_opaque_trace_state
+from jaxtyping import Array
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
+
+# Numbers of an array that `bind` copies into one with others: to look at an argument takes a call half a microsecond,
+# and its first touch more.
+_SMALL = 1 << 16
 
 
 def verb(function: F) -> F:
@@ -40,7 +48,8 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     """``function(*first, ...)`` as one compiled function of the rest, which must be arrays or pytrees of them.
 
     For calls from a loop in Python: a model is many arrays, and looking through them anew takes longer than the forward
-    solution of a small one. What of ``first`` is no array is static, as for `verb`. ::
+    solution of a small one. Small arrays are copied into one of each type. What of ``first`` is no array is static, as
+    for `verb`. ::
 
         voltages = je.bind(je.forward, model)
         voltages(sigma)
@@ -50,12 +59,42 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     """
     leaves, static = eqx.partition(first, eqx.is_array)
     flat, structure = jax.tree.flatten(leaves)
+    packed, unpacked = _packed(flat)
 
     @partial(jax.jit, compiler_options=compiler_options() if options is None else dict(options))
-    def program(flat, rest):
-        return function(*eqx.combine(jax.tree.unflatten(structure, flat), static), *rest)
+    def program(packed, rest):
+        return function(*eqx.combine(jax.tree.unflatten(structure, unpacked(packed)), static), *rest)
 
-    return lambda *rest: program(flat, rest)
+    return lambda *rest: program(packed, rest)
+
+
+def _packed(arrays: list[Array]) -> tuple[list[Array], Callable[[list[Array]], list[Array]]]:
+    """The arrays, of which the small ones of a type are one, and the function that takes that apart again."""
+    groups: dict[Any, list[int]] = {}
+    for place, array in enumerate(arrays):
+        small = array.size <= _SMALL and isinstance(array.dtype, np.dtype)  # and no random key
+        groups.setdefault(array.dtype if small else place, []).append(place)
+    order = np.argsort(list(chain(*groups.values())))
+    shapes = [[arrays[place].shape for place in group] for group in groups.values()]
+
+    def unpacked(packs: list[Array]) -> list[Array]:
+        pieces = list(chain(*map(_cut, packs, shapes)))
+        return [pieces[place] for place in order]
+
+    return [_joined([arrays[place] for place in group]) for group in groups.values()], unpacked
+
+
+def _joined(arrays: list[Array]) -> Array:
+    if len(arrays) == 1:
+        return arrays[0]
+    return jax.device_put(np.concatenate([np.asarray(array).ravel() for array in arrays]))
+
+
+def _cut(pack: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
+    if len(shapes) == 1:
+        return [pack]
+    pieces = jnp.split(pack, np.cumsum([prod(shape) for shape in shapes[:-1]]))
+    return [piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
 def _is_traced(*values: Any) -> bool:

@@ -1,5 +1,6 @@
 """Verbs compile themselves at the top, and become part of whatever program calls them."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,3 +55,15 @@ def test_a_bound_function_is_that_of_what_is_left(model):
     voltages = je.bind(je.forward, model)
     np.testing.assert_allclose(voltages(halved), je.forward(model, halved), rtol=1e-12)
     np.testing.assert_allclose(voltages(np.asarray(halved)), 2 * voltages(), rtol=1e-9)
+
+
+def test_bound_arrays_keep_their_values_types_and_shapes():
+    key = jax.random.key(3)
+    large = np.arange(verbs._SMALL + 1)
+    given = {"floats": [np.arange(3.0), np.float64(7), np.zeros((0, 2))], "more": [jnp.float32(2), key, large], "no": 5}
+    given = jax.tree.map(lambda v: jnp.asarray(v) if isinstance(v, np.ndarray | np.generic) else v, given)
+    given["whole"] = jnp.arange(6, dtype=jnp.uint32).reshape(2, 3), jnp.array([True, False]), jnp.arange(4, 6)
+    found = je.bind(lambda given, extra: (eqx.filter(given, eqx.is_array), extra), given)(jnp.arange(2.0))
+    wanted = eqx.filter(given, eqx.is_array), jnp.arange(2.0)
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    assert eqx.tree_equal(found, wanted, typematch=True)
