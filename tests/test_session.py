@@ -94,12 +94,13 @@ def everything(path: Path) -> list:
     """All that a session says, as values that can be compared."""
     with open_session(path) as s:
         found: list = [sorted(s.attrs.items()), s.skin_name, s.skin_toml, s.epoch_ns, s.scene]
-        found += [s.pattern.tobytes(), s.offset.tobytes(), s.current, s.frequency, s.complete]
+        found += [None if a is None else a.tobytes() for a in (s.pattern, s.offset)]
+        found += [s.current, s.frequency, s.complete]
         for name, stream in s.streams.items():
             arrays = [stream.time, stream.read(), stream.status(), stream.seq, stream.time_host]
             found += [name, stream.variable, stream.unit, stream.nominal_rate, stream.clock]
             found += [None if a is None else a.tobytes() for a in arrays]
-        return [*found, repr(s.presses), repr(s.events), repr(dict(s.truth))]
+        return [*found, repr(s.presses), repr(s.events), repr(dict(s.truth)), repr(dict(s.clocks))]
 
 
 @pytest.fixture(scope="module")
