@@ -1,9 +1,10 @@
 """Damaged and hostile input for everything that reads, in a process with little memory and little time.
 
-    python -m tests.fuzzing KIND COUNT SEED FOLDER
+    python -m tests.fuzzing COUNT SEED FOLDER KIND...
 
-prints what became of COUNT inputs, as JSON: how many were refused, read as before, or read as something else; the
-longest time of one (s), the growth of memory (bytes), and the first inputs that broke a reader, by their numbers.
+prints what became of COUNT inputs of each kind, as JSON: how many were refused, read as before, or read as something
+else; the longest time of one (s), the growth of memory (bytes), and the first inputs that broke a reader, by their
+numbers.
 """
 
 import contextlib
@@ -493,14 +494,14 @@ READERS = {
 def run(kind: str, count: int, seed: int, folder: Path) -> dict:
     """What became of so many inputs of a kind."""
     reader, rng = READERS[kind], np.random.default_rng(seed)
-    raw = reader.original(folder)
     work = folder / "work"
-    work.mkdir()
+    work.mkdir(parents=True)
+    raw = reader.original(folder)
     path = work / f"input{'.npz' if 'reconstructor' in kind else '.part' if 'journal' in kind else '.h5'}"
     path.write_bytes(raw)
     whole = reader.read(path, raw)  # the sound one compiles what there is to compile
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seen, broken, longest = Counter[str](), [], 0.0
     for number in range(count):
@@ -525,5 +526,5 @@ def run(kind: str, count: int, seed: int, folder: Path) -> dict:
 
 if __name__ == "__main__":
     assert pickle.dumps(Trap())
-    kind, count, seed, folder = sys.argv[1:]
-    print(json.dumps(run(kind, int(count), int(seed), Path(folder))))
+    count, seed, folder, *kinds = sys.argv[1:]
+    print(json.dumps({kind: run(kind, int(count), int(seed), Path(folder, kind)) for kind in kinds}))

@@ -19,7 +19,7 @@ INTRODUCTION = """\
 How far jaxeit has been taken, how wrong its numbers were at worst, and what a user sees there or beyond. The tests
 write this table, the slow ones too:
 
-    python -m pytest --hard-cases docs/hard-cases.md tests/test_hard_*.py
+    python -m pytest --hard-cases docs/hard-cases.md
 
 If all the tests of a run pass, it replaces the rows of the cases it came to; the other rows stay, so that the files
 may be run one by one. Without the slow tests some rows would tell of less. `python -m tests.mutations` breaks the

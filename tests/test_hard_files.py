@@ -28,19 +28,14 @@ LONGEST = 60.0  # seconds for one input, of a hang; refused in milliseconds, but
 
 
 def campaign(kinds, count, seed, folder, root, timeout):
-    """Results by kind, of processes one after the other."""
-    found = {}
-    for kind in kinds:
-        place = folder / kind.replace(" ", "_")
-        place.mkdir()
-        command = [sys.executable, "-W", "ignore", "-m", "tests.fuzzing", kind, str(count[kind]), str(seed), str(place)]
-        environment = os.environ | {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"}
-        done = subprocess.run(
-            command, cwd=root, env=environment, capture_output=True, text=True, timeout=timeout, check=False
-        )
-        assert done.returncode == 0, f"{kind}: {done.returncode}: {done.stderr[-2000:]}"
-        found[kind] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    """Results by kind, of one process."""
+    command = [sys.executable, "-W", "ignore", "-m", "tests.fuzzing", str(count), str(seed), str(folder), *kinds]
+    environment = os.environ | {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+    )
+    assert done.returncode == 0, f"{kinds}: {done.returncode}: {done.stderr[-2000:]}"
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def judged(found):
@@ -53,19 +48,17 @@ def judged(found):
             assert result.get("different", 0) == 0, f"{kind}: damaged and read as something else"
 
 
-QUICK = ["skin"]
-
-
-@pytest.mark.parametrize("kind", QUICK)
-def test_some_spoilt_inputs(kind, tmp_path, root):
-    judged(campaign([kind], {kind: 120}, 1, tmp_path, root, 100))
+def test_some_spoilt_inputs(tmp_path, root):
+    """Of the kinds whose readers compile nothing."""
+    compiled = {"calibration", "hostile calibration", "reconstructor", "hostile reconstructor"}
+    judged(campaign([kind for kind in READERS if kind not in compiled], 40, 1, tmp_path, root, 100))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", READERS)
 def test_thousands_of_spoilt_inputs(kind, tmp_path, root, hard):
     count = SLOW.get(kind, 1000)
-    found = campaign([kind], {kind: count}, 2, tmp_path, root, 900)
+    found = campaign([kind], count, 2, tmp_path, root, 900)
     print(f"{kind}: {count:,} inputs, {found[kind]}")
     judged(found)
     beyond = "one line that says what is wrong" + (

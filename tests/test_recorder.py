@@ -365,6 +365,8 @@ def test_plans_must_be_sound():
         replace(eit, tick=0.0)
     with pytest.raises(PlanError, match="title: is a text that cannot be stored; use at most 262,144 bytes of Unicode"):
         replace(PLANNED, title="\udcff")  # as a name of a file may be
+    with pytest.raises(PlanError, match="transport: is a text that cannot be stored"):
+        replace(eit, transport="serial:///dev/\udcff")
 
 
 # --- journal to session --------------------------------------------------------------------------

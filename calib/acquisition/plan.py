@@ -42,6 +42,16 @@ KINDS: Mapping[str, Kind] = {
 }
 
 
+def _check_texts(plan: Any) -> None:
+    """Raises `PlanError` for a field that is a text and fits no attribute of a session."""
+    for field in fields(plan):
+        text = getattr(plan, field.name)
+        raw = text.encode(errors="replace") if isinstance(text, str) else b""
+        if len(raw) > MAX_ATTRIBUTE_BYTES or b"\0" in raw or (raw and raw.decode() != text):
+            limit = f"use at most {MAX_ATTRIBUTE_BYTES:,} bytes of Unicode, none of them zero"
+            raise PlanError(f"{field.name}: is a text that cannot be stored; {limit}")
+
+
 @dataclass(frozen=True)
 class StreamPlan:
     """One stream: what it holds, and how its device sends it.
@@ -69,6 +79,7 @@ class StreamPlan:
             said = f"rate {self.rate} Hz, tick {self.tick} s"
             raise PlanError(f"{self.name}: {said}; give numbers above zero, and a tick of 1e-12 to 1e3 s")
         self.layout  # noqa: B018  refuses channels, scale and number
+        _check_texts(self)
 
     @property
     def kind(self) -> Kind:
@@ -127,11 +138,7 @@ class Plan:
 
     def _fits_a_session(self) -> None:
         """Or the recording would be made in vain."""
-        for name in [f.name for f in fields(self) if isinstance(getattr(self, f.name), str)]:
-            raw = getattr(self, name).encode(errors="replace")
-            if len(raw) > MAX_ATTRIBUTE_BYTES or b"\0" in raw or raw.decode() != getattr(self, name):
-                limit = f"use at most {MAX_ATTRIBUTE_BYTES:,} bytes of Unicode, none of them zero"
-                raise PlanError(f"{name}: is a text that cannot be stored; {limit}")
+        _check_texts(self)
         if any(len(row) != 4 or min(row) < 0 or max(row) >= 1 << 15 for row in self.pattern or ()):
             raise PlanError("pattern: names impossible electrodes; give four of each reading, counted from 0")
         if any(abs(number) >= 2**62 for number in (self.host_epoch, self.seed or 0)):
