@@ -34,13 +34,13 @@ import jaxeit as je
 from calib.acquisition.device import Device, Packets, rows
 from calib.acquisition.entries import unpack_frames
 from calib.acquisition.live import Show, live
-from calib.acquisition.priority import PriorityError, real_time
+from calib.acquisition.priority import real_time
 from calib.acquisition.recorder import Log, Nowhere, kept, record
 from calib.acquisition.results import Result
 from calib.acquisition.setup import prepare
 from calib.runtime import set_up_live
 
-from ._common import circumstances, write
+from ._common import circumstances, may_run_in_real_time, write
 from .memory import growth, resident
 
 RATE, PRESSURE_RATE = 100, 1000
@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     data: dict[str, Any] = {"circumstances": circumstances(), "readings": calibration.recon.readings}
     data["soak"] = soaked(calibration, 5.0 if args.smoke else 60 * args.minutes)
     print(data["soak"], flush=True)
-    if allowed():
+    if may_run_in_real_time():
         data["soak_realtime"] = soaked(calibration, 5.0 if args.smoke else 60 * args.minutes, realtime=True)
         print(data["soak_realtime"], flush=True)
     data["tenfold"] = tenfold(calibration, 3.0 if args.smoke else 6 * args.minutes)
@@ -81,16 +81,6 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     if not args.smoke:
         write("live_located" if args.calibration else "live", data)
     return data
-
-
-def allowed() -> bool:
-    """Whether there is real-time priority to be had."""
-    try:
-        with real_time():
-            return True
-    except PriorityError as error:
-        print("no soak at real-time priority:", error)
-        return False
 
 
 def highest(sustains: Callable[[int], bool], low: int, most: int) -> int:
