@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
+from calib.acquisition.priority import PriorityError, real_time
 from calib.session import replacing
 from jaxeit.solvers import NestedDissection
 
@@ -127,6 +128,16 @@ def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budg
             if sum(times[name]) < budget:
                 times[name].append(taken(tool, sigma * (1 + 1e-3 * turn))[0])
     return times
+
+
+def may_run_in_real_time() -> bool:
+    """Whether this user may have real-time priority; says if not."""
+    try:
+        with real_time():
+            return True
+    except PriorityError as error:
+        print(f"at ordinary priority, where others may come between: {error}")
+        return False
 
 
 def spread(times: list[float]) -> dict[str, float]:

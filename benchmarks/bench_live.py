@@ -1,15 +1,15 @@
 """Live over loopback: loss, latency from a frame's last byte to its force map, growth of memory, and the highest rate.
 
 The skin is a process of its own that sends frames of 928 readings and 1,000 samples of the pads' pressures a second.
-First a soak, which is recorded as well; then a recording of as many frames in a tenth of the time; then the highest
-rate of frames that is sustained, by doubling and bisection.
+First a soak, which is recorded as well, and another at real-time priority where that is allowed; then a recording of as
+many frames in a tenth of the time; then the highest rate of frames that is sustained, by doubling and bisection.
 
 python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5] [--no-rates]
 
 Latency counts from when the bytes that end a frame were read; `since_due` from when the simulated device should have
 sent it: the device's own lateness, and what the bytes waited to be read, are in it. `woken` is how late a process wakes
 that does nothing but sleep from one hundredth of a second to the next, at the same time: no program on this machine can
-promise less.
+promise less, at the same priority.
 """
 
 import argparse
@@ -34,12 +34,13 @@ import jaxeit as je
 from calib.acquisition.device import Device, Packets, rows
 from calib.acquisition.entries import unpack_frames
 from calib.acquisition.live import Show, live
+from calib.acquisition.priority import real_time
 from calib.acquisition.recorder import Log, Nowhere, kept, record
 from calib.acquisition.results import Result
 from calib.acquisition.setup import prepare
 from calib.runtime import set_up_live
 
-from ._common import circumstances, write
+from ._common import circumstances, may_run_in_real_time, write
 from .memory import growth, resident
 
 RATE, PRESSURE_RATE = 100, 1000
@@ -61,6 +62,9 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     data: dict[str, Any] = {"circumstances": circumstances(), "readings": calibration.recon.readings}
     data["soak"] = soaked(calibration, 5.0 if args.smoke else 60 * args.minutes)
     print(data["soak"], flush=True)
+    if may_run_in_real_time():
+        data["soak_realtime"] = soaked(calibration, 5.0 if args.smoke else 60 * args.minutes, realtime=True)
+        print(data["soak_realtime"], flush=True)
     data["tenfold"] = tenfold(calibration, 3.0 if args.smoke else 6 * args.minutes)
     print(data["tenfold"], flush=True)
     data["rates"] = []
@@ -223,10 +227,10 @@ def device(calibration: calib.Calibration, rates: tuple[int, int]) -> Iterator[t
 
 
 @contextmanager
-def metronome() -> Iterator[dict[str, float]]:
+def metronome(realtime: bool) -> Iterator[dict[str, float]]:
     """Filled on leaving: how late a process that only sleeps was woken in between."""
     found: dict[str, float] = {}
-    with beside(sleeping) as (told, stop):
+    with beside(sleeping, realtime) as (told, stop):
         told.get(timeout=120)
         try:
             yield found
@@ -235,14 +239,15 @@ def metronome() -> Iterator[dict[str, float]]:
             found |= spread("woken", told.get(timeout=10))
 
 
-def sleeping(told: Any, stop: Event) -> None:
+def sleeping(realtime: bool, told: Any, stop: Event) -> None:
     """Sleep to the next hundredth of a second until told to stop; then say how late each waking was, s."""
     told.put(None)
     late, due = [], time.monotonic()
-    while not stop.is_set():
-        due = max(due + 0.01, time.monotonic())
-        time.sleep(max(0.0, due - time.monotonic()))
-        late.append(time.monotonic() - due)
+    with real_time(realtime):
+        while not stop.is_set():
+            due = max(due + 0.01, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+            late.append(time.monotonic() - due)
     told.put(np.array(late))
 
 
@@ -269,11 +274,11 @@ def tenfold(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
     }
 
 
-def soaked(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
+def soaked(calibration: calib.Calibration, seconds: float, realtime: bool = False) -> dict[str, Any]:
     """One run at the rate of the paper, recorded as well: all that arrived is in the session, in order."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.h5"
-        row = watched(calibration, RATE, seconds, path)
+        row = watched(calibration, RATE, seconds, path, realtime)
         with calib.open_session(path) as session:
             streams = [session.stream(name) for name in ("eit", "pressure")]
             row["recorded"] = [len(stream) for stream in streams]
@@ -282,15 +287,27 @@ def soaked(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
     return row
 
 
-def watched(calibration: calib.Calibration, rate: int, seconds: float, output: Path | None = None) -> dict[str, Any]:
+def watched(
+    calibration: calib.Calibration, rate: int, seconds: float, output: Path | None = None, realtime: bool = False
+) -> dict[str, Any]:
     """One run: frames and what became of them, the latencies in ms, and what memory did."""
     with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
         with ExitStack() as stack:
             show, received = Show(), Received(stack.enter_context(kept(output)) if output is not None else Nowhere())
-            watch, woken = Watch(rate, seconds, begin, received), stack.enter_context(metronome())
+            watch, woken = Watch(rate, seconds, begin, received), stack.enter_context(metronome(realtime))
             timer = threading.Timer(seconds, show.stop.set)
             plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
-            live(calibration, plan, sources, watch, show, log=received, rest=REST, begun=timer.start)
+            live(
+                calibration,
+                plan,
+                sources,
+                watch,
+                show,
+                log=received,
+                realtime=realtime,
+                rest=REST,
+                begun=timer.start,
+            )
             timer.cancel()
             ended = time.monotonic()
         finishing = time.monotonic() - ended

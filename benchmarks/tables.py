@@ -213,8 +213,10 @@ def _live(results: dict) -> str:
     best = [row for row in results["rates"] if row["rate_hz"] == results["highest_hz"]]
     heads = ["run", "frames", "lost", "dropped", *(f"latency {p}, ms" for p in ("p50", "p99", "max"))]
     heads += ["beyond the scan, p99, ms", "a sleeper wakes late, p99, ms", "memory, MB an hour"]
+    long = f"live and recorded, {soak['rate_hz']} Hz, {soak['seconds'] / 60:.0f} min"
     rows = [
-        _live_row(f"live and recorded, {soak['rate_hz']} Hz, {soak['seconds'] / 60:.0f} min", soak),
+        _live_row(long, soak),
+        *([_live_row(long + ", `--realtime`", results["soak_realtime"])] if "soak_realtime" in results else []),
         *(_live_row(f"live, highest rate sustained: {row['rate_hz']} Hz", row) for row in best),
         [
             f"recorded, {tenfold['rate_hz']} Hz, {tenfold['seconds'] / 60:.0f} min",

@@ -577,12 +577,18 @@ def _live_args(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record what arrives as well")
     text = "tell the device what to read next: few readings at rest, those around a contact while there is one"
     parser.add_argument("--event-driven", action="store_true", help=text)
+    text = "go before all ordinary processes: frames are worked on at once on a busy machine too (Linux, if allowed)"
+    parser.add_argument("--realtime", action="store_true", help=text)
 
 
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def _live(args: argparse.Namespace) -> int:
+    from .acquisition.priority import real_time
+
+    with real_time(args.realtime):
+        pass  # refused at once or not at all
     for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
         os.environ.setdefault(name, "1")
     if args.rerun is not None:
@@ -624,6 +630,7 @@ def _live(args: argparse.Namespace) -> int:
             also=also,
             output=args.output,
             event_driven=args.event_driven,
+            realtime=args.realtime,
             tell=lambda line: print(f"jaxeit: {line}", file=sys.stderr),
             rest=args.rest,
             wait=args.wait,

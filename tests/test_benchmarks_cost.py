@@ -302,6 +302,7 @@ def test_tables_of_the_pages(root):
     run |= {f"{what}_ms_{p}": 1.234 for what in ("latency", "since_due", "woken") for p in ("p50", "p99", "max")}
     results["live"] = {
         "soak": run | {"memory_mb_per_hour": 0.123, "memory_mb_per_hour_error": 0.456},
+        "soak_realtime": run | {"dropped": 1},
         "tenfold": {"rate_hz": 1000, "seconds": 60.0, "recorded": [59999, 1], "lost": [1, 0]},
         "rates": [run, run | {"rate_hz": 400}],
         "highest_hz": 400,
@@ -330,4 +331,5 @@ def test_tables_of_the_pages(root):
         "| live and recorded, 100 Hz, 10 min | 60,000 | 0 | 3 | 1.23 | 1.23 | 1.23 | 1.23 | 1.23 | 0.12 ±"
         in text["live"]
     )
+    assert "| live and recorded, 100 Hz, 10 min, `--realtime` | 60,000 | 0 | 1 |" in text["live"]
     assert "| recorded, 1000 Hz, 1 min | 59,999 | 1 |" in text["live"]

@@ -29,12 +29,14 @@ from calib.acquisition.engine import Arrival, Engine, Mapped, Programs, Resting
 from calib.acquisition.live import Inbox, LiveError, Show, live
 from calib.acquisition.plan import StreamPlan
 from calib.acquisition.present import present
+from calib.acquisition.priority import PriorityError, real_time
 from calib.acquisition.recorder import Orders, record
 from calib.acquisition.results import Touches
 from calib.acquisition.setup import prepare
 from calib.acquisition.web import Page
 from calib.acquisition.wire import Frame
 from calib.bench import Bench, Timing, simulate
+from calib.cli import main
 from calib.maps import ForceLaw, fused
 
 S = 1_000_000_000
@@ -278,6 +280,54 @@ def test_results_come_as_frames_arrive(calibration):
     assert [r.number for r in results] == list(range(1, count + 1))
     np.testing.assert_allclose(results[-1].force, [0.0, 5.0])
     assert show.state == "running"
+
+
+def policies():
+    return [os.sched_getscheduler(int(task)) for task in os.listdir("/proc/self/task")]
+
+
+def test_a_live_show_may_go_before_all_ordinary_processes(calibration):
+    """Its threads, old and new, while it lasts; none afterwards."""
+    try:
+        with real_time():
+            pass
+    except PriorityError as error:
+        pytest.skip(str(error))
+    show, seen = Show(), []
+    with small_device() as device:
+
+        def publish(result):
+            seen.extend(policies())
+            show.stop.set()
+
+        plan, sources = sources_of(device, calibration)
+        live(calibration, plan, sources, publish, show, rest=0.1, realtime=True)
+    assert len(seen) > 2
+    assert set(seen) == {os.SCHED_FIFO}
+    assert os.SCHED_FIFO not in policies()
+
+
+def refuse(task, policy, parameters):
+    raise PermissionError
+
+
+@pytest.mark.parametrize(("system", "said"), [(refuse, "rtprio 1"), (None, "on Linux only")])
+def test_a_priority_that_is_refused_is_said(monkeypatch, system, said):
+    if system is None:
+        monkeypatch.delattr(os, "sched_setscheduler", raising=False)
+    else:
+        monkeypatch.setattr(os, "sched_setscheduler", system, raising=False)
+    with pytest.raises(PriorityError, match=said), real_time():
+        pytest.fail("must not go on")
+    with real_time(False):
+        pass
+
+
+def test_a_priority_that_is_refused_is_said_before_anything_else(monkeypatch, capsys):
+    monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
+    streams = ["--eit", "tcp://127.0.0.1:1", "--pressure", "tcp://127.0.0.1:1"]
+    assert main(["live", "--calibration", "nowhere.h5", *streams, "--realtime"]) == 2
+    assert "leave --realtime out" in capsys.readouterr().err
 
 
 def test_a_live_show_is_recorded(calibration, tmp_path):

@@ -17,6 +17,7 @@ from calib.calibration import Calibration
 from .direct import Director, prepare_director
 from .engine import Arrival, Engine
 from .plan import Plan, StreamPlan
+from .priority import real_time
 from .recorder import Log, Nowhere, Recorder, silence
 from .results import Result
 from .sources import Source
@@ -107,6 +108,7 @@ def live(
     *,
     log: Log | None = None,
     event_driven: bool = False,
+    realtime: bool = False,
     rest: float = 2.0,
     wait: float = 10.0,
     begun: Callable[[], object] = lambda: None,
@@ -118,12 +120,14 @@ def live(
         publish: told each result; must return at once.
         log: where all frames go as they arrive, such as a journal (`kept`); default: nowhere.
         event_driven: whether to tell the device what to read next (`direct`); it must understand.
+        realtime: whether to go before all ordinary processes, from when everything is compiled (`priority`).
         rest: s without contact at the beginning, from which levels are taken.
         wait: s for the devices to begin.
         begun: called when everything is compiled, and the devices are listened to.
 
     Raises:
         LiveError: if the streams do not fit the calibration, do not begin, or fail.
+        PriorityError: if ``realtime`` is refused.
     """
     _check(calibration, sources)
     inbox = Inbox(*(source.plan for source in sources))
@@ -133,7 +137,7 @@ def live(
     if event_driven:
         show.state = "choosing the readings of each place"
         director = prepare_director(calibration, sources[0].plan.number, recorder.intakes[0].send)
-    with recorder:
+    with real_time(realtime), recorder:
         begun()
         count = _work(engine, inbox, recorder, publish, show, wait, director)
     if recorder.failure is not None:

@@ -27,6 +27,7 @@ def present(
     also: Sequence[Publish] = (),
     output: str | Path | None = None,
     event_driven: bool = False,
+    realtime: bool = False,
     tell: Callable[[str], object] = lambda line: None,
     rest: float = 2.0,
     wait: float = 10.0,
@@ -39,10 +40,10 @@ def present(
         also: told each result as well.
         output: a session file to record into meanwhile.
         tell: told where to look.
-        event_driven, rest, wait: as in `live`.
+        event_driven, realtime, rest, wait: as in `live`.
 
     Raises:
-        LiveError: as `live`. RecordError: as `kept`. OSError: if a port is taken.
+        LiveError, PriorityError: as `live`. RecordError: as `kept`. OSError: if a port is taken.
     """
     with ExitStack() as stack:
         page = stack.enter_context(Page(calibration, show, host, port))
@@ -63,6 +64,7 @@ def present(
             show,
             log=log,
             event_driven=event_driven,
+            realtime=realtime,
             rest=rest,
             wait=wait,
         )
