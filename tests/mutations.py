@@ -517,6 +517,19 @@ MUTANTS = [
         ('.encode(errors="replace").decode().replace("\\0", "?")', "", "what_a_device_says"),
     ),
     *of(
+        "calib/acquisition/priority.py",
+        "test_live",
+        ("before = _raised() if wanted else {}", "before = _raised()", "a_priority_that_is_refused"),
+        ("        _set(before)", "        pass", "before_all_ordinary"),
+        ('not (hasattr(os, "sched_setscheduler") and _TASKS.is_dir())', "False", "a_priority_that_is_refused"),
+        ("    except PermissionError as error:", "    except ValueError as error:", "a_priority_that_is_refused"),
+    ),
+    *of(
+        "jaxeit/verbs.py",
+        "test_verbs",
+        ("small = array.size <= _SMALL and isinstance(array.dtype, np.dtype)", "small = True", "arrays_keep"),
+    ),
+    *of(
         "calib/acquisition/plan.py",
         "test_recorder",
         ("if not _is(value, declared[name]):", "if False:", "a_plan_no_session"),
