@@ -3,6 +3,8 @@
 One program serves all examples of a test: sheets and contacts are its arguments, and the ground is too.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -199,9 +201,12 @@ def test_presses_are_where_they_are_in_any_unit_and_on_any_clock(seed, count, lo
 
 @pytest.mark.slow
 @settings(max_examples=12, deadline=None, derandomize=True, database=None)
-@given(seeds, st.booleans(), st.integers(4, 9), st.floats(0.05, 0.2), st.floats(1.2, 2.0), st.sampled_from([1, 2]))
+@given(seeds, st.booleans(), st.integers(4, 9), st.floats(0.05, 0.2), st.floats(1.2, 1.7), st.sampled_from([1, 2]))
 def test_any_skin_and_protocol_keeps_the_identities(seed, askew, count, edge, growth, order):
-    """Bolts at random places of a sheet of random proportions, readings between random electrodes."""
+    """Bolts at random places of a sheet of random proportions, readings between random electrodes.
+
+    Of meshes that grow faster than by 1.7 a quarter is refused, as an angle is below 20 degrees.
+    """
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.1, 0.4, 2)
     corners = [(0, 0), (1, 0.1), (0.9, 1), (0.1, 0.9)] * size
@@ -216,6 +221,7 @@ def test_any_skin_and_protocol_keeps_the_identities(seed, askew, count, edge, gr
     readings = np.asarray(je.forward(model, sigma))
     np.testing.assert_allclose(readings[:10], readings[10:], rtol=1e-8, atol=1e-10 * np.abs(readings).max())
     theta = coefficients(model, sigma)
-    z, slope = jax.jvp(lambda t: transfer(model, t), (theta,), (theta,))
+    z, slope = jax.jvp(partial(transfer, model), (theta,), (theta,))
+    quarter, _ = jax.jvp(partial(transfer, model), (jax.tree.map(lambda x: 4 * x, theta),), (theta,))
     np.testing.assert_allclose(slope, -z, atol=1e-9 * np.abs(z).max())
-    np.testing.assert_allclose(4 * transfer(model, jax.tree.map(lambda x: 4 * x, theta)), z, rtol=1e-12)
+    np.testing.assert_allclose(4 * quarter, z, rtol=1e-12, atol=1e-12 * np.abs(z).max())
