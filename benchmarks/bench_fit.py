@@ -153,10 +153,9 @@ def fits(repeats: int) -> dict[str, Any]:
 
 
 def _ours(data: PressData, curve: calib.PowerLaw | None = None):
-    rows = data.own  # as `calibrate` gives them
-    pressure, mask = (np.take_along_axis(a, rows, 1) for a in (data.sample_pressure, data.mask))
-    force, groups = data.sample_force[rows], data.sample_place[rows]
-    return fit_curves(curve or calib.PowerLaw(), pressure, force, mask=mask, groups=groups)
+    curve = curve or calib.PowerLaw()
+    own = data.samples_for(curve)  # as `calibrate` gives them
+    return fit_curves(curve, own.pressure, own.force, mask=own.mask, groups=own.place)
 
 
 def _theirs(data: PressData, pad: int, reference: float, scale: float) -> np.ndarray:

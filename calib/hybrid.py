@@ -30,6 +30,25 @@ _TURNS = 2
 _FAINT = 0.05  # of the largest force: presses below weigh less, as their noise is not proportional
 
 
+class PadSamples(NamedTuple):
+    """What each pad's curve is fitted to, in order of time; rows that only fill up are not in `mask`.
+
+    | field    | meaning                          | shape     | unit |
+    |----------|----------------------------------|-----------|------|
+    | rows     | of the samples in `PressData`    | (pads, m) |      |
+    | pressure | of the pad                       | (pads, m) | Pa   |
+    | force    |                                  | (pads, m) | N    |
+    | mask     | samples to be fitted             | (pads, m) |      |
+    | place    | number of the place pressed      | (pads, m) |      |
+    """
+
+    rows: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+    mask: np.ndarray
+    place: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class PressData:
     """Presses of one or more sessions: their samples, and the means over their holds.
@@ -60,8 +79,15 @@ class PressData:
         """Number of the place of each sample, (n,)."""
         return self.place[self.sample_press]
 
+    def samples_for(self, curve: AbstractCurve) -> PadSamples:
+        """All samples for a curve with a path; for one that forgets, none but the pad's own: of four, a quarter."""
+        everything = np.broadcast_to(np.arange(len(self.sample_force)), self.mask.shape)
+        rows = everything if curve.path else self._own
+        pressure, mask = (np.take_along_axis(a, rows, 1) for a in (self.sample_pressure, self.mask))
+        return PadSamples(rows, pressure, self.sample_force[rows], mask, self.sample_place[rows])
+
     @cached_property
-    def own(self) -> np.ndarray:
+    def _own(self) -> np.ndarray:
         """Each pad's samples in `mask`, those that are missing, and others that fill up, (pads, m) in order of time."""
         wanted = self.mask | ~(np.isfinite(self.sample_pressure) & np.isfinite(self.sample_force))
         most = wanted.sum(1).max(initial=0)
@@ -145,21 +171,11 @@ def fit_hybrid(
 
 
 def _curves(curve, data: PressData, gain: np.ndarray, use: np.ndarray, loss) -> FittedCurve:
-    """Each pad's curve through forces over gains, each with the noise that the division left it.
-
-    A curve that forgets is given no presses but the pad's own: of four pads, a quarter of the work.
-    """
-    rows = np.broadcast_to(np.arange(len(data.sample_force)), data.mask.shape) if curve.path else data.own
-    pressure, mask, gain = (np.take_along_axis(a, rows, 1) for a in (data.sample_pressure, data.mask, gain))
-    return fit_curves(
-        curve,
-        pressure,
-        data.sample_force[rows] * np.exp(-gain),
-        mask=mask & use[data.sample_press][rows],
-        groups=data.sample_place[rows],
-        sigma=np.exp(-gain),
-        loss=loss,
-    )
+    """Each pad's curve through forces over gains, each with the noise that the division left it."""
+    own = data.samples_for(curve)
+    less = np.exp(-np.take_along_axis(gain, own.rows, 1))
+    mask = own.mask & use[data.sample_press][own.rows]
+    return fit_curves(curve, own.pressure, own.force * less, mask=mask, groups=own.place, sigma=less, loss=loss)
 
 
 _fit_field = je.verb(fit_field)
