@@ -13,6 +13,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Scalar = Float[Array, ""]
@@ -88,6 +89,11 @@ class AbstractCurve(eqx.Module):
     def size(self) -> int:
         """Number of parameters."""
         return len(self.names)
+
+    @property
+    def positive(self) -> np.ndarray:
+        """Which parameters are above zero, slopes and exponents, by their logarithms; not an offset, (parameters,)."""
+        return np.array([name != "offset" for name in self.names])
 
     def at(self, scale: Scale) -> "AbstractCurve":
         """The curve with whatever it left open (a reference pressure) taken from the samples."""

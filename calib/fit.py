@@ -2,9 +2,15 @@
 
 For residuals r_i = (F_i - h(P_i)) / (sigma_i s), s a robust scale, the fit minimises sum_i w^2 rho(r_i^2 / w^2) / 2
 (an M-estimate of width w). The loss goes to `optimistix.least_squares` as transformed residuals
-sign(r) w sqrt(rho(r^2 / w^2)), whose squares *are* the loss: the solver stays an ordinary Levenberg-Marquardt and
-needs no reweighting loop. The scale is 1.4826 times the median absolute residual (MAD), found again after each of a
-few rounds and then held.
+sign(r) w sqrt(rho(r^2 / w^2)), whose squares *are* the loss: any solver of least squares will do, and none needs a
+reweighting loop; the default one is told the loss's own curvature, and ends sooner. The scale is 1.4826 times the
+median absolute residual (MAD), found again after each of a few rounds and then held.
+
+Slopes and exponents are above zero. They are looked for as multiples of their start, down to next to nothing: a slope
+that the samples want at zero or below has its logarithm at minus infinity, and no solver arrives there. Where the
+samples want a slope at zero or just below, it ends on its bound, and the curve is flat there: a fit like any other,
+with the standard errors of slopes that may be below zero. Where they want it far below - the bound explains a good part
+of what is left - the curve is the wrong one, and the result says AT_BOUND.
 
 Samples of one press are near-duplicates. Given `groups` (a press or location per sample), the covariance is the
 cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), so that it is honest for a dozen presses; the
@@ -27,6 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 import jaxeit as je
 from calib.curves import AbstractCurve, Scale, scale_of
+from calib.solver import BoundedNewton
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation: 1 / Phi^-1(3/4)."""
@@ -62,7 +69,7 @@ _MESSAGES = {
     FitResult.NO_RESPONSE: "force does not rise with pressure, or there is only one pressure: check the pad's tube, "
     "its sign and its number, and record presses at more load levels",
     FitResult.SINGULAR: "the samples do not determine all parameters: record presses at more load levels",
-    FitResult.AT_BOUND: "somewhere the force does not rise with pressure at all, and this curve must: choose a curve "
+    FitResult.AT_BOUND: "somewhere the force falls with pressure or does not rise, and this curve must: choose a curve "
     "with fewer parameters, and check the range of the pressure sensor",
 }
 
@@ -79,7 +86,7 @@ class AbstractLoss(eqx.Module):
     def transform(self, r: Array) -> Array:
         """sign(r) w sqrt(rho(r^2/w^2)): its square is the loss."""
         w = self.width.astype(r.dtype)
-        return r * jnp.sqrt(self.ratio((r / w) ** 2))
+        return r * jnp.sqrt(self.ratio(jnp.minimum((r / w) ** 2, 0.1 * jnp.finfo(r.dtype).max)))
 
     def psi(self, r: Array) -> Array:
         """Influence of a residual: the derivative of half the loss."""
@@ -88,6 +95,10 @@ class AbstractLoss(eqx.Module):
     def dpsi(self, r: Array) -> Array:
         """Derivative of `psi`."""
         return jax.jvp(self.psi, (r,), (jnp.ones_like(r),))[1]
+
+    def curvature(self, t: Array) -> Array:
+        """`dpsi` over the square of the derivative of t = `transform`(r): Newton's share of Gauss and Newton's."""
+        return jnp.ones_like(t)
 
 
 class Squared(AbstractLoss):
@@ -108,6 +119,9 @@ class Huber(AbstractLoss):
         far = jnp.maximum(s, 1.0)
         return jnp.where(s <= 1, 1.0, 2 / jnp.sqrt(far) - 1 / far)
 
+    def curvature(self, t):
+        return jnp.where(jnp.abs(t) <= self.width.astype(t.dtype), 1.0, jnp.zeros_like(t))
+
 
 class SoftL1(AbstractLoss):
     """rho(s) = 2 (sqrt(1 + s) - 1), a smooth Huber. Width 1.287: 95 % efficient on normal noise."""
@@ -116,6 +130,10 @@ class SoftL1(AbstractLoss):
 
     def ratio(self, s):
         return 2 / (jnp.sqrt(1 + s) + 1)
+
+    def curvature(self, t):
+        root = 1 + (t / self.width.astype(t.dtype)) ** 2 / 2  # sqrt(1 + s)
+        return 2 / (root * (root + 1))
 
 
 class Cauchy(AbstractLoss):
@@ -127,6 +145,12 @@ class Cauchy(AbstractLoss):
         small = s < 1e-4
         safe = jnp.where(small, 1.0, s)
         return jnp.where(small, 1 - s / 2 + s**2 / 3, jnp.log1p(safe) / safe)
+
+    def curvature(self, t):
+        u = (t / self.width.astype(t.dtype)) ** 2  # log(1 + s)
+        small = u < 1e-4
+        safe = jnp.where(small, 1.0, u)
+        return jnp.where(small, 1 - 1.5 * u, (1 - jnp.expm1(safe)) * safe / jnp.expm1(safe))
 
 
 class Samples(eqx.Module):
@@ -219,10 +243,10 @@ def predict_pads(fitted: FittedCurve, pressures: Float[Array, "pads n"], toleran
     return eqx.filter_vmap(lambda f, p: f.predict(p, tolerance))(fitted, pressures)
 
 
-def default_solver(dtype) -> je.LevenbergMarquardt:
+def default_solver(dtype) -> BoundedNewton:
     """The solver with tolerances that `dtype` can reach."""
     tol = 1e-9 if dtype == jnp.float64 else 1e-4
-    return je.LevenbergMarquardt(tol, tol)
+    return BoundedNewton(tol, tol)
 
 
 def _residuals(free, curve: AbstractCurve, samples: Samples, scale: Scale, spread):
@@ -240,20 +264,36 @@ def _spread(free, curve, samples: Samples, scale: Scale):
     return jnp.where(mad > floor, mad, floor)
 
 
+_NEAR = 1e-4  # relative precision that is enough for all rounds but the last, which only serve to find the scale
+_VANISHED = 6e-6  # of its start: where a slope or an exponent is next to nothing, and goes no further
+
+
 def _solve(curve, samples, scale, start, loss, solver, max_steps, rounds):
-    """Free parameters, residual scale and step-limit flag after `rounds` of fit and new scale."""
+    """Free parameters, residual scale, step-limit flag, and which vanished, after `rounds` of fit and new scale.
 
-    def objective(free, spread):
-        return loss.transform(_residuals(free, curve, samples, scale, spread))
+    Derivatives by the implicit function theorem know no bounds: where a slope vanished they are those without.
+    """
+    positive = curve.positive
+    first = jnp.where(positive, 1.0, start)
+    options = {"lower": jnp.where(positive, _VANISHED, -jnp.inf).astype(start.dtype), "curvature": loss.curvature}
+    slack = jnp.ones(rounds, start.dtype).at[:-1].set(max(_NEAR / solver.rtol, 1.0))
 
-    def one_round(free, _):
-        spread = _spread(free, curve, samples, scale)
-        solution: optx.Solution = optx.least_squares(objective, solver, free, spread, max_steps=max_steps, throw=False)
+    def free_of(multiple):
+        return jnp.where(positive, start + jnp.log(jnp.maximum(multiple, _VANISHED)), multiple)
+
+    def objective(multiple, spread):
+        return loss.transform(_residuals(free_of(multiple), curve, samples, scale, spread))
+
+    def one_round(multiple, slack):
+        spread = _spread(free_of(multiple), curve, samples, scale)
+        solution: optx.Solution = optx.least_squares(
+            objective, solver, multiple, spread, options | {"slack": slack}, max_steps=max_steps, throw=False
+        )
         ended = solution.result == optx.RESULTS.successful
         return solution.value, (spread, ended)
 
-    free, (spread, ended) = jax.lax.scan(one_round, start, None, length=rounds)
-    return free, spread[-1], ended[-1]
+    multiple, (spread, ended) = jax.lax.scan(one_round, first, slack)
+    return free_of(multiple), spread[-1], ended[-1], positive & (multiple < 2 * _VANISHED)
 
 
 def _iid_covariance(left, psi, dpsi, valid):
@@ -300,10 +340,14 @@ def _thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[A
     return q @ left, singular, right
 
 
-def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_groups):
-    """Covariance of the parameters in their units, rank of the Jacobian, and whether presses suffice."""
+def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_groups, unit):
+    """Covariance of the parameters in their units, rank of the Jacobian, whether presses suffice, and what was missed.
+
+    The Jacobian is that of slopes themselves, not of their logarithms, in `unit`s: one on its bound is not degenerate.
+    What was missed is the share of the influence of the residuals that lies along the Jacobian: nothing at a minimum.
+    """
     r = _residuals(free, curve, samples, scale, spread)
-    jacobian = jax.jacfwd(_residuals)(free, curve, samples, scale, spread)
+    jacobian = jax.jacfwd(_residuals)(free, curve, samples, scale, spread) * unit
     left, singular, right = _thin_svd(jacobian)
     tiny = singular[0] * max(jacobian.shape) * jnp.finfo(r.dtype).eps
     rank = jnp.sum(singular > tiny)
@@ -314,8 +358,9 @@ def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_gro
     else:
         inner, enough = _iid_covariance(left, psi, dpsi, samples.valid), jnp.array(True)
     back = right.T / singular
-    units = jax.jacfwd(curve.bound)(free, scale) @ back
-    return units @ inner @ units.T, rank, enough
+    units = jax.jacfwd(curve.bound)(free, scale) * unit @ back
+    missed = jnp.sum((psi @ left) ** 2) / jnp.sum(psi**2)
+    return units @ inner @ units.T, rank, enough, missed
 
 
 def _groups_used(samples: Samples, n_groups: int):
@@ -338,7 +383,7 @@ def _pressure_range(samples: Samples):
     return jnp.stack([low, high])
 
 
-_VANISHED = 7.0  # e-folds below its start, at which a slope or an exponent has run to its bound of zero
+_CONTRADICTED = 0.25  # of what is left is a slope below zero: from there on a curve that must rise is the wrong one
 
 
 def _judge(finite, enough, ended, rises, determined, inside):
@@ -347,7 +392,7 @@ def _judge(finite, enough, ended, rises, determined, inside):
         (finite, FitResult.NOT_FINITE),
         (enough, FitResult.TOO_FEW),
         (rises, FitResult.NO_RESPONSE),
-        (inside | (ended & determined), FitResult.AT_BOUND),
+        (inside, FitResult.AT_BOUND),
         (ended, FitResult.MAX_STEPS),
         (determined, FitResult.SINGULAR),
     ]
@@ -384,8 +429,9 @@ def fit_samples(
     curve = curve.at(scale)
     start = curve.free(curve.initial(used.pressure, used.force, valid, scale), scale)
     seen = eqx.tree_at(lambda s: s.pressure, used, curve.seen(used.pressure))
-    free, spread, ended = _solve(curve, seen, scale, start, loss, solver, max_steps, rounds)
-    covariance, rank, decided = _covariance(free, curve, seen, scale, spread, loss, n_groups)
+    free, spread, ended, vanished = _solve(curve, seen, scale, start, loss, solver, max_steps, rounds)
+    unit = jnp.where(curve.positive, jnp.exp(start - free), 1.0)
+    covariance, rank, decided, missed = _covariance(free, curve, seen, scale, spread, loss, n_groups, unit)
 
     n, k = jnp.sum(valid), free.size
     params = curve.bound(free, scale)
@@ -399,7 +445,7 @@ def fit_samples(
         ended=ended,
         rises=rise > 1e-3 * scale.force,
         determined=(rank == k) & decided,
-        inside=jnp.all(free > start - _VANISHED),
+        inside=~jnp.any(vanished) | (missed < _CONTRADICTED),
     )
     unusable = (result == FitResult.NOT_FINITE) | (result == FitResult.TOO_FEW)
     failed = result != FitResult.SUCCESS

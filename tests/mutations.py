@@ -47,7 +47,7 @@ def of(file: str, tests: str, *changes: tuple[str, ...]) -> list[Mutant]:
 
 SOLVING = "test_solvers test_hard_contacts test_hard_forward"
 IMAGING = "test_hard_inverse test_inverse test_whitening test_methods test_hyperparameter"
-FITTING = "test_hard_fits test_fit test_curves"
+FITTING = "test_hard_fits test_fit test_curves test_solver"
 GRADIENTS = "test_hard_gradients"
 
 MUTANTS = [
@@ -401,13 +401,23 @@ MUTANTS = [
         ("rises=rise > 1e-3 * scale.force", "rises=True", "hopeless_samples_are"),
         ("determined=(rank == k) & decided", "determined=rank == k", "a_slope_from"),
         ("determined=(rank == k) & decided", "determined=decided", "a_curve_that_runs"),
-        ("inside=jnp.all(free > start - _VANISHED)", "inside=True", "a_curve_that_runs"),
+        ("inside=~jnp.any(vanished) | (missed < _CONTRADICTED)", "inside=True", "a_curve_that_runs"),
+        ("inside=~jnp.any(vanished) | (missed < _CONTRADICTED)", "inside=~jnp.any(vanished)", "a_slope_that_the"),
+        ("jnp.minimum((r / w) ** 2, 0.1 * jnp.finfo(r.dtype).max)", "(r / w) ** 2", "what_is_further"),
         ("parameters=jnp.where(unusable, jnp.nan, params)", "parameters=params", "hopeless_samples_each"),
         ("covariance=jnp.where(failed, jnp.nan, covariance)", "covariance=covariance", "hopeless_samples_are"),
         ("pressure_range=jnp.where(n > 0, limits, jnp.nan)", "pressure_range=limits", "hopeless_samples_are"),
         ("if not bool(jnp.all(jnp.isfinite(s) & (s > 0))):", "if False:", "wrong_shapes_and"),
         ("jnp.where(wide.sigma > 0, wide.sigma, 1.0)", "wide.sigma", "samples_that_only"),
         ("if p.ndim != 2:", "if False:", "wrong_shapes_and"),
+    ),
+    *of(
+        "calib/solver.py",
+        "test_solver",
+        ("taken = square < state.square", "taken = jnp.isfinite(square)", "a_step_that_leads"),
+        ("free = (y > lower) | (downhill > 0)", "free = y > lower", "one_that_starts"),
+        ("trial = jnp.maximum(y + part + rest, lower)", "trial = y + part + rest", "parameters_pushed"),
+        ("& (damping <= 1) & jnp.isfinite(square)", "", "what_is_not_finite"),
     ),
     *of(
         "calib/curves.py",

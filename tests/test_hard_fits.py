@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 import calib
 from calib.corrections import CorrectionError, LowPass, sample_rate
@@ -198,6 +199,24 @@ def test_a_curve_that_runs_to_its_bound_says_so():
     assert "fewer parameters" in fits.pad(0).message()
     assert "more load levels" in fits.pad(2).message()
     assert np.isfinite(fits.parameters).all()
+
+
+@pytest.mark.parametrize("dtype", ["f8", pytest.param("f4", marks=pytest.mark.slow)])
+def test_a_slope_that_the_samples_want_just_below_zero_is_fitted_as_next_to_nothing(dtype):
+    """As taxels of an insole do at small loads: the rest is as if that slope were zero."""
+    pressure, _ = line()
+    z = pressure / 4000
+    force = 12 * (z**2 - 0.02 * z) + np.random.default_rng(1).normal(0, NOISE, N)
+    fits = fitted(MonotonePolynomial(4000.0), [(pressure, force)], dtype, loss=Squared())
+    one = fits.pad(0)
+    assert one.result == FitResult.SUCCESS
+    bernstein = np.stack([3 * z * (1 - z) ** 2, 3 * z**2 * (1 - z), z**3], 1) @ np.tri(3)
+    best, wanted = nnls(bernstein, force)[0], np.linalg.lstsq(bernstein, force, rcond=None)[0]
+    assert wanted[0] < 0 == best[0]
+    np.testing.assert_allclose(one.parameters, best, atol=1e-4)
+    assert np.isfinite(one.covariance).all()
+    assert abs(wanted[0]) < 6 * one.standard_errors[0] < 1
+    assert one.predict(np.array([100.0, 3000.0])).valid.all()
 
 
 @pytest.mark.slow

@@ -23,8 +23,8 @@ ORDER = [
     "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
 BENCH = [
-    "session", "units", "choice", "corrections", "presses", "curves", "fit", "response", "smooth", "taxels", "location",
-    "locators", "hybrid", "splits", "online", "measured", "loops", "evaluation", "calibration", "maps",
+    "session", "units", "choice", "corrections", "presses", "curves", "solver", "fit", "response", "smooth", "taxels",
+    "location", "locators", "hybrid", "splits", "online", "measured", "loops", "evaluation", "calibration", "maps",
     "acquisition", "bench", "check", "importers", "logs", "figures", "ladder_figure", "report", "runtime", "workers",
     "batch", "cluster", "cli",
 ]  # fmt: skip
