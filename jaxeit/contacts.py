@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .basis import Elements
-from .descent import STEPS, Fit, descend, ridge, scale_of
+from .descent import STEPS, TRIAL, Fit, begun, descend, resume, ridge, scale_of
 from .discretise import Model
 from .gaps import gap_of
 from .inverse import require_frames
@@ -30,8 +30,11 @@ from .whitening import InverseError, Whitened, Whitening, whitened_readings
 _LONGEST = 0.04  # half length of an oblong contact, m
 _RIPPLE = 0.1  # of the strongest contact's strength: what is less is none
 _APART = 0.05  # of an atom's square that another does not explain: less are no pair to start from
-_FIRST = 4  # steps from each start; the best goes on first
+_AHEAD = 16  # falls as its last step promised, without which a further start is given up
+_FEW = 64  # atoms that explain most alone: one of them is in the pair that explains most
 _TRIALS = 512  # noise frames that set the threshold
+
+Number = float | Array
 
 
 class ContactResult(IntEnum):
@@ -240,18 +243,17 @@ class ContactFinder(eqx.Module):
     def _none(self, y) -> Fit:
         m, zero = 4 * self.most, jnp.zeros((), y.dtype)
         flat = jnp.zeros(m, y.dtype)
-        return Fit(flat, y @ y, jnp.zeros((m, m), y.dtype), flat, zero, jnp.asarray(False))
+        return Fit(flat, y @ y, jnp.zeros((m, m), y.dtype), flat, zero, zero, jnp.asarray(0), jnp.asarray(False))
 
     def _another(self, y, n: int):
         """The fit of n contacts, from that of n - 1."""
 
         def fitted(fit: Fit) -> Fit:
             theta = _round(fit.flat)[: n - 1]
-            best = self.added(y, theta)
             if n == 1:
-                return _padded(self.fit(y, best), self.most)
-            starts = jnp.stack([best, self._split(y, theta)])
-            tried = jax.vmap(lambda start: self.fit(y, start, steps=_FIRST))(starts)
+                return _padded(self.fit(y, self.added(y, theta)), self.most)
+            starts = jnp.stack([self.added(y, theta), self._split(y, theta)])
+            tried = jax.vmap(lambda start: self.fit(y, start, steps=TRIAL))(starts)
             # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
             hope = fit.square / (1 + (0.5 * (n - 1) * self.ratio) ** 2)
             return _padded(self._finished(y, tried, hope, n), self.most)
@@ -259,31 +261,33 @@ class ContactFinder(eqx.Module):
         return fitted
 
     def _finished(self, y, tried: Fit, hope, n: int) -> Fit:
-        """The best of some fits begun, finished, or the first of the others that leaves no more than noise and model
+        """The better of two fits begun, finished, or the first further one that leaves no more than noise and model
         error may: where none does, something else is wrong, and it is not for more contacts to explain.
 
-        For two contacts the last is that from the best pair of atoms. Noise leaves a chi-square, and seldom four of its
-        standard deviations more than its mean.
+        That is the other, and for two contacts the one from the best pair of atoms. Noise leaves a chi-square, and
+        seldom four of its standard deviations more than its mean.
         """
-        order = jnp.argsort(tried.square)
+        better = jnp.argmin(tried.square)
         allowed = len(y) + 4 * np.sqrt(2 * len(y)) + self.model_error**2 * (y @ y)
-        most = len(order) + (n == 2)
+        most = 2 + (n == 2)
 
         def going(state):
-            k, best = state
-            return (k == 0) | (k < most) & (best.square > allowed)
+            k, fit = state
+            return (k == 0) | (k < most) & (fit.square > allowed)
 
         def again(state):
-            k, best = state
-            start = _round(tried.flat[order[jnp.minimum(k, len(order) - 1)]])
+            k, before = state
+            fit = jax.tree.map(lambda leaf: leaf[(better + k) % 2], tried)
             if n == 2:
-                start = jax.lax.cond(k < len(order), lambda: start, lambda: self._pair(y))
-            fit = self.fit(y, start, hope)
-            better = (k == 0) | (fit.square <= allowed)
-            return k + 1, jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, best)
+                fit = jax.lax.cond(k < 2, lambda: fit, lambda: self._begun(y, self._pair(y)))
+            first = k == 0
+            aim, steps = jnp.where(first, hope, allowed), jnp.where(first, STEPS, STEPS + TRIAL)
+            fit = self._resumed(y, fit, aim, steps, jnp.where(first, 0, _AHEAD))
+            taken = first | (fit.square <= allowed)
+            return k + 1, jax.tree.map(lambda new, old: jnp.where(taken, new, old), fit, before)
 
-        begun = jax.tree.map(lambda leaf: leaf[order[0]], tried)
-        return jax.lax.while_loop(going, again, (0, begun._replace(square=jnp.full_like(begun.square, jnp.inf))))[1]
+        begin = jax.tree.map(lambda leaf: leaf[0], tried)
+        return jax.lax.while_loop(going, again, (0, begin))[1]
 
     def added(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
         """One contact more: the atom that explains most of what is left."""
@@ -301,14 +305,19 @@ class ContactFinder(eqx.Module):
         Two of one strength may look most like one between them, from which neither is found.
         """
         gain = self.atoms @ self._seen(y)
-        rest = 1 - self.alike**2
-        apart = rest > _APART
-        strength = (gain[:, None] - self.alike * gain) / jnp.where(apart, rest, 1)  # of the first of each pair
-        fine = apart & (strength > 0) & (strength.T > 0)
-        best = jnp.argmax(jnp.where(fine, strength * gain[:, None] + strength.T * gain, 0))
-        pair = jnp.stack(jnp.divmod(best, len(gain)))
-        strengths = jnp.maximum(strength[pair, pair[::-1]], 0) / self.norms[pair]
-        return jnp.concatenate([self.starts[pair], strengths[:, None]], 1)
+
+        def explained(alike, one):
+            """By an atom of gain ``one`` together with each of all, where both have a strength above zero."""
+            first, second, rest = one - alike * gain, gain - alike * one, 1 - alike**2
+            fine = (rest > _APART) & (first > 0) & (second > 0)
+            return jnp.where(fine, one * first + gain * second, 0) / jnp.maximum(rest, _APART)
+
+        few = jax.lax.top_k(gain, min(_FEW, len(gain)))[1]
+        j = jnp.argmax(jnp.max(jax.vmap(explained)(self.alike[few], gain[few]), 0))
+        pair = jnp.stack([jnp.argmax(explained(self.alike[j], gain[j])), j])
+        alike = self.alike[pair[0], j]
+        strength = (gain[pair] - alike * gain[pair[::-1]]) / jnp.maximum(1 - alike**2, _APART) / self.norms[pair]
+        return jnp.concatenate([self.starts[pair], jnp.maximum(strength, 0)[:, None]], 1)
 
     def _split(self, y, theta):
         """One contact more: the strongest in two, along the best of four directions."""
@@ -326,10 +335,16 @@ class ContactFinder(eqx.Module):
         squares = jax.vmap(lambda t: jnp.sum((y - self.response(t)[0]) ** 2))(tried)
         return tried[jnp.argmin(squares)]
 
-    def fit(self, y: Float[Array, " r"], theta: Float[Array, "n 4"], hope: float | Array = np.inf, steps=STEPS) -> Fit:
+    def fit(self, y: Float[Array, " r"], theta: Float[Array, "n 4"], steps: int = STEPS) -> Fit:
         """The best n contacts near these."""
-        low, high = (jnp.tile(bound, len(theta)) for bound in (self.low, self.high))
-        return descend(self._linear(_round), y, theta.ravel(), low, high, hope, steps)
+        return self._resumed(y, self._begun(y, theta), steps=steps)
+
+    def _begun(self, y, theta) -> Fit:
+        return begun(self._linear(_round), y, theta.ravel())
+
+    def _resumed(self, y, fit: Fit, hope: Number = np.inf, steps: Number = STEPS, ahead: Number = 0) -> Fit:
+        low, high = (jnp.tile(bound, len(fit.flat) // 4) for bound in (self.low, self.high))
+        return resume(self._linear(_round), y, fit, low, high, hope, steps, ahead)
 
     def oblong(self, y: Float[Array, " r"], pair: Float[Array, "2 4"]) -> Fit:
         """The best oblong contact in the place of two."""

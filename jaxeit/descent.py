@@ -5,11 +5,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 _ENOUGH = 1e-3  # fall of the square, in units of the noise, that is not worth another step
 STEPS = 20  # at most
-_TRIAL = 4  # steps after which a descent must have shown that it leads somewhere
+TRIAL = 4  # steps after which a descent must have shown that it leads somewhere
 
 
 class Fit(NamedTuple):
@@ -22,6 +22,8 @@ class Fit(NamedTuple):
     | normal: J^T J                                  | (m, m) |
     | downhill: J^T times what is left               | (m,)   |
     | damping                                        | ()     |
+    | promised: the fall expected of the last step   | ()     |
+    | steps taken                                    | ()     |
     | done: the last step promised next to nothing   | ()     |
     """
 
@@ -30,6 +32,8 @@ class Fit(NamedTuple):
     normal: Float[Array, "m m"]
     downhill: Float[Array, " m"]
     damping: Float[Array, ""]
+    promised: Float[Array, ""]
+    steps: Int[Array, ""]
     done: Bool[Array, ""]
 
 
@@ -51,22 +55,33 @@ def descend(linear, y, flat, low, high, hope=jnp.inf, steps=STEPS) -> Fit:
         hope: given up when the square is still above this after a few steps.
         steps: at most.
     """
+    return resume(linear, y, begun(linear, y, flat), low, high, hope, steps)
 
-    def going(state):
-        step, fit = state
-        return (step < steps) & ~fit.done & ((step < _TRIAL) | (fit.square < hope))
 
-    def again(state):
-        step, fit = state
-        return step + 1, _better(linear, y, fit, low, high)
+def resume(linear, y, fit: Fit, low, high, hope=jnp.inf, steps=STEPS, ahead=0.0) -> Fit:
+    """A descent from where it was left; else as `descend`.
 
-    return jax.lax.while_loop(going, again, (0, _at(linear, y, flat, jnp.asarray(1e-2, y.dtype))))[1]
+    Args:
+        ahead: falls as the last step promised that may still bring the square below ``hope``.
+    """
+
+    def going(fit):
+        hoped = (fit.steps < TRIAL) | (fit.square - ahead * fit.promised < hope)
+        return (fit.steps < steps) & ~fit.done & hoped
+
+    return jax.lax.while_loop(going, lambda fit: _better(linear, y, fit, low, high), fit)
+
+
+def begun(linear, y, flat) -> Fit:
+    """A descent without a step."""
+    return _at(linear, y, flat, jnp.asarray(1e-2, y.dtype))
 
 
 def _at(linear, y, flat, damping) -> Fit:
     value, j = linear(flat)
     left = y - value
-    return Fit(flat, left @ left, j.T @ j, j.T @ left, damping, jnp.asarray(False))
+    none = jnp.zeros((), y.dtype)
+    return Fit(flat, left @ left, j.T @ j, j.T @ left, damping, none, jnp.asarray(0), jnp.asarray(False))
 
 
 def _better(linear, y, fit: Fit, low, high) -> Fit:
@@ -75,7 +90,8 @@ def _better(linear, y, fit: Fit, low, high) -> Fit:
     trial = _at(linear, y, jnp.clip(fit.flat + step, low, high), 0.2 * fit.damping)
     taken = trial.square < fit.square
     best = jax.tree.map(lambda a, b: jnp.where(taken, a, b), trial, fit._replace(damping=5 * fit.damping))
-    return best._replace(done=fit.done | (expected < _ENOUGH + 1e-4 * fit.square))
+    done = fit.done | (expected < _ENOUGH + 1e-4 * fit.square)
+    return best._replace(promised=expected, steps=fit.steps + 1, done=done)
 
 
 def _damped(normal, downhill, free, damping):

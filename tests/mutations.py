@@ -253,7 +253,7 @@ MUTANTS = [
             "free = jnp.ones_like(fit.flat, bool)",
             "a_number_pushed",
         ),
-        ("((step < _TRIAL) | (fit.square < hope))", "True", "a_descent_that"),
+        ("(fit.steps < TRIAL) | (fit.square - ahead * fit.promised < hope)", "True", "a_descent_that"),
     ),
     *of(
         "jaxeit/nonlinear.py",
@@ -276,7 +276,7 @@ MUTANTS = [
     *of(
         "jaxeit/contacts.py",
         "test_contacts",
-        ("(k < most) & (best.square > allowed)", "False", "one_start_ends_badly"),
+        ("(k < most) & (fit.square > allowed)", "False", "one_start_ends_badly"),
     ),
     *of(
         "jaxeit/hyperparameter.py",

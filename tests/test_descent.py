@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.descent import _TRIAL, _damped, descend, scale_of
+from jaxeit.descent import TRIAL, _damped, descend, scale_of
 
 ALIKE = jnp.array([[1.0, 0.9], [0.0, 0.5], [0.3, 0.3]])
 WIDE = jnp.full(2, 1e6)
@@ -56,7 +56,7 @@ def test_a_descent_that_leads_nowhere_is_given_up():
 
     start = jnp.array([-1.2, 1.0])
     whole, few, hopeless = (
-        descended(banana, jnp.zeros(2), start, **how) for how in ({}, {"steps": _TRIAL}, {"hope": jnp.zeros(())})
+        descended(banana, jnp.zeros(2), start, **how) for how in ({}, {"steps": TRIAL}, {"hope": jnp.zeros(())})
     )
     np.testing.assert_array_equal(hopeless.flat, few.flat)
     assert whole.square < 0.2 * few.square
