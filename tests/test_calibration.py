@@ -277,21 +277,26 @@ def test_100_kills_leave_the_old_result_or_a_complete_new_one(calibration, tmp_p
         replace(calibration, notes=(mark,)).save(ready[-1])
         version = calib.load_calibration(ready[-1])
         drawn[version.notes] = draw(version, {})
-        start = time.monotonic()
         write_all(version, tmp_path / mark)
-        cycle = 2 * (time.monotonic() - start)
         for path in (tmp_path / mark).iterdir():
             known.setdefault(path.name, []).append(path.read_bytes())
-    out, rng, halves = tmp_path / "out", np.random.default_rng(0), 0
+    out, rng, halves, cycle = tmp_path / "out", np.random.default_rng(0), 0, 0.0
     out.mkdir()
     context = multiprocessing.get_context("forkserver")  # a fork before JAX has threads: 100 starts in a minute
     context.set_forkserver_preload(["tests.kill_worker"])
-    for _ in range(KILLS):
+    for kill in range(KILLS + 1):
         begun = context.Event()
         worker = context.Process(target=write_for_ever, args=(ready, drawn, out, begun))
         worker.start()
         assert begun.wait(120)
-        time.sleep(rng.uniform(0, cycle))
+        if kill:
+            time.sleep(rng.uniform(0, 1.5 * cycle))
+        else:  # how long a fresh process takes to write them all
+            start = time.monotonic()
+            while not {*known} <= {p.name for p in out.iterdir()}:
+                assert time.monotonic() < start + 120
+                time.sleep(0.01)
+            cycle = time.monotonic() - start
         worker.kill()
         worker.join()
         for path in out.iterdir():
@@ -300,6 +305,8 @@ def test_100_kills_leave_the_old_result_or_a_complete_new_one(calibration, tmp_p
                 path.unlink()
             else:
                 assert path.read_bytes() in known[path.name], path.name
+                if not kill:
+                    path.unlink()
     assert sorted(p.name for p in out.iterdir()) == sorted(known)
     assert halves > 0  # some of the kills did come in the middle of a file
 
