@@ -109,7 +109,7 @@ def _require_followed(problem: Problem, triangles: np.ndarray) -> None:
         where = problem.fixed[missing[0]].mean(0)
         raise MeshError(
             f"triangulate: the mesh cannot follow the outline at {place(where)}; use a shorter "
-            "edge_length there, or move what is crowded apart"
+            "edge_length there or a smaller growth, or move what is crowded apart"
         )
 
 

@@ -60,7 +60,8 @@ def test_a_bound_function_is_that_of_what_is_left(model):
 def test_bound_arrays_keep_their_values_types_and_shapes():
     key = jax.random.key(3)
     large = np.arange(verbs._SMALL + 1)
-    given = {"floats": [np.arange(3.0), np.float64(7), np.zeros((0, 2))], "more": [jnp.float32(2), key, jax.random.split(key), large], "no": 5}
+    more = [jnp.float32(2), key, jax.random.split(key), large]
+    given = {"floats": [np.arange(3.0), np.float64(7), np.zeros((0, 2))], "more": more, "no": 5}
     given = jax.tree.map(lambda v: jnp.asarray(v) if isinstance(v, np.ndarray | np.generic) else v, given)
     given["whole"] = jnp.arange(6, dtype=jnp.uint32).reshape(2, 3), jnp.array([True, False]), jnp.arange(4, 6)
     found = je.bind(lambda given, extra: (eqx.filter(given, eqx.is_array), extra), given)(jnp.arange(2.0))
