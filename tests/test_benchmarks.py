@@ -204,14 +204,27 @@ def test_the_clock_of_a_tool_in_another_process_counts():
         def __call__(self, sigma):
             return sigma
 
-    assert common.interleaved({"a": Elsewhere()}, np.ones(3), 2, budget=1e3) == {"a": [123.0, 123.0]}
+    assert common.interleaved({"a": Elsewhere()}, np.ones(3), 2, budget=1e3)["a"] == ([123.0, 123.0], [123.0, 123.0])
+
+
+def test_a_quick_tool_has_two_calls_a_turn_of_which_the_second_counts():
+    calls = []
+
+    class Tool:
+        def __call__(self, sigma):
+            calls.append(sigma[0])
+            self.last_seconds = (0.04, 0.01, 0.06)[len(calls) % 3 - 1]
+
+    times = common.interleaved({"a": Tool()}, np.ones(3), 2, budget=1e3)["a"]
+    assert times == ([0.01, 0.06], [0.04, 0.06])
+    assert len(set(calls)) == 3  # no conductivity twice
 
 
 def test_a_slow_tool_stops_after_its_budget():
     ticks = common.interleaved({"quick": np.copy, "slow": np.copy}, np.ones(3), 4, budget=0.0)
-    assert {name: len(times) for name, times in ticks.items()} == {"quick": 0, "slow": 0}
+    assert {name: len(times.own) for name, times in ticks.items()} == {"quick": 0, "slow": 0}
     ticks = common.interleaved({"quick": np.copy}, np.ones(3), 4, budget=60.0)
-    assert common.spread(ticks["quick"])["repeats"] == 4
+    assert common.spread(ticks["quick"].own)["repeats"] == 4
 
 
 def test_results_keep_other_sections(tmp_path):
