@@ -1,12 +1,14 @@
 """The doctor: every line ok, or with its mend."""
 
 import warnings
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 
 from calib.acquisition import doctor
 from calib.acquisition.doctor import Line, examine
+from calib.acquisition.priority import PriorityError
 from calib.cli import main
 
 
@@ -52,6 +54,18 @@ def test_what_breaks_keeps_nothing_else_from_being_told(monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "BAD   device: RuntimeError: no such device" in out
     assert "  loopback: " in out
+
+
+def test_real_time_priority_is_allowed_or_the_way_to_it_told(monkeypatch):
+    def refuse():
+        raise PriorityError("add a line")
+
+    monkeypatch.setattr(doctor, "real_time", refuse)
+    line = found("real-time priority")
+    assert line.ok
+    assert "add a line" in line.render()
+    monkeypatch.setattr(doctor, "real_time", nullcontext)
+    assert found("real-time priority").mend == ""
 
 
 def test_ports_without_permission(monkeypatch):

@@ -20,6 +20,8 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
+from .priority import PriorityError, real_time
+
 _FREE = 2e9  # bytes; an hour of 928 readings at 100 Hz takes 1.4 GB
 _SLOW_SYNC = 0.1  # s
 _REQUIREMENT = re.compile(r"([A-Za-z0-9_.\-]+)\s*>=\s*([0-9.]+)")
@@ -104,6 +106,16 @@ def _threads() -> Iterator[Line]:
     yield Line("BLAS threads", "one" if pinned else "as many as processors", mend, note=True)
 
 
+def _priority() -> Iterator[Line]:
+    try:
+        with real_time():
+            pass
+    except PriorityError as error:
+        yield Line("real-time priority", "refused; only jaxeit live --realtime wants it", str(error), note=True)
+    else:
+        yield Line("real-time priority", "allowed, for jaxeit live --realtime")
+
+
 def _cache() -> Iterator[Line]:
     runtime = importlib.import_module("calib.runtime")
     with warnings.catch_warnings(record=True) as caught:
@@ -155,4 +167,4 @@ def _network() -> Iterator[Line]:
         yield Line("loopback", f"listens on {server.getsockname()[0]}")
 
 
-_CHECKS = (_python, _packages, _device, _threads, _cache, _disk, _ports, _network)
+_CHECKS = (_python, _packages, _device, _threads, _priority, _cache, _disk, _ports, _network)
