@@ -129,15 +129,15 @@ class Times(NamedTuple):
 
 
 def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budget: float) -> dict[str, Times]:
-    """All tools in turn, round after round; a slow one stops after ``budget`` seconds.
+    """All tools in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds.
 
     A call shorter than `QUICK` is made twice: in the first the processor fetches anew what the other tools have driven
     from its caches, which a program that calls one tool pays once.
     """
     times = {name: Times([], []) for name in tools}
     for turn in range(repeats):
-        for name, tool in tools.items():
-            own, after_others = times[name]
+        for name in np.random.default_rng(turn).permutation(list(tools)):  # no tool always after the same one
+            (own, after_others), tool = times[name], tools[name]
             if sum(own) < budget:
                 after_others.append(taken(tool, sigma * (1 + 1e-3 * turn))[0])
                 again = after_others[-1] < QUICK
