@@ -68,7 +68,7 @@ def seeded(seed: int, width: float, smoke: bool) -> Bench:
     """The scene with all its chance drawn anew."""
     bench = load_bench("paper_bench")
     effects = tuple(_reseeded(effect, seed, width) for effect in bench.scene.effects)
-    changes: dict[str, Any] = {"sites": bench.sites[::28]} if smoke else {}
+    changes: dict[str, Any] = {"sites": bench.sites[::13]} if smoke else {}
     scene = je.Scene(bench.scene.skin, effects)
     return dataclasses.replace(bench, scene=scene, eit_rate=EIT_RATE, pad_rate=20.0, seed=seed, **changes)
 

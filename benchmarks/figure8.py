@@ -40,8 +40,9 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     set_up()
     before, scene = c.circumstances(), load_bench("two_contacts")
+    scene = _coarse(scene) if args.smoke else scene
     with tempfile.TemporaryDirectory() as folder:
-        forces = _forces(_coarse(scene) if args.smoke else scene, Path(folder), args.smoke)
+        forces = _forces(scene, Path(folder), args.smoke)
     rows = [_figures(scene, forces, press) for press in range(len(scene.sites))]
     data = {"rows": rows, "summary": _summary(rows), "grid": SIDE, "circumstances": before}
     print(table(rows))
