@@ -196,7 +196,7 @@ def test_a_worker_is_set_up_as_its_parent():
 
 
 @pytest.mark.slow
-def test_200_sessions_killed_twice(made, bundled, tmp_path):
+def test_200_sessions_killed_twice(made, bundled, tmp_path, hard):
     """None is done twice, none is lost."""
     folder, out, log = tmp_path / "many", tmp_path / "out", tmp_path / "log"
     folder.mkdir()
@@ -215,6 +215,7 @@ def test_200_sessions_killed_twice(made, bundled, tmp_path):
     assert sorted(os.listdir(out)) == [f"s{i:03d}.h5" for i in range(200)]
     hashes = {calib.load_calibration(out / f"s{i:03d}.h5").provenance["batch"] for i in range(200)}
     assert len(hashes) == 1  # all sessions are copies
+    hard("fault 18: a batch of sessions killed", "200 sessions, twice", beyond="none is done twice, none lost")
 
 
 def _results(out):
