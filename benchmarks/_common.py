@@ -37,6 +37,12 @@ QUICK = 0.05  # s
 Tool = Callable[[np.ndarray], np.ndarray]
 
 
+def set_up() -> None:
+    """64-bit numbers, and memory that is used again, whatever the tool (in `peers.eidors` as well)."""
+    jax.config.update("jax_enable_x64", True)
+    je.reuse_memory()
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """The testbed sheet with 25 point electrodes on a regular mesh; SI units, P1, sheet resistance 1.
@@ -228,7 +234,7 @@ def run(
     parser.add_argument("--section", default=section, help="name of this run among the results")
     parser.add_argument("--peak", nargs=2, metavar=("TOOL", "CELLS"), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    set_up()
     if args.peak:
         print_peak(prepare[args.peak[0]], int(args.peak[1]))
         return {}

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -309,7 +308,7 @@ def main(argv: list[str] | None = None) -> Row:
     parser.add_argument("--smoke", action="store_true", help="a few small models, few repeats, nothing written")
     parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     if args.draw_only:
         draw(c.stored("accuracy")["rows"], PICTURE)
         return {}

@@ -98,7 +98,7 @@ class Work:
     """One tool and the data set; the clock is read here, and nothing but voltages travels."""
 
     def __init__(self, way: Way, cells: int) -> None:
-        jax.config.update("jax_enable_x64", True)
+        c.set_up()
         self.before = c.peak_megabytes()
         self.problem = problem = c.Problem(cells)
         peers = {peer.NAME: peer for peer in PEERS}

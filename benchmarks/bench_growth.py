@@ -204,7 +204,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="two sizes of three series, nothing written")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     data: dict[str, Any] = {"circumstances": c.circumstances(), "rows": [], "fits": []}
     every = series()
     for one in (every[0], every[6], every[8]) if args.smoke else every:

@@ -266,7 +266,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--only", default="", metavar="TEXT", help="measure anew methods whose name contains TEXT")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     seeds, grid, pairs = (1, 4, 4) if args.smoke else (args.seeds, 15, 24)
     model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
     simulated = [Simulated(seed, grid, pairs) for seed in range(seeds)]

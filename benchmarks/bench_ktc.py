@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -368,7 +367,7 @@ def main(argv: list[str] | None = None) -> Row:
     parser.add_argument("--data", type=Path, required=True, help="folder with training/ and groundtruth_training/")
     parser.add_argument("--smoke", action="store_true", help="one frame at two levels, nothing written")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     data = load(args.data)
     model = tank(data)
     water = fits(model, data)

@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -193,7 +192,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     own.add_argument("--smoke", action="store_true")
     own.add_argument("--accuracy-only", action="store_true", help="leave the pipeline of the last run as it is")
     args, rest = own.parse_known_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     section = c.stored("pipeline") if args.accuracy_only else _pipeline([*rest, *(["--smoke"] * args.smoke)])
     if "rows" not in section:  # a child that was asked for its peak memory, or for help
         return section

@@ -285,7 +285,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--smoke", action="store_true", help="few presses and readings, nothing written")
     parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     if args.draw_only:
         draw(c.stored("protocol_cost"), PICTURE)
         return {}

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 
 import jaxeit as je
@@ -57,7 +56,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--smoke", action="store_true", help="one skin, two coarse rungs, nothing written")
     parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     if args.draw_only:
         draw(c.stored("ladder")["ladders"], PICTURE)
         return {}

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -296,7 +295,7 @@ def main(argv: list[str] | None = None) -> Row:
     parser.add_argument("--smoke", action="store_true", help="two severities of each axis, nothing written")
     parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
     args = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    c.set_up()
     if args.draw_only:
         draw(c.stored("stability")["rows"], PICTURE)
         return {}

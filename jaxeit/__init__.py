@@ -118,7 +118,7 @@ from .solvers import ConjugateGradient, Dense, NestedDissection, Single
 from .store import NUMBERS, StoreError, from_numbers, load_reconstructor, save_reconstructor, to_numbers
 from .surface import AbstractSurface, Cylinder, Sphere
 from .toml import TomlError, TomlTable, parse_toml, read_text
-from .verbs import bind, compiler_options, verb
+from .verbs import bind, compiler_options, reuse_memory, verb
 from .whitening import InverseError, noise_covariance
 
 __version__ = metadata.version("jaxeit")
@@ -301,6 +301,7 @@ __all__ = [
     "read_text",
     "reciprocal_rows",
     "refine_contacts",
+    "reuse_memory",
     "rounding",
     "save_reconstructor",
     "scan_time",

@@ -58,6 +58,7 @@ HOST = {
     "read_text": _DESCRIBES,
     "reciprocal_rows": _DESCRIBES,
     "refine_contacts": _PREPARES,
+    "reuse_memory": _DESCRIBES,
     "rounding": "what it estimates has no direction",
     "save_reconstructor": _DESCRIBES,
     "scan_time": _DESCRIBES,

@@ -1,5 +1,8 @@
 """Verbs compile themselves at the top, and become part of whatever program calls them."""
 
+import subprocess
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -68,3 +71,28 @@ def test_bound_arrays_keep_their_values_types_and_shapes():
     wanted = eqx.filter(given, eqx.is_array), jnp.arange(2.0)
     assert jax.tree.structure(found) == jax.tree.structure(wanted)
     assert eqx.tree_equal(found, wanted, typematch=True)
+
+
+_FAULTS = """
+import resource, sys
+import jaxeit as je
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    bytearray(10**8)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+given_back = max(faults() for _ in range(4))
+can = je.reuse_memory()
+faults()
+print(can, given_back, max(faults() for _ in range(4)))
+"""
+
+
+def test_memory_is_used_again():
+    """Counted in pages that the system had to supply; in a process of its own, as it cannot be taken back."""
+    done = subprocess.run([sys.executable, "-c", _FAULTS], check=True, capture_output=True, text=True)
+    can, given_back, kept = done.stdout.split()
+    if can == "False":
+        pytest.skip("not with this C library")
+    assert int(given_back) > 20 * int(kept) + 100

@@ -19,6 +19,7 @@ from scipy.io import savemat
 
 NAME = "EIDORS"
 SCRIPT = Path(__file__).with_suffix(".m")
+REUSE_MEMORY = dict.fromkeys(("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), str(2**31 - 1))
 
 
 def missing() -> str | None:
@@ -43,7 +44,7 @@ class Eidors:
         savemat(self.folder / "work.mat", _work(problem, pixels) | {"verb": verb, "order": order} | extra)
         self.process: Any = subprocess.Popen(
             ["octave-cli", "--norc", "--quiet", SCRIPT, self.folder],
-            env=os.environ | {"EIDORS": str(Path(os.environ["EIDORS"]).resolve())},
+            env=os.environ | REUSE_MEMORY | {"EIDORS": str(Path(os.environ["EIDORS"]).resolve())},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
