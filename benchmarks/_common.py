@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from calib.acquisition.priority import PriorityError, real_time
+from calib.acquisition.priority import refusal
 from calib.session import replacing
 from jaxeit.solvers import NestedDissection
 
@@ -153,12 +153,10 @@ def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budg
 
 def may_run_in_real_time() -> bool:
     """Whether this user may have real-time priority; says if not."""
-    try:
-        with real_time():
-            return True
-    except PriorityError as error:
-        print(f"at ordinary priority, where others may come between: {error}")
-        return False
+    refused = refusal()
+    if refused:
+        print(f"at ordinary priority, where others may come between: {refused}")
+    return not refused
 
 
 def spread(times: list[float]) -> dict[str, float]:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib.acquisition import doctor
+from calib.acquisition import doctor, priority
 from calib.acquisition.doctor import Line, examine
 from calib.acquisition.priority import PriorityError
 from calib.cli import main
@@ -60,11 +60,11 @@ def test_real_time_priority_is_allowed_or_the_way_to_it_told(monkeypatch):
     def refuse():
         raise PriorityError("add a line")
 
-    monkeypatch.setattr(doctor, "real_time", refuse)
+    monkeypatch.setattr(priority, "real_time", refuse)
     line = found("real-time priority")
     assert line.ok
     assert "add a line" in line.render()
-    monkeypatch.setattr(doctor, "real_time", nullcontext)
+    monkeypatch.setattr(priority, "real_time", nullcontext)
     assert found("real-time priority").mend == ""
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-from .priority import PriorityError, real_time
+from .priority import refusal
 
 _FREE = 2e9  # bytes; an hour of 928 readings at 100 Hz takes 1.4 GB
 _SLOW_SYNC = 0.1  # s
@@ -107,13 +107,9 @@ def _threads() -> Iterator[Line]:
 
 
 def _priority() -> Iterator[Line]:
-    try:
-        with real_time():
-            pass
-    except PriorityError as error:
-        yield Line("real-time priority", "refused; only jaxeit live --realtime wants it", str(error), note=True)
-    else:
-        yield Line("real-time priority", "allowed, for jaxeit live --realtime")
+    refused = refusal()
+    found = "refused; only jaxeit live --realtime wants it" if refused else "allowed, for jaxeit live --realtime"
+    yield Line("real-time priority", found, refused or "", note=bool(refused))
 
 
 def _cache() -> Iterator[Line]:

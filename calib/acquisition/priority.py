@@ -30,6 +30,15 @@ def real_time(wanted: bool = True) -> Iterator[None]:
         _set(before)
 
 
+def refusal() -> str | None:
+    """Why `real_time` is not to be had here; None where it is."""
+    try:
+        with real_time():
+            return None
+    except PriorityError as error:
+        return str(error)
+
+
 Policy = tuple[int, "os.sched_param"]
 
 
