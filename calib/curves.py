@@ -95,6 +95,11 @@ class AbstractCurve(eqx.Module):
         """Which parameters are above zero, slopes and exponents, by their logarithms; not an offset, (parameters,)."""
         return np.array([name != "offset" for name in self.names])
 
+    @property
+    def bends(self) -> Float[np.ndarray, "m parameters"]:
+        """Combinations of the parameters, as multiples of their start, that are of order one at most; see `fit`."""
+        return np.zeros((0, self.size))
+
     def at(self, scale: Scale) -> "AbstractCurve":
         """The curve with whatever it left open (a reference pressure) taken from the samples."""
         del scale
@@ -368,16 +373,27 @@ class MonotonePolynomial(_Stretch):
         return jnp.broadcast_to(slope * self._top(slope.dtype) / 3, (3,))
 
 
+_BEND = 0.5  # of the typical slope: how far a slope is expected from the middle between its neighbours, twice over
+
+
 class MonotoneSpline(_PositiveSlopes, _Stretch):
     """A curve whose slope is straight between five knots from 0 to `top`, and positive at each: a quadratic I-spline.
 
     | parameter     | meaning                       | shape | unit | bound |
     |---------------|-------------------------------|-------|------|-------|
     | slope 0 .. 4  | at the knots, evenly spaced   | ()    | N/Pa | > 0   |
+
+    Where samples say little about a bend, it is fitted gently bent (P-spline; Eilers and Marx 1996, Statist. Sci. 11):
+    second differences of the slopes, over the slope at the start, are expected to be of size 0.5.
     """
 
     names: ClassVar[tuple[str, ...]] = tuple(f"slope {j}" for j in range(5))
     units: ClassVar[tuple[str, ...]] = ("N/Pa",) * 5
+
+    @property
+    def bends(self):
+        """Second differences of the slopes."""
+        return np.diff(np.eye(self.size), 2, axis=0) / _BEND
 
     def _unit(self, params, z):
         pieces = len(params) - 1
@@ -533,6 +549,12 @@ class HysteresisSpline(AbstractCurve):
     path: ClassVar[bool] = True
     names: ClassVar[tuple[str, ...]] = (*MonotoneSpline.names, *_RATIOS, "offset")
     units: ClassVar[tuple[str, ...]] = (*MonotoneSpline.units, *("1",) * len(_RATIOS), "N")
+
+    @property
+    def bends(self):
+        """Those of S."""
+        own = MonotoneSpline(self.top).bends
+        return np.pad(own, ((0, 0), (0, self.size - own.shape[1])))
 
     def at(self, scale):
         return HysteresisSpline(Play(self.widths).at(scale).widths, MonotoneSpline(self.top).at(scale).top)

@@ -12,6 +12,11 @@ samples want a slope at zero or just below, it ends on its bound, and the curve 
 with the standard errors of slopes that may be below zero. Where they want it far below - the bound explains a good part
 of what is left - the curve is the wrong one, and the result says AT_BOUND.
 
+A spline's bends are expected to be of a known size (`AbstractCurve.bends`), as one more residual each. Samples that
+err together, by presses or by stretches of time, as they do on the two branches of a loop, weigh as the few that they
+are then; else the spline would follow one branch here and the other there. Many samples that err each for itself leave
+the bends to the samples, and the covariance is that of the samples alone.
+
 Samples of one press are near-duplicates. Given `groups` (a press or location per sample), the covariance is the
 cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), so that it is honest for a dozen presses; the
 sample count then hardly matters, which is the point. Without groups it is Huber's (Robust Statistics, 1981, 7.6).
@@ -264,36 +269,67 @@ def _spread(free, curve, samples: Samples, scale: Scale):
     return jnp.where(mad > floor, mad, floor)
 
 
+_BLOCKS = 20  # of samples in a row, of which each errs for itself if the samples do
+
+
+def _design_effect(influence, samples: Samples, n_groups: int):
+    """By how much fewer independent samples would do (Kish 1965, Survey Sampling, 8.2): variance of sums, over groups
+    or else over blocks in the order of the samples, over that of sums of independent ones; one at least.
+    """
+    count = jnp.cumsum(samples.valid)
+    block = (count - 1) * _BLOCKS // count[-1]
+    sums = jax.ops.segment_sum(influence, samples.group if n_groups else block, n_groups or _BLOCKS)
+    total = jnp.sum(influence**2)
+    return jnp.maximum(jnp.sum(sums**2) / jnp.where(total > 0, total, 1), 1)
+
+
 _NEAR = 1e-4  # relative precision that is enough for all rounds but the last, which only serve to find the scale
 _VANISHED = 6e-6  # of its start: where a slope or an exponent is next to nothing, and goes no further
 
 
-def _solve(curve, samples, scale, start, loss, solver, max_steps, rounds):
-    """Free parameters, residual scale, step-limit flag, and which vanished, after `rounds` of fit and new scale.
+def _solve(curve, samples, scale, start, loss, solver, max_steps, rounds, n_groups):
+    """Free parameters, residual scale, weight of the bends, step-limit flag, and which vanished, after `rounds`.
 
     Derivatives by the implicit function theorem know no bounds: where a slope vanished they are those without.
     """
     positive = curve.positive
     first = jnp.where(positive, 1.0, start)
-    options = {"lower": jnp.where(positive, _VANISHED, -jnp.inf).astype(start.dtype), "curvature": loss.curvature}
+    bends, n = jnp.asarray(curve.bends, start.dtype), len(samples.force)
     slack = jnp.ones(rounds, start.dtype).at[:-1].set(max(_NEAR / solver.rtol, 1.0))
+    bent = jnp.ones(rounds, start.dtype).at[0].set(0)  # the first round's residuals tell only what the start lacks
+
+    def curvature(transformed):
+        return jnp.concatenate([loss.curvature(transformed[:n]), jnp.ones(len(bends), start.dtype)])
+
+    options = {"lower": jnp.where(positive, _VANISHED, -jnp.inf).astype(start.dtype), "curvature": curvature}
+
+    def above(multiple):
+        return jnp.maximum(multiple, _VANISHED)
 
     def free_of(multiple):
-        return jnp.where(positive, start + jnp.log(jnp.maximum(multiple, _VANISHED)), multiple)
+        return jnp.where(positive, start + jnp.log(above(multiple)), multiple)
 
-    def objective(multiple, spread):
-        return loss.transform(_residuals(free_of(multiple), curve, samples, scale, spread))
+    def objective(multiple, args):
+        spread, weight = args
+        residuals = loss.transform(_residuals(free_of(multiple), curve, samples, scale, spread))
+        return jnp.concatenate([residuals, weight * (bends @ above(multiple))])  # clipped alike: as steep at a bound
 
-    def one_round(multiple, slack):
+    def one_round(multiple, settings):
+        slack, bent = settings
         spread = _spread(free_of(multiple), curve, samples, scale)
+        weight = bent
+        if len(bends):
+            influence = loss.psi(_residuals(free_of(multiple), curve, samples, scale, spread))
+            weight = bent * jnp.sqrt(_design_effect(influence, samples, n_groups))
+        args = spread, weight
         solution: optx.Solution = optx.least_squares(
-            objective, solver, multiple, spread, options | {"slack": slack}, max_steps=max_steps, throw=False
+            objective, solver, multiple, args, options | {"slack": slack}, max_steps=max_steps, throw=False
         )
         ended = solution.result == optx.RESULTS.successful
-        return solution.value, (spread, ended)
+        return solution.value, (spread, weight, ended)
 
-    multiple, (spread, ended) = jax.lax.scan(one_round, first, slack)
-    return free_of(multiple), spread[-1], ended[-1], positive & (multiple < 2 * _VANISHED)
+    multiple, (spread, weight, ended) = jax.lax.scan(one_round, first, (slack, bent))
+    return free_of(multiple), spread[-1], weight[-1], ended[-1], positive & (multiple < 2 * _VANISHED)
 
 
 def _iid_covariance(left, psi, dpsi, valid):
@@ -340,12 +376,14 @@ def _thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[A
     return q @ left, singular, right
 
 
-def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_groups, unit):
+def _covariance(at_end, curve, samples: Samples, scale: Scale, loss, n_groups, unit):
     """Covariance of the parameters in their units, rank of the Jacobian, whether presses suffice, and what was missed.
 
     The Jacobian is that of slopes themselves, not of their logarithms, in `unit`s: one on its bound is not degenerate.
     What was missed is the share of the influence of the residuals that lies along the Jacobian: nothing at a minimum.
+    There is one but for what vanished; of that, what the samples and the expected bends both want below zero.
     """
+    free, spread, weight, vanished = at_end
     r = _residuals(free, curve, samples, scale, spread)
     jacobian = jax.jacfwd(_residuals)(free, curve, samples, scale, spread) * unit
     left, singular, right = _thin_svd(jacobian)
@@ -359,7 +397,11 @@ def _covariance(free, curve, samples: Samples, scale: Scale, spread, loss, n_gro
         inner, enough = _iid_covariance(left, psi, dpsi, samples.valid), jnp.array(True)
     back = right.T / singular
     units = jax.jacfwd(curve.bound)(free, scale) * unit @ back
-    missed = jnp.sum((psi @ left) ** 2) / jnp.sum(psi**2)
+    bends = weight * jnp.asarray(curve.bends, free.dtype)
+    push = psi @ jacobian
+    less = jnp.where(vanished, jnp.maximum(jnp.minimum(push, push + bends.T @ (bends @ (1 / unit))), 0), 0)
+    _, size, axes = _thin_svd(jnp.concatenate([jacobian, bends])) if len(bends) else (left, singular, right)
+    missed = jnp.sum(jnp.where(size > tiny, axes @ less / size, 0) ** 2) / jnp.sum(psi**2)
     return units @ inner @ units.T, rank, enough, missed
 
 
@@ -429,9 +471,10 @@ def fit_samples(
     curve = curve.at(scale)
     start = curve.free(curve.initial(used.pressure, used.force, valid, scale), scale)
     seen = eqx.tree_at(lambda s: s.pressure, used, curve.seen(used.pressure))
-    free, spread, ended, vanished = _solve(curve, seen, scale, start, loss, solver, max_steps, rounds)
+    free, spread, weight, ended, vanished = _solve(curve, seen, scale, start, loss, solver, max_steps, rounds, n_groups)
     unit = jnp.where(curve.positive, jnp.exp(start - free), 1.0)
-    covariance, rank, decided, missed = _covariance(free, curve, seen, scale, spread, loss, n_groups, unit)
+    at_end = free, spread, weight, vanished
+    covariance, rank, decided, missed = _covariance(at_end, curve, seen, scale, loss, n_groups, unit)
 
     n, k = jnp.sum(valid), free.size
     params = curve.bound(free, scale)

@@ -11,7 +11,7 @@ import pytest
 from scipy import linalg, optimize
 
 from calib.choice import Tried, simplest
-from calib.curves import Affine, Linear, PowerLaw
+from calib.curves import Affine, Linear, MonotoneSpline, PowerLaw
 from calib.fit import (
     Cauchy,
     FitError,
@@ -19,6 +19,7 @@ from calib.fit import (
     Huber,
     SoftL1,
     Squared,
+    _design_effect,
     default_solver,
     fit_curve,
     fit_curves,
@@ -136,6 +137,69 @@ def test_weights_are_those_of_weighted_least_squares():
     got = fit_curve(Affine(), pressure, force, sigma=sigma, loss=Squared())
     slope, offset = np.polyfit(pressure, force, 1, w=1 / sigma)
     np.testing.assert_allclose(got.parameters, [slope, offset], rtol=1e-8)
+
+
+SLOPES = np.array([4e-3, 2e-3, 3e-3, 6e-3, 8e-3])
+
+
+def on_a_loop(noise: float, width: float):
+    """Pressure up and down twice, and the force of a bent spline with noise, more on the way up than down."""
+    pressure = 2000 * (1 - np.cos(np.linspace(0, 4 * np.pi, N)))
+    side = width * np.sign(np.gradient(pressure)) + noise * np.random.default_rng(5).normal(size=N)
+    return pressure, np.asarray(MonotoneSpline(4000.0)(jnp.asarray(SLOPES), pressure)) + side
+
+
+@pytest.mark.parametrize("groups", [None, GROUPS], ids=["blocks", "presses"])
+def test_a_spline_is_as_bent_as_the_samples_that_err_for_themselves_can_tell(groups):
+    """The rounds written out, by normal equations: a bend counts against as many samples as err together."""
+    pressure, force = on_a_loop(0.1, 0.5)
+    fit = fit_curve(MonotoneSpline(4000.0), pressure, force, groups=groups, loss=Squared())
+    slope = np.median((force / np.maximum(pressure, 1))[pressure > 0.2 * np.quantile(pressure, 0.75)])
+    spline = jax.jacfwd(lambda p: MonotoneSpline(4000.0)(p, jnp.asarray(pressure)))
+    design = slope * np.asarray(spline(jnp.ones(5)))
+    bends = np.diff(np.eye(5), 2, axis=0) / 0.5
+    block = np.arange(N) // (N // 20) if groups is None else groups
+    multiple = np.linalg.lstsq(design, force, rcond=None)[0]
+    free = multiple
+    for _ in range(3):
+        left = force - design @ multiple
+        effect = np.sum(np.bincount(block, left) ** 2) / np.sum(left**2)
+        weight = effect * (1.4826 * np.median(np.abs(left))) ** 2
+        multiple = np.linalg.solve(design.T @ design + weight * bends.T @ bends, design.T @ force)
+    np.testing.assert_allclose(fit.parameters, slope * multiple, rtol=1e-6)
+    assert np.ptp(np.diff(multiple)) < 0.9 * np.ptp(np.diff(free))
+
+
+def test_where_each_sample_errs_for_itself_bends_are_left_to_the_samples():
+    pressure, force = on_a_loop(0.1, 0.0)
+    fit = fit_curve(MonotoneSpline(4000.0), pressure, force, loss=Squared())
+    design = np.asarray(jax.jacfwd(lambda p: MonotoneSpline(4000.0)(p, jnp.asarray(pressure)))(jnp.ones(5)))
+    plain = np.linalg.lstsq(design, force, rcond=None)[0]
+    assert (np.abs(fit.parameters - plain) < 0.1 * fit.standard_errors).all()
+    exact = fit_curve(MonotoneSpline(4000.0), *on_a_loop(0.0, 0.0))
+    np.testing.assert_allclose(exact.parameters, SLOPES, rtol=1e-6)
+
+
+def test_a_dead_zone_on_a_loop_is_no_contradiction():
+    """The bends that are expected there would have the first slope below zero; the samples would not."""
+    pressure, _ = on_a_loop(0.0, 0.0)
+    side, noise = np.sign(np.gradient(pressure)), np.random.default_rng(1).normal(0, 0.05, N)
+    force = [
+        5e-3 * np.maximum(pressure - toe, 0) + width * side + noise
+        for toe in (400, 800, 1200, 1600)
+        for width in (0.3, 1.0, 2.0, 3.0)
+    ]
+    fits = fit_curves(MonotoneSpline(), np.tile(pressure, (16, 1)), force)
+    assert (fits.result == FitResult.SUCCESS).all()
+    assert (fits.parameters[:, 0] < 1e-7).any()
+
+
+def test_samples_without_residuals_err_each_for_itself():
+    samples = jax.tree.map(lambda leaf: leaf[0], gather(np.ones((1, 40)), np.zeros((1, 40)))[0])
+    together = np.repeat([1.0, -1.0], 20)
+    assert _design_effect(jnp.zeros(40), samples, 0) == 1
+    assert _design_effect(jnp.asarray(together), samples, 0) == 2  # blocks of two
+    assert _design_effect(jnp.asarray(np.tile([1.0, -1.0], 20)), samples, 0) == 1
 
 
 @pytest.mark.slow

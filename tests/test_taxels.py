@@ -65,6 +65,6 @@ def test_an_insole_in_a_chamber_is_fitted_but_for_a_taxel_or_two():
     assert len(laws) == 4
     assert all(law["failed"] <= 3 for law in laws)
     by = {law["law"]: law for law in laws}
-    for name in ("polynomial", "hysteresis", "hysteresis-spline"):
+    for name in ("polynomial", "spline", "hysteresis", "hysteresis-spline"):
         assert by[name]["predicted"] < cubic["predicted"]
     assert by["hysteresis-spline"]["better_than_cubic"] > 0.7
