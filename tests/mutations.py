@@ -405,7 +405,11 @@ MUTANTS = [
         ("inside=~jnp.any(vanished) | (missed < _CONTRADICTED)", "inside=~jnp.any(vanished)", "a_slope_that_the"),
         ("jnp.where(total > 0, total, 1)", "total", "samples_without_residuals"),
         ("bends @ above(multiple)", "bends @ multiple", "a_dead_zone"),
-        ("jnp.maximum(jnp.minimum(push, push + bends.T @ (bends @ (1 / unit))), 0)", "push", "a_dead_zone"),
+        (
+            "jnp.minimum(push, push + bends.T @ (bends @ (1 / unit)))",
+            "(push + bends.T @ (bends @ (1 / unit)))",
+            "a_dead_zone",
+        ),
         ("jnp.minimum((r / w) ** 2, 0.1 * jnp.finfo(r.dtype).max)", "(r / w) ** 2", "what_is_further"),
         ("parameters=jnp.where(unusable, jnp.nan, params)", "parameters=params", "hopeless_samples_each"),
         ("covariance=jnp.where(failed, jnp.nan, covariance)", "covariance=covariance", "hopeless_samples_are"),
