@@ -7,6 +7,7 @@ from functools import partial
 import jaxeit as je
 
 from . import bench_paper, bench_protocol
+from .repeat import compared
 
 SHOWN = {
     ("forward", "jaxeit float64"): "forward, jaxeit",
@@ -70,6 +71,23 @@ def _speed(forward: dict, jacobian: dict) -> str:
         if found:
             rows.append([label, *(_figures(found[n]) if n in found else "" for n in nodes)])
     return _markdown(["ms, median", *(f"{n:,} nodes" for n in nodes)], rows)
+
+
+def _repeat(*runs: dict) -> str:
+    """Whether the ratios between the times of `_speed` came out alike in two runs; in words."""
+    kinds = ("forward", "jacobian")
+    found = [
+        one
+        for kind, first, second in zip(kinds, runs[:2], runs[2:], strict=True)
+        for one in compared(first["rows"], second["rows"])
+        if (kind, one.what.rpartition(", ")[0]) in SHOWN
+    ]
+    change = max(abs(one.second.value / one.first.value - 1) for one in found)
+    agree = sum(one.agrees for one in found)
+    return (
+        f"Measured a second time, {agree} of the {len(found)} ratios of these times to jaxeit's lie within the spread "
+        f"of the other run; the largest change is {100 * change:.0f} %.\n"
+    )
 
 
 def _images(results: dict) -> str:
@@ -251,6 +269,7 @@ def _figures(ms: float) -> str:
 
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "speed": (("forward", "jacobian"), _speed),
+    "repeat": (("forward", "jacobian", "forward-again", "jacobian-again"), _repeat),
     "images": (("images",), _images),
     "scenes": (("scene",), _scenes),
     "paper": (("paper",), _paper),

@@ -132,6 +132,22 @@ def test_ratios_that_moved_more_than_the_spread_are_named():
     )
 
 
+def test_the_page_says_how_far_the_ratios_it_quotes_moved():
+    """Those of the table only: of the Jacobians not the ones onto elements, of the forward solves all the peers'."""
+    onto = [f"{tool}, {image}" for tool in ("jaxeit float64", "EIDORS") for image in ("pixels", "elements")]
+    jacobian, again = (
+        [
+            {"tool": tool, "nodes": 961, "median_ms": ms, "min_ms": 0.9 * ms, "max_ms": 1.1 * ms}
+            for tool, ms in zip(onto, times, strict=True)
+        ]
+        for times in ((1, 1, 9, 9), (1, 1, 10, 90))
+    )
+    runs = [{"rows": rows} for rows in (_run(1, 10, 100), jacobian, _run(2, 21, 300), again)]
+    said = tables.TABLES["repeat"][1](*runs)
+    assert "2 of the 3 ratios" in said
+    assert "50 %" in said
+
+
 def test_two_files_or_two_sections_are_compared(tmp_path, capsys):
     files = [tmp_path / "a.json", tmp_path / "b.json"]
     for file, again in zip(files, (100, 300), strict=True):
