@@ -2,8 +2,9 @@
 
 python -m benchmarks.bench_fit [--sessions 24] [--workers 1 2] [--smoke]
 
-end to end: the bundled session, each stage apart, in a process whose programs are compiled already; and the same in the
-first call, which compiles (or reads the cache of compiled programs).
+end to end: the bundled session, whose streams are slow, and one with all the frames that a bench records in 25 minutes
+(scene paper_bench, simulated first), without and with a correction by location. Each stage apart, in the first call,
+which compiles (or reads the cache of compiled programs), and in the second.
 many: copies of the bundled session through `calib.calibrate_many`, sessions per minute for each number of workers, the
 start of the workers included, and after each has done its first; results are new every time. Workers are renewed after
 16 sessions each: give --sessions 100 to see a long batch.
@@ -28,6 +29,7 @@ from scipy.optimize import least_squares
 
 import calib
 import jaxeit as je
+from calib.bench import load_bench, simulate
 from calib.calibration import press_data
 from calib.fit import fit_curves
 from calib.hybrid import PressData
@@ -51,7 +53,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     options: dict[str, Any] = {"location": calib.PadEdge()}
     if args.smoke:
         options = {"basis": je.Pixels(20), "fidelity": je.Fidelity.draft()}
-    data["end_to_end"] = [stages(options) for _ in range(2)]
+    data["end_to_end"] = list(end_to_end(options, args.smoke))
     data["fits"] = fits(3 if args.smoke else 20)
     many = (2, [1]) if args.smoke else (args.sessions, args.workers)
     data["many"] = [batch(many[0], workers, options) for workers in many[1]]
@@ -65,15 +67,28 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 # --- end to end -----------------------------------------------------------------------------------
 
 
-def stages(options: dict[str, Any]) -> dict[str, float]:
+def end_to_end(options: dict[str, Any], smoke: bool) -> Iterator[dict[str, Any]]:
+    """A row of seconds for each session, way and call."""
+    with tempfile.TemporaryDirectory() as folder:
+        sessions = {"bundled": SESSION}
+        if not smoke:
+            sessions["paper_bench"] = simulate(load_bench("paper_bench"), Path(folder) / "paper_bench.h5")
+        for name, path in sessions.items():
+            for way in (options,) if smoke else ({}, options):
+                for call in ("first", "second"):
+                    about = {"session": name, "location": "location" in way, "call": call}
+                    yield about | stages(path, way, Path(folder) / "calibration.h5")
+
+
+def stages(path: Path, options: dict[str, Any], out: Path) -> dict[str, float]:
     """Seconds of each stage of one calibration, saving included."""
     began = [("opening", time.perf_counter())]
-    with tempfile.TemporaryDirectory() as folder, calib.open_session(SESSION) as session:
+    with calib.open_session(path) as session:
         calibration = calib.calibrate(
             [session], **options, progress=lambda stage: began.append((stage, time.perf_counter()))
         )
         began.append(("saving", time.perf_counter()))
-        calibration.save(Path(folder) / "calibration.h5")
+        calibration.save(out)
         began.append(("", time.perf_counter()))
     spent = {name: after - at for (name, at), (_, after) in pairwise(began)}
     return {name: round(s, 3) for name, s in spent.items()} | {"all": round(began[-1][1] - began[0][1], 3)}
