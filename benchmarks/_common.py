@@ -33,6 +33,7 @@ SMOKE = (10,)
 SIDE, PITCH, MARGIN = 0.2, 0.04, 0.02
 AGREE = 1e-9
 QUICK = 0.05  # s
+LEAST = 5  # turns: least and most of fewer times say little of their spread
 
 Tool = Callable[[np.ndarray], np.ndarray]
 
@@ -135,7 +136,8 @@ class Times(NamedTuple):
 
 
 def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budget: float) -> dict[str, Times]:
-    """All tools in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds.
+    """All tools in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds
+    and `LEAST` turns.
 
     A call shorter than `QUICK` is made twice: in the first the processor fetches anew what the other tools have driven
     from its caches, which a program that calls one tool pays once.
@@ -144,7 +146,7 @@ def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budg
     for turn in range(repeats):
         for name in np.random.default_rng(turn).permutation(list(tools)):  # no tool always after the same one
             (own, after_others), tool = times[name], tools[name]
-            if sum(own) < budget:
+            if len(own) < LEAST or sum(own) < budget:
                 after_others.append(taken(tool, sigma * (1 + 1e-3 * turn))[0])
                 again = after_others[-1] < QUICK
                 own.append(taken(tool, sigma * (1.0005 + 1e-3 * turn))[0] if again else after_others[-1])
