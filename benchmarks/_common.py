@@ -39,7 +39,10 @@ Tool = Callable[[np.ndarray], np.ndarray]
 
 
 def set_up() -> None:
-    """64-bit numbers, and memory that is used again, whatever the tool (in `peers.eidors` as well)."""
+    """64-bit numbers, and memory that is used again, whatever the tool (in `peers.eidors` as well).
+
+    No cache of compiled programs, as `calib.runtime.set_up` has it: what the first call takes is measured.
+    """
     jax.config.update("jax_enable_x64", True)
     je.reuse_memory()
 

@@ -75,13 +75,11 @@ def _speed(forward: dict, jacobian: dict) -> str:
 
 def _repeat(*runs: dict) -> str:
     """Whether the ratios between the times of `_speed` came out alike in two runs; in words."""
-    kinds = ("forward", "jacobian")
-    found = [
-        one
-        for kind, first, second in zip(kinds, runs[:2], runs[2:], strict=True)
-        for one in compared(first["rows"], second["rows"])
-        if (kind, one.what.rpartition(", ")[0]) in SHOWN
+    kinds = ("forward", "jacobian", "forward", "jacobian")
+    quoted = [
+        [row for row in run["rows"] if (kind, row["tool"]) in SHOWN] for kind, run in zip(kinds, runs, strict=True)
     ]
+    found = [one for first, second in zip(quoted[:2], quoted[2:], strict=True) for one in compared(first, second)]
     change = max(abs(one.second.value / one.first.value - 1) for one in found)
     agree = sum(one.agrees for one in found)
     return (
