@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
 from .discretise import Model
+from .stiffness import Stiffness, stiffness
 
 
 class BasisError(ValueError):
@@ -83,14 +84,18 @@ class BasisMap(AbstractPictured):
     |-------------------------------------------------------|-------------|------|
     | element, weight: entries of each line; weight 0: none | (lines, c)  |      |
     | coefficient of each line                              | (lines,)    |      |
+    | stiffness of each line                                |             |      |
     | picture: where the coefficients lie                   |             |      |
+    | single: whether each coefficient has one line         |             |      |
     """
 
     element: Int[Array, "lines c"]
     weight: Float[Array, "lines c"]
     coefficient: Int[Array, " lines"]
+    stiffness: Stiffness
     picture: Picture
     elements: int = eqx.field(static=True)
+    single: bool = eqx.field(static=True)
 
     def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
         """Values on the elements, from those of the coefficients."""
@@ -242,10 +247,12 @@ def _across_sides(triangles: np.ndarray, chart: np.ndarray) -> tuple[np.ndarray,
 def _basis_map(model, entries, centres, areas, neighbours, shape, chart, margin=(0.0, 0.0)) -> BasisMap:
     (x0, y0), (x1, y1) = (chart.min(0) - margin).tolist(), (chart.max(0) + margin).tolist()
     element, weight, coefficient = _lines(entries, len(areas))
+    system = model.system
     return BasisMap(
         element=jnp.asarray(element, jnp.int32),
         weight=jnp.asarray(weight, model.dtype),
         coefficient=jnp.asarray(coefficient, jnp.int32),
+        stiffness=stiffness(element, weight, _host(system.dofs), _host(system.slopes), system.unknowns, model.dtype),
         picture=Picture(
             centres=jnp.asarray(centres, model.dtype),
             areas=jnp.asarray(areas, model.dtype),
@@ -255,6 +262,7 @@ def _basis_map(model, entries, centres, areas, neighbours, shape, chart, margin=
             extent=(x0, x1, y0, y1),
         ),
         elements=model.areas.shape[0],
+        single=np.array_equal(coefficient, np.arange(len(areas))),
     )
 
 
@@ -264,7 +272,7 @@ def _lines(entries: tuple[np.ndarray, np.ndarray, np.ndarray], size: int) -> tup
     order = np.lexsort((element, coefficient))
     element, coefficient, weight = element[order], coefficient[order], weight[order]
     counts = np.bincount(coefficient, minlength=size)
-    length = int(np.clip(np.median(counts[counts > 0]), 1, 64))
+    length = int(np.clip(np.median(counts[counts > 0]), 1, 128))
     lines = -(-counts // length)
     rank = np.arange(len(element)) - np.repeat(np.cumsum(counts) - counts, counts)
     line = np.repeat(np.cumsum(lines) - lines, counts) + rank // length

@@ -2,9 +2,9 @@
 
 `forward` gives the derivative rule of the transfer matrix, ``dZ[a, b] = -A(dtheta; x_a, x_b)``: no
 further solve.  As A is a sum over elements, the derivative for one coefficient of an image is that
-sum over its few elements, ``-sum_e w_e sum_r g_era g_erb`` with the slopes g of the L fields.  All
-readings are differences of these L(L+1)/2 products, which are formed for a batch of coefficients at
-a time: nothing of the size elements times readings exists unless it is asked for.
+sum over its few elements, a product of the L fields at their nodes (`stiffness`).  All readings are
+differences of these L(L+1)/2 products, which are formed for a batch of coefficients at a time:
+nothing of the size elements times readings exists unless it is asked for.
 """
 
 from functools import partial
@@ -45,17 +45,23 @@ def jacobian(
         raise ValueError("sigma is that of a sheet and its coat; the Jacobian is for one sheet: give sigma.sigma")
     basis = Elements() if basis is None else basis
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
-    return _jacobian(model, None if sigma is None else jnp.asarray(sigma), image)
+    return scaled_jacobian(model, None if sigma is None else jnp.asarray(sigma), image)
 
 
 @verb
-def _jacobian(model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap) -> Float[Array, "readings basis"]:
+def scaled_jacobian(
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    scale: Float[Array, " elements"] | None = None,
+) -> Float[Array, "readings basis"]:
+    """`jacobian`, of coefficients that change each element's conductivity by ``scale`` times what the basis says."""
     first, second = np.triu_indices(model.electrodes)
     # dZ is symmetric: `pair` finds an unordered pair of electrodes among the columns.
     number = np.zeros((model.electrodes, model.electrodes), np.int32)
     number[first, second] = number[second, first] = np.arange(len(first))
     pair = jnp.asarray(number)
-    slopes = _pair_slopes(model, sigma, image, np.stack([first, second], 1))
+    slopes = _pair_slopes(model, sigma, image, np.stack([first, second], 1), scale)
     by_pair = jax.lax.optimization_barrier(slopes.T)
     if chosen(model.effects, AbstractTerminalEffect):
         z = transfer(model, coefficients(model, sigma))
@@ -81,45 +87,55 @@ def pair_jacobian(
 
 
 def _pair_slopes(
-    model: Model, sigma: Float[Array, " elements"] | None, image: BasisMap, pairs: Int[ArrayLike, "k 2"]
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    pairs: Int[ArrayLike, "k 2"],
+    scale: Float[Array, " elements"] | None = None,
 ) -> Float[Array, "basis k"]:
     """dZ for these pairs of electrodes."""
+    made_for, given = (image.elements, image.stiffness.unknowns), (len(model.areas), model.system.unknowns)
+    if made_for != given:
+        raise ValueError(
+            f"the basis lies on a model of {made_for[0]} elements and {made_for[1]} unknowns, this one has {given[0]} "
+            f"and {given[1]}; make basis.on(model) of this model"
+        )
     theta, (first, second) = coefficients(model, sigma), jnp.asarray(pairs).T
-    products = _products(model, fields(model, theta).potential, image, first * model.electrodes + second)
-    return jnp.where(first == second, _series_slopes(model, theta, image).T[:, first], 0) - products
+    potential = fields(model, theta).potential
+    if scale is None:
+        owner = None if image.single else image.coefficient
+        products = image.stiffness.products(potential, (first, second), owner, image.size)
+    else:
+        products = _by_elements(model, potential, image, (first, second), scale)
+    series = _series_slopes(model, theta, image, scale)
+    return jnp.where(first == second, series.T[:, first], 0) - products
 
 
-def _products(
-    model: Model, potential: Float[Array, "n electrodes"], image: BasisMap, place: Int[Array, " k"]
+def _by_elements(
+    model: Model,
+    potential: Float[Array, "n electrodes"],
+    image: BasisMap,
+    pairs: tuple[Int[Array, " k"], Int[Array, " k"]],
+    scale: Float[Array, " elements"],
 ) -> Float[Array, "basis k"]:
-    """A restricted to each coefficient, for the pairs of electrodes at these places of a matrix; batch after batch."""
-    system, electrodes = model.system, model.electrodes
-    lines = max(1, _BATCH // image.element.shape[1])
-    count = -(-len(image.element) // lines)
+    """What `Stiffness.products` returns, where each element counts ``scale`` times; batch after batch of lines."""
+    system, (first, second) = model.system, pairs
+    weights = image.weight * scale[image.element]
+    size = min(len(weights), max(1, _BATCH // image.element.shape[1]))
 
-    def batch(array, i):
-        return jax.lax.dynamic_slice_in_dim(array, i * lines, lines)
+    def line(element, weight):
+        slopes = jnp.einsum("ekr,eka->era", system.slopes[element], potential[system.dofs[element]])
+        return jnp.einsum("e,era,erb->ab", weight, slopes, slopes)[first, second]
 
-    tables = [_padded(a, count * lines) for a in (image.element, image.weight, image.coefficient)]
-
-    def add(i, sums):
-        element, weight, coefficient = (batch(table, i) for table in tables)
-        nodes = potential[system.dofs[element]]
-        slopes = jnp.einsum("lekr,leka->lera", system.slopes[element], nodes).reshape(lines, -1, electrodes)
-        weighted = jnp.repeat(weight, system.slopes.shape[2], 1)[..., None] * slopes
-        products = jnp.einsum("lxa,lxb->lab", weighted, slopes).reshape(lines, -1)[:, place]
-        return sums.at[coefficient].add(products)
-
-    return jax.lax.fori_loop(0, count, add, jnp.zeros((image.size, len(place)), potential.dtype))
+    found = jax.lax.map(lambda table: line(*table), (image.element, weights), batch_size=size)
+    return jnp.zeros((image.size, len(first)), potential.dtype).at[image.coefficient].add(found)
 
 
-def _padded(array: Array, length: int) -> Array:
-    return jnp.concatenate([array, jnp.zeros_like(array, shape=(length - len(array), *array.shape[1:]))])
-
-
-def _series_slopes(model: Model, theta: Coefficients, image: BasisMap) -> Float[Array, "electrodes basis"]:
+def _series_slopes(
+    model: Model, theta: Coefficients, image: BasisMap, scale: Float[Array, " elements"] | None
+) -> Float[Array, "electrodes basis"]:
     """Derivative of the contact resistances in closed form, each of which knows few elements."""
     if not model.system.near_element.size:
         return jnp.zeros((model.electrodes, image.size), model.dtype)
     slopes = jax.jacrev(lambda sigma: series_resistance(model.system, theta._replace(sigma=sigma)))(theta.sigma)
-    return jax.vmap(image.restrict)(slopes)
+    return jax.vmap(image.restrict)(slopes if scale is None else scale * slopes)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from .basis import BasisMap, Picture
 from .discretise import Model
 from .forward import forward
-from .jacobian import jacobian
+from .jacobian import scaled_jacobian
 from .optimise import LevenbergMarquardt
 from .priors import AbstractPrecision
 
@@ -45,8 +45,7 @@ class LogConductivity(eqx.Module):
     def slopes(self, x: Float[Array, " basis"]) -> Float[Array, "readings basis"]:
         """Derivative of the readings with respect to the image, V: each element's share times its conductivity."""
         sigma = self.sigma(x)
-        weight = self.image.weight * sigma[self.image.element]
-        return jacobian(self.model, sigma, eqx.tree_at(lambda image: image.weight, self.image, weight))
+        return scaled_jacobian(self.model, sigma, self.image, sigma)
 
 
 class AbstractPenalty(eqx.Module):

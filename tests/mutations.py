@@ -52,6 +52,19 @@ GRADIENTS = "test_hard_gradients"
 
 MUTANTS = [
     *of(
+        "jaxeit/stiffness.py",
+        "test_stiffness test_jacobian",
+        ("jnp.where(fresh[:, None], found, 0)", "found", "sums_over_the_elements"),
+        ("x = x[:, 1:] - x[:, :1]", "x = x[:, 1:]", "sums_over_the_elements"),
+        ("np.abs(value) > rounding * largest[owner[first]]", "np.abs(value) > 0", "right_angle"),
+        ("np.flatnonzero(excess > 1)", "np.flatnonzero(excess > 2)", "shared_out"),
+    ),
+    *of(
+        "jaxeit/jacobian.py",
+        "test_stiffness test_jacobian",
+        ("made_for != given", "False", "another_model"),
+    ),
+    *of(
         "jaxeit/solvers/_base.py",
         SOLVING,
         ("d = jax.lax.rsqrt(values[plan.diagonal])", "d = jnp.ones_like(values[plan.diagonal])", "iteration_does_not"),

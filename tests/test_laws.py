@@ -18,9 +18,9 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise", "forward",
-    "pneumatics", "basis", "jacobian", "whitening", "gaps", "priors", "methods", "hyperparameter", "inverse", "store",
-    "responses", "descent", "contacts", "refine", "optimise", "nonlinear", "background", "fusion", "metrics", "regions",
-    "adaptive", "choices", "rungs", "ladder",
+    "pneumatics", "stiffness", "basis", "jacobian", "whitening", "gaps", "priors", "methods", "hyperparameter",
+    "inverse", "store", "responses", "descent", "contacts", "refine", "optimise", "nonlinear", "background",
+    "fusion", "metrics", "regions", "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
 BENCH = [
     "session", "units", "choice", "corrections", "presses", "curves", "solver", "fit", "response", "smooth", "taxels",

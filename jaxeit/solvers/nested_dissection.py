@@ -27,6 +27,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
+from ..verbs import stacked_product
 from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale, on_device
 from ._dissection import dissect
 from ._fronts import Level, lay_out
@@ -201,7 +202,7 @@ def _swept(
         )
         fronts.append(front)
         boundary = slice(level.pivots, None)
-        update = jnp.sum(_spread(level, update, boundary, boundary), 1) - _square(w, w)
+        update = jnp.sum(_spread(level, update, boundary, boundary), 1) - stacked_product(w, w)
     return update, tuple(fronts[::-1]) if keep else ()
 
 
@@ -231,10 +232,6 @@ def _cut(tree: T, parts: int) -> list[T]:
     arrays, structure = jax.tree.flatten(tree)
     pieces = zip(*(jnp.split(array, parts) for array in arrays), strict=True)
     return [jax.tree.unflatten(structure, piece) for piece in pieces]
-
-
-def _square(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
-    return jnp.einsum("mki,mkj->mij", left, right)
 
 
 def _taken(values: Array, places: Int[Array, "..."]) -> Array:
@@ -269,7 +266,9 @@ def _eliminate(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> t
     h = (p + 1) // 2
     w1, first = _eliminate(among[:, :h, :h], jnp.concatenate([among[:, :h, h:], beside[:, :h]], 2))
     across, beyond = w1[:, :, : p - h], w1[:, :, p - h :]
-    w2, second = _eliminate(among[:, h:, h:] - _square(across, across), beside[:, h:] - _square(across, beyond))
+    w2, second = _eliminate(
+        among[:, h:, h:] - stacked_product(across, across), beside[:, h:] - stacked_product(across, beyond)
+    )
     return jnp.concatenate([beyond, w2], 1), first + second
 
 
@@ -366,7 +365,7 @@ def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Arra
     for panel in front:
         p = panel.upper.shape[1]
         _, y = _descended(panel.upper, load[:, :p])
-        load = load[:, p:] - _square(panel.beside, y)
+        load = load[:, p:] - stacked_product(panel.beside, y)
         ys.append(y)
     return ys, load
 
@@ -400,7 +399,7 @@ def _backward(
     for level, front, y in zip(factor.plan.levels, factor.levels, ys, strict=True):
         x = _inherited(level, x)
         for k in reversed(range(len(front))):
-            rest = front[k].beside @ x
+            rest = stacked_product(_transposed(front[k].beside), x)
             _, own = _ascended(front[k].upper, rest if y is None else rest - y[k])
             x = jnp.concatenate([-own, x], 1)
         own = x[:, : level.pivots]

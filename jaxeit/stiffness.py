@@ -1,0 +1,168 @@
+"""The sheet's stiffness, coefficient by coefficient of an image.
+
+What one coefficient contributes to the energy of two fields is ``A_p(x, y) = x^T K_p y`` with K_p the sum of its
+elements' stiffnesses at unit conductivity.  K_p only knows differences: with potentials taken from those of the first
+node, that node drops out.  Of the rest half is kept, ``K_p = H + H^T``, with few entries in each row of H, so that
+``x^T K_p y = x^T H y + (y^T H x)^T`` takes a row of products per node, where a sum over elements takes two per triangle
+(six on P2 elements), of which there are twice as many.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy import sparse
+
+from .verbs import stacked_product
+
+_ROWS = 4096  # of H at once: the potentials of their nodes stay in a core's cache
+_FEW = 16  # rows; of more, XLA's own loops would make H x anew for each field, which libraries cannot
+_ENTRIES = 1 << 18  # elements of lines that the host puts together at once
+
+
+class Stiffness(eqx.Module):
+    """H of each line of a `BasisMap`, whose elements have up to n + 1 nodes.
+
+    | meaning                                                       | shape          | unit |
+    |---------------------------------------------------------------|----------------|------|
+    | dofs: unknowns of the line; all potentials are from the first | (lines, n + 1) |      |
+    | column, entry of each row of H, the first node left out       | (lines, n, c)  | 1    |
+    """
+
+    dofs: Int[Array, "lines n1"]
+    column: Int[Array, "lines n c"]
+    entry: Float[Array, "lines n c"]
+    unknowns: int = eqx.field(static=True)
+
+    def products(
+        self,
+        potential: Float[Array, "unknowns k"],
+        pairs: tuple[Int[Array, " r"], Int[Array, " r"]],
+        coefficient: Int[Array, " lines"] | None,
+        size: int,
+    ) -> Float[Array, "size r"]:
+        """``x_a^T K_p x_b`` for each coefficient p and these pairs (a, b) of fields, batch after batch of lines.
+
+        Args:
+            coefficient: of each line; None if line p is the one of p.
+        """
+        lines, rows, width = self.entry.shape
+        batch = max(1, min(-(-lines // 2), _ROWS // rows))  # a loop of one step XLA would make part of its surroundings
+        here = jnp.arange(batch)
+        product = stacked_product if rows <= _FEW else partial(jnp.einsum, "lna,lnb->lab")
+        first, second = pairs
+
+        def add(i, sums):
+            start = jnp.minimum(i * batch, lines - batch)  # the last batch has lines of the one before
+
+            def cut(table):
+                return jax.lax.dynamic_slice_in_dim(table, start, batch)
+
+            dofs, column, entry = cut(self.dofs), cut(self.column), cut(self.entry)
+            x = potential.at[dofs].get(mode="promise_in_bounds")
+            x = x[:, 1:] - x[:, :1]
+            terms = (
+                entry[..., c, None] * x.at[here[:, None], column[..., c]].get(mode="promise_in_bounds")
+                for c in range(width)
+            )
+            half = product(x, sum(terms))
+            found = half[:, first, second] + half[:, second, first]
+            if coefficient is None:
+                return jax.lax.dynamic_update_slice_in_dim(sums, found, start, 0)
+            fresh = start + here >= i * batch
+            return sums.at[cut(coefficient)].add(jnp.where(fresh[:, None], found, 0))
+
+        return jax.lax.fori_loop(0, -(-lines // batch), add, jnp.zeros((size, len(first)), potential.dtype))
+
+
+def stiffness(
+    element: Int[np.ndarray, "lines e"],
+    weight: Float[np.ndarray, "lines e"],
+    dofs: Int[np.ndarray, "elements k"],
+    slopes: Float[np.ndarray, "elements k r"],
+    unknowns: int,
+    dtype: np.dtype,
+) -> Stiffness:
+    """H of the elements of each line, times their weights; those of weight zero do not count.
+
+    Args:
+        dofs, slopes, unknowns: of a `System`.
+        dtype: of the entries; what rounding to it leaves of a right angle is no entry.
+    """
+    lines, step = len(element), max(1, _ENTRIES // element.shape[1])
+    cuts = [slice(start, start + step) for start in range(0, lines, step)]
+    parts = [_halves(element[cut], weight[cut], dofs, slopes, 4 * np.finfo(dtype).eps) for cut in cuts]
+    nodes = max(2, *(part.dofs.shape[1] for part in parts))
+    shape = lines, nodes - 1, max(1, *(part.slot.max(initial=-1) + 1 for part in parts))
+    table = np.empty((lines, nodes), np.uint32)
+    column, entry = np.zeros(shape, np.min_scalar_type(nodes)), np.zeros(shape, dtype)
+    for cut, part in zip(cuts, parts, strict=True):
+        table[cut] = np.pad(part.dofs, ((0, 0), (0, nodes - part.dofs.shape[1])), mode="edge")
+        at = cut.start + part.line, part.row, part.slot
+        column[at], entry[at] = part.column, part.entry
+    return Stiffness(jnp.asarray(table), jnp.asarray(column), jnp.asarray(entry), unknowns)
+
+
+class _Halves(NamedTuple):
+    """H of some lines: where its entries belong."""
+
+    dofs: np.ndarray  # (lines, nodes)
+    line: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    slot: np.ndarray
+    entry: np.ndarray
+
+
+def _halves(element: np.ndarray, weight: np.ndarray, dofs: np.ndarray, slopes: np.ndarray, rounding: float) -> _Halves:
+    lines = len(element)
+    line, place = np.nonzero(weight)
+    chosen, width = element[line, place], dofs.shape[1]
+    own = weight[line, place, None, None] * (slopes[chosen] @ slopes[chosen].swapaxes(1, 2))
+    # Every line has rows of its own, one for each unknown, in one sparse matrix of all.
+    unknowns = int(dofs.max()) + 1
+    known, row = np.unique(line[:, None] * unknowns + dofs[chosen], return_inverse=True)
+    row = row.reshape(-1, width)
+    owner, count = known // unknowns, len(known)
+    begin = np.searchsorted(owner, np.arange(lines))
+    local = np.arange(count) - begin[owner]
+    table = np.zeros((lines, local.max(initial=0) + 1), int)
+    table[:] = np.append(known % unknowns, 0)[begin, None]
+    table[owner, local] = known % unknowns
+
+    places = np.repeat(row, width, 1).ravel(), np.tile(row, (1, width)).ravel()
+    whole = sparse.coo_array((own.ravel(), places), (count, count)).tocsr()  # sums what elements share
+    lower = sparse.tril(whole).tocoo()
+    first, second = lower.row, lower.col
+    value = np.where(first == second, 0.5, 1) * lower.data
+    largest = np.zeros(lines)
+    np.maximum.at(largest, owner[first], np.abs(value))
+    kept = (local[first] > 0) & (local[second] > 0) & (np.abs(value) > rounding * largest[owner[first]])
+    first, second, value = first[kept], second[kept], value[kept]
+    first, second = _shared_out(first, second, count)
+    order = np.argsort(first, kind="stable")
+    first, second, value = first[order], second[order], value[order]
+    slot = np.arange(len(first)) - np.searchsorted(first, first)
+    return _Halves(table, owner[first], local[first] - 1, local[second] - 1, slot, value)
+
+
+def _shared_out(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs turned around until no row of so many has two entries more than one that it shares a pair with.
+
+    The longest row decides the width of the table: in meshes it goes down from 8 to 4, all but that of the mean.
+    """
+    while True:
+        entries = np.bincount(first, minlength=count)
+        excess = entries[first] - entries[second]
+        turned = np.flatnonzero(excess > 1)
+        if not len(turned):
+            return first, second
+        turned = turned[np.argsort(-excess[turned], kind="stable")]
+        for end in (first, second):  # one pair of a row at a time, so that none overshoots
+            turned = turned[np.sort(np.unique(end[turned], return_index=True)[1])]
+        first, second = first.copy(), second.copy()
+        first[turned], second[turned] = second[turned], first[turned]
