@@ -246,7 +246,7 @@ def _across_sides(triangles: np.ndarray, chart: np.ndarray) -> tuple[np.ndarray,
 
 def _basis_map(model, entries, centres, areas, neighbours, shape, chart, margin=(0.0, 0.0)) -> BasisMap:
     (x0, y0), (x1, y1) = (chart.min(0) - margin).tolist(), (chart.max(0) + margin).tolist()
-    element, weight, coefficient = _lines(entries, len(areas))
+    element, weight, coefficient = _lines(entries, len(areas), _host(model.centroids))
     system = model.system
     return BasisMap(
         element=jnp.asarray(element, jnp.int32),
@@ -266,10 +266,15 @@ def _basis_map(model, entries, centres, areas, neighbours, shape, chart, margin=
     )
 
 
-def _lines(entries: tuple[np.ndarray, np.ndarray, np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Entries in lines as long as half the coefficients need, so that little is padding."""
+def _lines(
+    entries: tuple[np.ndarray, np.ndarray, np.ndarray], size: int, places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries in lines as long as half the coefficients need, so that little is padding; each of neighbours, which
+    share their nodes."""
     element, coefficient, weight = entries
-    order = np.lexsort((element, coefficient))
+    turn = np.empty(len(places), int)
+    turn[cKDTree(places).indices] = np.arange(len(places))
+    order = np.lexsort((turn[element], coefficient))
     element, coefficient, weight = element[order], coefficient[order], weight[order]
     counts = np.bincount(coefficient, minlength=size)
     length = int(np.clip(np.median(counts[counts > 0]), 1, 128))

@@ -134,9 +134,13 @@ def _halves(element: np.ndarray, weight: np.ndarray, dofs: np.ndarray, slopes: n
     table[:] = np.append(known % unknowns, 0)[begin, None]
     table[owner, local] = known % unknowns
 
-    places = np.repeat(row, width, 1).ravel(), np.tile(row, (1, width)).ravel()
-    whole = sparse.coo_array((own.ravel(), places), (count, count)).tocsr()  # sums what elements share
-    lower = sparse.tril(whole).tocoo()
+    i, j = np.tril_indices(width)
+    places = np.maximum(row[:, i], row[:, j]), np.minimum(row[:, i], row[:, j])
+    # A corner that two nodes of an element share (an electrode) has the entry between them twice.
+    twice = (row[:, i] == row[:, j]) & (i != j)
+    values = np.where(twice, 2, 1) * own[:, i, j]
+    lower = sparse.coo_array((values.ravel(), tuple(place.ravel() for place in places)), (count, count))
+    lower = lower.tocsr().tocoo()  # sums what elements share
     first, second = lower.row, lower.col
     value = np.where(first == second, 0.5, 1) * lower.data
     largest = np.zeros(lines)

@@ -142,10 +142,10 @@ def reuse_memory() -> bool:
     glibc returns a block of over 32 MB to the system once it is freed. A program of XLA takes and frees its working
     memory at every call, so that with meshes of some 30,000 nodes or more it gets a new block each time, which the
     system clears page by page: a fifth of the time of a Jacobian. After this call the process keeps what it once
-    needed. The commands do this; in a program of yours call it once, before the first computation.
+    needed, in one store for all threads, as one of a thread's own holds no block of over 64 MB. The commands do this;
+    in a program of yours call it once, before the first computation.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    # The store that a thread has for itself holds no block of over 64 MB: all are to use the first one.
     settings = {_MMAP_THRESHOLD: _LARGE, _TRIM_THRESHOLD: _LARGE, _ARENA_MAX: 1}
     return mallopt is not None and all(mallopt(name, value) for name, value in settings.items())
 

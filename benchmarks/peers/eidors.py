@@ -20,6 +20,7 @@ from scipy.io import savemat
 NAME = "EIDORS"
 SCRIPT = Path(__file__).with_suffix(".m")
 REUSE_MEMORY = dict.fromkeys(("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), str(2**31 - 1))
+REUSE_MEMORY["MALLOC_ARENA_MAX"] = "1"
 
 
 def missing() -> str | None:
