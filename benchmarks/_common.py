@@ -32,7 +32,7 @@ SIZES = (30, 60, 120, 240)  # cells a side, multiples of 10: the electrodes are 
 SMOKE = (10,)
 SIDE, PITCH, MARGIN = 0.2, 0.04, 0.02
 AGREE = 1e-9
-QUICK = 0.05  # s
+TURN = 0.1  # s
 LEAST = 5  # turns: least and most of fewer times say little of their spread
 
 Tool = Callable[[np.ndarray], np.ndarray]
@@ -140,20 +140,29 @@ class Times(NamedTuple):
 
 def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budget: float) -> dict[str, Times]:
     """All tools in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds
-    and `LEAST` turns.
-
-    A call shorter than `QUICK` is made twice: in the first the processor fetches anew what the other tools have driven
-    from its caches, which a program that calls one tool pays once.
-    """
+    and `LEAST` turns."""
     times = {name: Times([], []) for name in tools}
     for turn in range(repeats):
         for name in np.random.default_rng(turn).permutation(list(tools)):  # no tool always after the same one
-            (own, after_others), tool = times[name], tools[name]
+            own, after_others = times[name]
             if len(own) < LEAST or sum(own) < budget:
-                after_others.append(taken(tool, sigma * (1 + 1e-3 * turn))[0])
-                again = after_others[-1] < QUICK
-                own.append(taken(tool, sigma * (1.0005 + 1e-3 * turn))[0] if again else after_others[-1])
+                last, first = a_turn(tools[name], sigma * (1 + 1e-3 * turn))
+                own.append(last)
+                after_others.append(first)
     return times
+
+
+def a_turn(tool: Tool, sigma: np.ndarray) -> tuple[float, float]:
+    """Seconds of a tool's last call and its first, of as many as `TURN` holds; no conductivity twice.
+
+    In the first ones the processor fetches anew what other tools have driven from its caches, and the system learns
+    that two threads need two cores: a program that calls one tool again and again pays for that once.
+    """
+    last = first = spent = taken(tool, sigma)[0]
+    while spent < TURN:
+        last = taken(tool, sigma * (1 + 1e-3 * spent))[0]
+        spent += last
+    return last, first
 
 
 def may_run_in_real_time() -> bool:

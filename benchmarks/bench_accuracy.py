@@ -159,7 +159,7 @@ def timed(runs: Sequence[Run], repeats: int, budget: float) -> list[Row]:
     for _ in range(repeats):
         for run, mine in zip(runs, times, strict=True):
             if sum(mine) < budget:
-                mine.append(c.taken(run.tool, run.flat)[0])
+                mine.append(c.a_turn(run.tool, run.flat)[0])
     return [run.labels | c.spread(mine) for run, mine in zip(runs, times, strict=True)]
 
 
