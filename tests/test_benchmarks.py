@@ -207,7 +207,8 @@ def test_the_clock_of_a_tool_in_another_process_counts():
     assert common.interleaved({"a": Elsewhere()}, np.ones(3), 2, budget=1e3)["a"] == ([123.0, 123.0], [123.0, 123.0])
 
 
-def test_a_quick_tool_is_called_again_and_again_in_its_turn_and_the_last_call_counts():
+def test_a_quick_tool_is_called_again_and_again_in_its_turn_and_the_last_call_counts(monkeypatch):
+    monkeypatch.setattr(common, "TURN", 0.15)
     calls = []
 
     class Tool:
