@@ -258,8 +258,7 @@ def draw(rows: list[Row], path: Path) -> None:
 def _panel(axes: Any, rows: list[Row], sheet: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel="time of one forward solve, ms")
     axes.set_title(TITLES[sheet], fontsize=10.5)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
+    c.plain_numbers(axes)
     axes.grid(True, which="major", color="#e4e4e4", linewidth=0.8)
     axes.axhline(100 * TARGET, color=GREY, linewidth=0.9, linestyle=":")
     for (mesh, order, dtype), curve in _curves(_of(rows, sheet, "jaxeit")).items():

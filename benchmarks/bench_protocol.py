@@ -268,8 +268,7 @@ def picture(rows: Sequence[Row]) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel=label, ylabel="mean error of place, mm")
         axes.set_title(title, fontsize=10)
         axes.grid(True, which="both", color="#e4e4e4", linewidth=0.7)
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter("{x:g}")
+        c.plain_numbers(axes)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     return figure
 
