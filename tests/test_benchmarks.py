@@ -2,6 +2,7 @@
 
 import json
 import os
+from functools import partial
 
 import numpy as np
 import pytest
@@ -253,6 +254,19 @@ def test_a_slow_way_of_application_stops_after_its_budget():
     assert not any(len(times) for times in bench_inverse.latencies(ways, 30, 10, budget=0.0).values())
 
 
+def test_frames_follow_one_another_or_other_work():
+    """One call of each block does not count; after other work every one does."""
+    done: list[str] = []
+    ways = {name: bench_inverse.Way(partial(done.append, name), np.ones(1), 8) for name in "ab"}
+    counted = bench_inverse.latencies(ways, calls=4, block=2, budget=60.0)
+    assert "".join(done) == "aaabbb" * 2
+    assert [len(times) for times in counted.values()] == [4, 4]
+    done.clear()
+    counted = bench_inverse.latencies(ways, 2, 1, 60.0, between=partial(done.append, " "))
+    assert "".join(done) == " a b" * 2
+    assert [len(times) for times in counted.values()] == [2, 2]
+
+
 def test_goals_are_judged_by_what_was_measured():
     def tools(nodes, ours):
         names = ("jaxeit float64, pixels", ours), (f"{eidors.NAME}, pixels", 100.0)
@@ -262,11 +276,13 @@ def test_goals_are_judged_by_what_was_measured():
         times = {"p50_ms": 0.02, "p99_ms": 0.03, "p99.9_ms": 0.04, "min_ms": 0.01, "max_ms": most, "least_ms": 0.01}
         return {"way": name, "frames": frames} | times
 
-    single = [way("jaxeit, a", 0.09), way("jaxeit, b", 0.2), way("jaxeit, loop", 0.2, 100), way("NumPy", 0.2)]
-    said = bench_inverse.verdict({"rows": tools(900, 11.0) + tools(400, 9.0), "application": {"single": single}})
-    about = ["400 nodes onto 900 pixels", "900 nodes onto 900 pixels", "jaxeit, a", "jaxeit, b"]
+    quick = [way("jaxeit, a", 0.09), way("jaxeit, b", 0.2), way("jaxeit, loop", 0.1, 100), way("NumPy", 0.2)]
+    application = {"single": quick, "single, after other work": [way("jaxeit, a", 0.2)], "batch": [way("jaxeit", 9)]}
+    said = bench_inverse.verdict({"rows": tools(900, 11.0) + tools(400, 9.0), "application": application})
+    about = ["400 nodes onto 900 pixels", "900 nodes onto 900 pixels", "single, jaxeit, a", "single, jaxeit, b"]
+    about += ["single, jaxeit, loop", "single, after other work, jaxeit, a"]
     assert [line.split(":")[0] for line in said] == about
-    assert [": met" in line for line in said] == [True, False, True, False]
+    assert [": met" in line for line in said] == [True, False, True, False, True, False]
 
 
 @pytest.mark.slow
