@@ -96,7 +96,7 @@ def work(problem: c.Problem, factor: dict[str, float], coefficients: int) -> dic
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
-    return c.run(argv, __doc__, "jacobian", PREPARE, measure, repeats=9)
+    return c.run(argv, __doc__, "jacobian", PREPARE, measure, repeats=15)
 
 
 if __name__ == "__main__":

@@ -95,7 +95,8 @@ def stiffness(
     """
     lines, step = len(element), max(1, _ENTRIES // element.shape[1])
     cuts = [slice(start, start + step) for start in range(0, lines, step)]
-    parts = [_halves(element[cut], weight[cut], dofs, slopes, 4 * np.finfo(dtype).eps) for cut in cuts]
+    rounding = 4 * np.finfo(dtype).eps
+    parts = [_halves(element[cut], weight[cut], dofs, slopes, unknowns, rounding) for cut in cuts]
     nodes = max(2, *(part.dofs.shape[1] for part in parts))
     shape = lines, nodes - 1, max(1, *(part.slot.max(initial=-1) + 1 for part in parts))
     table = np.empty((lines, nodes), np.uint32)
@@ -118,13 +119,15 @@ class _Halves(NamedTuple):
     entry: np.ndarray
 
 
-def _halves(element: np.ndarray, weight: np.ndarray, dofs: np.ndarray, slopes: np.ndarray, rounding: float) -> _Halves:
+def _halves(
+    element: np.ndarray, weight: np.ndarray, dofs: np.ndarray, slopes: np.ndarray, unknowns: int, rounding: float
+) -> _Halves:
     lines = len(element)
     line, place = np.nonzero(weight)
     chosen, width = element[line, place], dofs.shape[1]
-    own = weight[line, place, None, None] * (slopes[chosen] @ slopes[chosen].swapaxes(1, 2))
+    root = slopes[chosen]
+    own = weight[line, place, None, None] * (root @ root.swapaxes(1, 2))
     # Every line has rows of its own, one for each unknown, in one sparse matrix of all.
-    unknowns = int(dofs.max()) + 1
     known, row = np.unique(line[:, None] * unknowns + dofs[chosen], return_inverse=True)
     row = row.reshape(-1, width)
     owner, count = known // unknowns, len(known)

@@ -171,12 +171,6 @@ def stacked_product(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -
 def _in_loops(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
     """On processors jaxlib calls Eigen for each pair in turn, on one core and with the instructions of old machines.
     Loops that XLA compiles for this one take a third of the time, and for larger matrices no more."""
-    left, right = jax.lax.optimization_barrier(
-        (left, right)
-    )  # else what they are made of is made anew for each product
     cuts = np.linspace(0, left.shape[1], -(-left.shape[1] // _SUMMED) + 1).astype(int)
-    sums: Array = jnp.zeros((), left.dtype)
-    for begin, end in pairwise(cuts):
-        sums = sums + jnp.sum(left[:, begin:end, :, None] * right[:, begin:end, None, :], 1)
-        sums = jax.lax.optimization_barrier(sums)  # the next loop adds to it in place
-    return sums
+    sums = (jnp.sum(left[:, i:j, :, None] * right[:, i:j, None, :], 1) for i, j in pairwise(cuts))
+    return sum(sums, start=jnp.zeros((), left.dtype))
