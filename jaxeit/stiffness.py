@@ -20,7 +20,7 @@ from scipy import sparse
 from .verbs import stacked_product
 
 _ROWS = 4096  # of H at once: the potentials of their nodes stay in a core's cache
-_FEW = 16  # rows; of more, XLA's own loops would make H x anew for each field, which libraries cannot
+_FEW = 40  # entries of H; of more, XLA's own loops make H x anew for each field and take twice as long as a library
 _ENTRIES = 1 << 18  # elements of lines that the host puts together at once
 
 
@@ -53,7 +53,7 @@ class Stiffness(eqx.Module):
         lines, rows, width = self.entry.shape
         batch = max(1, min(-(-lines // 2), _ROWS // rows))  # a loop of one step XLA would make part of its surroundings
         here = jnp.arange(batch)
-        product = stacked_product if rows <= _FEW else partial(jnp.einsum, "lna,lnb->lab")
+        product = stacked_product if rows * width <= _FEW else partial(jnp.einsum, "lna,lnb->lab")
         first, second = pairs
 
         def add(i, sums):
