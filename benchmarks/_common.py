@@ -8,7 +8,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import metadata
@@ -138,15 +138,22 @@ class Times(NamedTuple):
     after_others: list[float]
 
 
-def interleaved(tools: Mapping[str, Tool], sigma: np.ndarray, repeats: int, budget: float) -> dict[str, Times]:
-    """All tools in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds
-    and `LEAST` turns."""
-    times = {name: Times([], []) for name in tools}
+class Work(NamedTuple):
+    """A tool, and the conductivity that it is called with."""
+
+    tool: Tool
+    sigma: np.ndarray
+
+
+def interleaved(works: Sequence[Work], repeats: int, budget: float) -> list[Times]:
+    """All in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds and
+    `LEAST` turns."""
+    times = [Times([], []) for _ in works]
     for turn in range(repeats):
-        for name in np.random.default_rng(turn).permutation(list(tools)):  # no tool always after the same one
-            own, after_others = times[name]
+        for number in np.random.default_rng(turn).permutation(len(works)):  # none always after the same one
+            (tool, sigma), (own, after_others) = works[number], times[number]
             if len(own) < LEAST or sum(own) < budget:
-                last, first = a_turn(tools[name], sigma * (1 + 1e-3 * turn))
+                last, first = a_turn(tool, sigma * (1 + 1e-3 * turn))
                 own.append(last)
                 after_others.append(first)
     return times
@@ -171,18 +178,6 @@ def may_run_in_real_time() -> bool:
     if refused:
         print(f"at ordinary priority, where others may come between: {refused}")
     return not refused
-
-
-def plain_numbers(axes: Any) -> None:
-    """Numbers as people write them along logarithmic axes; on axes of little more than a decade also 2 and 5."""
-
-    def between(axis, value):
-        low, high = axis.get_view_interval()
-        return f"{value:g}" if high < 100 * low and f"{value:e}"[0] in "25" else ""
-
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(lambda value, _, axis=axis: between(axis, value))
 
 
 def spread(times: list[float]) -> dict[str, float]:
@@ -223,7 +218,7 @@ def measured(
     found = require_agreement({name: out for name, (_, out) in first.items()}, reference, loose)
     first_call = {name: round(spent, 3) for name, (spent, _) in first.items()}
     del first  # Jacobians are large
-    times = interleaved(tools, problem.sigma, repeats, budget)
+    times = interleaved([Work(tool, problem.sigma) for tool in tools.values()], repeats, budget)
     return [
         {
             "tool": name,
@@ -232,10 +227,10 @@ def measured(
             "difference": found.get(name, 0.0),
             "prepare_s": round(prepared[name][0], 3),
             "first_call_s": first_call[name],
-            **spread(times[name].own),
-            "after_others_ms": round(1e3 * float(np.median(times[name].after_others)), 4),
+            **spread(own),
+            "after_others_ms": round(1e3 * float(np.median(after_others)), 4),
         }
-        for name in tools
+        for name, (own, after_others) in zip(tools, times, strict=True)
     ]
 
 

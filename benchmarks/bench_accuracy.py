@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import jaxeit as je
-from calib.figures import png
+from calib.figures import plain_numbers, png
 from calib.session import replacing
 from jaxeit.solvers import NestedDissection
 from tests.oracles.disc import disc_potentials
@@ -154,13 +154,8 @@ def peer(case: Case, name: str, prepare: Any, order: int, cells: int) -> Run:
 
 
 def timed(runs: Sequence[Run], repeats: int, budget: float) -> list[Row]:
-    """All in turn, round after round; a slow one stops after ``budget`` seconds."""
-    times: list[list[float]] = [[] for _ in runs]
-    for _ in range(repeats):
-        for run, mine in zip(runs, times, strict=True):
-            if sum(mine) < budget:
-                mine.append(c.a_turn(run.tool, run.flat)[0])
-    return [run.labels | c.spread(mine) for run, mine in zip(runs, times, strict=True)]
+    times = c.interleaved([c.Work(run.tool, run.flat) for run in runs], repeats, budget)
+    return [run.labels | c.spread(own) for run, (own, _) in zip(runs, times, strict=True)]
 
 
 def prepared(runs: Iterator[Run]) -> list[Run]:
@@ -258,7 +253,7 @@ def draw(rows: list[Row], path: Path) -> None:
 def _panel(axes: Any, rows: list[Row], sheet: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel="time of one forward solve, ms")
     axes.set_title(TITLES[sheet], fontsize=10.5)
-    c.plain_numbers(axes)
+    plain_numbers(axes)
     axes.grid(True, which="major", color="#e4e4e4", linewidth=0.8)
     axes.axhline(100 * TARGET, color=GREY, linewidth=0.9, linestyle=":")
     for (mesh, order, dtype), curve in _curves(_of(rows, sheet, "jaxeit")).items():

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 import calib
 import jaxeit as je
 from calib.calibration import press_data
-from calib.figures import png
+from calib.figures import plain_numbers, png
 from calib.fit import FitResult
 from calib.hybrid import Hybrid, PressData, fit_hybrid, folds_by_place
 from calib.location import Geometry, Places, geometry_of
@@ -292,7 +292,7 @@ def picture(data: Mapping[str, Any]) -> Figure:
             right.plot(places, values, line, color=f"C{number}", marker="o", label=f"{curve}, {count} presses")
     left.set(xscale="log", yscale="log", xlabel="presses fitted", ylabel="RMS error of held-out forces, N")
     left.set_title("over the holds; scattered (lines), grid (dashed), random (dotted, ± sd)", fontsize=10)
-    c.plain_numbers(left)
+    plain_numbers(left)
     left.set_xticks([s**2 for s in SIDES], labels=[str(s**2) for s in SIDES])
     left.set_xticks([], minor=True)
     right.set_xticks(range(len(LEVELS)), labels=["whole press" if n is None else str(n) for n in LEVELS])

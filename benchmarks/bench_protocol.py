@@ -26,7 +26,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import jaxeit as je
-from calib.figures import png
+from calib.figures import plain_numbers, png
 from calib.session import replacing
 
 from . import _common as c
@@ -268,7 +268,7 @@ def picture(rows: Sequence[Row]) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel=label, ylabel="mean error of place, mm")
         axes.set_title(title, fontsize=10)
         axes.grid(True, which="both", color="#e4e4e4", linewidth=0.7)
-        c.plain_numbers(axes)
+        plain_numbers(axes)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     return figure
 

@@ -51,9 +51,13 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--only", choices=RECORDINGS, help="one of them; its rows alone are replaced in the results")
     parser.add_argument("--smoke", action="store_true", help="few samples; writes nothing")
     args = parser.parse_args(argv)
+    wanted = [args.only] if args.only else list(RECORDINGS)
+    absent = [name for name in wanted if not (args.folder / name).is_dir()]
+    if absent:
+        parser.error(f"{args.folder} has no folder {', '.join(absent)}: give the one that holds the recordings")
     set_up()
     data: dict[str, Any] = (_stored() if args.only else {}) | {"circumstances": c.circumstances()}
-    for name in [args.only] if args.only else RECORDINGS:
+    for name in wanted:
         data[name] = []
         for row in RECORDINGS[name](args.folder, args.smoke):
             data[name].append(row)

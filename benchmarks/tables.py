@@ -6,7 +6,7 @@ from functools import partial
 
 import jaxeit as je
 
-from . import bench_paper, bench_protocol
+from . import bench_inverse, bench_paper, bench_protocol
 from .repeat import compared
 
 SHOWN = {
@@ -121,12 +121,36 @@ def _scenes(results: dict) -> str:
 
 def _pipeline(results: dict) -> str:
     """Mesh to images of 100 frames, by tool and mesh."""
-    nodes = sorted({row["nodes"] for row in results["rows"]})
+    return _by_tool("mesh to images of 100 frames, ms", results["rows"])
+
+
+def _preparation(results: dict) -> str:
+    """Conductivity to reconstructor, by tool and mesh."""
+    return _by_tool("a reconstruction prepared, ms", results["rows"])
+
+
+def _by_tool(head: str, measured: Sequence[dict]) -> str:
+    nodes = sorted({row["nodes"] for row in measured})
     rows = []
-    for tool in dict.fromkeys(row["tool"] for row in results["rows"]):
-        found = {row["nodes"]: _figures(row["median_ms"]) for row in results["rows"] if row["tool"] == tool}
+    for tool in dict.fromkeys(row["tool"] for row in measured):
+        found = {row["nodes"]: _figures(row["median_ms"]) for row in measured if row["tool"] == tool}
         rows.append([tool.replace(", ", ", onto "), *(found.get(n, "") for n in nodes)])
-    return _markdown(["mesh to images of 100 frames, ms", *(f"{n:,} nodes" for n in nodes)], rows)
+    return _markdown([head, *(f"{n:,} nodes" for n in nodes)], rows)
+
+
+def _frame(results: dict) -> str:
+    """One frame to its image: in a stream of frames, after other work, and in a batch."""
+    stream, after, batch = (
+        {row["way"]: row for row in results["application"][kind]}
+        for kind in (bench_inverse.SINGLE, bench_inverse.AFTER_WORK, bench_inverse.BATCH)
+    )
+    heads = ["ms a frame", *(f"{p}{when}" for when in ("", ", after other work") for p in ("p50", "p99", "most"))]
+    rows = []
+    for way, row in stream.items():
+        times = [f"{one[f'{p}_ms']:.3f}" if one else "" for one in (row, after.get(way)) for p in ("p50", "p99", "max")]
+        together = f"{batch[way]['p50_ms']:.4f}" if way in batch else ""
+        rows.append([way, *times, together, f"{row['least_ms']:.3f}"])
+    return _markdown([*heads, "1,000 together", "as many bytes copied"], rows)
 
 
 def _to_accuracy(results: dict) -> str:
@@ -273,6 +297,8 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "paper": (("paper",), _paper),
     "ladder": (("ladder",), partial(_ladder, skin=0)),
     "ladder-chest": (("ladder",), partial(_ladder, skin=1)),
+    "preparation": (("inverse",), _preparation),
+    "frame": (("inverse",), _frame),
     "pipeline": (("pipeline",), _pipeline),
     "to-accuracy": (("pipeline",), _to_accuracy),
     "calibration-cost": (("calibration_cost",), _calibration),

@@ -56,6 +56,18 @@ def require_matplotlib() -> None:
         raise ReportError("figures and reports need matplotlib, which is not installed; install jaxeit[report]")
 
 
+def plain_numbers(axes: Any) -> None:
+    """Numbers as people write them along logarithmic axes; on axes of little more than a decade also 2 and 5."""
+
+    def between(axis, value):
+        low, high = axis.get_view_interval()
+        return f"{value:g}" if high < 100 * low and f"{value:e}"[0] in "25" else ""
+
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(lambda value, _, axis=axis: between(axis, value))
+
+
 def png(figure: "Figure") -> bytes:
     """The figure as a PNG file."""
     buffer = io.BytesIO()

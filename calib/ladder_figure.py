@@ -1,15 +1,14 @@
 """The picture of `jaxeit bench`: error against time, one point per fidelity."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from .figures import require_matplotlib
+from .figures import plain_numbers, require_matplotlib
 
 try:  # an extra, as for all figures
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import LogFormatter
 except ImportError:
     Figure = None  # type: ignore[assignment,misc]
 
@@ -23,7 +22,7 @@ def ladder_figure(ladders: Sequence[Mapping[str, Any]]) -> "Figure":
 
     Args:
         ladders: from `jaxeit.Ladder.summary`; where its rungs say ``least_ms``, the least time that the machine's
-            arithmetic and memory allow the factorisation, a line joins these.
+            arithmetic and memory allow the factorisation, a line tells which error takes how long at least.
 
     Raises:
         ReportError: where matplotlib is not installed.
@@ -42,20 +41,27 @@ def ladder_figure(ladders: Sequence[Mapping[str, Any]]) -> "Figure":
 def _panel(axes: Any, found: Mapping[str, Any]) -> None:
     axes.set(xscale="log", yscale="log", xlabel="time of one forward solve, ms")
     axes.set_title(", ".join([found["skin"], *found["effects"]]), fontsize=10.5)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))  # numbers where a decade is not full
+    plain_numbers(axes)
     axes.margins(0.12)
     axes.grid(True, which="major", color="#e4e4e4", linewidth=0.8)
     axes.axhspan(0, 100 * found["reference"]["difference_uncertainty"], color="#f0f0f0", zorder=0)
     rungs = _once(found["rungs"])
     front = sorted(_point(rung) for rung in rungs if rung["front"])
     axes.plot(*zip(*front, strict=True), color=_GREY, linewidth=0.9, zorder=1)
-    least = sorted((rung["least_ms"], 100 * rung["difference_error"]) for rung in rungs if "least_ms" in rung)
+    least = _falling((rung["least_ms"], 100 * rung["difference_error"]) for rung in rungs if "least_ms" in rung)
     if least:
         axes.plot(*zip(*least, strict=True), color=_GREY, linewidth=1.2, linestyle=":", zorder=1)
     for rung in rungs:
         _mark(axes, rung)
+
+
+def _falling(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those that nothing to their left undercuts, from left to right."""
+    found: list[tuple[float, float]] = []
+    for point in sorted(points):
+        if not found or point[1] < found[-1][1]:
+            found.append(point)
+    return found
 
 
 def _once(rungs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -78,7 +84,7 @@ def _mark(axes: Any, rung: Mapping[str, Any]) -> None:
     plain = fidelity["solver"] == "None"
     axes.plot(*place, marker="o" if plain else "s", color=colour, markerfacecolor=face, markersize=6, linestyle="none")
     if rung["label"] in NAMED:
-        axes.annotate(rung["label"], place, xytext=(6, 5), textcoords="offset points", fontsize=9)
+        axes.annotate(rung["label"], place, xytext=(0, 7), textcoords="offset points", ha="center", fontsize=9)
 
 
 def _legend(limited: bool) -> list["Line2D"]:

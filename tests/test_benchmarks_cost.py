@@ -271,6 +271,10 @@ def test_smoke_pipeline():
 # --- tables of the README
 
 
+def _frame_row(way, ms):
+    return {"way": way, "least_ms": 0.0629} | {f"{name}_ms": ms for name in ("p50", "p99", "max")}
+
+
 def test_tables_of_the_pages(root):
     spread = {"median_ms": 1234.0, "min_ms": 1.0, "max_ms": 2e3}
     press = {"curve": "linear", "location": "none", "spread": "scattered", "minutes": 2.1}
@@ -278,6 +282,14 @@ def test_tables_of_the_pages(root):
         "pipeline": {
             "rows": [{"tool": "EIDORS, pixels", "nodes": n, **spread} for n in (961, 3721)],
             "to_accuracy": bench_pipeline.to_accuracy([_reached("EIDORS first order", 1, "regular", 5e-4, 20.0)]),
+        },
+        "inverse": {
+            "rows": [{"tool": "jaxeit float64, pixels", "nodes": n, **spread} for n in (961, 3721)],
+            "application": {
+                "single": [_frame_row("on_host", 0.0257), _frame_row("in a loop", 0.02)],
+                "single, after other work": [_frame_row("on_host", 0.1346)],
+                "batch": [_frame_row("on_host", 0.0055), _frame_row("of a batch only", 1.0)],
+            },
         },
         "calibration_cost": {"presses": [press | {"presses": 25}, press | {"presses": 225, "hold_n": 3.014}]},
         "protocol_cost": {
@@ -337,6 +349,10 @@ def test_tables_of_the_pages(root):
     assert "| at rest | 24 |  |  | 4,000 | 2,000 |" in text["event-scan"]
     assert "| none | 7 | 7 | 7 | 7 | 7 | 7 |" in text["effects"]
     assert "| EIDORS, onto pixels | 1,234 | 1,234 |" in text["pipeline"]
+    assert "| jaxeit float64, onto pixels | 1,234 | 1,234 |" in text["preparation"]
+    assert "| on_host | 0.026 | 0.026 | 0.026 | 0.135 | 0.135 | 0.135 | 0.0055 | 0.063 |" in text["frame"]
+    assert "| in a loop | 0.020 | 0.020 | 0.020 |  |  |  |  | 0.063 |" in text["frame"]
+    assert "of a batch only" not in text["frame"]
     assert "| EIDORS first order | 20 (9) | 20 (9) | not reached |" in text["to-accuracy"]
     assert "| linear, location none | not determined | 3.01 |" in text["calibration-cost"]
     assert "40 readings, 2,500 frames/s" in text["measurement-cost"]
