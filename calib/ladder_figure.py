@@ -84,7 +84,8 @@ def _mark(axes: Any, rung: Mapping[str, Any]) -> None:
     plain = fidelity["solver"] == "None"
     axes.plot(*place, marker="o" if plain else "s", color=colour, markerfacecolor=face, markersize=6, linestyle="none")
     if rung["label"] in NAMED:
-        axes.annotate(rung["label"], place, xytext=(0, 7), textcoords="offset points", ha="center", fontsize=9)
+        below = {"xytext": (-9, -9), "ha": "right", "va": "center"}  # where no rung is, nor the line between them
+        axes.annotate(rung["label"], place, textcoords="offset points", fontsize=9, **below)
 
 
 def _legend(limited: bool) -> list["Line2D"]:
