@@ -268,10 +268,12 @@ def test_the_summary_is_json_and_draws(found):
     assert [rung["label"] for rung in numbers["rungs"]] == ["coarse", "middle", "single"]
     assert numbers["rungs"][1]["image"]["frame"]["repeats"] == 3
     assert numbers["rungs"][2]["fidelity"]["dtype"] == "float32"
-    numbers["rungs"][0]["least_ms"] = 1e-3
-    numbers["rungs"][1]["least_ms"] = 1e-2
+    for rung, least, error in zip(numbers["rungs"], (2e-3, 1e-3, 1e-2), (3e-2, 2e-2, 1e-2), strict=True):
+        rung |= {"least_ms": least, "difference_error": error}
     figure = ladder_figure([numbers, numbers])
     assert [axes.get_title() for axes in figure.axes] == ["test", "test"]
+    (limit,) = (line for line in figure.axes[1].lines if line.get_linestyle() == ":")
+    np.testing.assert_allclose(limit.get_xydata(), [(1e-3, 2), (1e-2, 1)])  # the first rung takes longer and errs more
 
 
 def test_the_command_prints_recommends_and_draws(monkeypatch, tmp_path, capsys):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import bench_real
 from benchmarks.bench_real import RECORDINGS
 from calib.curves import Affine
 from calib.response import fit_log
@@ -26,6 +27,13 @@ def test_every_fault_is_told_and_only_that():
     flags = {name: np.flatnonzero(flag).tolist() for name, flag in found._asdict().items()}
     assert flags == {"stuck": [1], "saturated": [2], "silent": [3], "spiking": [4]}
     assert np.flatnonzero(found.any).tolist() == [1, 2, 3]
+
+
+def test_recordings_that_are_not_there_are_named(tmp_path, capsys):
+    (tmp_path / "eflesh").mkdir()
+    with pytest.raises(SystemExit):
+        bench_real.main([str(tmp_path)])
+    assert f"{tmp_path} has no folder pneumatic_actuator, insole_plenum" in capsys.readouterr().err
 
 
 def test_a_lag_follows_a_step_by_its_time_constant():
