@@ -138,20 +138,20 @@ class Times(NamedTuple):
     after_others: list[float]
 
 
-class Work(NamedTuple):
+class Call(NamedTuple):
     """A tool, and the conductivity that it is called with."""
 
     tool: Tool
     sigma: np.ndarray
 
 
-def interleaved(works: Sequence[Work], repeats: int, budget: float) -> list[Times]:
+def interleaved(calls: Sequence[Call], repeats: int, budget: float) -> list[Times]:
     """All in turn, round after round, each round in another order; a slow one stops after ``budget`` seconds and
     `LEAST` turns."""
-    times = [Times([], []) for _ in works]
+    times = [Times([], []) for _ in calls]
     for turn in range(repeats):
-        for number in np.random.default_rng(turn).permutation(len(works)):  # none always after the same one
-            (tool, sigma), (own, after_others) = works[number], times[number]
+        for number in np.random.default_rng(turn).permutation(len(calls)):  # none always after the same one
+            (tool, sigma), (own, after_others) = calls[number], times[number]
             if len(own) < LEAST or sum(own) < budget:
                 last, first = a_turn(tool, sigma * (1 + 1e-3 * turn))
                 own.append(last)
@@ -218,7 +218,7 @@ def measured(
     found = require_agreement({name: out for name, (_, out) in first.items()}, reference, loose)
     first_call = {name: round(spent, 3) for name, (spent, _) in first.items()}
     del first  # Jacobians are large
-    times = interleaved([Work(tool, problem.sigma) for tool in tools.values()], repeats, budget)
+    times = interleaved([Call(tool, problem.sigma) for tool in tools.values()], repeats, budget)
     return [
         {
             "tool": name,

@@ -7,7 +7,6 @@ import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import jaxeit as je
-from calib.figures import plain_numbers, png
-from calib.session import replacing
+from calib.figures import plain_numbers, write_figure
 from jaxeit.solvers import NestedDissection
 from tests.oracles.disc import disc_potentials
 from tests.oracles.rectangle import green
@@ -154,7 +152,8 @@ def peer(case: Case, name: str, prepare: Any, order: int, cells: int) -> Run:
 
 
 def timed(runs: Sequence[Run], repeats: int, budget: float) -> list[Row]:
-    times = c.interleaved([c.Work(run.tool, run.flat) for run in runs], repeats, budget)
+    """What each is called, with its times."""
+    times = c.interleaved([c.Call(run.tool, run.flat) for run in runs], repeats, budget)
     return [run.labels | c.spread(own) for run, (own, _) in zip(runs, times, strict=True)]
 
 
@@ -244,12 +243,6 @@ def picture(rows: list[Row]) -> Figure:
     return figure
 
 
-def draw(rows: list[Row], path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with replacing(path) as new:
-        new.write_bytes(png(picture(rows)))
-
-
 def _panel(axes: Any, rows: list[Row], sheet: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel="time of one forward solve, ms")
     axes.set_title(TITLES[sheet], fontsize=10.5)
@@ -304,14 +297,14 @@ def main(argv: list[str] | None = None) -> Row:
     args = parser.parse_args(argv)
     c.set_up()
     if args.draw_only:
-        draw(c.stored("accuracy")["rows"], PICTURE)
+        write_figure(picture(c.stored("accuracy")["rows"]), PICTURE)
         return {}
     data: Row = {"circumstances": c.circumstances()}
     data["rows"] = rows = measure(*(SMOKE if args.smoke else FULL))
     print(table(rows), verdict(rows), sep="\n\n", flush=True)
     if not args.smoke:
         c.write("accuracy", c.closed(data))
-        draw(rows, PICTURE)
+        write_figure(picture(rows), PICTURE)
     return data
 
 

@@ -15,7 +15,6 @@ import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,12 +24,11 @@ from matplotlib.figure import Figure
 import calib
 import jaxeit as je
 from calib.calibration import press_data
-from calib.figures import plain_numbers, png
+from calib.figures import plain_numbers, write_figure
 from calib.fit import FitResult
 from calib.hybrid import Hybrid, PressData, fit_hybrid, folds_by_place
 from calib.location import Geometry, Places, geometry_of
 from calib.runtime import set_up
-from calib.session import replacing
 
 from . import _common as c
 
@@ -304,12 +302,6 @@ def picture(data: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw(data: Mapping[str, Any], path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with replacing(path) as new:
-        new.write_bytes(png(picture(data)))
-
-
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="few fits, nothing written")
@@ -317,7 +309,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     set_up()
     if args.draw_only:
-        draw(c.stored("calibration_cost"), PICTURE)
+        write_figure(picture(c.stored("calibration_cost")), PICTURE)
         return {}
     data: dict[str, Any] = {"circumstances": c.circumstances()}
     found = pool(**SMOKE) if args.smoke else pool()
@@ -328,7 +320,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     print(table([*data["presses"], *data["levels"]]), data["verdict"], sep="\n\n", flush=True)
     if not args.smoke:
         c.write("calibration_cost", c.closed(data))
-        draw(data, PICTURE)
+        write_figure(picture(data), PICTURE)
     return data
 
 

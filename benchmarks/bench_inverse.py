@@ -38,7 +38,7 @@ FLOAT32_IMAGES = (
 CALLS, BLOCK, BUDGET = 2000, 100, 12.0  # calls whose times are taken, in turns of a block; s for a slow one
 SINGLE, AFTER_WORK, BATCH = "single", "single, after other work", "batch"
 QUICK, CLOCK = 25e-6, "nothing but the clock, for 0.025 ms"  # as long as our quickest way takes
-WORK = np.zeros(1 << 25, np.uint8)  # bytes that other work touches: sixteen times what a core keeps to itself
+ELSEWHERE = np.zeros(1 << 25, np.uint8)  # bytes that other work touches: sixteen times what a core keeps to itself
 TOGETHER, LOOP = 1000, 100
 GOAL_MS, GOAL_TIMES = 0.1, 10
 DTYPES = ("float64", "float32")
@@ -294,7 +294,7 @@ def _block(call: Callable[[], Any], calls: int, left: float, between: Callable[[
 
 def other_work() -> None:
     """What a robot does between two frames: the caches hold other things thereafter."""
-    np.add(WORK, 1, out=WORK)
+    np.add(ELSEWHERE, 1, out=ELSEWHERE)
 
 
 def copy_seconds(count: int) -> float:

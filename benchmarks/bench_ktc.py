@@ -28,8 +28,7 @@ from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from scipy.optimize import minimize_scalar
 
 import jaxeit as je
-from calib.figures import png
-from calib.session import replacing
+from calib.figures import write_figure
 
 from . import _common as c
 
@@ -356,12 +355,6 @@ def _panel(axes: Any, labels: np.ndarray, level: int) -> None:
     axes.set_frame_on(False)
 
 
-def draw(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with replacing(path) as new:
-        new.write_bytes(png(figure))
-
-
 def main(argv: list[str] | None = None) -> Row:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder with training/ and groundtruth_training/")
@@ -391,7 +384,7 @@ def main(argv: list[str] | None = None) -> Row:
         "other_sectors": others,
     }
     c.write("ktc", c.closed(results))
-    draw(picture(data, found), PICTURE)
+    write_figure(picture(data, found), PICTURE)
     return results
 
 

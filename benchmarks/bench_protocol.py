@@ -13,9 +13,8 @@ fit finds no contact.
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -26,8 +25,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import jaxeit as je
-from calib.figures import plain_numbers, png
-from calib.session import replacing
+from calib.figures import plain_numbers, write_figure
 
 from . import _common as c
 
@@ -273,12 +271,6 @@ def picture(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def draw(data: Mapping[str, Any], path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with replacing(path) as new:
-        new.write_bytes(png(picture(data["rows"])))
-
-
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="few presses and readings, nothing written")
@@ -286,7 +278,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     c.set_up()
     if args.draw_only:
-        draw(c.stored("protocol_cost"), PICTURE)
+        write_figure(picture(c.stored("protocol_cost")["rows"]), PICTURE)
         return {}
     skin = je.load_skin("testbed")
     model = je.discretise(je.Scene(skin), je.Fidelity.draft())
@@ -302,7 +294,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     print(table(data["rows"]), event_table(data["events"]), sep="\n\n", flush=True)
     if not args.smoke:
         c.write("protocol_cost", c.closed(data))
-        draw(data, PICTURE)
+        write_figure(picture(data["rows"]), PICTURE)
     return data
 
 

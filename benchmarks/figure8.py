@@ -21,9 +21,8 @@ import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.bench.motion import moments, planned
-from calib.figures import ForceSeries, force_series_figure, png
+from calib.figures import ForceSeries, force_series_figure, write_figure
 from calib.runtime import set_up
-from calib.session import replacing
 
 from . import _common as c
 
@@ -50,8 +49,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     if not args.smoke:
         c.write("figure8", c.closed(data))
         cases = [_series(scene, forces, press, title) for press, title in _cases(rows)]
-        with replacing(PICTURE) as new:
-            new.write_bytes(png(force_series_figure(cases, simulated=True)))
+        write_figure(force_series_figure(cases, simulated=True), PICTURE)
     return data
 
 

@@ -5,16 +5,14 @@ python -m benchmarks.ladder [--smoke | --draw-only]
 
 import argparse
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 import jaxeit as je
-from calib.figures import png
+from calib.figures import write_figure
 from calib.ladder_figure import ladder_figure
-from calib.session import replacing
 from jaxeit.solvers import NestedDissection
 
 from . import _common as c
@@ -45,12 +43,6 @@ def least(scene: je.Scene, fidelity: je.Fidelity, machine: dict[str, float]) -> 
     return {"least_ms": 1e3 * max(work["flops"] / machine["flop_per_s"], work["bytes"] / machine["byte_per_s"])}
 
 
-def draw(ladders: list[dict[str, Any]], path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with replacing(path) as new:
-        new.write_bytes(png(ladder_figure(ladders)))
-
-
 def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="one skin, two coarse rungs, nothing written")
@@ -58,14 +50,14 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     c.set_up()
     if args.draw_only:
-        draw(c.stored("ladder")["ladders"], PICTURE)
+        write_figure(ladder_figure(c.stored("ladder")["ladders"]), PICTURE)
         return {}
     data: dict[str, Any] = {"circumstances": c.circumstances(), "limits": c.limits()}
     skins, choices = (SKINS[:1], je.few_choices()) if args.smoke else (SKINS, None)
     data["ladders"] = [measure(name, choices, data["limits"]) for name in skins]
     if not args.smoke:
         c.write("ladder", c.closed(data))
-        draw(data["ladders"], PICTURE)
+        write_figure(ladder_figure(data["ladders"]), PICTURE)
     return data
 
 

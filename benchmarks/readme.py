@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 import calib
-from calib.figures import png, sensitivity_figure
+from calib.figures import sensitivity_figure, write_figure
 from calib.runtime import set_up
 from calib.session import replacing
 
@@ -30,7 +30,7 @@ def main() -> None:
         with replacing(page) as new:
             new.write_text(text, encoding="utf-8")
     figure = sensitivity_figure(calibration.evaluation, calibration.skin, simulated=True)
-    (ROOT / "docs" / "sensitivity.png").write_bytes(png(figure))
+    write_figure(figure, ROOT / "docs" / "sensitivity.png")
 
 
 if __name__ == "__main__":

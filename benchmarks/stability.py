@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,8 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import jaxeit as je
-from calib.figures import png
-from calib.session import replacing
+from calib.figures import write_figure
 from tests import hard_sheet as sheet
 from tests import hard_strip as strip
 from tests.oracles.rational import inverse_corner
@@ -284,12 +282,6 @@ def _legend() -> list[Line2D]:
     return [*entries, Line2D([], [], color="#555555", marker="x", linestyle="none", label="not finite, or refused")]
 
 
-def draw(rows: list[Row], path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with replacing(path) as new:
-        new.write_bytes(png(picture(rows)))
-
-
 def main(argv: list[str] | None = None) -> Row:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="two severities of each axis, nothing written")
@@ -297,13 +289,13 @@ def main(argv: list[str] | None = None) -> Row:
     args = parser.parse_args(argv)
     c.set_up()
     if args.draw_only:
-        draw(c.stored("stability")["rows"], PICTURE)
+        write_figure(picture(c.stored("stability")["rows"]), PICTURE)
         return {}
     data: Row = {"circumstances": c.circumstances()}
     data["rows"] = rows = measure(AXES, 2 if args.smoke else None)
     if not args.smoke:
         c.write("stability", c.closed(data))
-        draw(rows, PICTURE)
+        write_figure(picture(rows), PICTURE)
     return data
 
 

@@ -726,12 +726,10 @@ def _bench_scene(what: str):
 
 
 def _write_ladder_figure(found, path: Path) -> None:
-    from .figures import png
+    from .figures import write_figure
     from .ladder_figure import ladder_figure
-    from .session import replacing
 
-    with replacing(path) as new:
-        new.write_bytes(png(ladder_figure([found.summary()])))
+    write_figure(ladder_figure([found.summary()]), path)
 
 
 def _size(path: str) -> int:

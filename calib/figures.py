@@ -6,6 +6,7 @@ Lengths are drawn in mm, pressures in kPa, forces in N. Nothing here touches mat
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -18,6 +19,7 @@ from .calibration import Calibration
 from .evaluation import CALIBRATED, Evaluation
 from .location import FittedField, log_gain, single_places
 from .presses import dominant_pad
+from .session import replacing
 
 try:  # an extra: without it everything but the figures works
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -66,6 +68,12 @@ def plain_numbers(axes: Any) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(lambda value, _, axis=axis: between(axis, value))
+
+
+def write_figure(figure: "Figure", path: Path) -> None:
+    """The figure as a PNG file at a path, whole or not at all."""
+    with replacing(path) as new:
+        new.write_bytes(png(figure))
 
 
 def png(figure: "Figure") -> bytes:

@@ -1,7 +1,9 @@
 """The picture of `jaxeit bench`: error against time, one point per fidelity."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from jaxeit.rungs import undominated
 
 from .figures import plain_numbers, require_matplotlib
 
@@ -48,20 +50,12 @@ def _panel(axes: Any, found: Mapping[str, Any]) -> None:
     rungs = _once(found["rungs"])
     front = sorted(_point(rung) for rung in rungs if rung["front"])
     axes.plot(*zip(*front, strict=True), color=_GREY, linewidth=0.9, zorder=1)
-    least = _falling((rung["least_ms"], 100 * rung["difference_error"]) for rung in rungs if "least_ms" in rung)
+    least = [(rung["least_ms"], 100 * rung["difference_error"]) for rung in rungs if "least_ms" in rung]
     if least:
-        axes.plot(*zip(*least, strict=True), color=_GREY, linewidth=1.2, linestyle=":", zorder=1)
+        limit = sorted(undominated(least, lambda costs: costs))
+        axes.plot(*zip(*limit, strict=True), color=_GREY, linewidth=1.2, linestyle=":", zorder=1)
     for rung in rungs:
         _mark(axes, rung)
-
-
-def _falling(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those that nothing to their left undercuts, from left to right."""
-    found: list[tuple[float, float]] = []
-    for point in sorted(points):
-        if not found or point[1] < found[-1][1]:
-            found.append(point)
-    return found
 
 
 def _once(rungs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

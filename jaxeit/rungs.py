@@ -3,13 +3,15 @@
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from .choices import Choice, LadderError, Touch
 from .fidelity import Fidelity
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -130,12 +132,12 @@ class Ladder:
 
     def front(self) -> tuple[Rung, ...]:
         """Fidelities that no other beats in both difference error and time of a forward solve."""
-        return _pareto(self.fidelities(), lambda r: (self.certain(r), r.forward.median))
+        return undominated(self.fidelities(), lambda r: (self.certain(r), r.forward.median))
 
     def image_front(self) -> tuple[Rung, ...]:
         """Rungs that no other beats in both localisation error and time of a frame."""
-        imaged = [r for r in self.rungs if r.image]
-        return _pareto(imaged, lambda r: (r.image.localisation, r.image.frame.median))
+        images = {r: r.image for r in self.rungs if r.image}
+        return undominated(list(images), lambda r: (images[r].localisation, images[r].frame.median))
 
     def recommend(self, *, budget_ms: float | None = None, error: float | None = None) -> Rung:
         """The quickest rung that is within ``error``; without one, the most accurate within the budget.
@@ -187,13 +189,14 @@ class Ladder:
         return f"{rung.choice.label}, has {self.certain(rung):.2g} in {1e3 * rung.forward.median:.3g} ms"
 
 
-def _pareto(rungs: Sequence[Rung], costs: Callable[[Any], tuple[float, float]]) -> tuple[Rung, ...]:
-    found = [costs(rung) for rung in rungs]
+def undominated(items: Sequence[T], costs: Callable[[T], tuple[float, float]]) -> tuple[T, ...]:
+    """Those that no other beats in both costs, the Pareto front, in the order given."""
+    found = [costs(item) for item in items]
 
     def beaten(mine):
         return any(a <= mine[0] and b <= mine[1] and (a, b) != mine for a, b in found)
 
-    return tuple(rung for rung, cost in zip(rungs, found, strict=True) if not beaten(cost))
+    return tuple(item for item, cost in zip(items, found, strict=True) if not beaten(cost))
 
 
 def require_wishes(budget_ms: float | None, error: float | None) -> None:

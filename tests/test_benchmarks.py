@@ -11,6 +11,7 @@ import jaxeit as je
 from benchmarks import _common as common
 from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_inverse, bench_jacobian, stability
 from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
+from calib.figures import write_figure
 
 from .oracles.rectangle import four_point
 
@@ -86,8 +87,8 @@ def test_the_picture_has_a_curve_per_order_precision_and_grading(tmp_path):
     ]
     assert [len(lines) for lines in curves] == [12, 12]
     assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in curves[0]}) == 12
-    bench_accuracy.draw(rows, tmp_path / "docs" / "accuracy.png")
-    assert (tmp_path / "docs" / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+    write_figure(bench_accuracy.picture(rows), tmp_path / "accuracy.png")
+    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_float32_is_run_on_the_finest():
@@ -205,7 +206,7 @@ def test_the_clock_of_a_tool_in_another_process_counts():
         def __call__(self, sigma):
             return sigma
 
-    assert common.interleaved([common.Work(Elsewhere(), np.ones(3))], 2, budget=1e3) == [
+    assert common.interleaved([common.Call(Elsewhere(), np.ones(3))], 2, budget=1e3) == [
         ([123.0, 123.0], [123.0, 123.0])
     ]
 
@@ -219,16 +220,16 @@ def test_a_quick_tool_is_called_again_and_again_in_its_turn_and_the_last_call_co
             calls.append(sigma[0])
             self.last_seconds = (0.08, 0.04, 0.05)[len(calls) % 3 - 1]
 
-    (times,) = common.interleaved([common.Work(Tool(), np.ones(3))], 2, budget=1e3)
+    (times,) = common.interleaved([common.Call(Tool(), np.ones(3))], 2, budget=1e3)
     assert times == ([0.05, 0.05], [0.08, 0.08])
     assert len(set(calls)) == 6  # no conductivity twice
 
 
 def test_a_slow_tool_stops_after_its_budget():
-    work = common.Work(np.copy, np.ones(3))
-    times = common.interleaved([work, work], 9, budget=0.0)
+    call = common.Call(np.copy, np.ones(3))
+    times = common.interleaved([call, call], 9, budget=0.0)
     assert [len(own) for own, _ in times] == [common.LEAST, common.LEAST]
-    ((own, _),) = common.interleaved([work], 9, budget=60.0)
+    ((own, _),) = common.interleaved([call], 9, budget=60.0)
     assert common.spread(own)["repeats"] == 9
 
 
@@ -354,7 +355,7 @@ def test_stability_holds_where_the_textbook_fails(tmp_path):
     assert max(row["float32"] for row in rows) < 1e-4
     assert min(row["naive"] for row in rows) > 1e-4
     rows[0]["naive"] = None
-    stability.draw(rows, tmp_path / "map.png")
+    write_figure(stability.picture(rows), tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     titles = [axes.get_title() for axes in stability.picture(rows).axes]
     assert titles == [axis.title for axis in stability.AXES]

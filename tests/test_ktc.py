@@ -9,6 +9,7 @@ import pytest
 
 import jaxeit as je
 from benchmarks import bench_ktc as ktc
+from calib.figures import write_figure
 
 from .helpers import disc_model
 
@@ -82,8 +83,8 @@ def test_the_picture_shows_the_score_and_the_electrodes_in_use(tmp_path):
     panels = np.array(figure.axes).reshape(2, 5)
     assert [len(axes.lines) for axes in panels[0]] == [32, 32, 32, 20, 20]
     assert {axes.get_xlabel() for axes in panels[:, 1:].ravel()} == {"score 1.00"}
-    ktc.draw(figure, tmp_path / "docs" / "ktc.png")
-    assert (tmp_path / "docs" / "ktc.png").read_bytes().startswith(b"\x89PNG")
+    write_figure(figure, tmp_path / "ktc.png")
+    assert (tmp_path / "ktc.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.fixture(scope="module")
