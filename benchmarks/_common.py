@@ -391,7 +391,7 @@ def stored(section: str) -> Any:
     path = RESULTS / f"{machine()}.json"
     results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if section not in results:
-        raise SystemExit(f"{path} has no {section!r} to draw; measure first (leave out --draw-only)")
+        raise SystemExit(f"{path} has no {section!r}; measure first (leave out --draw-only or another --...-only)")
     return results[section]
 
 
