@@ -21,11 +21,10 @@ from .basis import Elements
 from .descent import STEPS, TRIAL, Fit, begun, descend, resume, ridge, scale_of
 from .discretise import Model
 from .gaps import gap_of
-from .inverse import require_frames
 from .jacobian import pair_jacobian
 from .responses import Nodes, Responses, nodes_of, reached, responses_of, tabulate
 from .verbs import verb
-from .whitening import InverseError, Whitened, Whitening, whitened_readings
+from .whitening import InverseError, Whitened, Whitening, require_frames, whitened_readings
 
 _LONGEST = 0.04  # half length of an oblong contact, m
 _RIPPLE = 0.1  # of the strongest contact's strength: what is less is none

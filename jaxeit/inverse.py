@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
-from math import isfinite
-from typing import Any, TypedDict, Unpack, overload
+from typing import TypedDict, Unpack, overload
 
 import equinox as eqx
 import jax
@@ -14,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from scipy.sparse import csr_array
 
 from .basis import AbstractBasis, AbstractPictured, BasisMap, Picture, Pixels
 from .discretise import Model
+from .host import FEW, HostImages
 from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, one_step
@@ -28,13 +27,13 @@ from .whitening import (
     Whitened,
     Whitening,
     as_flags,
+    require_frames,
     require_some,
     whitened_readings,
 )
 
 _VERSION = metadata.version("jaxeit")
 _MOST = 1e4  # hyperparameter
-_FEW = 16  # readings missing from a frame, up to which they are mended one by one
 
 
 class Provenance(dict[str, str]):
@@ -100,17 +99,17 @@ class AbstractReconstructor(AbstractPictured):
     def _mended(self, dv: Float[Array, " readings"]) -> Float[Array, " k"]:
         """Sums that give the image of the readings at hand: the others are what that image predicts for them."""
         missing = self.channels & ~jnp.isfinite(dv)
-        few = jnp.sum(missing) <= (_FEW if self.whitening.weight.ndim == 1 else 0)
+        few = jnp.sum(missing) <= (FEW if self.whitening.weight.ndim == 1 else 0)
         return jax.lax.cond(few, lambda *a: self._few(*a), lambda *a: self._many(*a), dv, missing)
 
     def _few(self, dv, missing):
         """Through the missing readings themselves: ``y = P T (t + P^T W y)`` on their rows of P."""
-        rows = jnp.flatnonzero(missing, size=_FEW, fill_value=0)
-        there = (jnp.arange(_FEW) < jnp.sum(missing)).astype(dv.dtype)
+        rows = jnp.flatnonzero(missing, size=FEW, fill_value=0)
+        there = (jnp.arange(FEW) < jnp.sum(missing)).astype(dv.dtype)
         p = self.whitening.rows(rows) * there[:, None]
         weighted = p * self.whitening.weight[rows, None] if self.whitening.weight.ndim == 1 else p
         sums, through = self.whitening.sums(jnp.where(missing, 0, dv)), p @ self.predict
-        y = jnp.linalg.solve(jnp.eye(_FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
+        y = jnp.linalg.solve(jnp.eye(FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
         return sums + weighted.T @ y
 
     def _many(self, dv, missing):
@@ -160,25 +159,11 @@ class Reconstructor(AbstractReconstructor):
         return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
 
     def on_host(self) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
-        """The same in NumPy: for one frame at a time JAX's call alone takes longer than the image.
+        """The same in NumPy: for one frame at a time a call of JAX alone takes longer than the image.
 
-        Frames with readings that are not finite go through JAX.
+        Frames that lack more than a few readings, or any while noise is correlated, go through JAX.
         """
-        dtype, readings = np.dtype(self.factor.dtype), self.readings
-        sums = self.whitening.sums(jnp.eye(readings, dtype=dtype)).T
-        weigh: Any = csr_array(sums) if self.whitening.weight.ndim == 1 else np.asarray(sums)
-        factor = np.asarray(self.factor)
-
-        def apply(dv):
-            dv = np.asarray(dv, dtype)
-            require_frames(dv, readings)
-            t = weigh @ (dv if dv.ndim == 1 else dv.reshape(-1, readings).T)
-            if not isfinite(np.vdot(t, t)):
-                return np.asarray(self(dv))
-            image = factor @ t
-            return image if dv.ndim == 1 else image.T.reshape(*dv.shape[:-1], -1)
-
-        return apply
+        return HostImages(self.factor, self.predict, self.whitening, lambda dv: np.asarray(self(dv)))
 
     def astype(self, dtype: str) -> "Reconstructor":
         """The same in another precision: built in float64, a matrix may be applied in float32."""
@@ -380,9 +365,3 @@ def _rank(found: Whitened, followed: Float[Array, "r k"]) -> str:
 
 def _whiten(found: Whitened, dtype: np.dtype, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... r"]:
     return found.whitening.sums(jnp.asarray(dv, dtype)) @ jnp.asarray(found.compress, dtype).T
-
-
-def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
-    """Refuse what is no frame, or frames, of so many readings."""
-    if np.shape(dv)[-1:] != (readings,):
-        raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {readings} readings")

@@ -84,7 +84,7 @@ class Whitening(eqx.Module):
         """Rows of P."""
         place = self.pairs[number]
         row = jnp.zeros((len(number), self.lines.shape[0]), self.sign.dtype)
-        signs = self.current * jnp.asarray(_SIGNS, self.sign.dtype)
+        signs = self.current * jnp.asarray(SIGNS, self.sign.dtype)
         return row.at[jnp.arange(len(number))[:, None], place].add(signs)
 
     def lost(self, dv: Float[Array, " readings"]) -> Lost:
@@ -167,13 +167,13 @@ class Whitened(NamedTuple):
     compress: np.ndarray
 
 
-_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def lines_of(pairs: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """For each pair sum the readings it occurs in, and its sign there; padded with sign 0."""
     order = np.argsort(pairs, axis=None, kind="stable")
-    pair, reading, sign = pairs.ravel()[order], order // 4, _SIGNS[order % 4]
+    pair, reading, sign = pairs.ravel()[order], order // 4, SIGNS[order % 4]
     counts = np.bincount(pair, minlength=count)
     rank = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
     lines, signs = np.zeros((count, counts.max()), int), np.zeros((count, counts.max()))
@@ -185,10 +185,10 @@ def _gram(pairs: np.ndarray, count: int, weight: np.ndarray) -> np.ndarray:
     """``G = P^T W P`` for a unit current."""
     if weight.ndim == 1:
         place = count * pairs[:, :, None] + pairs[:, None]
-        shares = weight[:, None, None] * np.outer(_SIGNS, _SIGNS)
+        shares = weight[:, None, None] * np.outer(SIGNS, SIGNS)
         return np.bincount(place.ravel(), shares.ravel(), count**2).reshape(count, count)
     rows = np.repeat(np.arange(len(pairs)), 4)
-    p = sp.csr_array((np.tile(_SIGNS, len(pairs)), (rows, pairs.ravel())))
+    p = sp.csr_array((np.tile(SIGNS, len(pairs)), (rows, pairs.ravel())))
     return p.T @ (p.T @ weight).T
 
 
@@ -228,6 +228,12 @@ def as_flags(channels, readings: int) -> np.ndarray:
     if flags.shape != (readings,):
         raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
     return flags
+
+
+def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
+    """Refuse what is no frame, or frames, of so many readings."""
+    if np.shape(dv)[-1:] != (readings,):
+        raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {readings} readings")
 
 
 def require_some(used: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import lstsq
 
 import jaxeit as je
+from jaxeit.host import HostImages
 from jaxeit.basis import overlap_areas
 
 
@@ -72,16 +73,48 @@ def test_the_compiled_function_is_the_same_map(recon):
     np.testing.assert_allclose(apply(dv[0]), recon(dv[0]), rtol=1e-9, atol=1e-12)
 
 
+def _same_in_numpy(recon, dv):
+    """`on_host` against JAX, which mends through one padded system, or through all pair sums."""
+    found, expected = recon.on_host()(dv), np.asarray(recon(dv))
+    assert found.shape == expected.shape
+    assert found.dtype == expected.dtype
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
 def test_numpy_gives_the_same_image(recon):
     dv = np.array(jax.random.normal(jax.random.key(0), (2, 3, recon.readings)))
     dv[1, 2, 5] = np.nan
-    apply = recon.on_host()
     for frames in (dv, dv[0], dv[0, 0], dv[1, 2]):
-        found, expected = apply(frames), np.asarray(recon(frames))
-        assert found.shape == expected.shape
-        np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+        _same_in_numpy(recon, frames)
     with pytest.raises(je.InverseError, match="must hold 550"):
-        apply(np.zeros(3))
+        recon.on_host()(np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def correlated(model, pixels):
+    """The noise of neighbours goes together."""
+    place = np.arange(550)
+    return je.prepare(model, basis=pixels, noise=1e-6 * 0.5 ** np.abs(place - place[:, None]))
+
+
+@pytest.mark.parametrize("lost", [1, 16, 17, 60])
+def test_numpy_mends_frames_as_jax_does(recon, correlated, lost):
+    rng = np.random.default_rng(lost)
+    dv = rng.normal(size=550)
+    dv[rng.choice(550, lost, replace=False)] = rng.choice([np.nan, np.inf], lost)
+    for one in (recon, correlated):
+        _same_in_numpy(one, dv)
+
+
+def test_numpy_leaves_out_what_jax_leaves_out(model, recon, correlated):
+    dv = np.random.default_rng(0).normal(size=(2, 550))
+    electrode = (np.asarray(model.pattern) == 7).any(1)  # some pair sums are not read at all then
+    dv[:, electrode] = np.nan
+    for one in (recon.without(electrode), correlated.without(electrode)):
+        alone = HostImages(one.factor, one.predict, one.whitening, lambda dv: pytest.fail("this frame is whole"))
+        np.testing.assert_array_equal(alone(dv), one.on_host()(dv))
+        for frames in (dv, dv[0], np.where(np.arange(550) == int(np.argmin(electrode)), np.nan, dv[0])):
+            _same_in_numpy(one, frames)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 549), (550, 2)])

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
     "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise", "forward",
-    "pneumatics", "stiffness", "basis", "jacobian", "whitening", "gaps", "priors", "methods", "hyperparameter",
+    "pneumatics", "stiffness", "basis", "jacobian", "whitening", "host", "gaps", "priors", "methods", "hyperparameter",
     "inverse", "store", "responses", "descent", "contacts", "refine", "optimise", "nonlinear", "background",
     "fusion", "metrics", "regions", "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
