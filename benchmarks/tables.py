@@ -153,6 +153,19 @@ def _frame(results: dict) -> str:
     return _markdown([*heads, "1,000 together", "as many bytes copied"], rows)
 
 
+def _stream(results: dict) -> str:
+    """Frames one after the other, so many that those which take long can be counted."""
+    rows = results["application"][bench_inverse.STREAM]
+    heads = ["ms a frame", "frames", *PERCENTILES, f"above {bench_inverse.GOAL_MS} ms"]
+    cells = ([f"{row[f'{p}_ms']:.3f}" for p in PERCENTILES] for row in rows)
+    return _markdown(
+        heads, [[r["way"], f"{r['calls']:,}", *c, f"{r['above']:,}"] for r, c in zip(rows, cells, strict=True)]
+    )
+
+
+PERCENTILES = ("p50", "p99", "p99.9")
+
+
 def _to_accuracy(results: dict) -> str:
     """The quickest mesh of each tool that reaches an accuracy."""
     targets = list(dict.fromkeys(row["target"] for row in results["to_accuracy"]))
@@ -299,6 +312,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "ladder-chest": (("ladder",), partial(_ladder, skin=1)),
     "preparation": (("inverse",), _preparation),
     "frame": (("inverse",), _frame),
+    "stream": (("inverse",), _stream),
     "pipeline": (("pipeline",), _pipeline),
     "to-accuracy": (("pipeline",), _to_accuracy),
     "calibration-cost": (("calibration_cost",), _calibration),

@@ -254,12 +254,15 @@ def test_a_slow_way_of_application_stops_after_its_budget():
     assert [len(times) for times in taken.values()] == [30, 30]
     rows = bench_inverse.application_rows(ways, taken, byte_per_s=1e3)
     assert [row["least_ms"] for row in rows] == [4.0, 4.0]
+    assert [row["above"] for row in rows] == [int(np.sum(times > 1e-4)) for times in taken.values()]
     assert all(row["min_ms"] <= row["p50_ms"] <= row["p99_ms"] <= row["max_ms"] for row in rows)
     assert not any(len(times) for times in bench_inverse.latencies(ways, 30, 10, budget=0.0).values())
 
 
-def test_the_clock_is_read_for_as_long_as_a_frame_takes():
-    assert common.seconds(bench_inverse.waited)[0] >= bench_inverse.QUICK
+def test_work_in_the_first_cache_is_repeated_until_it_takes_as_long():
+    short, long = (bench_inverse.as_long_as(partial(sum, range(count))) for count in (2_000, 50_000))
+    assert 1 <= 5 * short.args[0] < long.args[0]
+    np.testing.assert_array_equal(long(), np.ones(1))
 
 
 def test_frames_follow_one_another_or_other_work():
@@ -282,16 +285,18 @@ def test_goals_are_judged_by_what_was_measured():
 
     def way(name, most, frames=1):
         times = {"p50_ms": 0.02, "p99_ms": 0.03, "p99.9_ms": 0.04, "min_ms": 0.01, "max_ms": most, "least_ms": 0.01}
-        return {"way": name, "frames": frames} | times
+        return {"way": name, "frames": frames, "calls": 1000, "above": 7} | times
 
     quick = [way("jaxeit, a", 0.09), way("jaxeit, b", 0.2), way("jaxeit, loop", 0.1, 100), way("NumPy", 0.2)]
-    quick.append(way(bench_inverse.CLOCK, 0.2))
-    application = {"single": quick, "single, after other work": [way("jaxeit, a", 0.2)], "batch": [way("jaxeit", 9)]}
+    stream = [way("jaxeit, a", 0.2), way(bench_inverse.STILL, 0.2)]
+    application = {"single": quick, "stream": stream, "single, after other work": [way("jaxeit, a", 0.2)]}
     said = bench_inverse.verdict({"rows": tools(900, 11.0) + tools(400, 9.0), "application": application})
     about = ["400 nodes onto 900 pixels", "900 nodes onto 900 pixels", "single, jaxeit, a", "single, jaxeit, b"]
-    about += ["single, jaxeit, loop", f"single, {bench_inverse.CLOCK}", "single, after other work, jaxeit, a"]
+    about += ["single, jaxeit, loop", "stream, jaxeit, a", f"stream, {bench_inverse.STILL}"]
+    about += ["single, after other work, jaxeit, a"]
     assert [line.split(":")[0] for line in said] == about
-    assert [": met" in line for line in said] == [True, False, True, False, True, False, False]
+    assert [": met" in line for line in said] == [True, False, True, False, True, False, False, False]
+    assert ["7 of 1,000 calls above 0.1" in line for line in said] == [False] * 5 + [True, True, False]
 
 
 @pytest.mark.slow

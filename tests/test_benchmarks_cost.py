@@ -288,6 +288,7 @@ def test_tables_of_the_pages(root):
             "application": {
                 "single": [_frame_row("on_host", 0.0257), _frame_row("in a loop", 0.02)],
                 "single, after other work": [_frame_row("on_host", 0.1346)],
+                "stream": [_frame_row("on_host", 0.0257) | {"p99.9_ms": 0.0774, "calls": 100_000, "above": 28}],
                 "batch": [_frame_row("on_host", 0.0055), _frame_row("of a batch only", 1.0)],
             },
         },
@@ -353,6 +354,7 @@ def test_tables_of_the_pages(root):
     assert "| on_host | 0.026 | 0.026 | 0.026 | 0.135 | 0.135 | 0.135 | 0.0055 | 0.063 |" in text["frame"]
     assert "| in a loop | 0.020 | 0.020 | 0.020 |  |  |  |  | 0.063 |" in text["frame"]
     assert "of a batch only" not in text["frame"]
+    assert "| on_host | 100,000 | 0.026 | 0.026 | 0.077 | 28 |" in text["stream"]
     assert "| EIDORS first order | 20 (9) | 20 (9) | not reached |" in text["to-accuracy"]
     assert "| linear, location none | not determined | 3.01 |" in text["calibration-cost"]
     assert "40 readings, 2,500 frames/s" in text["measurement-cost"]

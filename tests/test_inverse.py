@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import lstsq
 
 import jaxeit as je
-from jaxeit.host import HostImages
 from jaxeit.basis import overlap_areas
+from jaxeit.host import HostImages
 
 
 @pytest.fixture(scope="module")
