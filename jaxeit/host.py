@@ -52,7 +52,7 @@ class HostImages:
     def _batch(self, dv: np.ndarray) -> np.ndarray:
         t = self._sums(dv)
         whole = np.isfinite(t).all(0)
-        images = self._factor.dot(np.where(whole, t, 0)).T
+        images = self._factor.dot(t if whole.all() else np.where(whole, t, 0)).T
         for frame in np.flatnonzero(~whole):
             images[frame] = self._mended(dv[frame])
         return images

@@ -90,11 +90,17 @@ class AbstractReconstructor(AbstractPictured):
     def _sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
         sums = self.whitening.sums(dv)
 
-        def mended():
+        def each():
             frames = dv.reshape(-1, self.readings)
-            return jax.lax.map(lambda dv: self._mended(dv), frames).reshape(sums.shape)
+            return jax.lax.map(self._mended_if_need_be, (frames, sums.reshape(len(frames), -1))).reshape(sums.shape)
 
-        return jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, mended)
+        return jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, each)
+
+    def _mended_if_need_be(
+        self, of_a_frame: tuple[Float[Array, " readings"], Float[Array, " k"]]
+    ) -> Float[Array, " k"]:
+        dv, sums = of_a_frame
+        return jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, lambda: self._mended(dv))
 
     def _mended(self, dv: Float[Array, " readings"]) -> Float[Array, " k"]:
         """Sums that give the image of the readings at hand: the others are what that image predicts for them."""

@@ -119,7 +119,7 @@ MUTANTS = [
     *of(
         "jaxeit/inverse.py",
         IMAGING,
-        ("jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, mended)", "sums", "readings_that_are"),
+        ("jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, each)", "sums", "readings_that_are"),
         (
             "there = (jnp.arange(FEW) < jnp.sum(missing)).astype(dv.dtype)",
             "there = jnp.ones(FEW, dv.dtype)",
