@@ -263,7 +263,7 @@ def _effects(results: dict) -> str:
 def _live(results: dict) -> str:
     """What came over loopback, and when it was shown."""
     soak, tenfold = results["soak"], results["tenfold"]
-    best = [row for row in results["rates"] if row["rate_hz"] == results["highest_hz"]]
+    best = [row for row in results["rates"] if row["rate_hz"] == results["highest_hz"] and row["sustained"]]
     heads = ["run", "frames", "lost", "dropped", *(f"latency {p}, ms" for p in ("p50", "p99", "max"))]
     heads += ["beyond the scan, p99, ms", "a sleeper wakes late, p99, ms", "memory, MB an hour"]
     long = f"live and recorded, {soak['rate_hz']} Hz, {soak['seconds'] / 60:.0f} min"

@@ -333,7 +333,7 @@ def test_tables_of_the_pages(root):
         "soak": run | {"memory_mb_per_hour": 0.123, "memory_mb_per_hour_error": 0.456},
         "soak_realtime": run | {"dropped": 1},
         "tenfold": {"rate_hz": 1000, "seconds": 60.0, "recorded": [59999, 1], "lost": [1, 0]},
-        "rates": [run, run | {"rate_hz": 400}],
+        "rates": [run | {"rate_hz": hz, "sustained": ok} for hz, ok in ((100, True), (400, False), (400, True))],
         "highest_hz": 400,
     }
     pages = [(root / "docs" / name).read_text() for name in ("costs.md", "live.md")]
@@ -367,3 +367,4 @@ def test_tables_of_the_pages(root):
     )
     assert "| live and recorded, 100 Hz, 10 min, `--realtime` | 60,000 | 0 | 1 |" in text["live"]
     assert "| recorded, 1000 Hz, 1 min | 59,999 | 1 |" in text["live"]
+    assert text["live"].count("highest rate sustained: 400 Hz") == 1

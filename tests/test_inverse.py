@@ -104,6 +104,10 @@ def test_numpy_mends_frames_as_jax_does(recon, correlated, lost):
     dv[rng.choice(550, lost, replace=False)] = rng.choice([np.nan, np.inf], lost)
     for one in (recon, correlated):
         _same_in_numpy(one, dv)
+    exact = np.asarray(recon(dv))
+    rounded = recon.astype("float32").on_host()(dv)
+    assert rounded.dtype == np.float32
+    np.testing.assert_allclose(rounded, exact, atol=1e-5 * np.abs(exact).max())
 
 
 def test_numpy_leaves_out_what_jax_leaves_out(model, recon, correlated):
