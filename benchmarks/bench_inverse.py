@@ -214,14 +214,14 @@ def single_ways(recon: je.Reconstructor, frame: np.ndarray) -> dict[str, Way]:
     return {
         f"{name} {dtype}": way
         for dtype in DTYPES
-        for name, way in _single_ways(recon.astype(dtype), frame.astype(dtype), exact, broken, mended).items()
+        for name, way in _single_ways(recon, dtype, frame.astype(dtype), exact, broken.astype(dtype), mended).items()
     }
 
 
-def _single_ways(recon, frame, exact, broken, mended) -> dict[str, Way]:
+def _single_ways(recon, dtype, frame, exact, broken, mended) -> dict[str, Way]:
     on_device, many = jnp.asarray(frame), jnp.tile(frame, (LOOP, 1))
-    broken, wait = broken.astype(frame.dtype), jax.block_until_ready
-    compiled, looped, on_host = recon.compiled(), in_a_loop(recon), recon.on_host()
+    on_host, recon, wait = recon.on_host(dtype), recon.astype(dtype), jax.block_until_ready
+    compiled, looped = recon.compiled(), in_a_loop(recon)
     matrix, factor, sparse = np.asarray(recon.matrix), np.asarray(recon.factor), pair_sums(recon)
     ends = frame.nbytes + len(matrix) * frame.itemsize
     ours, dense = touched(recon), matrix.nbytes + ends
@@ -248,15 +248,14 @@ def batch_ways(recon: je.Reconstructor, frames: np.ndarray) -> dict[str, Way]:
     return {
         f"{name} {dtype}": way
         for dtype in DTYPES
-        for name, way in _batch_ways(
-            recon.astype(dtype), frames.astype(dtype), exact, broken.astype(dtype), mended
-        ).items()
+        for name, way in _batch_ways(recon, dtype, frames.astype(dtype), exact, broken.astype(dtype), mended).items()
     }
 
 
-def _batch_ways(recon, frames, exact, broken, mended) -> dict[str, Way]:
+def _batch_ways(recon, dtype, frames, exact, broken, mended) -> dict[str, Way]:
+    on_host, recon = recon.on_host(dtype), recon.astype(dtype)
     matrix, factor, sparse = np.asarray(recon.matrix), np.asarray(recon.factor), pair_sums(recon)
-    n, ends, on_host = len(frames), frames.nbytes + exact.size * frames.itemsize, recon.on_host()
+    n, ends = len(frames), frames.nbytes + exact.size * frames.itemsize
     ours, dense = touched(recon) + ends, matrix.nbytes + ends
     return {
         QUICKEST: Way(lambda: on_host(frames), exact, ours, n),

@@ -13,10 +13,11 @@ FEW = 16  # readings missing from a frame, up to which they are mended one by on
 
 
 class HostImages:
-    """``factor P^T W dv`` of frames (..., readings) V: images (..., basis) S, NumPy in and out.
+    """``factor P^T W dv`` of frames (..., readings) V: images (..., basis) S, NumPy in and out, of one ``dtype``.
 
     The few readings that a frame lacks are mended through themselves.  A frame that lacks more, or that lacks any of
-    readings whose noise is correlated, is left to ``otherwise``: (readings,) to (basis,).
+    readings whose noise is correlated, is left to ``otherwise``: (readings,) to (basis,).  Mending loses digits
+    (`AbstractReconstructor.__call__`), so it keeps the precision of ``predict``.
     """
 
     def __init__(
@@ -25,18 +26,20 @@ class HostImages:
         predict: Float[Array, "k k"],
         whitening: Whitening,
         otherwise: Callable[[Float[np.ndarray, " readings"]], Float[np.ndarray, " basis"]],
+        dtype: str,
     ):
-        self._factor, self._predict, self._otherwise = np.asarray(factor), np.asarray(predict), otherwise
+        self._factor, self._predict, self._otherwise = np.asarray(factor, dtype), np.asarray(predict), otherwise
         self._used, self._weight = np.asarray(whitening.channels), np.asarray(whitening.weight)
         self._pairs = np.asarray(whitening.pairs, np.intp)
-        self._signs = (float(whitening.current) * SIGNS).astype(self._factor.dtype)
+        self._signs = (float(whitening.current) * SIGNS).astype(self._predict.dtype)
         self._correlated = self._weight.ndim == 2
         weight = np.ones_like(self._weight, shape=len(self._pairs)) if self._correlated else self._weight
         sums = _pair_sums(self._pairs, np.outer(weight, self._signs), self._used, len(self._predict))
-        self._weigh = sums @ self._weight if self._correlated else sums
+        self._exact = sums @ self._weight if self._correlated else sums
+        self._weigh = self._exact.astype(dtype, copy=False)
 
     def __call__(self, dv: Float[np.ndarray, "... readings"]) -> Float[np.ndarray, "... basis"]:
-        dv = np.asarray(dv, self._factor.dtype)
+        dv = np.asarray(dv)
         require_frames(dv, len(self._used))
         if dv.ndim > 1:
             return self._batch(dv.reshape(-1, dv.shape[-1])).reshape(*dv.shape[:-1], -1)
@@ -44,6 +47,7 @@ class HostImages:
         return self._factor.dot(t) if isfinite(t.dot(t)) else self._mended(dv)
 
     def _sums(self, dv: np.ndarray) -> np.ndarray:
+        dv = dv.astype(self._factor.dtype, copy=False)
         if not self._correlated:
             return self._weigh.dot(dv.T)
         with np.errstate(invalid="ignore"):  # infinite readings, which show in the sums
@@ -62,13 +66,14 @@ class HostImages:
         there = np.isfinite(dv)
         missing = np.flatnonzero(self._used & ~there)
         if len(missing) > FEW or self._correlated:
-            return self._otherwise(dv)
-        t, place, weight = self._sums(np.where(there, dv, 0)), self._pairs[missing], self._weight[missing]
+            return np.asarray(self._otherwise(dv), self._factor.dtype)
+        t = self._exact.dot(np.where(there, dv, 0).astype(self._predict.dtype, copy=False))
+        place, weight = self._pairs[missing], self._weight[missing]
         through = self._signs @ self._predict[place]
         among = through[:, place] @ self._signs * weight
-        y = np.linalg.solve(np.eye(len(missing), dtype=t.dtype) - among, through @ t)
+        y = np.linalg.solve(np.eye(len(missing)) - among, through @ t)
         np.add.at(t, place.ravel(), np.outer(weight * y, self._signs).ravel())
-        return self._factor.dot(t)
+        return self._factor.dot(t.astype(self._factor.dtype))
 
 
 def _pair_sums(pairs: np.ndarray, shares: np.ndarray, used: np.ndarray, count: int) -> csr_array:

@@ -75,7 +75,7 @@ class AbstractReconstructor(AbstractPictured):
         finite is replaced by what the one-step image of the other readings predicts for it, at the cost of one small
         solve: the image of `OneStep` is exactly that of a reconstructor which never had the reading (prior and
         strength as they were).  That loses digits as one over the square of the hyperparameter, three of which are left
-        at 1e-5: what is dead for good is better left out by `prepare`.
+        at 1e-5, in float32 at 1e-2: what is dead for good is better left out by `prepare`.
 
         Raises:
             InverseError: if the last axis does not hold the readings of a frame.
@@ -164,15 +164,22 @@ class Reconstructor(AbstractReconstructor):
         """Q as one matrix, S/V; applying a reconstruction does not need it."""
         return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
 
-    def on_host(self) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
+    def on_host(
+        self, dtype: str | None = None
+    ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
         """The same in NumPy: for one frame at a time a call of JAX alone takes longer than the image.
 
-        Frames that lack more than a few readings, or any while noise is correlated, go through JAX.
+        In ``dtype``, but for mending, which stays in the reconstructor's own precision.  Frames that lack more than a
+        few readings, or any while noise is correlated, go through JAX.
         """
-        return HostImages(self.factor, self.predict, self.whitening, lambda dv: np.asarray(self(dv)))
+        dtype = str(self.factor.dtype) if dtype is None else dtype
+        return HostImages(self.factor, self.predict, self.whitening, lambda dv: np.asarray(self(dv)), dtype)
 
     def astype(self, dtype: str) -> "Reconstructor":
-        """The same in another precision: built in float64, a matrix may be applied in float32."""
+        """The same in another precision: built in float64, a matrix may be applied in float32.
+
+        What frames lack is then mended in float32 too, which loses digits (`__call__`); not so with `on_host`.
+        """
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
 
     def without(self, channels: Bool[Array, " readings"]) -> "Reconstructor":

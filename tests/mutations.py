@@ -115,6 +115,7 @@ MUTANTS = [
         ("np.flatnonzero(~whole)", "()", "numpy_gives_the"),
         ("if len(missing) > FEW or self._correlated:", "if False:", "numpy_mends"),
         ("np.where(self._used, dv, 0).T", "dv.T", "numpy_leaves_out"),
+        ("np.asarray(predict), otherwise", "np.asarray(predict, dtype), otherwise", "mended_in_double"),
     ),
     *of(
         "jaxeit/inverse.py",

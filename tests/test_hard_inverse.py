@@ -493,6 +493,26 @@ def test_all_channels_dead_but_few(hard, recon, jac, pixels, left):
     hard("channels not finite", "1 to 549 of 550 dead", float64=error, naive=zeroed, beyond=said)
 
 
+@pytest.mark.parametrize("hyperparameter", [1e-2, 1e-5])
+def test_what_is_applied_in_single_precision_is_mended_in_double(hard, model, jac, pixels, hyperparameter):
+    rng = np.random.default_rng(0)
+    used = np.sort(rng.permutation(550)[:40])  # each tells what no other does
+    channels, lost, dv = np.isin(np.arange(550), used), used[:12], rng.normal(size=550)
+    recon = je.prepare(model, basis=pixels, channels=channels, hyperparameter=hyperparameter)
+    broken = np.where(np.isin(np.arange(550), lost), np.nan, dv)
+    exact = _kept(jac[used], pixels, np.arange(12, 40), dv[used], hyperparameter)
+    error, rounded = (_error(apply(broken), exact) for apply in (recon.on_host("float32"), recon.astype("float32")))
+    assert error < 1e-6
+    assert rounded > 30 * error
+    hard(
+        "channels not finite, applied in float32",
+        "12 of 40 readings that tell of different things, hyperparameter 1e-2 to 1e-5",
+        float32=error,
+        naive=rounded,
+        beyond="by `on_host` the image of the readings left; naive: a reconstructor that is in float32 altogether",
+    )
+
+
 @pytest.mark.slow
 def test_gaps_do_not_stop_a_batch_or_its_gradient(recon):
     """Frames with gaps beside whole ones under vmap and grad: both branches run, no NaN comes of the one not taken."""

@@ -105,7 +105,7 @@ def test_numpy_mends_frames_as_jax_does(recon, correlated, lost):
     for one in (recon, correlated):
         _same_in_numpy(one, dv)
     exact = np.asarray(recon(dv))
-    rounded = recon.astype("float32").on_host()(dv)
+    rounded = recon.on_host("float32")(dv)
     assert rounded.dtype == np.float32
     np.testing.assert_allclose(rounded, exact, atol=1e-5 * np.abs(exact).max())
 
@@ -115,7 +115,7 @@ def test_numpy_leaves_out_what_jax_leaves_out(model, recon, correlated):
     electrode = (np.asarray(model.pattern) == 7).any(1)  # some pair sums are not read at all then
     dv[:, electrode] = np.nan
     for one in (recon.without(electrode), correlated.without(electrode)):
-        alone = HostImages(one.factor, one.predict, one.whitening, lambda dv: pytest.fail("this frame is whole"))
+        alone = HostImages(one.factor, one.predict, one.whitening, lambda dv: pytest.fail("it is whole"), "float64")
         np.testing.assert_array_equal(alone(dv), one.on_host()(dv))
         for frames in (dv, dv[0], np.where(np.arange(550) == int(np.argmin(electrode)), np.nan, dv[0])):
             _same_in_numpy(one, frames)

@@ -84,7 +84,7 @@ class Programs:
 
     def __init__(self, law: ForceLaw):
         self._law = law
-        self._image = law.recon.astype(_IMAGED).on_host()
+        self._image = law.recon.on_host(_IMAGED)
         self._cut: OrderedDict[bytes, Callable] = OrderedDict()
         self._dtypes = law.recon.factor.dtype, law.curves.parameters.dtype
         self._map = _compiled(lambda *a: _mapped(law, *a))  # its numbers built in: a call has a third of the overhead
@@ -135,7 +135,7 @@ class Programs:
         used = np.asarray(self._law.recon.channels)
         if lost.tobytes() in self._cut or (lost | ~used).all():
             return
-        self._cut[lost.tobytes()] = self._law.recon.without(lost & used).astype(_IMAGED).on_host()
+        self._cut[lost.tobytes()] = self._law.recon.without(lost & used).on_host(_IMAGED)
         if len(self._cut) > _KEPT:
             self._cut.popitem(last=False)
 
