@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from .basis import AbstractBasis, AbstractPictured, BasisMap, Picture, Pixels
 from .discretise import Model
-from .host import FEW, HostImages
+from .host import HostImages
 from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, one_step
@@ -34,6 +34,7 @@ from .whitening import (
 
 _VERSION = metadata.version("jaxeit")
 _MOST = 1e4  # hyperparameter
+_FEW = 16  # readings missing from a frame, up to which they are mended one by one
 
 
 class Provenance(dict[str, str]):
@@ -105,17 +106,17 @@ class AbstractReconstructor(AbstractPictured):
     def _mended(self, dv: Float[Array, " readings"]) -> Float[Array, " k"]:
         """Sums that give the image of the readings at hand: the others are what that image predicts for them."""
         missing = self.channels & ~jnp.isfinite(dv)
-        few = jnp.sum(missing) <= (FEW if self.whitening.weight.ndim == 1 else 0)
+        few = jnp.sum(missing) <= (_FEW if self.whitening.weight.ndim == 1 else 0)
         return jax.lax.cond(few, lambda *a: self._few(*a), lambda *a: self._many(*a), dv, missing)
 
     def _few(self, dv, missing):
         """Through the missing readings themselves: ``y = P T (t + P^T W y)`` on their rows of P."""
-        rows = jnp.flatnonzero(missing, size=FEW, fill_value=0)
-        there = (jnp.arange(FEW) < jnp.sum(missing)).astype(dv.dtype)
+        rows = jnp.flatnonzero(missing, size=_FEW, fill_value=0)
+        there = (jnp.arange(_FEW) < jnp.sum(missing)).astype(dv.dtype)
         p = self.whitening.rows(rows) * there[:, None]
         weighted = p * self.whitening.weight[rows, None] if self.whitening.weight.ndim == 1 else p
         sums, through = self.whitening.sums(jnp.where(missing, 0, dv)), p @ self.predict
-        y = jnp.linalg.solve(jnp.eye(FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
+        y = jnp.linalg.solve(jnp.eye(_FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
         return sums + weighted.T @ y
 
     def _many(self, dv, missing):
@@ -169,11 +170,9 @@ class Reconstructor(AbstractReconstructor):
     ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
         """The same in NumPy: for one frame at a time a call of JAX alone takes longer than the image.
 
-        In ``dtype``, but for mending, which stays in the reconstructor's own precision.  Frames that lack more than a
-        few readings, or any while noise is correlated, go through JAX.
+        In ``dtype``, but for mending, which stays in the reconstructor's own precision.
         """
-        dtype = str(self.factor.dtype) if dtype is None else dtype
-        return HostImages(self.factor, self.predict, self.whitening, lambda dv: np.asarray(self(dv)), dtype)
+        return HostImages(self.factor, self.predict, self.whitening, dtype or str(self.factor.dtype))
 
     def astype(self, dtype: str) -> "Reconstructor":
         """The same in another precision: built in float64, a matrix may be applied in float32.

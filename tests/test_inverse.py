@@ -8,7 +8,6 @@ from scipy.linalg import lstsq
 
 import jaxeit as je
 from jaxeit.basis import overlap_areas
-from jaxeit.host import HostImages
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +96,7 @@ def correlated(model, pixels):
     return je.prepare(model, basis=pixels, noise=1e-6 * 0.5 ** np.abs(place - place[:, None]))
 
 
-@pytest.mark.parametrize("lost", [1, 16, 17, 60])
+@pytest.mark.parametrize("lost", [1, 16, 17, 60, 500, 550])
 def test_numpy_mends_frames_as_jax_does(recon, correlated, lost):
     rng = np.random.default_rng(lost)
     dv = rng.normal(size=550)
@@ -115,8 +114,6 @@ def test_numpy_leaves_out_what_jax_leaves_out(model, recon, correlated):
     electrode = (np.asarray(model.pattern) == 7).any(1)  # some pair sums are not read at all then
     dv[:, electrode] = np.nan
     for one in (recon.without(electrode), correlated.without(electrode)):
-        alone = HostImages(one.factor, one.predict, one.whitening, lambda dv: pytest.fail("it is whole"), "float64")
-        np.testing.assert_array_equal(alone(dv), one.on_host()(dv))
         for frames in (dv, dv[0], np.where(np.arange(550) == int(np.argmin(electrode)), np.nan, dv[0])):
             _same_in_numpy(one, frames)
 

@@ -5,7 +5,6 @@ newest frame when there is time before the next is due (`Engine.spare`), and ser
 """
 
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,7 +27,6 @@ _TOUCHED = 3.0  # times its standard error: a force that is there
 _STALE = 0.1  # s, after which contacts are fitted even if a frame is lost to it
 _FORGOTTEN = 0.3  # s, after which they say nothing about the present frame
 _GATE = 0.6
-_KEPT = 16  # reconstructions kept for frames that lack the same readings again, 2 MB each
 _IMAGED = "float32"  # what images are made in, of matrices built in float64: half the memory to go through
 
 
@@ -85,7 +83,6 @@ class Programs:
     def __init__(self, law: ForceLaw):
         self._law = law
         self._image = law.recon.on_host(_IMAGED)
-        self._cut: OrderedDict[bytes, Callable] = OrderedDict()
         self._dtypes = law.recon.factor.dtype, law.curves.parameters.dtype
         self._map = _compiled(lambda *a: _mapped(law, *a))  # its numbers built in: a call has a third of the overhead
         leaves, tree = jax.tree.flatten(law)
@@ -100,44 +97,24 @@ class Programs:
         return self._law.locator is not None
 
     def warm_up(self) -> None:
-        """Run everything once."""
+        """Run everything once, for frames that lack most readings too."""
         readings, pads = self._law.recon.readings, self._law.masks.weights.shape[0]
         frame = np.zeros(readings)
         self.map(frame, np.zeros(pads), self.nowhere, np.zeros((1, pads)))
-        self.learn(np.arange(readings) == int(np.argmax(self._law.recon.channels)))
-        self._cut.clear()
+        self._image(np.full(readings, np.nan))
         if self.searches:
             self.search(frame)
 
     def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> Mapped:
         """Forces of a difference frame (readings,) V and pressures (pads,) Pa, after those ``before`` (m, pads)."""
-        image = self._image_without(~np.isfinite(frame))(frame)
+        image = self._image(frame)
         row = self._map(image[None], self._row(pressure, 1), places, filled(self._law, before))
         return _unpacked(np.asarray(row), pressure.size, image)
-
-    def _image_without(self, lost: np.ndarray) -> Callable:
-        key = lost.tobytes()
-        if key not in self._cut:
-            return self._image
-        self._cut.move_to_end(key)
-        return self._cut[key]
 
     def search(self, frame: np.ndarray) -> tuple[Places, Touches]:
         """Where a difference frame is touched."""
         places, found = self._search(self._row(frame, 0))
         return jax.block_until_ready(places), NO_TOUCHES if found is None else _touches(jax.device_get(found))
-
-    def learn(self, lost: np.ndarray) -> None:
-        """Make the reconstruction without these readings, (readings,) true to leave out, for frames that lack them.
-
-        It gives the same image as leaving them out of each frame anew, as is done otherwise, in a tenth of the time.
-        """
-        used = np.asarray(self._law.recon.channels)
-        if lost.tobytes() in self._cut or (lost | ~used).all():
-            return
-        self._cut[lost.tobytes()] = self._law.recon.without(lost & used).on_host(_IMAGED)
-        if len(self._cut) > _KEPT:
-            self._cut.popitem(last=False)
 
     def _row(self, values: np.ndarray, which: int) -> np.ndarray:
         return np.asarray(values[None], self._dtypes[which])
@@ -202,8 +179,6 @@ class Engine:
         self._programs = programs(self._law)
         self._programs.warm_up()
         self._before = np.zeros((1, len(self._owner)))
-        self._lost: np.ndarray | None = None  # by the frame before
-        self._wanted: np.ndarray | None = None
         self._newest: np.ndarray | None = None  # touched, and its contacts not fitted
         self._places, self._touches, self._found = self._programs.nowhere, NO_TOUCHES, 0.0
         self._placing = placing_error(calibration)
@@ -235,7 +210,7 @@ class Engine:
         found = self._programs.map(frame, pressed, self._present_places(), self._before)
         if self._law.remembers:
             self._before = remembered(np.concatenate([self._before, pressure[None]]))
-        self._note(frame, lost, bool(found.loaded.any()))
+        self._note(frame, bool(found.loaded.any()))
         force = np.where(silent, np.nan, found.force)
         error = np.where(silent, np.nan, found.standard_error)
         self._number += 1
@@ -258,11 +233,8 @@ class Engine:
     def _present_places(self) -> Places:
         return self._places if time.monotonic() - self._found < _FORGOTTEN else self._programs.nowhere
 
-    def _note(self, frame: np.ndarray, lost: np.ndarray, touched: bool) -> None:
+    def _note(self, frame: np.ndarray, touched: bool) -> None:
         """What is to be done when there is time."""
-        again = self._lost is not None and np.array_equal(lost, self._lost)
-        self._wanted = lost if again and lost.any() else None
-        self._lost = lost
         if self._touches.age is not None:
             self._touches = replace(self._touches, age=self._touches.age + 1)
         if not self._programs.searches:
@@ -273,13 +245,8 @@ class Engine:
             self._places, self._touches = self._programs.nowhere, replace(NO_TOUCHES, age=0)
 
     def spare(self, seconds: float) -> None:
-        """Use the time until the next frame is due for contacts of the newest frame.
-
-        First for what is missing again and again: to learn that costs some frames once, and later none.
-        """
-        if self._wanted is not None:
-            self._programs.learn(self._wanted)
-        elif self._newest is not None and (seconds > self._took or time.monotonic() - self._found > _STALE):
+        """Use the time until the next frame is due for contacts of the newest frame."""
+        if self._newest is not None and (seconds > self._took or time.monotonic() - self._found > _STALE):
             begin = time.monotonic()
             self._places, touches = self._programs.search(self._newest)
             self._touches = replace(touches, covariance=touches.covariance + self._placing)
