@@ -22,8 +22,9 @@ write this table, the slow ones too:
     python -m pytest --hard-cases docs/hard-cases.md
 
 If all the tests of a run pass, it replaces the rows of the cases it came to; the other rows stay, so that the files
-may be run one by one. Without the slow tests some rows would tell of less. `python -m tests.mutations` breaks the
-guards behind these rows one at a time, in a copy, and names those that no test holds.
+may be run one by one. A run that picks its tests by `-m` or `-k` only adds rows, as it may tell less of a case than the
+row that is there. `python -m tests.mutations` breaks the guards behind these rows one at a time, in a copy, and names
+those that no test holds.
 
 Errors are the largest found over the whole severity reached, relative to the largest of the values compared unless the
 case says otherwise. "Naive" is the textbook form of the same computation, which the test keeps to show that it
@@ -63,14 +64,18 @@ def hard(record_property):
 def pytest_configure(config: pytest.Config) -> None:
     path = config.getoption("hard_cases")
     if path and not hasattr(config, "workerinput"):  # parallel workers leave it to their controller
-        config.pluginmanager.register(_Collector(path))
+        picked = bool(config.getoption("markexpr") or config.getoption("keyword"))
+        config.pluginmanager.register(_Collector(path, picked))
 
 
 class _Collector:
-    """Rows of the tests that passed, written once all have, in the place of what the file says of the same cases."""
+    """Rows of the tests that passed, written once all have, in the place of what the file says of the same cases.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Of ``picked`` tests only those of other cases.
+    """
+
+    def __init__(self, path: Path, picked: bool) -> None:
+        self.path, self.picked = path, picked
         self.rows: list[Row] = []
         self.said = ""
 
@@ -84,6 +89,8 @@ class _Collector:
             return
         lines = lines_of(table(merge(self.rows)))
         known = lines_of(self.path.read_text()) if self.path.exists() else {}
+        if self.picked:
+            lines = {case: line for case, line in lines.items() if case not in known}
         replace(self.path, INTRODUCTION + table([]) + "".join(line for _, line in sorted((known | lines).items())))
         self.said = f"hard cases: {len(lines)} written to {self.path}"
 

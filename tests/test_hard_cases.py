@@ -59,13 +59,24 @@ def test_a_run_replaces_the_rows_of_its_own_cases(run, tmp_path):
         [Row("angle", "9 degrees", None, None, None, "nothing"), Row("zeal", "1", None, None, None, "no \\| end")]
     )
     (tmp_path / "table.md").write_text("# Another introduction\n\n" + old)
-    _, path = run("-k", "slivers")
+    _, path = run("test_suite.py::test_slivers")
     text = path.read_text()
     assert text.startswith(INTRODUCTION)
     assert text.splitlines()[-2:] == [
         "| angle | 1 degree | – | 2e-04 | – | one error that names it |",
         old.splitlines()[-1],
     ]
+
+
+@pytest.mark.parametrize("how", ["-k", "-m"])
+def test_a_run_of_picked_tests_leaves_the_rows_of_cases_that_are_there(run, tmp_path, how):
+    old = table([Row("angle", "9 degrees", None, None, None, "nothing")])
+    (tmp_path / "table.md").write_text(old)
+    said, path = run(how, "not wrong", "--deselect", "test_suite.py::test_wrong")
+    assert "hard cases: 1 written to table.md" in said
+    rows = path.read_text().splitlines()[-2:]
+    assert rows[0] == old.splitlines()[-1]
+    assert rows[1].startswith("| contact resistance | 1e-12 to 1e8 |")
 
 
 def test_a_run_that_failed_leaves_the_table_as_it_was(run, tmp_path):
