@@ -202,8 +202,9 @@ def as_long_as(call: Callable[[], Any]) -> Callable[[], np.ndarray]:
             matrix.dot(vector)
         return np.ones(1)
 
-    many = 100
-    target, taken = (np.median([c.seconds(run)[0] for _ in range(500)]) for run in (call, partial(products, many)))
+    many = 20
+    runs = call, partial(products, many)
+    target, taken = np.median([[c.seconds(run)[0] for run in runs] for _ in range(2000)], 0)
     return partial(products, max(round(many * float(target / taken)), 1))
 
 
