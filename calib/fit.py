@@ -20,9 +20,6 @@ the bends to the samples, and the covariance is that of the samples alone.
 Samples of one press are near-duplicates. Given `groups` (a press or location per sample), the covariance is the
 cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), so that it is honest for a dozen presses; the
 sample count then hardly matters, which is the point. Without groups it is Huber's (Robust Statistics, 1981, 7.6).
-
-No large stack of matrices goes to LAPACK at once: jaxlib 0.10.2 spreads one over its threads while the caller, one of
-them, waits, and two programs that do so in two threads of Python may wait for ever.
 """
 
 import abc
@@ -39,6 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxeit as je
 from calib.curves import AbstractCurve, Scale, scale_of
 from calib.solver import BoundedNewton
+from jaxeit.lapack import eigh, svd
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation: 1 / Phi^-1(3/4)."""
@@ -352,11 +350,11 @@ def _cluster_covariance(left, psi, dpsi, group, n_groups):
     """
     score = jax.ops.segment_sum(left * psi[:, None], group, n_groups)
     leverage = jax.ops.segment_sum(left[:, :, None] * left[:, None, :], group, n_groups)
-    values, vectors = jax.lax.map(jnp.linalg.eigh, leverage)
+    values, vectors = jax.vmap(eigh)(leverage)
     decided = values > 1 - 1e-3
     root = jax.lax.rsqrt(1 - values)
     adjusted = jnp.einsum("gij,gj,gkj,gk->gi", vectors, root, vectors, score)
-    steepness, axes = jnp.linalg.eigh(left.T @ (left * dpsi[:, None]))
+    steepness, axes = eigh(left.T @ (left * dpsi[:, None]))
     bread = axes / steepness @ axes.T
     enough = ~jnp.any(decided) & (steepness[0] > 0.05)
     return bread @ adjusted.T @ adjusted @ bread, enough
@@ -372,7 +370,7 @@ def _thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[A
         length = jnp.sqrt(column @ column)
         columns.append(column / jnp.where(length > 0, length, 1))
     q = jnp.stack(columns, 1)
-    left, singular, right = jnp.linalg.svd(q.T @ matrix)
+    left, singular, right = svd(q.T @ matrix)
     return q @ left, singular, right
 
 

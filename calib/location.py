@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 import jaxeit as je
+from jaxeit.lapack import eigh, solve
 
 from .fit import MAD_TO_SIGMA, FitResult
 
@@ -487,7 +488,7 @@ def _project(z, y, share, weight) -> _Whitened:
     z, y, x = z * root, y * root[:, 0], share * root
     present = jnp.sum(x**2, 0) > 0
     gram = x.T @ x + jnp.diag(jnp.where(present, 1e-12, 1.0).astype(x.dtype))
-    levels = jnp.linalg.solve(gram, x.T @ jnp.column_stack([z, y]))
+    levels = solve(gram, x.T @ jnp.column_stack([z, y]))
     left = jnp.column_stack([z, y]) - x @ levels
     return _Whitened(left[:, :-1], left[:, -1], jnp.maximum(jnp.sum(weight) - jnp.sum(present), 1.0))
 
@@ -513,7 +514,7 @@ class _Shape(NamedTuple):
 
 def _of_shape(white: _Whitened, shape) -> _Shape:
     root, ratio = jnp.sqrt(shape), jnp.asarray(_RATIOS, shape.dtype)[:, None]
-    values, vectors = jnp.linalg.eigh(root[:, None] * (white.z.T @ white.z) * root)
+    values, vectors = eigh(root[:, None] * (white.z.T @ white.z) * root)
     values, axes = jnp.maximum(values, 0), root[:, None] * vectors
     moment = axes.T @ (white.z.T @ white.y)
     shrink = ratio / (1 + ratio * values)
@@ -524,7 +525,7 @@ def _of_shape(white: _Whitened, shape) -> _Shape:
 
 def _average(white: _Whitened, shapes) -> _Averaged:
     """Posterior over all sizes and shapes of the prior, by the law of total variance."""
-    each = jax.lax.map(lambda shape: _of_shape(white, shape), shapes)  # a stack at once may hang, see `fit`
+    each = jax.lax.map(lambda shape: _of_shape(white, shape), shapes)
     weight = jnp.exp(each.evidence - jnp.max(each.evidence))
     weight = weight / jnp.sum(weight)
     of_shape = jnp.sum(weight, 1)

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
+from jaxeit.lapack import cho_solve, cholesky, solve_triangular
+
 _MOST = 400  # samples from which the hyperparameters are found
 _STEPS = 60
 _JITTER = 1e-8
@@ -101,13 +103,13 @@ def _kernel(hyper, p: Float[Array, "n d"], q: Float[Array, "m d"]) -> Float[Arra
 
 def _factor(hyper, inputs):
     noise = jnp.exp(hyper[-1]) + _JITTER
-    return jnp.linalg.cholesky(_kernel(hyper, inputs, inputs) + noise * jnp.eye(len(inputs), dtype=inputs.dtype))
+    return cholesky(_kernel(hyper, inputs, inputs) + noise * jnp.eye(len(inputs), dtype=inputs.dtype), lower=True)
 
 
 def _cost(hyper, inputs, y):
     """Minus log evidence, up to a constant."""
     low = _factor(hyper, inputs)
-    half = jax.scipy.linalg.solve_triangular(low, y, lower=True)
+    half = solve_triangular(low, y, lower=True)
     return 0.5 * half @ half + jnp.sum(jnp.log(jnp.diagonal(low)))
 
 
@@ -120,7 +122,7 @@ def _cost_and_slope(inputs, y, hyper):
 
 @jax.jit
 def _weights(hyper, inputs, y):
-    return jax.scipy.linalg.cho_solve((_factor(hyper, inputs), True), y)
+    return cho_solve((_factor(hyper, inputs), True), y)
 
 
 def _predicted(found: _Found, inputs, force, at) -> np.ndarray:

@@ -14,8 +14,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
+
+from jaxeit.lapack import cho_factor, cho_solve
 
 _DAMPING = 1e-3  # at first, of the normal matrix scaled to a diagonal of one
 _LEAST, _LESS, _MORE = 1e-9, 0.1, 10.0  # damping at least; its change after a step that led down, or up

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_factor, cho_solve
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
@@ -22,6 +21,7 @@ from .descent import STEPS, TRIAL, Fit, begun, descend, resume, ridge, scale_of
 from .discretise import Model
 from .gaps import gap_of
 from .jacobian import pair_jacobian
+from .lapack import cho_factor, cho_solve
 from .responses import Nodes, Responses, nodes_of, reached, responses_of, tabulate
 from .verbs import verb
 from .whitening import InverseError, Whitened, Whitening, require_frames, whitened_readings

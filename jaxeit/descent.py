@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int
+
+from .lapack import cho_factor, cho_solve
 
 _ENOUGH = 1e-3  # fall of the square, in units of the noise, that is not worth another step
 STEPS = 20  # at most

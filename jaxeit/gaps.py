@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .lapack import eigh
 from .whitening import Lost
 
 
@@ -35,7 +36,7 @@ class Gap(NamedTuple):
 def gap_of(compress: Float[Array, "r k"], lost: Lost) -> Gap:
     """The gap, in numbers ``compress @ sums``; directions that only missing readings knew are left out."""
     metric = jnp.eye(len(compress), dtype=lost.sums.dtype) - compress @ lost.gram @ compress.T
-    left, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(metric))  # it does not depend on what was read
+    left, vectors = eigh(jax.lax.stop_gradient(metric))  # it does not depend on what was read
     known = left > 1e4 * jnp.finfo(left.dtype).eps
     root = jnp.sqrt(jnp.where(known, left, 0))
     y = vectors @ (jnp.where(known, 1 / jnp.where(known, root, 1), 0) * (vectors.T @ (compress @ lost.sums)))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .lapack import eigh
 from .methods import Problem
 
 _RANGE = np.logspace(-4, 2, 241)
@@ -47,7 +48,7 @@ def spectrum(problem: Problem) -> Spectrum:
     """The eigenvectors that all choices share."""
     gained = problem.precision().solve(problem.jacobian.T)
     scale = jnp.sum(problem.jacobian.T * gained) / problem.readings
-    squares, vectors = jnp.linalg.eigh(problem.jacobian @ gained / scale)
+    squares, vectors = eigh(problem.jacobian @ gained / scale)
     return Spectrum(jnp.maximum(squares, 0), vectors, gained @ vectors / scale, problem)
 
 

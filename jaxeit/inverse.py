@@ -19,6 +19,7 @@ from .discretise import Model
 from .host import HostImages
 from .hyperparameter import AbstractHyperparameter, spectrum
 from .jacobian import pair_jacobian
+from .lapack import solve
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, one_step
 from .priors import AbstractPrior, Noser
 from .verbs import compiler_options
@@ -116,13 +117,13 @@ class AbstractReconstructor(AbstractPictured):
         p = self.whitening.rows(rows) * there[:, None]
         weighted = p * self.whitening.weight[rows, None] if self.whitening.weight.ndim == 1 else p
         sums, through = self.whitening.sums(jnp.where(missing, 0, dv)), p @ self.predict
-        y = jnp.linalg.solve(jnp.eye(_FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
+        y = solve(jnp.eye(_FEW, dtype=dv.dtype) - through @ weighted.T, through @ sums)
         return sums + weighted.T @ y
 
     def _many(self, dv, missing):
         """Through all pair sums: ``t = sums + G_lost T t``."""
         lost = self.whitening.lost(dv)
-        return jnp.linalg.solve(jnp.eye(len(lost.sums), dtype=dv.dtype) - lost.gram @ self.predict, lost.sums)
+        return solve(jnp.eye(len(lost.sums), dtype=dv.dtype) - lost.gram @ self.predict, lost.sums)
 
     @property
     def readings(self) -> int:
@@ -197,7 +198,7 @@ class Reconstructor(AbstractReconstructor):
 def _without(recon: Reconstructor, used: Bool[Array, " readings"]) -> Reconstructor:
     found, gram = recon.whitening.without(used)
     mend = jnp.eye(len(gram), dtype=gram.dtype) - gram @ recon.predict
-    factor, predict = (jnp.linalg.solve(mend.T, m.T).T for m in (recon.factor, recon.predict))
+    factor, predict = (solve(mend.T, m.T).T for m in (recon.factor, recon.predict))
     return Reconstructor(
         factor=factor,
         variance=recon.variance + jnp.sum((factor @ gram) * recon.factor, 1),

@@ -15,10 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
-from jax.scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from jaxtyping import Array, Float
 
 from .basis import Picture
+from .lapack import cho_factor, cho_solve, cholesky, solve_triangular
 from .priors import AbstractPrecision, AbstractPrior, Diagonal
 
 
@@ -242,8 +242,7 @@ def _positive_part(above, j, weight, y):
 def _pixels_above_zero(steps: int):
     """A function of j, weight, y: the pixels above zero in argmin over x >= 0 of ``|J x - y|^2 + x^T diag(weight) x``.
 
-    Of many frames one after the other: so that each pays only for the way it takes, and because jaxlib's LAPACK calls
-    for whole stacks of matrices, both ways at once, may wait for each other for ever (0.10.2).
+    Of many frames one after the other, so that each pays only for the way it takes.
     """
 
     @sequential_vmap

@@ -10,13 +10,13 @@ from abc import abstractmethod
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from .basis import BasisMap, Picture
 from .discretise import Model
 from .forward import forward
 from .jacobian import scaled_jacobian
+from .lapack import cho_factor, cho_solve
 from .optimise import LevenbergMarquardt
 from .priors import AbstractPrecision
 

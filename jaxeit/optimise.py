@@ -5,6 +5,9 @@ from collections.abc import Callable
 import jax
 import lineax as lx
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
+
+from .lapack import cho_factor, cho_solve
 
 
 class TypedTrustRegion(optx.AbstractSearch):
@@ -23,6 +26,17 @@ class TypedTrustRegion(optx.AbstractSearch):
         return self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state)
 
 
+class Cholesky(lx.Cholesky):
+    """`lineax.Cholesky` of a positive operator, by our factors, which are safe under `jax.vmap`."""
+
+    def init(self, operator, options):
+        return cho_factor(operator.as_matrix())[0], None
+
+    def compute(self, state, vector, options):
+        flat, unflatten = ravel_pytree(vector)
+        return unflatten(cho_solve((state[0], False), flat)), lx.RESULTS.successful, {}
+
+
 def _silent(**_):
     """Print nothing."""
 
@@ -37,6 +51,6 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     rtol: float
     atol: float
     norm: Callable = optx.max_norm
-    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Normal(lx.Cholesky()))
+    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Normal(Cholesky()))
     search: TypedTrustRegion = TypedTrustRegion()
     verbose: Callable = _silent

@@ -8,10 +8,10 @@ from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from jaxtyping import Array, Float
 
 from .basis import Picture
+from .lapack import cho_factor, cho_solve, cholesky, solve_triangular
 
 
 class AbstractPrecision(eqx.Module):

@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_factor, cho_solve
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -12,6 +11,7 @@ from .contacts import ContactResult, Contacts, bounds_of, mean_of
 from .descent import descend, ridge, scale_of
 from .discretise import Model
 from .forward import conductivity, forward
+from .lapack import cho_factor, cho_solve
 from .responses import points_of
 from .verbs import verb
 from .whitening import InverseError, Whitening, whitened_readings

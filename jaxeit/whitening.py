@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jax.scipy.linalg import cho_factor, cho_solve
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import solve_triangular as solve_lower
@@ -27,6 +26,7 @@ from scipy.linalg.lapack import dpstrf, dtrtri
 
 from .discretise import Model
 from .effects import AbstractTerminalEffect, chosen
+from .lapack import cho_factor, cho_solve
 
 
 class InverseError(ValueError):

@@ -64,6 +64,8 @@ def hard(record_property):
 def pytest_configure(config: pytest.Config) -> None:
     path = config.getoption("hard_cases")
     if path and not hasattr(config, "workerinput"):  # parallel workers leave it to their controller
+        if path.suffix != ".md":
+            raise pytest.UsageError(f"--hard-cases {path}: not written over; name the table, docs/hard-cases.md")
         picked = bool(config.getoption("markexpr") or config.getoption("keyword"))
         config.pluginmanager.register(_Collector(path, picked))
 

@@ -1,5 +1,8 @@
 """Small skins whose answers are known."""
 
+import math
+import re
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -44,3 +47,20 @@ def sheet_of(sigma, places, pressure=None, temperature=0.0):
     """A sheet of elements of 1 mm2 at ``places``."""
     pressure = jnp.zeros_like(sigma) if pressure is None else pressure
     return Sheet(sigma, pressure, places, jnp.full_like(sigma, 1e-3), jnp.asarray(temperature))
+
+
+_LAPACK = re.compile(r"custom_call @lapack_([a-z]+)_ffi.*? : \((.*?)\) ->")
+_OPERATIONS = {"syevd": 5, "gesdd": 10}
+
+
+def spread_stacks(lowered):
+    """LAPACK calls of a lowered program that jaxlib 0.10 would spread over threads, see `jaxeit.lapack`."""
+    found = []
+    for call, operands in _LAPACK.findall(lowered):
+        shapes = [[int(n) for n in shape.split("x")[:-1]] for shape in re.findall(r"tensor<([^>]*)>", operands)]
+        stack, rows = math.prod(shapes[0][:-2]), shapes[0][-2]
+        columns = max(shape[-1] for shape in shapes if len(shape) >= 2)
+        work = stack * _OPERATIONS.get(call[1:], 1) * rows**2 * max(rows, columns)
+        if stack > 1 and work > 200_000:
+            found.append((call, shapes))
+    return found

@@ -88,13 +88,16 @@ MUTANTS = [
         ("jnp.where(below == 0, 0, above / jnp.where(below == 0, 1, below))", "above / below", "iteration_leaves_a"),
     ),
     *of(
-        "jaxeit/solvers/nested_dissection.py",
-        SOLVING,
+        "jaxeit/lapack.py",
+        f"test_lapack {SOLVING}",
         (
-            "return gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // work))))",
+            "return gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // max(1, work)))))",
             "return count",
-            "test_several_solves",
+            "no_stack_is_spread",
         ),
+        ("operations=10", "operations=1", "no_stack_is_spread"),
+        ("if batched[0]:", "if True:", "one_matrix_for_many"),
+        ("eye = jnp.eye(len(apart), dtype=apart.dtype)", "eye = jnp.zeros(())", "values_and_derivatives"),
     ),
     *of(
         "jaxeit/forward.py",

@@ -12,6 +12,8 @@ from jaxeit.contacts import ContactResult, prepare_contacts, strongest
 from jaxeit.refine import refine_contacts
 from jaxeit.whitening import InverseError
 
+from .helpers import spread_stacks
+
 STD = 1e-5  # V: a signal-to-noise ratio of 60 dB
 FRAMES = 300
 
@@ -155,6 +157,12 @@ def single(model):
     channels = np.ones(550, bool)
     channels[3:60:3] = False
     return prepare_contacts(model, noise=np.full(550, STD), most=1, columns=31, channels=channels)
+
+
+def test_many_frames_mapped_wait_for_no_thread(single):
+    """See `jaxeit.lapack`: without that this program stood still for ever in most runs on two cores."""
+    frames = jax.ShapeDtypeStruct((1000, 550), single.compress.dtype)
+    assert not spread_stacks(jax.jit(jax.vmap(single)).lower(frames).as_text())
 
 
 @pytest.mark.slow

@@ -11,12 +11,13 @@ import pytest
 from scipy import linalg, optimize
 
 from calib.choice import Tried, simplest
-from calib.curves import Affine, Linear, MonotoneSpline, PowerLaw
+from calib.curves import Affine, Hysteresis, Linear, MonotoneSpline, PowerLaw
 from calib.fit import (
     Cauchy,
     FitError,
     FitResult,
     Huber,
+    Samples,
     SoftL1,
     Squared,
     _design_effect,
@@ -38,6 +39,8 @@ from calib.response import (
     score,
     time_split,
 )
+
+from .helpers import spread_stacks
 
 REAL = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
 N, PRESSES = 240, 12
@@ -362,6 +365,16 @@ def test_the_pure_fit_has_gradients():
 
 
 # --- predictions ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("curve", [PowerLaw(2000.0), MonotoneSpline(), Hysteresis()], ids=lambda c: type(c).__name__)
+@pytest.mark.parametrize("n_groups", [0, 225])
+def test_many_pads_mapped_wait_for_no_thread(curve, n_groups):
+    """See `jaxeit.lapack`."""
+    many = Samples(*(jax.ShapeDtypeStruct((100_000, 900), kind) for kind in (float, float, float, bool, int)))
+    solver = default_solver(jnp.float64)
+    program = jax.vmap(lambda samples: fit_samples(curve, samples, SoftL1(), solver, n_groups=n_groups))
+    assert not spread_stacks(jax.jit(program).lower(many).as_text())
 
 
 def test_prediction_error_is_the_delta_method_and_extrapolation_is_flagged():

@@ -38,7 +38,7 @@ def run(tmp_path, root):
         quiet = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST")}
         env = quiet | {"PYTHONPATH": str(root), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
         done = subprocess.run([*command, *args], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
-        return done.stdout, (tmp_path / "table.md")
+        return done.stdout + done.stderr, (tmp_path / "table.md")
 
     return run
 
@@ -106,3 +106,10 @@ def test_every_guard_to_break_stands_where_its_list_says():
         *("jaxeit/forward.py", "test_none.py", "test_forward test_none"),
         *("none.py", "test_none.py", "test_none"),
     ]
+
+
+def test_a_file_of_tests_is_not_written_over(run, tmp_path):
+    """Where the path was forgotten."""
+    said, _ = run("--hard-cases", "test_suite.py")
+    assert "--hard-cases test_suite.py: not written over" in said
+    assert (tmp_path / "test_suite.py").read_text() == textwrap.dedent(SUITE)

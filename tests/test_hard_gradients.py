@@ -18,7 +18,7 @@ import pytest
 
 import jaxeit as je
 
-from .helpers import square_model
+from .helpers import spread_stacks, square_model
 
 _DESCRIBES = "describes hardware, or reads or writes files: on the host"
 _GEOMETRY = "geometry, on the host: its arrays are constants of a model"
@@ -354,6 +354,15 @@ def test_jit_vmap_and_plain_python_agree(tiny, name):
             plain = program(points[0], along)
         for found, expected in zip(plain, compiled(points[0], along), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * float(jnp.max(jnp.abs(expected))))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_stack_of_matrices_is_spread_over_threads_that_wait_for_it(tiny, name):
+    """However many are mapped at once; see `jaxeit.lapack`."""
+    case = CASES[name](tiny)
+    many = jax.ShapeDtypeStruct((1_000_000, case.smooth[0].size), jnp.float64)
+    along = jnp.ones_like(case.smooth[0])
+    assert not spread_stacks(jax.jit(jax.vmap(_program(case), (0, None))).lower(many, along).as_text())
 
 
 @pytest.mark.slow

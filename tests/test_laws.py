@@ -16,11 +16,11 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "toml", "verbs", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh", "elements",
-    "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise", "forward",
-    "pneumatics", "stiffness", "basis", "jacobian", "whitening", "host", "gaps", "priors", "methods", "hyperparameter",
-    "inverse", "store", "responses", "descent", "contacts", "refine", "optimise", "nonlinear", "background",
-    "fusion", "metrics", "regions", "adaptive", "choices", "rungs", "ladder",
+    "toml", "verbs", "lapack", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh",
+    "elements", "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise",
+    "forward", "pneumatics", "stiffness", "basis", "jacobian", "whitening", "host", "gaps", "priors", "methods",
+    "hyperparameter", "inverse", "store", "responses", "descent", "contacts", "refine", "optimise", "nonlinear",
+    "background", "fusion", "metrics", "regions", "adaptive", "choices", "rungs", "ladder",
 ]  # fmt: skip
 BENCH = [
     "session", "units", "choice", "corrections", "presses", "curves", "solver", "fit", "response", "smooth", "taxels",

@@ -19,6 +19,7 @@ from calib.location import (
     _RATIOS,
     FIELDS,
     Constant,
+    GaussianProcess,
     PadEdge,
     PadEdgeSize,
     Places,
@@ -32,6 +33,8 @@ from calib.location import (
     restored,
     single_places,
 )
+
+from .helpers import spread_stacks
 
 features_of = eqx.filter_jit(pad_features)
 REACH = jnp.array([[0.01, 0.01], [0.19, 0.19]])
@@ -279,6 +282,19 @@ def test_two_contacts_on_one_pad_share_its_gain_by_their_weights(fitted):
     mean = np.asarray(log_gain(found, both).mean)[0]
     assert mean[0] == pytest.approx(0.25 * alone[0] + 0.75 * alone[1])
     assert (mean[1:] == 0).all()
+
+
+@pytest.mark.parametrize("field", [PadEdge(), GaussianProcess()], ids=lambda f: type(f).__name__)
+def test_many_fits_mapped_wait_for_no_thread(geometry, field):
+    """See `jaxeit.lapack`."""
+    place = jittered(64, 2)
+    ratio, *rows = press_rows(place, np.zeros(len(place)))
+
+    def one(ratio):
+        return fit_field(field, geometry, single_places(place, 4), ratio, *rows).coefficients
+
+    many = jax.ShapeDtypeStruct((100_000, *ratio.shape), jnp.float64)
+    assert not spread_stacks(jax.jit(jax.vmap(one)).lower(many).as_text())
 
 
 def test_pulls_and_intervals_over_many_simulated_fits(skin, geometry):

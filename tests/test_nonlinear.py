@@ -7,7 +7,7 @@ import pytest
 
 import jaxeit as je
 
-from .helpers import square_model
+from .helpers import spread_stacks, square_model
 
 PENALTIES = {
     "variation": lambda picture: je.IsotropicVariation(),
@@ -149,6 +149,15 @@ def test_such_an_image_has_derivatives(tiny):
     np.testing.assert_allclose(slope, change, atol=1e-4 * np.abs(change).max())
     back = jax.grad(lambda given: jnp.sum(image(given) ** 2))(readings) @ along
     assert float(back) == pytest.approx(float(2 * image(readings) @ slope), rel=1e-4)
+
+
+def test_many_images_mapped_wait_for_no_thread(tiny):
+    """See `jaxeit.lapack`; the Gauss-Newton steps of optimistix too."""
+    readings = tiny.voltages(jnp.zeros(16))
+    std, penalty = jnp.ones(len(readings)), _tiny_penalty(tiny)
+    program = jax.vmap(lambda given: je.least_squares_image(tiny, penalty, given, std))
+    many = jax.ShapeDtypeStruct((100_000, len(readings)), readings.dtype)
+    assert not spread_stacks(jax.jit(program).lower(many).as_text())
 
 
 def test_an_image_that_did_not_converge_is_not_given(tiny):

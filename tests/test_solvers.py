@@ -376,7 +376,7 @@ print(float(found[0][0, 0] / found[3][0, 0]))
 
 @pytest.mark.slow
 def test_several_solves_in_one_program_do_not_wait_for_each_other_for_ever():
-    """What LAPACK calls of jaxlib 0.10 do once each of its threads has to wait for another (`_IN_PLACE`)."""
+    """What LAPACK calls of jaxlib 0.10 do once each of its threads has to wait for another (`jaxeit.lapack`)."""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "JAX_ENABLE_X64": "1"}
     environment.pop("OPENBLAS_NUM_THREADS", None)  # as users have it
     command = [sys.executable, "-c", SEVERAL_AT_ONCE]

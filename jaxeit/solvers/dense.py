@@ -2,9 +2,9 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, cholesky
 from jaxtyping import Array, Float, Int
 
+from ..lapack import cho_solve, cholesky
 from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale, unit_columns
 
 

@@ -13,20 +13,20 @@ a level keeps U and W for the sweeps of a solve:
 `corner`, the inverse on the unknowns of the root, needs neither sweep: the last front holds it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
-from math import gcd, prod
-from typing import Any, NamedTuple, TypeVar
+from math import prod
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
+from ..lapack import portion_of, portioned
 from ..verbs import stacked_product
 from ._base import AbstractLinearSolver, AbstractPlan, Pattern, index_arrays, jacobi_scale, on_device
 from ._dissection import dissect
@@ -38,10 +38,6 @@ _WIDEST = 72
 
 # Unknowns of a subtree whose fronts stay in a processor's cache.
 _SUBTREE = 6000
-
-# Multiplications up to which jaxlib does a stack of LAPACK calls at once.  A larger stack it spreads over
-# its threads while the caller, one of them, waits; as many such callers as threads wait for ever (0.10.2).
-_IN_PLACE = 200_000
 
 # Parts of a level that are written out one after the other; more are done in a loop, which copies in and out.
 _MOST_PARTS = 8
@@ -207,9 +203,9 @@ def _swept(
 
 
 def _parts(level: LevelPlan) -> int:
-    """Into how many parts to cut a level, so that no part needs a loop (`_portioned`); 1 if these were too many."""
+    """Into how many parts to cut a level, so that no part needs a loop (`portioned`); 1 if these were too many."""
     count, pivots, boundary = level.beside.shape
-    parts = count // _portion(count, pivots, boundary)
+    parts = count // portion_of(count, pivots**2 * max(pivots, boundary))
     return parts if pivots <= _WIDEST and parts <= _MOST_PARTS else 1
 
 
@@ -272,53 +268,11 @@ def _eliminate(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> t
     return jnp.concatenate([beyond, w2], 1), first + second
 
 
-def _portion(count: int, pivots: int, columns: int) -> int:
-    """How many of so many matrices are done at once, `_IN_PLACE`."""
-    work = max(1, pivots**2 * max(pivots, columns))
-    return gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // work))))
-
-
-def _portioned(function: Callable[..., Any]) -> Callable[..., Any]:
-    """For stacks of matrices, in portions that jaxlib does in place (`_IN_PLACE`).
-
-    The results of ``function`` take the places of its last arguments.
-    """
-
-    def in_portions(stacks, portion):
-        def step(i, stacks):
-            part = [lax.dynamic_slice_in_dim(stack, i * portion, portion) for stack in stacks]
-            done = function(*part)
-            kept, changed = stacks[: -len(done)], stacks[-len(done) :]
-            pairs = zip(changed, done, strict=True)
-            return *kept, *(lax.dynamic_update_slice_in_dim(old, new, i * portion, 0) for old, new in pairs)
-
-        return lax.fori_loop(0, stacks[0].shape[0] // portion, step, stacks)
-
-    @custom_vmap
-    def stacked(*stacks):
-        count, pivots, _ = stacks[0].shape
-        portion = _portion(count, pivots, max(stack.shape[2] for stack in stacks))
-        return lax.platform_dependent(
-            stacks,
-            cpu=partial(in_portions, portion=portion),
-            default=lambda stacks: in_portions(stacks, count),
-        )
-
-    @stacked.def_vmap
-    def _(size, batched, *stacks):
-        whole = [s if b else jnp.broadcast_to(s, (size, *s.shape)) for s, b in zip(stacks, batched, strict=True)]
-        out = stacked(*(s.reshape(-1, *s.shape[2:]) for s in whole))
-        apart = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), out)
-        return apart, jax.tree.map(lambda _: True, apart)
-
-    return stacked
-
-
 # LAPACK takes a matrix by columns, XLA by rows: what is lower to the one is upper to the other, so that
 # nothing is copied between them.  The barriers keep XLA from moving the transposition elsewhere.
 
 
-@_portioned
+@portioned
 def _panel(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> Panel:
     """U, and W = U^-T F12; of ``among`` the upper triangle is read."""
     among, beside = lax.optimization_barrier((among, beside))
@@ -327,14 +281,14 @@ def _panel(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> Panel
     return Panel(*lax.optimization_barrier((_transposed(lower), _transposed(w))))
 
 
-@_portioned
+@portioned
 def _descended(upper: Float[Array, "m p p"], rhs: Float[Array, "m p k"]) -> tuple[Float[Array, "m p k"]]:
     """U^-T r."""
     lower, rhs = _transposed(upper), _transposed(rhs)
     return (_transposed(lax.linalg.triangular_solve(lower, rhs, left_side=False, lower=True, transpose_a=True)),)
 
 
-@_portioned
+@portioned
 def _ascended(upper: Float[Array, "m p p"], rhs: Float[Array, "m p k"]) -> tuple[Float[Array, "m p k"]]:
     """U^-1 r."""
     lower, rhs = _transposed(upper), _transposed(rhs)
