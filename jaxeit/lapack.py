@@ -1,11 +1,11 @@
-"""Cholesky factors, triangular solves and eigenvectors that are safe under `jax.vmap`.
+"""Dense factors and solves that are safe under `jax.vmap`.
 
 jaxlib 0.10 spreads a stack of matrices that is given to LAPACK over the threads of XLA's pool, while the caller, one of
-those threads, waits for them. A program in which as many such stacks as there are threads are reached at once waits for
-ever: on two cores two products of two stacks of matrices of 156 rows, each after a Cholesky factor of its own, do in
-most runs. (Its builds after July 2026 no longer do so.) A `jax.vmap` makes such stacks of single matrices. Here it
-makes one stack, however many vmaps there are, and on a CPU gives it to LAPACK in portions too small to be spread. On
-other devices it stays whole.
+those threads, waits for them. A program that comes to as many such stacks at once as there are threads waits for ever:
+on two cores two chains of a Cholesky factor and a product, each of two matrices of 156 rows, do in most runs. (Builds
+after July 2026 no longer spread any.) A `jax.vmap` makes such stacks of single matrices. Here it makes one, however
+many vmaps there are, and on a CPU gives it to LAPACK in portions too small to be spread. On other devices it stays
+whole.
 
 The functions are named and mean as those of `jax.scipy.linalg` and `jax.numpy.linalg`, for one real matrix, and have
 derivatives of any order in both directions.
