@@ -23,7 +23,7 @@ from .gaps import gap_of
 from .jacobian import pair_jacobian
 from .lapack import cho_factor, cho_solve
 from .responses import Nodes, Responses, nodes_of, reached, responses_of, tabulate
-from .verbs import verb
+from .verbs import one_by_one, verb
 from .whitening import InverseError, Whitened, Whitening, require_frames, whitened_readings
 
 _LONGEST = 0.04  # half length of an oblong contact, m
@@ -154,8 +154,8 @@ class ContactFinder(eqx.Module):
 
         A reading that is not finite is left out of its frame exactly, as if it had never been measured (`gaps`).
 
-        A batch is done frame by frame, each of which stops as soon as it can; ``jax.vmap`` of a finder gives the same
-        numbers, for machines wide enough to gain by it.
+        A batch is done frame by frame, each of which stops as soon as it can. So does ``jax.vmap`` of a finder on a
+        processor; elsewhere it does them side by side.
         """
         frames = jnp.asarray(dv, self.compress.dtype)
         require_frames(frames, self.readings)
@@ -418,10 +418,13 @@ class ContactFinder(eqx.Module):
         return jnp.where(found.fit.done, shape, ContactResult.NOT_CONVERGED)
 
 
+_alone = one_by_one(lambda finder, frame: finder.frame(frame))
+
+
 @verb
 def _find(finder: ContactFinder, frames: Float[Array, "... readings"]) -> Contacts:
     if frames.ndim == 1:
-        return finder.frame(frames)
+        return _alone(finder, frames)
     found = jax.lax.map(finder.frame, frames.reshape(-1, frames.shape[-1]))  # each stops on its own, in a core's cache
     return jax.tree.map(lambda a: a.reshape(*frames.shape[:-1], *a.shape[1:]), found)
 

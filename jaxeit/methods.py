@@ -14,12 +14,12 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float
 
 from .basis import Picture
 from .lapack import cho_factor, cho_solve, cholesky, solve_triangular
 from .priors import AbstractPrecision, AbstractPrior, Diagonal
+from .verbs import one_by_one
 
 
 class Problem(eqx.Module):
@@ -245,7 +245,7 @@ def _pixels_above_zero(steps: int):
     Of many frames one after the other, so that each pays only for the way it takes.
     """
 
-    @sequential_vmap
+    @one_by_one
     def found(j, weight, y):
         def going(state):
             step, _, above, before, length = state

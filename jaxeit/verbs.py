@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer, eval_context
+from jax.custom_batching import custom_vmap
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float
 
@@ -157,6 +158,32 @@ def _is_known(options: dict[str, Any]) -> bool:
     except jax.errors.JaxRuntimeError:
         return False
     return True
+
+
+def one_by_one(function: Callable[..., T]) -> Callable[..., T]:
+    """``function``, which `jax.vmap` does one by one on a processor, so that each takes only its own way.
+
+    In a batch a loop goes on for as long as one needs it, and both sides of a condition are computed: so on other
+    devices, and where it is differentiated. Arguments and results are pytrees of arrays.
+    """
+    one = custom_vmap(function)
+
+    @one.def_vmap
+    def _(size, batched, *args):
+        moving, still = eqx.partition(args, tuple(batched))
+        out = jax.lax.platform_dependent(
+            moving,
+            cpu=lambda moving: jax.lax.map(lambda each: one(*eqx.combine(each, still)), moving),
+            default=jax.vmap(lambda each: function(*eqx.combine(each, still))),
+        )
+        return out, jax.tree.map(lambda _: True, out)
+
+    @eqx.filter_custom_jvp
+    def call(*args):
+        return one(*args)
+
+    call.def_jvp(lambda primals, tangents: eqx.filter_jvp(function, primals, tangents))
+    return call
 
 
 def stacked_product(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:

@@ -96,3 +96,51 @@ def test_memory_is_used_again():
     if can == "False":
         pytest.skip("not with this C library")
     assert int(given_back) > 20 * int(kept) + 100
+
+
+def _halved(seen):
+    """Of x and a limit that all share: x halved until it is below, or the sine of what is so from the start."""
+
+    def function(limit, x):
+        held = jax.lax.stop_gradient(x)
+
+        def again(steps):
+            jax.debug.callback(lambda _: seen.append("halved"), held)
+            return steps + 1
+
+        def sine(x):
+            jax.debug.callback(lambda _: seen.append("sine"), held)
+            return jnp.sin(x)
+
+        steps = jax.lax.while_loop(lambda steps: held * 0.5**steps > limit, again, jnp.asarray(0))
+        return jax.lax.cond(x > limit, lambda x: x * 0.5**steps, sine, x), steps
+
+    return function
+
+
+def test_each_takes_only_its_own_way():
+    """Where a vmap by itself goes both ways, and on for as long as one needs it."""
+    x = jnp.array([[9.0, 0.5, 5.0], [0.3, 1.5, 0.2]])
+    ours, theirs = [], []
+    mapped = [
+        jax.jit(jax.vmap(jax.vmap(function, (None, 0)), (None, 0)))(1.0, x)
+        for function in (verbs.one_by_one(_halved(ours)), _halved(theirs))
+    ]
+    jax.effects_barrier()
+    np.testing.assert_array_equal(mapped[0][0], mapped[1][0])
+    np.testing.assert_array_equal(mapped[0][1], mapped[1][1])
+    np.testing.assert_allclose(mapped[0][0], [[0.5625, np.sin(0.5), 0.625], [np.sin(0.3), 0.75, np.sin(0.2)]])
+    assert (ours.count("halved"), ours.count("sine")) == (4 + 3 + 1, 3)
+    assert (theirs.count("halved"), theirs.count("sine")) == (6 * 4, 6)
+
+
+def test_what_is_done_one_by_one_has_derivatives():
+    one, x = verbs.one_by_one(_halved([])), jnp.array([9.0, 0.5, 1.5])
+    slopes = [0.5**4, np.cos(0.5), 0.5]
+    for many in (
+        jax.vmap(jax.grad(lambda x: one(1.0, x)[0])),
+        jax.grad(lambda x: jnp.sum(jax.vmap(one, (None, 0))(1.0, x)[0])),
+        lambda x: jax.jvp(lambda x: jax.vmap(one, (None, 0))(1.0, x)[0], (x,), (jnp.ones(3),))[1],
+        lambda x: jax.vmap(lambda x: jax.jvp(lambda x: one(1.0, x)[0], (x,), (1.0,))[1])(x),
+    ):
+        np.testing.assert_allclose(jax.jit(many)(x), slopes, rtol=1e-12)
