@@ -80,6 +80,22 @@ def test_only_the_command_line_touches_the_configuration_of_jax():
                 assert not re.search(r"^ *jax\.config\.", path.read_text(), re.MULTILINE), path
 
 
+def test_factors_and_solves_are_those_that_are_safe_under_vmap():
+    """See `jaxeit.lapack`. What is done once, on the host, may be JAX's."""
+    theirs = r"from jax\.scipy\.linalg|\b(?:jnp|jsp|lax|jax\.scipy)\.linalg\.(?!norm)\w+(?=[(,)])"
+    found = {
+        (str(path.relative_to(ROOT)), name)
+        for package in ("jaxeit", "calib")
+        for path in (ROOT / package).rglob("*.py")
+        for name in re.findall(theirs, path.read_text())
+    }
+    own = {"jaxeit/lapack.py", "jaxeit/solvers/nested_dissection.py"}
+    assert {(path, name) for path, name in found if path not in own} == {
+        ("jaxeit/methods.py", "jnp.linalg.qr"),
+        ("jaxeit/methods.py", "jnp.linalg.svd"),
+    }
+
+
 def test_no_path_of_a_machine_in_the_project():
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
     for name in filter(lambda n: n.endswith((".py", ".toml", ".md", "Makefile")), tracked.split()):
