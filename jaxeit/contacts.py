@@ -425,7 +425,7 @@ _alone = one_by_one(lambda finder, frame: finder.frame(frame))
 def _find(finder: ContactFinder, frames: Float[Array, "... readings"]) -> Contacts:
     if frames.ndim == 1:
         return _alone(finder, frames)
-    found = jax.lax.map(finder.frame, frames.reshape(-1, frames.shape[-1]))  # each stops on its own, in a core's cache
+    found = jax.lax.map(lambda frame: _alone(finder, frame), frames.reshape(-1, frames.shape[-1]))
     return jax.tree.map(lambda a: a.reshape(*frames.shape[:-1], *a.shape[1:]), found)
 
 
