@@ -49,7 +49,7 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
     def stacked(*stacks):
         count, rows, _ = stacks[0].shape
         columns = max(stack.shape[2] for stack in stacks)
-        portion = portion_of(count, operations * rows**2 * max(rows, columns))
+        portion = portion_of(count, rows, columns, operations)
         return lax.platform_dependent(
             stacks,
             cpu=partial(in_portions, portion=portion),
@@ -65,9 +65,10 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
     return stacked
 
 
-def portion_of(count: int, work: int) -> int:
-    """How many of so many matrices are done at once, each of so much work."""
-    return gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // max(1, work)))))
+def portion_of(count: int, rows: int, columns: int, operations: int = 1) -> int:
+    """How many of so many matrices are done at once, see `portioned`."""
+    work = max(1, operations * rows**2 * max(rows, columns))
+    return gcd(count, 1 << int(np.log2(max(1, _IN_PLACE // work))))
 
 
 def _spread(size: int, batched: Any, arrays: Any) -> list[Array]:

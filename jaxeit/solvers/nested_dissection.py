@@ -205,7 +205,7 @@ def _swept(
 def _parts(level: LevelPlan) -> int:
     """Into how many parts to cut a level, so that no part needs a loop (`portioned`); 1 if these were too many."""
     count, pivots, boundary = level.beside.shape
-    parts = count // portion_of(count, pivots**2 * max(pivots, boundary))
+    parts = count // portion_of(count, pivots, boundary)
     return parts if pivots <= _WIDEST and parts <= _MOST_PARTS else 1
 
 
