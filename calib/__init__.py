@@ -1,85 +1,72 @@
 """calib: from what a bench or a robot recorded to newtons.
 
-Names are imported when first used, so that the command line answers at once.
+The names used every day are here; each room holds the rest, such as `calib.fitting.Huber`.
+Rooms and names are imported on first use, so that the command line answers at once.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ._lazy import lazy_names
 
 if TYPE_CHECKING:
-    from .batch import Outcome, calibrate_many
-    from .bench import Bench, Timing, load_bench, simulate
-    from .calibration import Calibration, calibrate, evaluate, load_calibration
+    from . import batch, bench, calibration, check, fitting, live, presses, record, report, session
+    from .batch.sessions import calibrate_many
+    from .bench import Bench, load_bench, simulate
+    from .calibration import (
+        Calibration,
+        Evaluation,
+        FittedContact,
+        ForceEstimate,
+        ImageCentroid,
+        Recipe,
+        apply,
+        calibrate,
+        evaluate,
+        force_map,
+        load_calibration,
+        locate,
+    )
     from .check import check_session
-    from .corrections import LowPass, PreOnly, TwoSided
-    from .curves import Affine, Hysteresis, HysteresisSpline, Linear, MonotonePolynomial, MonotoneSpline, Play, PowerLaw
-    from .evaluation import Evaluation
-    from .fit import Cauchy, FittedCurve, Huber, SoftL1, Squared, fit_curve, fit_curves
-    from .hybrid import Hybrid
-    from .importers import import_csv
-    from .location import (
+    from .fitting import (
+        Affine,
         Bilinear,
-        Constant,
-        FittedField,
         GaussianProcess,
+        Linear,
+        MonotonePolynomial,
+        MonotoneSpline,
         PadEdge,
         PadEdgeSize,
-        Places,
+        PowerLaw,
         RadialBasis,
         TensorSpline,
-        single_places,
+        fit_curve,
+        fit_curves,
     )
-    from .locators import FittedContact, ImageCentroid, locate
-    from .maps import ForceEstimate, apply, force_map
-    from .measured import Measured, Processing, measure
-    from .online import RecursiveLeastSquares, SensitivityTracker, Touched, follow, follow_frames
-    from .report import write_report
-    from .response import cross_validate, fit_log
-    from .session import (
-        PressTable,
-        Session,
-        SessionError,
-        SessionWriter,
-        Status,
-        Stream,
-        open_session,
-        read_archive,
-        write_archive,
-    )
+    from .report.document import write_report
+    from .session import Session, SessionError, SessionWriter, open_session
+    from .session.importers import import_csv
 
-_HOMES = {
-    "batch": "Outcome calibrate_many",
-    "bench": "Bench Timing load_bench simulate",
-    "calibration": "Calibration calibrate evaluate load_calibration",
-    "check": "check_session",
-    "corrections": "LowPass PreOnly TwoSided",
-    "curves": "Affine Hysteresis HysteresisSpline Linear MonotonePolynomial MonotoneSpline Play PowerLaw",
-    "evaluation": "Evaluation",
-    "fit": "Cauchy FittedCurve Huber SoftL1 Squared fit_curve fit_curves",
-    "hybrid": "Hybrid",
-    "location": (
-        "Bilinear Constant FittedField GaussianProcess PadEdge PadEdgeSize Places RadialBasis TensorSpline "
-        "single_places"
-    ),
-    "locators": "FittedContact ImageCentroid locate",
-    "maps": "ForceEstimate apply force_map",
-    "importers": "import_csv",
-    "measured": "Measured Processing measure",
-    "online": "RecursiveLeastSquares SensitivityTracker Touched follow follow_frames",
-    "report": "write_report",
-    "response": "cross_validate fit_log",
-    "session": "PressTable Session SessionError SessionWriter Status Stream open_session read_archive write_archive",
-}
-_HOME = {name: module for module, names in _HOMES.items() for name in names.split()}
-
-__all__ = sorted(_HOME)  # noqa: PLE0605
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'calib' has no attribute {name!r}")
-    return getattr(import_module(f".{_HOME[name]}", __name__), name)
+__getattr__, __all__ = lazy_names(
+    __name__,
+    {
+        "batch.sessions": "calibrate_many",
+        "bench": "Bench load_bench simulate",
+        "calibration": (
+            "Calibration Evaluation FittedContact ForceEstimate ImageCentroid Recipe apply "
+            "calibrate evaluate force_map load_calibration locate"
+        ),
+        "check": "check_session",
+        "fitting": (
+            "Affine Bilinear GaussianProcess Linear MonotonePolynomial MonotoneSpline PadEdge "
+            "PadEdgeSize PowerLaw RadialBasis TensorSpline fit_curve fit_curves"
+        ),
+        "report.document": "write_report",
+        "session": "Session SessionError SessionWriter open_session",
+        "session.importers": "import_csv",
+    },
+    rooms=("batch", "bench", "calibration", "check", "fitting", "live", "presses", "record", "report", "session"),
+)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+    return sorted({*globals(), *__all__})

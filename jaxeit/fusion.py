@@ -1,26 +1,37 @@
-"""Fusion: the shape of the contact from the image, its force from the pads."""
+"""Fusion: force maps with the shape of the contact from the image and its force from the pads."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from numpy.typing import DTypeLike
 
-from .basis import BasisMap, overlap_areas
-from .inverse import Reconstructor
-from .skin import Skin
+from ._compile import require_known
+from .model.bases import AbstractPictured, overlap_areas
+from .skin.description import Skin
+
+__all__ = [
+    "ContactShares",
+    "ForceMap",
+    "FusionError",
+    "PadMasks",
+    "contact_shares",
+    "fuse",
+    "pad_masks",
+]
 
 
 class FusionError(ValueError):
-    """Masks or forces that do not fit the image."""
+    """Masks or forces whose shape does not fit the image."""
 
 
 class PadMasks(eqx.Module):
-    """Which pad carries which part of the image.
+    """Share of each pad in each pixel of an image.
 
     | meaning                                                  | shape          | unit |
     |----------------------------------------------------------|----------------|------|
-    | weights: share of each pad in each pixel, sum at most 1  | (pads, pixels) |      |
+    | weights: share of each pad in each pixel; the sum over pads is at most 1 | (pads, pixels) | |
     | areas of the pixels                                      | (pixels,)      | m^2  |
     """
 
@@ -34,13 +45,14 @@ class ForceMap(eqx.Module):
     | meaning                                                          | shape         | unit |
     |------------------------------------------------------------------|---------------|------|
     | force on each pixel; over a pad it sums to the pad's force       | (..., pixels) | N    |
-    | valid: the shape comes from the image, not from the fallback     | (..., pads)   |      |
+    | valid: the image gives the shape; else the force is spread evenly | (..., pads)  |      |
     | concentration: positive part of the image over its magnitude     | (..., pads)   |      |
-    | discarded: negative part of the image that was cut away          | (..., pads)   | S m^2|
+    | discarded: negative part of the image, which has no force        | (..., pads)   | S m^2|
     | areas of the pixels                                              | (pixels,)     | m^2  |
-    | standard_error of each pixel's force; None: not asked for        | (..., pixels) | N    |
+    | standard_error of each pixel's force; None: pad_errors not given | (..., pixels) | N    |
 
-    The standard error is that of the pads' forces, for the shape as it is; within a pad all pixels err together.
+    The standard error propagates the errors of the pads' forces alone, with the shape taken as exact; within a pad the
+    errors of all pixels are fully correlated.
     """
 
     force: Float[Array, "... pixels"]
@@ -56,11 +68,11 @@ class ForceMap(eqx.Module):
         area = jnp.where(self.areas > 0, self.areas, 1.0)
         return jnp.where(self.areas > 0, self.force / area, 0.0)
 
-    def __array__(self, dtype=None, copy=None):
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self.force, dtype=dtype)
 
 
-def pad_masks(skin: Skin, image: Reconstructor | BasisMap) -> PadMasks:
+def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
     """Masks of the skin's pads on a pixel image, by exact areas of overlap.
 
     Where pads overlap they share the pixel equally (a partition of unity).
@@ -68,6 +80,7 @@ def pad_masks(skin: Skin, image: Reconstructor | BasisMap) -> PadMasks:
     Raises:
         FusionError: if the image is not one of pixels, or a pad lies outside it.
     """
+    require_known("pad_masks", FusionError, image)
     if len(image.shape) != 2:
         raise FusionError("pad masks need an image of pixels; prepare with basis=Pixels(...)")
     x0, x1, y0, y1 = image.extent
@@ -91,13 +104,13 @@ def _coverage(outline: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndar
 
 
 class ContactShares(eqx.Module):
-    """How several contacts divide the image and the pads between them; from `contact_shares`.
+    """Shares of several contacts in the image and in the pads' forces; from `contact_shares`.
 
-    | meaning                                                                                | shape            |
-    |----------------------------------------------------------------------------------------|------------------|
-    | part of each pixel's change that is each contact's; over contacts it sums to one       | (..., K, pixels) |
-    | share of each contact in each pad's force; sums to one, or zeros: no contact on the pad | (..., K, pads)   |
-    | lies: part of each contact that lies on each pad; zeros where there is none            | (..., K, pads)   |
+    | meaning                                                                                   | shape            |
+    |-------------------------------------------------------------------------------------------|------------------|
+    | part of each pixel's change that belongs to each contact; sums to 1 over contacts          | (..., K, pixels) |
+    | share of each contact in each pad's force; sums to 1, or to 0 for a pad without a contact  | (..., K, pads)   |
+    | lies: part of each contact that lies on each pad; 0 for a contact that is not there        | (..., K, pads)   |
     """
 
     part: Float[Array, "... K pixels"]
@@ -105,7 +118,10 @@ class ContactShares(eqx.Module):
     lies: Float[Array, "... K pads"]
 
 
-_ASIDE = 0.05  # part of a contact on a pad below which the contact is beside it
+# A contact with less than this part of its bump on a pad lies beside the pad.
+MIN_PART_ON_PAD = 0.05
+# Logarithm of zero that leads to no difference of infinities, and so to no NaN.
+LOG_OF_ZERO = -1e30
 
 
 @eqx.filter_jit
@@ -116,16 +132,16 @@ def contact_shares(
     centres: Float[Array, "pixels 2"],
     masks: PadMasks,
 ) -> ContactShares:
-    """Shares of fitted contacts: on a pad, each has that of its bump's integral inside the pad's mask.
+    """Shares of fitted contacts: on a pad, each contact's share is that of its bump's integral over the pad's mask.
 
-    The bumps are Gaussian, ``a exp(-|x - x0|^2 / 2 s^2)``, as `jaxeit.Contacts` has them. A contact of which less than
-    a twentieth lies on a pad is beside it and has no share in it, unless none lies nearer.
+    The bumps are Gaussian, ``a exp(-|x - x0|^2 / 2 s^2)``, as in `jaxeit.contacts.Contacts`. A contact with less than a
+    twentieth of its bump on a pad lies beside the pad and has no share in it, unless this holds for all contacts.
 
     Args:
-        position: m; anything where there is no contact.
-        width: standard deviation, m.
-        amplitude: S, or any unit that is that of all; 0 where there is no contact.
-        centres: of the pixels, m.
+        position: (..., K, 2) m; ignored where there is no contact.
+        width: standard deviation, (..., K) m.
+        amplitude: (..., K) S, or any other unit; 0 where there is no contact.
+        centres: of the pixels, (pixels, 2) m.
         masks: from `pad_masks`.
     """
     there = (amplitude > 0) & jnp.all(jnp.isfinite(position), -1) & (width > 0)
@@ -135,15 +151,12 @@ def contact_shares(
     bump = jnp.where(there[..., None], jnp.exp(log_bump), 0)
     inside, whole = bump @ (masks.weights * masks.areas).T, (bump @ masks.areas)[..., None]
     lies = inside / jnp.where(whole > 0, whole, 1)
-    on = lies > _ASIDE
+    on = lies > MIN_PART_ON_PAD
     mine = jnp.where(on | ~jnp.any(on, -2, keepdims=True), inside, 0)
     total = mine.sum(-2, keepdims=True)
-    # by logarithms: far from every contact all bumps are zero
-    part = jnp.where(there[..., None], jax.nn.softmax(jnp.where(there[..., None], log_bump, _NEVER), -2), 0)
+    # From logarithms, since far from every contact all bumps underflow to zero.
+    part = jnp.where(there[..., None], jax.nn.softmax(jnp.where(there[..., None], log_bump, LOG_OF_ZERO), -2), 0)
     return ContactShares(part, mine / jnp.where(total > 0, total, 1), lies)
-
-
-_NEVER = -1e30  # the logarithm of nothing, without the NaN of a difference of infinities
 
 
 @eqx.filter_jit
@@ -158,24 +171,24 @@ def fuse(
 ) -> ForceMap:
     """Distribute each pad's force over its part of the image.
 
-    The paper's equation 4 in a form that cannot blow up: a pixel weighs its area times the positive
-    part of its image; where the image over a pad is mostly noise (its positive part less than
-    ``gate`` of its magnitude; noise alone gives a half) or not finite, or the pad's force is not
-    positive, the force is spread evenly over the pad and flagged as not valid.  Either way the
+    The paper's equation 4 in a bounded form: the weight of a pixel is its area times the positive
+    part of its image.  Where the image over a pad is mostly noise (its positive part is less than
+    ``gate`` of its magnitude; pure noise gives a half) or not finite, or the pad's force is not
+    positive, the force is spread evenly over the pad and flagged as not valid.  In both cases the
     map over a pad sums to the pad's force.  A pad whose force is not finite has NaN on its own pixels only.
 
     Args:
         image: conductivity change, (..., pixels) S.
         masks: from `pad_masks`.
         pad_forces: (..., pads) N.
-        gate: least concentration of a valid image, 0.5 to 1.
-        contacts: from `contact_shares`. A valid pad with two contacts or more then has each contact's share of its
-            force on that contact's part of the image, which blurs and may hide the weaker one. Default: what the
-            image says.
-        pad_errors: standard errors of the pads' forces, (..., pads) N, for those of the map.
+        gate: smallest concentration of a valid image, 0.5 to 1.
+        contacts: from `contact_shares`. The force of a valid pad with two contacts or more is then divided by the
+            contacts' shares, and each share is distributed over that contact's part of the image; the image alone
+            blurs contacts together and may hide the weaker one. Default: the image alone divides the force.
+        pad_errors: standard errors of the pads' forces, (..., pads) N, for the standard errors of the map.
 
     Raises:
-        ValueError: if the shapes do not fit.
+        FusionError: if the shapes do not fit.
     """
     image, forces = jnp.asarray(image), jnp.asarray(pad_forces)
     pads, pixels = masks.weights.shape
@@ -199,7 +212,8 @@ def fuse(
     whole = part.sum(-1, keepdims=True)
     part = part / jnp.where(whole > 0, whole, 1)
     force = (part * jnp.where(known, forces, 0)[..., None]).sum(-2)
-    silent = (~known).astype(mass.dtype) @ masks.weights > 0  # NaN last: it spreads in no sum, and in no derivative
+    # NaN is set last, so that it spreads neither through a sum nor through a derivative.
+    silent = (~known).astype(mass.dtype) @ masks.weights > 0
     force = jnp.where(silent, jnp.nan, force)
     error = None if pad_errors is None else _root((part**2 * (pad_errors**2)[..., None]).sum(-2))
     return ForceMap(force, valid, concentration, discarded, masks.areas, error)
@@ -213,9 +227,9 @@ def _root(square: Float[Array, "..."]) -> Float[Array, "..."]:
 def _balance(
     seen: Float[Array, "... pixels"], masks: PadMasks, contacts: ContactShares
 ) -> Float[Array, "... pads pixels"]:
-    """What the image over each pad is to be multiplied with for its contacts to have their shares; 1 for a single one.
+    """Factor on the image over each pad with which its contacts have their shares; 1 for a pad with one contact.
 
-    A contact that the image does not show at all leaves its share to the others.
+    The share of a contact that the image does not show goes to the other contacts.
     """
     mass = (seen[..., None, :] * contacts.part) @ masks.weights.T
     there = (contacts.share > 0) & (mass > 0)

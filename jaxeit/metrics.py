@@ -1,22 +1,48 @@
-"""Figures of merit: where a contact is said to be, how true its image is, and how even the sensitivity is."""
+"""Figures of merit: the position of a contact in an image, the fidelity of the image, the evenness of sensitivity."""
 
 from abc import abstractmethod
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
-from .verbs import verb
+from ._compile import is_traced, verb
+
+__all__ = [
+    "ESTIMATORS",
+    "AbstractEstimator",
+    "GreitFigures",
+    "LevelCentroid",
+    "MetricError",
+    "Peak",
+    "Pictured",
+    "PositiveCentroid",
+    "coefficient_of_variation",
+    "greit_figures",
+    "image_correlation",
+    "image_sum",
+    "inward_bias",
+    "ktc_score",
+    "localisation_error",
+    "otsu_thresholds",
+    "structural_similarity",
+]
+
+
+Places: TypeAlias = Float[ArrayLike, "... 2"] | Sequence[float]
+"""Positions on the flat sheet, m; also one as a list or tuple."""
 
 
 class MetricError(ValueError):
-    """Images that cannot be compared, or a setting without meaning."""
+    """Images that cannot be compared, or a setting out of range."""
 
 
+@runtime_checkable
 class Pictured(Protocol):
-    """Whatever says where the pixels of an image lie: a reconstructor, a basis map or a picture.
+    """Anything that knows where the pixels of an image lie: a reconstructor, a basis map or a picture.
 
     | meaning                                              | shape       | unit |
     |------------------------------------------------------|-------------|------|
@@ -36,7 +62,7 @@ class Pictured(Protocol):
 
 
 class AbstractEstimator(eqx.Module):
-    """Where an image says that the contact is."""
+    """An estimator of the contact's position from an image."""
 
     @abstractmethod
     def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
@@ -46,7 +72,7 @@ class AbstractEstimator(eqx.Module):
 class Peak(AbstractEstimator):
     """The pixel with the largest value."""
 
-    def __call__(self, image, recon):
+    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         found = recon.centres[jnp.argmax(image, -1)]
         return jnp.where(jnp.max(image, -1, keepdims=True) > 0, found, jnp.nan)
 
@@ -60,7 +86,7 @@ class LevelCentroid(AbstractEstimator):
 
     level: float = 0.25
 
-    def __call__(self, image, recon):
+    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         top = jnp.max(image, -1, keepdims=True)
         inside = jnp.where((image >= self.level * top) & (top > 0), recon.areas, 0)
         return _centroid(inside, recon)
@@ -69,11 +95,11 @@ class LevelCentroid(AbstractEstimator):
 class PositiveCentroid(AbstractEstimator):
     """The centroid of the positive part, weighted by its value."""
 
-    def __call__(self, image, recon):
+    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         return _centroid(jnp.maximum(image, 0) * recon.areas, recon)
 
 
-def _centroid(weight, recon):
+def _centroid(weight: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
     total = weight.sum(-1, keepdims=True)
     return jnp.where(total > 0, weight @ recon.centres / jnp.where(total > 0, total, 1), jnp.nan)
 
@@ -86,21 +112,21 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
 }
 
 
-def localisation_error(estimated: Float[ArrayLike, "... 2"], true: Float[ArrayLike, "... 2"]) -> Float[Array, "..."]:
+def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
     """Distance between estimated and true positions, m."""
     return _length(jnp.asarray(estimated) - jnp.asarray(true))
 
 
-def _length(vector):
-    """Euclidean, with a gradient of zero (not NaN) at zero."""
+def _length(vector: Float[Array, "... n"]) -> Float[Array, "..."]:
+    """Euclidean length, with a gradient of zero (not NaN) at zero."""
     square = jnp.sum(vector**2, -1)
     return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
 
 
 def inward_bias(
-    estimated: Float[ArrayLike, "... 2"], true: Float[ArrayLike, "... 2"], centre: Float[ArrayLike, "2"]
+    estimated: Places, true: Places, centre: Float[ArrayLike, "2"] | Sequence[float]
 ) -> Float[Array, "..."]:
-    """How much nearer to the sheet's centre the estimate lies than the truth, m, signed.
+    """Shift of the estimate towards the sheet's centre, m; negative if outward.
 
     The position error PE of the GREIT figures of merit, with the origin at ``centre``.
     """
@@ -113,9 +139,13 @@ def image_sum(image: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " p
 
 
 def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) -> Float[Array, "..."]:
-    """Standard deviation over mean along the last axis; ``ddof`` is 0 or 1, and must be said.
+    """Standard deviation over mean along the last axis.
 
-    NaN where the mean is zero, and for one value with ``ddof=1``: nothing is known of their spread.
+    NaN where the mean is zero, and for a single value with ``ddof=1``, whose spread is unknown.
+
+    Args:
+        values: (..., n).
+        ddof: degrees of freedom that the mean takes, 0 or 1; without a default, since results differ.
     """
     values = jnp.asarray(values)
     mean = jnp.mean(values, -1)
@@ -133,9 +163,9 @@ class GreitFigures(eqx.Module):
     |----------------------------------------------------------------|-------|-------|-------|
     | amplitude AR: integral of the image                            | (...) | S m^2 | even  |
     | position_error PE: inward shift, negative if outward           | (...) | m     | 0     |
-    | resolution RES: root of the share of the sheet that lights up  | (...) |       | small |
-    | shape_deformation SD: share of it outside its circle           | (...) |       | 0     |
-    | ringing RNG: negative part over the sum of what lights up      | (...) |       | 0     |
+    | resolution RES: square root of A_q / A_sheet                   | (...) |       | small |
+    | shape_deformation SD: share of q outside its circle            | (...) |       | 0     |
+    | ringing RNG: negative part of the image over the sum over q    | (...) |       | 0     |
     """
 
     amplitude: Float[Array, "..."]
@@ -148,13 +178,13 @@ class GreitFigures(eqx.Module):
 def greit_figures(
     image: Float[ArrayLike, "... pixels"],
     recon: Pictured,
-    target: Float[ArrayLike, "... 2"],
-    centre: Float[ArrayLike, "2"],
+    target: Places,
+    centre: Float[ArrayLike, "2"] | Sequence[float],
 ) -> GreitFigures:
-    """The GREIT figures of merit, with every sum over pixels weighted by their areas A on the sheet.
+    """The GREIT figures of merit; every sum over pixels is weighted by their areas A on the sheet.
 
     With q = {pixels of at least a quarter of the largest value x}, r_q the centroid of q (each
-    pixel by its area, whatever its value), and C the circle about r_q that has the area of q:
+    pixel weighted by its area alone), and C the circle about r_q that has the area of q:
 
         AR  = sum(A x)                                  RES = sqrt(A_q / A_sheet)
         PE  = |target - centre| - |r_q - centre|        SD  = A_(q outside C) / A_q
@@ -162,20 +192,20 @@ def greit_figures(
 
     A pixel is in C if its centre is. These are the definitions of EIDORS
     (``eval_GREIT_fig_merit``), with the origin at ``centre``; there AR is divided by its mean over
-    targets near the centre when there are more than ten images, here that is left to the caller.
+    targets near the centre when there are more than ten images; here the caller does this.
     The text of the paper sums the ringing outside and inside C in place of q.
 
-    PE is radial: an error along the circle about ``centre`` does not show. `localisation_error`
-    has all of it. Negative contacts are seen after a change of the image's sign.
+    PE is radial: it does not contain an error along the circle about ``centre``. `localisation_error`
+    contains both. For contacts that lower the conductivity, change the sign of the image.
 
     Args:
-        image: (..., pixels) S; pixels that miss the sheet are not looked at.
-        recon: whose centres and areas the image has.
+        image: (..., pixels) S; pixels that miss the sheet are ignored.
+        recon: the reconstructor, basis map or picture that the image belongs to.
         target: true position, (..., 2) m.
         centre: of the sheet, (2,) m.
 
     Returns:
-        Everything but the amplitude is NaN where the image is nowhere positive, and only there.
+        The figures; all but the amplitude are NaN where the image is nowhere positive, and only there.
 
     Source: Adler et al. 2009, Physiol. Meas. 30 S35, section 2.2.
     """
@@ -185,7 +215,13 @@ def greit_figures(
 
 
 @verb
-def _greit_figures(image, centres, areas, target, centre):
+def _greit_figures(
+    image: Float[Array, "... pixels"],
+    centres: Float[Array, "pixels 2"],
+    areas: Float[Array, " pixels"],
+    target: Float[Array, "... 2"],
+    centre: Float[Array, "2"],
+) -> GreitFigures:
     image = jnp.where(areas > 0, image, 0)
     top = jnp.max(image, -1, keepdims=True)
     seen = top[..., 0] > 0
@@ -204,7 +240,7 @@ def _greit_figures(image, centres, areas, target, centre):
     )
 
 
-# --- likeness of two images ------------------------------------------------------------------------------------------
+# --- similarity of two images ----------------------------------------------------------------------------------------
 
 
 def image_correlation(
@@ -212,14 +248,15 @@ def image_correlation(
 ) -> Float[Array, "..."]:
     """Pearson's correlation of two images over the sheet, each pixel weighted by its area; -1 to 1.
 
-    0 where either image is constant: it then says nothing about the other, and a mean over many
-    frames stays finite. Pixels without area are not looked at.
+    0 where either image is constant, so that a mean over many frames stays finite. Pixels without area are ignored.
     """
     return _image_correlation(jnp.asarray(image), jnp.asarray(truth), jnp.asarray(areas))
 
 
 @verb
-def _image_correlation(image, truth, areas):
+def _image_correlation(
+    image: Float[Array, "... pixels"], truth: Float[Array, "... pixels"], areas: Float[Array, " pixels"]
+) -> Float[Array, "..."]:
     weight = areas / areas.sum()
     a, b = _contrast(image, weight), _contrast(truth, weight)
     square = jnp.sum(weight * a**2, -1) * jnp.sum(weight * b**2, -1)
@@ -227,8 +264,8 @@ def _image_correlation(image, truth, areas):
     return jnp.where(known, jnp.sum(weight * a * b, -1) / jnp.sqrt(jnp.where(known, square, 1)), 0)
 
 
-def _contrast(image, weight):
-    """The image less its mean, in units of its span; exactly zero for a constant one."""
+def _contrast(image: Float[Array, "... pixels"], weight: Float[Array, " pixels"]) -> Float[Array, "... pixels"]:
+    """The image less its mean, in units of its span; exactly zero for a constant image."""
     there = jnp.argmax(weight)
     rise = jnp.where(weight > 0, image - image[..., there, None], 0)
     span = jnp.max(jnp.abs(rise), -1, keepdims=True)
@@ -237,8 +274,8 @@ def _contrast(image, weight):
 
 
 def structural_similarity(
-    image: Float[ArrayLike, "... rows columns"],
-    truth: Float[ArrayLike, "... rows columns"],
+    image: Real[ArrayLike, "... rows columns"],
+    truth: Real[ArrayLike, "... rows columns"],
     *,
     width: float = 80.0,
     c1: float = 1e-4,
@@ -262,16 +299,22 @@ def structural_similarity(
         MetricError: if the shapes differ, there is no picture, or a setting is not above zero.
     """
     a, b = _pictures(image, truth)
-    if not (width > 0 and c1 > 0 and c2 > 0):
+    if not is_traced(width, c1, c2) and not (width > 0 and c1 > 0 and c2 > 0):
         raise MetricError(f"width, c1 and c2 are {width}, {c1} and {c2}; give numbers above zero")
     return _structural_similarity(a, b, *(jnp.asarray(number, a.dtype) for number in (width, c1, c2)))
 
 
 @verb
-def _structural_similarity(a, b, width, c1, c2):
+def _structural_similarity(
+    a: Float[Array, "... rows columns"],
+    b: Float[Array, "... rows columns"],
+    width: Float[Array, ""],
+    c1: Float[Array, ""],
+    c2: Float[Array, ""],
+) -> Float[Array, "..."]:
     rows, columns = (_window(size, width) for size in a.shape[-2:])
 
-    def mean(picture):
+    def mean(picture: Float[Array, "... rows columns"]) -> Float[Array, "... rows columns"]:
         return rows @ picture @ columns.T  # the window is a product of one along each side, rim included
 
     m_a, m_b = mean(a), mean(b)
@@ -280,7 +323,7 @@ def _structural_similarity(a, b, width, c1, c2):
     return jnp.mean(like, (-2, -1))
 
 
-def _window(size, width):
+def _window(size: int, width: Float[Array, ""]) -> Float[Array, "size size"]:
     """Weights of the local mean along one side, (size, size); every row sums to one."""
     apart = jnp.arange(size)[:, None] - jnp.arange(size)
     weight = jnp.where(jnp.abs(apart) <= jnp.ceil(2 * width), jnp.exp(-0.5 * (apart / width) ** 2), 0)
@@ -288,23 +331,26 @@ def _window(size, width):
 
 
 def ktc_score(
-    labels: Int[ArrayLike, "... rows columns"], truth: Int[ArrayLike, "... rows columns"]
+    labels: Integer[ArrayLike, "... rows columns"], truth: Integer[ArrayLike, "... rows columns"]
 ) -> Float[Array, "..."]:
     """Score of a segmented picture in the Kuopio Tomography Challenge 2023 (Räsänen et al.); 1 is best.
 
-    The mean of the `structural_similarity` of two masks: where the pictures say 1 (resistive) and
-    where they say 2 (conductive); anything else is water. A class that is in neither picture
-    counts as found. The challenge's pictures are 256 x 256, and its window of 80 pixels is for
-    that size.
+    The mean `structural_similarity` of two masks: pixels labelled 1 (resistive) and pixels labelled 2
+    (conductive); other labels are water. A class that is in neither picture scores 1. The pictures of
+    the challenge are 256 x 256, and the window of 80 pixels suits that size.
 
     Raises:
         MetricError: if the shapes differ or there is no picture.
     """
     a, b = _pictures(labels, truth)
-    return (structural_similarity(a == 1, b == 1) + structural_similarity(a == 2, b == 2)) / 2
+    masks = ([(picture == label).astype(a.dtype) for picture in (a, b)] for label in (1, 2))
+    resistive, conductive = (structural_similarity(*pair) for pair in masks)
+    return (resistive + conductive) / 2
 
 
-def _pictures(image, truth):
+def _pictures(
+    image: Real[ArrayLike, "..."], truth: Real[ArrayLike, "..."]
+) -> tuple[Float[Array, "... rows columns"], Float[Array, "... rows columns"]]:
     image, truth = jnp.asarray(image), jnp.asarray(truth)
     if image.shape != truth.shape or image.ndim < 2 or not image.size:
         raise MetricError(
@@ -318,24 +364,25 @@ def _pictures(image, truth):
 
 
 def otsu_thresholds(
-    values: Float[ArrayLike, "..."],
+    values: Real[ArrayLike, "..."],
     classes: int = 3,
     *,
     bins: int = 256,
     weights: Float[ArrayLike, "..."] | None = None,
-) -> Float[Array, " classes-1"]:
-    """Thresholds that part the values into classes of the largest variance between them (Otsu 1979).
+) -> Float[Array, " {classes}-1"]:
+    """Thresholds that divide the values into classes with the largest variance between classes (Otsu 1979).
 
-    Exact for the histogram of ``bins`` equal bins from the least value to the largest: every choice
-    of bin edges is looked at, by dynamic programming. Of edges that part the values alike, the
-    threshold is the middle. Class numbers are ``jnp.searchsorted(thresholds, values, side="right")``.
-    If the values fill fewer bins than there are classes, some class is empty; all thresholds of
-    values that are all the same are that value.
+    Exact for the histogram of ``bins`` equal bins from the smallest value to the largest: dynamic
+    programming covers every choice of bin edges. Where several edges divide the values alike, the
+    threshold is their mean. Class numbers are ``jnp.searchsorted(thresholds, values, side="right")``.
+    If the values fill fewer bins than there are classes, some class is empty; if all values are
+    equal, every threshold is that value.
 
     Args:
-        values: of any shape; those that are not finite are left out.
-        classes: 2 or more.
-        weights: of each value, such as the area of its pixel; default: the same for all.
+        values: of any shape; values that are not finite are ignored.
+        classes: number of classes, 2 or more.
+        bins: of the histogram, at least as many as classes.
+        weights: of each value, such as the area of its pixel; default: equal weights.
 
     Returns:
         Ascending, in the unit of the values; NaN if no value is finite and has weight.
@@ -347,15 +394,19 @@ def otsu_thresholds(
     values = jnp.asarray(values)
     weights = jnp.ones(values.shape) if weights is None else jnp.asarray(weights)
     if not 2 <= classes <= bins:
-        raise MetricError(f"{classes} classes from {bins} bins; give at least 2, and no more than there are bins")
+        raise MetricError(f"{classes} classes from {bins} bins; give at least 2 classes, and no more classes than bins")
     if weights.shape != values.shape or not values.size:
-        raise MetricError(f"values of shape {values.shape} with weights of shape {weights.shape}; give one for each")
+        raise MetricError(
+            f"values of shape {values.shape} with weights of shape {weights.shape}; give one for each value"
+        )
     dtype = jnp.result_type(values, float)
     return _otsu_thresholds(values.ravel().astype(dtype), weights.ravel().astype(dtype), classes, bins)
 
 
 @verb
-def _otsu_thresholds(values, weights, classes, bins):
+def _otsu_thresholds(
+    values: Float[Array, " n"], weights: Float[Array, " n"], classes: int, bins: int
+) -> Float[Array, " {classes}-1"]:
     edges, count = _histogram(values, jnp.where(jnp.isfinite(values), weights, 0), bins)
     mass, moment = _sums(count), _sums(count * jnp.linspace(-1, 1, bins, dtype=count.dtype))
     inside, first = mass - mass[:, None], moment - moment[:, None]  # of the class from edge i to edge j
@@ -366,7 +417,9 @@ def _otsu_thresholds(values, weights, classes, bins):
     return jnp.sum(alike * edges, 1) / jnp.sum(alike, 1)
 
 
-def _histogram(values, weights, bins):
+def _histogram(
+    values: Float[Array, " n"], weights: Float[Array, " n"], bins: int
+) -> tuple[Float[Array, " {bins}+1"], Float[Array, " {bins}"]]:
     low = jnp.min(jnp.where(weights > 0, values, jnp.inf))
     high = jnp.max(jnp.where(weights > 0, values, -jnp.inf))
     part = jnp.where(weights > 0, values - low, 0) / jnp.where(high > low, high - low, 1)
@@ -375,14 +428,14 @@ def _histogram(values, weights, bins):
     return edges, jnp.zeros(bins, weights.dtype).at[place].add(weights)
 
 
-def _sums(values):
-    """Sums of all values before each edge, (bins + 1,)."""
+def _sums(values: Shaped[Array, " bins"]) -> Real[Array, " bins+1"]:
+    """Sum of all values before each edge."""
     return jnp.concatenate([jnp.zeros_like(jnp.cumsum(values[:1])), jnp.cumsum(values)])
 
 
-def _best_cuts(gain, classes):
-    """The path over edges from first to last, in ``classes`` steps, of the largest sum of gains."""
-    best, before = gain[0], list[Any]()
+def _best_cuts(gain: Float[Array, "edges edges"], classes: int) -> Int[Array, " {classes}-1"]:
+    """The path over edges from first to last, in ``classes`` steps, with the largest sum of gains."""
+    best, before = gain[0], list[Array]()
     for _ in range(classes - 2):
         total = best[:, None] + gain
         best, before = total.max(0), [*before, total.argmax(0)]

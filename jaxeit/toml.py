@@ -1,4 +1,4 @@
-"""TOML files read key by key: what is missing, wrong or unknown is named, with its reason."""
+"""TOML files read key by key: errors name the key that is missing, wrong or unknown, and the reason."""
 
 import difflib
 import math
@@ -8,6 +8,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+
+__all__ = [
+    "TomlError",
+    "TomlTable",
+    "parse_toml",
+    "read_text",
+]
 
 T = TypeVar("T")
 
@@ -26,10 +33,15 @@ def read_text(path: Path) -> str:
         raise TomlError(f"{path}: cannot be read ({error.strerror}); check the name and the folder") from None
 
 
-def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T]) -> T:
-    """What ``build`` makes of the text; every ValueError on the way comes back naming ``source``."""
+def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T], allow_import: bool = False) -> T:
+    """The result of ``build`` for the text; every ValueError on the way becomes a `TomlError` that names ``source``.
+
+    Args:
+        allow_import: whether the text may name classes by import path.  Set it for a file that the user names, not for
+            text that a session or calibration file holds.
+    """
     try:
-        return build(TomlTable(tomllib.loads(text), source))
+        return build(TomlTable(tomllib.loads(text), source, allow_import))
     except tomllib.TOMLDecodeError as error:
         raise TomlError(f"{source}: not valid TOML: {error}") from None
     except RecursionError:
@@ -41,13 +53,14 @@ def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T]) -> T:
 
 
 class TomlTable:
-    """A TOML table read key by key; `done` refuses what was not asked for."""
+    """A TOML table that is read key by key; `done` refuses keys that were not read."""
 
-    def __init__(self, values: dict[str, Any], where: str):
-        self._values, self._where, self._asked = values, where, set[str]()
+    def __init__(self, values: dict[str, Any], where: str, allow_import: bool = False):
+        self._values, self.where, self._asked = values, where, set[str]()
+        self.allow_import = allow_import
 
     def error(self, key: str, reason: str) -> TomlError:
-        return TomlError(f"{self._where}: {key}: {reason}")
+        return TomlError(f"{self.where}: {key}: {reason}")
 
     def has(self, key: str) -> bool:
         self._asked.add(key)
@@ -73,11 +86,13 @@ class TomlTable:
         return float(self.get(key, lambda v: _is_number(v) and v > 0, f"{meaning}, above zero"))
 
     def count(self, key: str) -> int:
-        return self.get(key, lambda v: type(v) is int and 0 < v <= _MOST, f"a whole number from 1 to {_MOST:,}")
+        meaning = f"a whole number from 1 to {MAX_COUNT:,}"
+        return int(self.get(key, lambda v: type(v) is int and 0 < v <= MAX_COUNT, meaning))
 
     def choice(self, key: str, *names: str, default: Any = ...) -> str:
         meaning = "one of " + ", ".join(f'"{name}"' for name in names)
-        return self.get(key, lambda v: v in names, meaning, default)
+        chosen: str = self.get(key, lambda v: v in names, meaning, default)
+        return chosen
 
     def array(self, key: str, columns: int | None, meaning: str) -> np.ndarray:
         def good(value: Any) -> bool:
@@ -99,14 +114,15 @@ class TomlTable:
 
     def table(self, key: str) -> "TomlTable":
         value = self.get(key, lambda v: isinstance(v, dict), f"a table [{key}]")
-        return TomlTable(value, f"{self._where}: [{key}]")
+        return TomlTable(value, f"{self.where}: [{key}]", self.allow_import)
 
     def tables(self, key: str) -> list["TomlTable"]:
         def good(value: Any) -> bool:
             return isinstance(value, list) and all(isinstance(v, dict) for v in value)
 
         values = self.get(key, good, f"tables [[{key}]]", [])
-        return [TomlTable(v, f"{self._where}: [[{key}]] number {i + 1}") for i, v in enumerate(values)]
+        where = f"{self.where}: [[{key}]] number"
+        return [TomlTable(v, f"{where} {i + 1}", self.allow_import) for i, v in enumerate(values)]
 
     def done(self) -> None:
         for key in self._values:
@@ -119,9 +135,10 @@ class TomlTable:
         return ", ".join(sorted(self._asked))
 
 
-_MOST = 1_000_000  # of anything that is counted: electrodes, rows, places
+MAX_COUNT = 1_000_000
+"""Limit of everything that is counted: electrodes, rows, places."""
 
 
 def _is_number(value: Any) -> bool:
-    """Finite, and a float can hold it."""
+    """Whether a value is a finite number that a float can hold."""
     return (type(value) is int and abs(value) < 1 << 63) or (type(value) is float and math.isfinite(value))

@@ -10,13 +10,13 @@ import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
-import calib.batch
-from calib.calibration import Calibration, load_calibration
-from calib.workers import begin
+from calib.batch import sessions as batch
+from calib.batch.workers import begin
+from calib.calibration.calibration import Calibration, load_calibration
 
 
 def begin_quick(made: str, log: str) -> None:
-    """In place of `calib.workers.begin`."""
+    """In place of `calib.batch.workers.begin`."""
     begin()
     ready, save = load_calibration(made), Calibration.save
 
@@ -27,7 +27,7 @@ def begin_quick(made: str, log: str) -> None:
         os.close(file)
 
     Calibration.save = logged
-    calib.batch.calibrate = lambda sessions, **options: ready
+    batch.calibrate = lambda sessions, **options: ready
 
 
 def begin_deadly(made: str) -> None:
@@ -40,7 +40,7 @@ def begin_deadly(made: str) -> None:
             os._exit(9)
         return ready
 
-    calib.batch.calibrate = calibrate
+    batch.calibrate = calibrate
 
 
 def deadly_pool(jobs: int, made: str) -> ProcessPoolExecutor:
@@ -51,7 +51,7 @@ def deadly_pool(jobs: int, made: str) -> ProcessPoolExecutor:
 def main(made: str, log: str, out: str, *sessions: str) -> None:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context, initializer=begin_quick, initargs=(made, log)) as pool:
-        calib.batch.calibrate_many(sessions, out, executor=pool)
+        batch.calibrate_many(sessions, out, executor=pool)
 
 
 if __name__ == "__main__":

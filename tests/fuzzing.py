@@ -30,20 +30,23 @@ import numpy as np
 
 import calib
 import jaxeit as je
-from calib.acquisition.entries import END, EVENT, PLAN, PONG, Code, pack_event, pack_pong
-from calib.acquisition.finish import finish
-from calib.acquisition.journal import Journal, JournalError, Scan
-from calib.acquisition.wire import Layout, Pong, State, cobs_encode, crc16, decode, decode_lines, encode
 from calib.bench import load_bench
-from calib.calibration import Calibration
+from calib.calibration.calibration import Calibration
+from calib.calibration.evaluation import Evaluation
 from calib.cli import main as command
-from calib.curves import PowerLaw
-from calib.evaluation import Evaluation
-from calib.fit import FittedCurve
-from calib.importers import FileSpec, StreamSpec, import_csv
+from calib.fitting.curve_fit import FittedCurve
+from calib.fitting.curves import PowerLaw
+from calib.record.conversion import convert_journal
+from calib.record.decoding import DecoderState, decode, decode_lines
+from calib.record.encoding import encode_frame
+from calib.record.framing import cobs_encode, crc16
+from calib.record.journal import Journal, JournalError, JournalReader
+from calib.record.records import END, EVENT, PLAN, PONG, EventCode, pack_event, pack_pong
+from calib.record.wire import Layout, Pong
 from calib.session import SessionError, open_session
-from tests.test_recorder import both, journal
-from tests.test_session import everything, make
+from calib.session.importers import FileSpec, StreamSpec, import_csv
+from tests.record.test_recorder import both, journal
+from tests.session.test_session import everything, make
 
 MEMORY = 1 << 30  # bytes beyond what the libraries take
 NUMBERS = ("-1", "0", "1e308", "1e-320", "nan", "inf", "-inf", "9" * 400, "1_0", "true", "1979-05-27", "0x7fffffffffff")
@@ -220,7 +223,7 @@ def resealed(raw: bytes, rng: np.random.Generator) -> bytes:
     """A sound journal with records changed, left out or repeated, every sum and number right."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "read").write_bytes(raw)
-        records = [record[1:] for record in Scan(Path(folder, "read"))]
+        records = [record[1:] for record in JournalReader(Path(folder, "read"))]
         for _ in range(int(rng.integers(1, 5))):
             _unlike(records, rng)
         with Journal(Path(folder, "written")) as out:
@@ -312,7 +315,7 @@ def small_reconstructor(skin: je.Skin) -> je.Reconstructor:
         "edges": np.array([[0, 1], [2, 3], [0, 2], [1, 3]]),
         "edge_length": np.full(4, 0.1),
     }
-    return je.from_numbers(numbers, (2, 2), (0.0, 0.2, 0.0, 0.2), {"skin": skin.name})
+    return je.imaging.from_numbers(numbers, (2, 2), (0.0, 0.2, 0.0, 0.2), {"skin": skin.name})
 
 
 def reconstructor(folder: Path) -> bytes:
@@ -353,12 +356,14 @@ def skin_text(_: Path) -> bytes:
 
 
 def scene_text(_: Path) -> bytes:
-    return (Path(calib.__file__).parent / "scenes" / "testbed_grid.toml").read_bytes()
+    return (Path(calib.__file__).parent / "bench" / "scenes" / "testbed_grid.toml").read_bytes()
 
 
 def bench_texts(_: Path) -> bytes:
     """The shipped scene with most kinds of effects."""
-    return max((Path(calib.__file__).parent / "scenes").glob("*.toml"), key=lambda p: p.stat().st_size).read_bytes()
+    return max(
+        (Path(calib.__file__).parent / "bench" / "scenes").glob("*.toml"), key=lambda p: p.stat().st_size
+    ).read_bytes()
 
 
 def table(_: Path) -> bytes:
@@ -374,9 +379,9 @@ def recording(folder: Path) -> bytes:
 def full_recording(folder: Path) -> bytes:
     """With events, what a simulated device says and answers to pings."""
     seconds = 8 * 10**9
-    about = pack_event(Code.SIMULATED, json.dumps({"simulated": True, "scene": "a scene", "seed": 3}))
+    about = pack_event(EventCode.SIMULATED, json.dumps({"simulated": True, "scene": "a scene", "seed": 3}))
     pongs = [(PONG, 0, seconds + n * 10**8, pack_pong(n % 2, Pong(seconds + n * 10**8 - 10**6, n))) for n in range(4)]
-    events = [(EVENT, 0, seconds, pack_event(Code.CONNECTED, "tcp://x")), (EVENT, 0, seconds, about)]
+    events = [(EVENT, 0, seconds, pack_event(EventCode.CONNECTED, "tcp://x")), (EVENT, 0, seconds, about)]
     return journal(folder / "full.h5.part", [*events, *both(20), *pongs]).read_bytes()
 
 
@@ -385,7 +390,7 @@ LAYOUTS = {1: Layout(1, 4, limit=1e3)}
 
 def frames(_: Path) -> bytes:
     values = np.random.default_rng(0).normal(size=(200, 4)).astype("f4")
-    return b"".join(encode(1, i, 1000 * i, row) for i, row in enumerate(values))
+    return b"".join(encode_frame(1, i, 1000 * i, row) for i, row in enumerate(values))
 
 
 def lines(_: Path) -> bytes:
@@ -437,7 +442,7 @@ def read_journal(path: Path, raw: bytes):
     out.unlink(missing_ok=True)
     said = io.StringIO()
     try:
-        finish(path, out, recovered=True)
+        convert_journal(path, out, recovered=True)
     finally:
         _nothing_left(path.parent, {path.name, "out.h5"})
     try:
@@ -459,7 +464,7 @@ def _nothing_left(folder: Path, known: set[str]) -> None:
 
 def read_frames(_: Path, raw: bytes):
     """Binary frames; and whatever fits its checksum by design, since damage alone seldom does."""
-    state, found = decode(LAYOUTS, State(), raw)
+    state, found = decode(LAYOUTS, DecoderState(), raw)
     body = bytes(raw[: 10 + len(raw) % 40])
     state, more = decode(LAYOUTS, state, b"\0" + cobs_encode(body + crc16(body).to_bytes(2, "little")) + b"\0")
     assert all(len(frame.values) == 4 for frame in found + more)
@@ -467,21 +472,21 @@ def read_frames(_: Path, raw: bytes):
 
 
 def read_lines(_: Path, raw: bytes):
-    state, found = decode_lines(LAYOUTS, State(), b"\n" + raw + b"\n")
+    state, found = decode_lines(LAYOUTS, DecoderState(), b"\n" + raw + b"\n")
     assert all(len(frame.values) == 4 for frame in found)
     assert len(state.tail) < 1 << 16
     return len(found)
 
 
-FILES = (SessionError, je.TomlError)
+FILES = (SessionError, je.toml.TomlError)
 READERS = {
     "session": Reader(session, damaged, lambda path, _: everything(path), (SessionError,)),
     "hostile session": Reader(session, rewritten, lambda path, _: everything(path), FILES, False),
     "calibration": Reader(calibration, damaged, read_calibration, FILES),
     "hostile calibration": Reader(calibration, rewritten, read_calibration, FILES, False),
-    "reconstructor": Reader(reconstructor, damaged, read_reconstructor, (je.StoreError,)),
-    "hostile reconstructor": Reader(reconstructor, repacked, read_reconstructor, (je.StoreError,), False),
-    "skin": Reader(skin_text, edited, read_skin, (je.TomlError,), False),
+    "reconstructor": Reader(reconstructor, damaged, read_reconstructor, (je.imaging.StoreError,)),
+    "hostile reconstructor": Reader(reconstructor, repacked, read_reconstructor, (je.imaging.StoreError,), False),
+    "skin": Reader(skin_text, edited, read_skin, (je.toml.TomlError,), False),
     "scene": Reader(bench_texts, edited, read_bench, (ValueError,), False),
     "table": Reader(table, cells, read_table, (SessionError,), False),
     "journal": Reader(recording, damaged, read_journal, (JournalError, SessionError), False),

@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from jaxeit.forward import coefficients, transfer
-from jaxeit.solvers import AbstractLinearSolver
+from jaxeit.linalg import AbstractLinearSolver
+from jaxeit.model.forward_model import coefficients, transfer
 
 from .helpers import skin_of
 from .oracles.rational import Piece, transfer_matrix
 
 SHEET = je.Rectangle(8.0, 4.0)
-MESH = je.structured(SHEET, 8, 4)
+MESH = je.meshing.structured(SHEET, 8, 4)
 EDGES = {0: (0.0, 1.0), 1: (13.0, 15.0)}  # arc lengths: under the sheet near a corner, over its middle
 PATCHES = {2: (1.0, 2.0, 2.0, 3.0), 3: (5.0, 1.0, 7.0, 2.0)}  # corners of rectangles in it
 PAIRS = list(combinations(range(4), 2))

@@ -2,8 +2,8 @@
 
 import jax
 
-from calib import report
-from calib.calibration import load_calibration
+from calib.calibration.calibration import load_calibration
+from calib.report import document as report
 
 jax.config.update("jax_enable_x64", True)
 

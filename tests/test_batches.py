@@ -15,16 +15,16 @@ PLACES = np.array([(0.2, 0.2), (0.7, 0.5), (0.5, 0.7), (0.2, 0.6), (0.8, 0.2)]) 
 PATTERN = [[0, 1, 2, 3], [0, 2, 1, 4], [3, 4, 0, 1]]
 SHEETS = [(0.2, 0.2, 1.0), (0.25, 0.15, 3.0), (0.16, 0.22, 0.5)]  # width, height, ohm
 MIDDLE = CELLS // 2 * (CELLS + 2)  # the ground: by default the node nearest the middle, which other shapes may move
-SOLVERS = [je.NestedDissection(), je.Dense()]
+SOLVERS = [je.linalg.NestedDissection(), je.linalg.Dense()]
 
 
 def _model(sheet, solver, bend=0.0):
     """Electrodes on the same nodes whatever the size; ``bend`` moves nodes off the lines of the grid."""
     width, height, resistance = sheet
-    size, unit = np.array([width, height]), je.structured(je.Rectangle(1.0, 1.0), CELLS, CELLS)
+    size, unit = np.array([width, height]), je.meshing.structured(je.Rectangle(1.0, 1.0), CELLS, CELLS)
     points = [je.PointElectrode(tuple(p)) for p in (size * _bent(PLACES, bend)).tolist()]
     skin = skin_of(je.Rectangle(width, height), points, PATTERN, sheet_resistance=resistance)
-    mesh = je.Mesh(size * _bent(unit.nodes, bend), unit.triangles)
+    mesh = je.meshing.Mesh(size * _bent(unit.nodes, bend), unit.triangles)
     return je.discretise(je.Scene(skin), je.Fidelity(solver=solver), mesh=mesh, ground=MIDDLE)
 
 

@@ -8,10 +8,21 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from benchmarks import _common as common
-from benchmarks import bench_accuracy, bench_batch, bench_forward, bench_inverse, bench_jacobian, stability
+from benchmarks import (
+    bench_accuracy,
+    bench_batch,
+    bench_forward,
+    bench_inverse,
+    bench_jacobian,
+    clock,
+    harness,
+    problems,
+    stability,
+    tools,
+)
+from benchmarks.clock import difference
 from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
-from calib.figures import write_figure
+from calib.report.figures import write_figure
 
 from .oracles.rectangle import four_point
 
@@ -20,12 +31,12 @@ pytestmark = pytest.mark.filterwarnings("default")  # peers' own warnings are th
 
 @pytest.fixture(scope="module")
 def problem():
-    return common.Problem(10)
+    return problems.Problem(10)
 
 
 def test_the_pattern_is_every_pair_of_neighbours_without_a_common_electrode(problem):
     steps = np.abs(problem.points[problem.pairs[:, 0]] - problem.points[problem.pairs[:, 1]]).sum(1)
-    assert steps == pytest.approx(common.PITCH)
+    assert steps == pytest.approx(problems.PITCH)
     assert len(np.unique(problem.pairs, axis=0)) == 40
     assert problem.pattern.shape == (1372, 4)
     assert all(len(set(row)) == 4 for row in problem.pattern.tolist())
@@ -33,20 +44,20 @@ def test_the_pattern_is_every_pair_of_neighbours_without_a_common_electrode(prob
 
 def test_a_mesh_without_nodes_at_the_electrodes_is_refused():
     with pytest.raises(ValueError, match="multiple of 10"):
-        _ = common.Problem(12).electrode_nodes
+        _ = problems.Problem(12).electrode_nodes
 
 
 def test_exact_voltages(problem):
     """Against the oracle along one axis only, whose 4,000 terms leave an error of about 1e-4."""
-    exact = bench_accuracy.exact(problem)
+    exact = problems.exact_rectangle(problem)
     for row in (0, 500, 1371):
         points = [problem.points[k] for k in problem.pattern[row]]
         assert exact[row] == pytest.approx(four_point(0.2, 0.2, *points), rel=1e-3)
 
 
 def test_exact_voltages_of_the_disc_are_reciprocal():
-    pattern = je.adjacent(16)
-    exact, other = bench_accuracy.exact_disc(pattern), je.reciprocal_rows(pattern)
+    pattern = je.skin.adjacent(16)
+    exact, other = problems.exact_disc(pattern), je.skin.reciprocal_rows(pattern)
     assert (other >= 0).all()
     np.testing.assert_allclose(exact[other], exact, atol=1e-12)
 
@@ -54,20 +65,6 @@ def test_exact_voltages_of_the_disc_are_reciprocal():
 def _row(sheet, tool, order, error, ms, dtype="float64", mesh="regular"):
     labels = {"sheet": sheet, "tool": tool, "mesh": mesh, "order": order, "dtype": dtype}
     return labels | {"nodes": 1000, "unknowns": 999, "relative_error": error, "median_ms": ms}
-
-
-def test_the_quickest_way_is_one_that_is_accurate_on_the_rectangle():
-    rows = [
-        _row("rectangle", "jaxeit", 1, 1e-2, 1.0),
-        _row("rectangle", "jaxeit", 2, 1.5e-4, 4.0, mesh="growth 1.4"),
-        _row("rectangle", "jaxeit", 2, 1e-4, 6.0),
-        _row("disc", "jaxeit", 2, 1e-4, 2.0),
-        _row("rectangle", cholmod.NAME, 1, 2e-3, 5.0),
-    ]
-    said = bench_accuracy.verdict(rows)
-    assert "P2 float64, mesh growth 1.4, 999 unknowns, 0.015 %, 4 ms" in said
-    assert "takes 5 ms for P1 with 1,000 nodes (0.2 %)" in said
-    assert bench_accuracy.verdict(rows[:1]) == "Nothing reaches 0.02 % on the rectangle."
 
 
 def test_the_picture_has_a_curve_per_order_precision_and_grading(tmp_path):
@@ -80,14 +77,14 @@ def test_the_picture_has_a_curve_per_order_precision_and_grading(tmp_path):
         for error, ms in ((1e-2, 1.0), (1e-3, 10.0))
     ]
     rows = [*ours, _row("rectangle", cholmod.NAME, 1, 2e-3, 5.0), _row("rectangle", eidors.NAME, 2, 2e-4, 500.0)]
-    rectangle, disc = bench_accuracy.picture(rows).axes
+    rectangle, disc = bench_accuracy.picture({"rows": rows}).axes
     curves = [
         [line for line in axes.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
         for axes in (rectangle, disc)
     ]
     assert [len(lines) for lines in curves] == [12, 12]
     assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in curves[0]}) == 12
-    write_figure(bench_accuracy.picture(rows), tmp_path / "accuracy.png")
+    write_figure(bench_accuracy.picture({"rows": rows}), tmp_path / "accuracy.png")
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -98,7 +95,7 @@ def test_float32_is_run_on_the_finest():
 
 
 def test_nothing_to_draw(monkeypatch, tmp_path):
-    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)
     with pytest.raises(SystemExit, match="measure first"):
         bench_accuracy.main(["--draw-only"])
 
@@ -107,39 +104,40 @@ def test_nothing_to_draw(monkeypatch, tmp_path):
 def test_peers_and_jaxeit_agree(problem, peer):
     if peer.missing():
         pytest.skip(peer.missing())
-    ours = bench_forward.ours(problem)(problem.sigma)
-    assert common.difference(peer.prepare(problem)(problem.sigma), ours) < 1e-11
+    ours = tools.forward(problem)(problem.sigma)
+    prepare = eidors.Eidors if peer is eidors else peer.prepare
+    assert difference(prepare(problem)(problem.sigma), ours) < 1e-11
 
 
 def test_a_tool_that_computes_something_else_is_not_timed(capsys):
     outputs = {"a": np.ones(3), "b": np.array([1, 1, 1 + 1e-8])}
     with pytest.raises(SystemExit, match="b disagrees with a"):
-        common.require_agreement(outputs, "a", {})
-    assert common.require_agreement(outputs, "a", {"b": 1e-7})["b"] == pytest.approx(1e-8)
+        clock.require_agreement(outputs, "a", {})
+    assert clock.require_agreement(outputs, "a", {"b": 1e-7})["b"] == pytest.approx(1e-8)
     assert "1.0e-08" in capsys.readouterr().out
 
 
 def test_jacobians_agree(problem):
     by_hand = adjoint.prepare(problem)(problem.sigma)
-    assert common.difference(bench_jacobian.ours(problem, False)(problem.sigma), by_hand) < 1e-11
-    pixels = bench_jacobian.pixel_matrix(problem)
-    assert common.difference(adjoint.prepare(problem, pixels)(problem.sigma), by_hand @ pixels) < 1e-11
+    assert difference(tools.jacobian(problem, False)(problem.sigma), by_hand) < 1e-11
+    pixels = tools.projection(problem)
+    assert difference(adjoint.prepare(problem, pixels)(problem.sigma), by_hand @ pixels) < 1e-11
     if not pyeit.missing():
-        assert common.difference(pyeit.prepare_jacobian(problem)(problem.sigma), by_hand) < 1e-9
+        assert difference(pyeit.prepare_jacobian(problem)(problem.sigma), by_hand) < 1e-9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pixels", [False, True])
 def test_reconstruction_matrices_agree(problem, pixels):
-    by_hand = bench_inverse.by_hand(problem, pixels)(problem.sigma)
+    by_hand = tools.inverse_by_hand(problem, pixels)(problem.sigma)
     others = {
-        "image space": bench_inverse.by_hand(problem, pixels, bench_inverse.in_image_space),
-        "ours": bench_inverse.Ours(problem, pixels),
+        "image space": tools.inverse_by_hand(problem, pixels, tools.in_image_space),
+        "ours": tools.Reconstruction(problem, pixels),
     }
     if not (pixels or pyeit.missing()):
-        others["pyEIT"] = pyeit.prepare_inverse(problem, bench_inverse.strength(problem, pixels))
+        others["pyEIT"] = pyeit.prepare_inverse(problem, tools.strength(problem, pixels))
     for name, tool in others.items():
-        assert common.difference(tool(problem.sigma), by_hand) < 1e-9, name
+        assert difference(tool(problem.sigma), by_hand) < 1e-9, name
     assert others["ours"].last_seconds > 0
 
 
@@ -149,9 +147,9 @@ with_eidors = pytest.mark.skipif(bool(eidors.missing()), reason=str(eidors.missi
 @with_eidors
 @pytest.mark.parametrize("pixels", [False, True])
 def test_jacobian_of_eidors(problem, pixels):
-    matrix = bench_jacobian.pixel_matrix(problem) if pixels else None
-    tool = eidors.prepare_jacobian(problem, matrix)
-    assert common.difference(tool(problem.sigma), adjoint.prepare(problem, matrix)(problem.sigma)) < 1e-11
+    matrix = tools.projection(problem, pixels)
+    tool = tools.by_eidors(problem, pixels, "jacobian")
+    assert difference(tool(problem.sigma), adjoint.prepare(problem, matrix)(problem.sigma)) < 1e-11
     assert tool.last_seconds > 0
     tool.close()
 
@@ -159,25 +157,25 @@ def test_jacobian_of_eidors(problem, pixels):
 @with_eidors
 @pytest.mark.parametrize("pixels", [False, True])
 def test_reconstruction_matrix_of_eidors(problem, pixels):
-    tool = bench_inverse.by_eidors(problem, pixels)
-    by_hand = bench_inverse.by_hand(problem, pixels)
+    tool = tools.by_eidors(problem, pixels, "inverse")
+    by_hand = tools.inverse_by_hand(problem, pixels)
     first = tool(problem.sigma)
-    assert common.difference(first, by_hand(problem.sigma)) < 1e-9
-    assert common.difference(tool(2 * problem.sigma), first) > 1e-2  # nothing is kept of the first
+    assert difference(first, by_hand(problem.sigma)) < 1e-9
+    assert difference(tool(2 * problem.sigma), first) > 1e-2  # nothing is kept of the first
     tool.close()
 
 
 @with_eidors
 def test_quadratic_elements_of_eidors(problem):
-    ours = common.as_tool(common.compiled(je.forward, problem.model(order=2)))
-    tool = eidors.prepare_quadratic(problem)
-    assert common.difference(tool(problem.sigma), ours(problem.sigma)) < 1e-11
+    ours = tools.forward(problem, order=2)
+    tool = eidors.Eidors(problem, order=2)
+    assert difference(tool(problem.sigma), ours(problem.sigma)) < 1e-11
     tool.close()
 
 
 @with_eidors
 def test_what_octave_said_last_is_told_when_it_stops(problem):
-    tool = eidors.prepare(problem)
+    tool = eidors.Eidors(problem)
     with pytest.raises(RuntimeError, match="error:"):
         tool(np.ones(3))
     tool.close()
@@ -206,13 +204,11 @@ def test_the_clock_of_a_tool_in_another_process_counts():
         def __call__(self, sigma):
             return sigma
 
-    assert common.interleaved([common.Call(Elsewhere(), np.ones(3))], 2, budget=1e3) == [
-        ([123.0, 123.0], [123.0, 123.0])
-    ]
+    assert clock.interleaved([clock.Call(Elsewhere(), np.ones(3))], 2, budget=1e3) == [([123.0, 123.0], [123.0, 123.0])]
 
 
 def test_a_quick_tool_is_called_again_and_again_in_its_turn_and_the_last_call_counts(monkeypatch):
-    monkeypatch.setattr(common, "TURN", 0.15)
+    monkeypatch.setattr(clock, "TURN_SECONDS", 0.15)
     calls = []
 
     class Tool:
@@ -220,24 +216,24 @@ def test_a_quick_tool_is_called_again_and_again_in_its_turn_and_the_last_call_co
             calls.append(sigma[0])
             self.last_seconds = (0.08, 0.04, 0.05)[len(calls) % 3 - 1]
 
-    (times,) = common.interleaved([common.Call(Tool(), np.ones(3))], 2, budget=1e3)
+    (times,) = clock.interleaved([clock.Call(Tool(), np.ones(3))], 2, budget=1e3)
     assert times == ([0.05, 0.05], [0.08, 0.08])
     assert len(set(calls)) == 6  # no conductivity twice
 
 
 def test_a_slow_tool_stops_after_its_budget():
-    call = common.Call(np.copy, np.ones(3))
-    times = common.interleaved([call, call], 9, budget=0.0)
-    assert [len(own) for own, _ in times] == [common.LEAST, common.LEAST]
-    ((own, _),) = common.interleaved([call], 9, budget=60.0)
-    assert common.spread(own)["repeats"] == 9
+    call = clock.Call(np.copy, np.ones(3))
+    times = clock.interleaved([call, call], 9, budget=0.0)
+    assert [len(own) for own, _ in times] == [clock.MIN_TURNS, clock.MIN_TURNS]
+    ((own, _),) = clock.interleaved([call], 9, budget=60.0)
+    assert clock.spread(own)["repeats"] == 9
 
 
 def test_results_keep_other_sections(tmp_path):
-    common.write("forward", {"rows": [1]}, tmp_path)
-    path = common.write("jacobian", {"rows": [2]}, tmp_path)
+    harness.write("forward", {"rows": [1]}, tmp_path)
+    path = harness.write("jacobian", {"rows": [2]}, tmp_path)
     assert json.loads(path.read_text()) == {"forward": {"rows": [1]}, "jacobian": {"rows": [2]}}
-    assert path.stem == common.machine()
+    assert path.stem == harness.machine()
 
 
 @pytest.mark.parametrize("bench", [bench_forward, bench_jacobian])
@@ -317,7 +313,7 @@ def test_smoke_of_accuracy(capsys):
         (sheet, dtype) for sheet in ("rectangle", "disc") for dtype in ("float64", "float32")
     ]
     assert all(row["relative_error"] < 0.03 for row in rows)
-    assert "on the rectangle" in capsys.readouterr().out
+    assert "| rectangle | jaxeit |" in capsys.readouterr().out
 
 
 def test_contacts_of_the_data_set(problem):
@@ -347,7 +343,7 @@ def test_smoke_of_batches(capsys):
     data = bench_batch.main(["--smoke"])
     assert [row["tool"] for row in data["rows"]] == [str(way) for way in bench_batch.SMOKE]
     assert all(row["min_per_s"] <= row["median_per_s"] <= row["max_per_s"] for row in data["rows"])
-    assert [row["cache"] for row in data["startup"]] == list(bench_batch.CACHES)
+    assert [row["cache"] for row in data["startup"]] == ["no cache", "fresh cache", "second process"]
     assert capsys.readouterr().out.count("| second process |") == 1
 
 
@@ -360,9 +356,9 @@ def test_stability_holds_where_the_textbook_fails(tmp_path):
     assert max(row["float32"] for row in rows) < 1e-4
     assert min(row["naive"] for row in rows) > 1e-4
     rows[0]["naive"] = None
-    write_figure(stability.picture(rows), tmp_path / "map.png")
+    write_figure(stability.picture({"rows": rows}), tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
-    titles = [axes.get_title() for axes in stability.picture(rows).axes]
+    titles = [axes.get_title() for axes in stability.picture({"rows": rows}).axes]
     assert titles == [axis.title for axis in stability.AXES]
 
 

@@ -5,23 +5,28 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
-from benchmarks import _common as common
 from benchmarks import (
     bench_calibration,
     bench_growth,
     bench_pipeline,
     bench_protocol,
     bench_start,
+    harness,
+    problems,
     repeat,
     tables,
+    tools,
 )
+from benchmarks.__main__ import questions
+from benchmarks.clock import difference
 from benchmarks.memory import growth
 from benchmarks.peers import eidors, pyeit
-from calib.hybrid import PressData
+from calib.presses import PressData
 
 pytestmark = pytest.mark.filterwarnings("default")  # peers' own warnings are theirs
 
@@ -95,20 +100,21 @@ def test_the_quickest_mesh_that_reaches_the_accuracy():
     found = {(r["kind"], r["target"]): r["best"] for r in bench_pipeline.to_accuracy(rows)}
     assert [found["jaxeit P2, graded", t]["median_ms"] for t in bench_pipeline.TARGETS] == [4.0, 4.0, 9.0]
     assert found["EIDORS first order", 1e-3] is None
-    assert "| jaxeit P1, regular | 1 (1 to 1)" in bench_pipeline.accuracy_table(bench_pipeline.to_accuracy(rows))
+    page = tables.TABLES["to-accuracy"][1]({"to_accuracy": bench_pipeline.to_accuracy(rows)})
+    assert "| jaxeit P1, regular | 1 (9) | not reached | not reached |" in page
 
 
 @pytest.mark.slow
 def test_all_tools_make_the_same_images_from_the_mesh():
-    problem = common.Problem(10)
-    tools = {"by hand": bench_pipeline.by_hand, "jaxeit": bench_pipeline.ours}
-    tools |= {} if eidors.missing() else {"EIDORS": bench_pipeline.by_eidors}
+    problem = problems.Problem(10)
+    ways = {"by hand": tools.pipeline_by_hand, "jaxeit": tools.pipeline}
+    ways |= {} if eidors.missing() else {"EIDORS": partial(tools.by_eidors, verb="pipeline")}
     for pixels in (True, False):
-        images = {name: prepare(problem, pixels)(problem.sigma) for name, prepare in tools.items()}
+        images = {name: prepare(problem, pixels)(problem.sigma) for name, prepare in ways.items()}
         if not pyeit.missing() and not pixels:
-            images["pyEIT"] = bench_pipeline.by_pyeit(problem)(problem.sigma)
+            images["pyEIT"] = tools.pipeline_by_pyeit(problem)(problem.sigma)
         for name, image in images.items():
-            assert common.difference(image, images["by hand"]) < 1e-7, name
+            assert difference(image, images["by hand"]) < 1e-7, name
 
 
 # --- runs compared
@@ -163,18 +169,18 @@ def test_two_files_or_two_sections_are_compared(tmp_path, capsys):
 
 
 def test_nothing_stored(monkeypatch, tmp_path):
-    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)
     with pytest.raises(SystemExit, match="measure first"):
-        common.stored("protocol_cost")
-    (tmp_path / f"{common.machine()}.json").write_text('{"start": {"rows": []}}')
-    assert common.stored("start") == {"rows": []}
+        harness.stored("protocol_cost")
+    (tmp_path / f"{harness.machine()}.json").write_text('{"start": {"rows": []}}')
+    assert harness.stored("start") == {"rows": []}
 
 
 # --- growth and start
 
 
 def test_exponents_of_a_power_law():
-    one = bench_growth.Series("work", "size", (), "2", "1", lambda size: (None, (), size))
+    one = bench_growth.Series("work", "size", (), "2", "1", lambda size: (print, (), size))
     rows = [{"size": n, "median_ms": 3e-3 * n**2, "megabytes": 5.0 * n} for n in (10, 30, 200)]
     found = bench_growth.fits(one, rows)
     assert (found["time"]["exponent"], found["time"]["at_the_end"], found["memory"]["exponent"]) == (2.0, 2.0, 1.0)
@@ -215,16 +221,43 @@ def test_growth_knows_a_page_at_best_and_leaves_out_the_start():
 # --- smoke
 
 
+def test_every_question_is_listed_and_named_in_the_readme(root):
+    readme = (root / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"python -m benchmarks\.(\w+)", readme)) == set(questions())
+    assert all(questions().values())
+
+
+def test_a_part_measured_again_leaves_the_others(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)
+    count = iter(range(9))
+
+    def part(run):
+        yield {run.args.name: [{"time": next(count)}]}
+        yield {run.args.name: [{"time": next(count)}]}
+
+    def other(run):
+        yield {"other": next(count)}
+
+    main = harness.Question("work", "about", {"one": part, "two": other}, {"--name": {"default": "rows"}})
+    assert main([])["rows"] == [{"time": 0}, {"time": 1}]
+    main(["--only", "one"])
+    again = harness.stored("work")
+    assert (again["rows"], again["other"]) == ([{"time": 3}, {"time": 4}], 2)
+    main(["--smoke"])
+    assert harness.stored("work") == again
+    assert "| 3 |" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bench_fit", "bench_images", "bench_live", "bench_paper", "bench_scene", "figure8"])
 def test_smoke_of_those_without_a_test_of_their_own(name, root):
     """As a command; nothing is written."""
-    results = {path: path.stat().st_mtime_ns for path in common.RESULTS.iterdir()}
+    results = {path: path.stat().st_mtime_ns for path in harness.RESULTS.iterdir()}
     command = [sys.executable, "-m", f"benchmarks.{name}", "--smoke"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout
-    assert {path: path.stat().st_mtime_ns for path in common.RESULTS.iterdir()} == results
+    assert {path: path.stat().st_mtime_ns for path in harness.RESULTS.iterdir()} == results
 
 
 @pytest.mark.slow
@@ -242,7 +275,7 @@ def test_smoke_protocol():
     errors = {row["way"]: row["fit_mm"] for row in data["rows"]}
     assert errors["D-optimal"] < 2
     assert data["events"]["rest"]["readings"] == 24
-    assert len(bench_protocol.picture(data["rows"]).axes) == 3
+    assert len(bench_protocol.picture(data).axes) == 3
 
 
 @pytest.mark.slow

@@ -98,12 +98,12 @@ def test_batches_and_gradients(pixels, masks):
 
 
 def test_shapes_that_do_not_fit_are_refused(skin, model, pixels, masks):
-    with pytest.raises(je.FusionError, match="400 pixels and 4 pads"):
+    with pytest.raises(je.fusion.FusionError, match="400 pixels and 4 pads"):
         je.fuse(jnp.zeros(10), masks, jnp.zeros(4))
     away = replace(skin.pads[0], outline=np.array([[1.0, 1.0], [1.1, 1.0], [1.1, 1.1]]))
-    with pytest.raises(je.FusionError, match="lower left"):
+    with pytest.raises(je.fusion.FusionError, match="lower left"):
         je.pad_masks(replace(skin, pads=(away,)), pixels)
-    with pytest.raises(je.FusionError, match=r"basis=Pixels"):
+    with pytest.raises(je.fusion.FusionError, match=r"basis=Pixels"):
         je.pad_masks(skin, je.Elements().on(model))
 
 
@@ -114,7 +114,7 @@ WIDTHS = jnp.array([0.009, 0.012])
 
 
 def _shares(pixels, masks, amplitudes, places=PLACES):
-    return je.contact_shares(places, WIDTHS, jnp.asarray(amplitudes), pixels.centres, masks)
+    return je.fusion.contact_shares(places, WIDTHS, jnp.asarray(amplitudes), pixels.centres, masks)
 
 
 def test_contacts_share_a_pad_by_the_integrals_of_their_bumps_inside_it(pixels, masks):

@@ -1,19 +1,16 @@
 """The Kuopio Tomography Challenge 2023: what does not need its data, and its training frames where they are at hand."""
 
-import os
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxeit as je
 from benchmarks import bench_ktc as ktc
-from calib.figures import write_figure
+from calib.report.figures import write_figure
 
-from .helpers import disc_model
+from .helpers import REAL_DATA, disc_model
 
-DATA = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data")) / "ktc2023"
+DATA = REAL_DATA / "ktc2023"
 needs_data = pytest.mark.skipif(
     not (DATA / "training" / "ref.mat").exists(), reason="ktc2023 is not at hand; set JAXEIT_REAL_DATA to its folder"
 )
@@ -22,8 +19,8 @@ needs_data = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def disc():
     """The unit disc with eight electrodes, even, on 10 x 10 pixels; conductivity 2."""
-    model = disc_model(0.1, 0.15, electrodes=8, pattern=je.adjacent(8))
-    return je.LogConductivity(model, je.Pixels(10).on(model), jnp.asarray(2.0))
+    model = disc_model(0.1, 0.15, electrodes=8, pattern=je.skin.adjacent(8))
+    return je.imaging.LogConductivity(model, je.Pixels(10).on(model), jnp.asarray(2.0))
 
 
 def _bump(physics, x, y, height):
@@ -37,7 +34,7 @@ def test_gauss_newton_finds_both_kinds_without_some_readings(disc):
     truth = _bump(disc, 0.45, 0.0, 2.0) + _bump(disc, -0.45, 0.0, -2.0)
     readings = disc.voltages(truth).at[jnp.array([3, 17])].set(jnp.nan)
     std = jnp.full(len(readings), 1e-3 * float(jnp.nanmax(jnp.abs(readings))))
-    found = np.asarray(je.gauss_newton(disc, je.IsotropicVariation(weight=1.0), readings, std))
+    found = np.asarray(je.gauss_newton(disc, je.imaging.IsotropicVariation(weight=1.0), readings, std))
     assert np.isfinite(found).all()
     assert np.corrcoef(found, truth)[0, 1] > 0.8
     assert np.std(found[np.asarray(disc.image.areas) == 0]) == 0

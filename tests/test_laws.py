@@ -5,7 +5,10 @@ import os
 import re
 import subprocess
 import sys
+from inspect import isclass, isfunction, signature, unwrap
+from itertools import chain
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +19,12 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "toml", "verbs", "lapack", "surface", "domain", "grading", "smoothing", "triangles", "footprints", "mesh",
-    "elements", "electrodes", "protocol", "skin", "solvers", "effects", "scene", "fidelity", "coat", "discretise",
-    "forward", "pneumatics", "stiffness", "basis", "jacobian", "whitening", "host", "gaps", "priors", "methods",
-    "hyperparameter", "inverse", "store", "responses", "descent", "contacts", "refine", "optimise", "nonlinear",
-    "background", "fusion", "metrics", "regions", "adaptive", "choices", "rungs", "ladder",
+    "_compile", "toml", "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
+    "imaging", "metrics", "fusion", "contacts", "scan", "accuracy",
 ]  # fmt: skip
 BENCH = [
-    "session", "units", "choice", "corrections", "presses", "curves", "solver", "fit", "response", "smooth", "taxels",
-    "location", "locators", "hybrid", "splits", "online", "measured", "loops", "evaluation", "calibration", "maps",
-    "acquisition", "bench", "check", "importers", "logs", "figures", "ladder_figure", "report", "runtime", "workers",
-    "batch", "cluster", "cli",
+    "_lazy", "session", "presses", "fitting", "calibration", "runtime", "record", "bench", "check", "live", "report",
+    "batch", "cli",
 ]  # fmt: skip
 
 
@@ -81,7 +79,7 @@ def test_only_the_command_line_touches_the_configuration_of_jax():
 
 
 def test_factors_and_solves_are_those_that_are_safe_under_vmap():
-    """See `jaxeit.lapack`. What is done once, on the host, may be JAX's."""
+    """See `jaxeit.linalg.lapack`: also what is prepared once may be mapped over."""
     theirs = r"from jax\.scipy\.linalg|\b(?:jnp|jsp|lax|jax\.scipy)\.linalg\.(?!norm)\w+(?=[(,)])"
     found = {
         (str(path.relative_to(ROOT)), name)
@@ -89,11 +87,8 @@ def test_factors_and_solves_are_those_that_are_safe_under_vmap():
         for path in (ROOT / package).rglob("*.py")
         for name in re.findall(theirs, path.read_text())
     }
-    own = {"jaxeit/lapack.py", "jaxeit/solvers/nested_dissection.py"}
-    assert {(path, name) for path, name in found if path not in own} == {
-        ("jaxeit/methods.py", "jnp.linalg.qr"),
-        ("jaxeit/methods.py", "jnp.linalg.svd"),
-    }
+    own = {"jaxeit/linalg/lapack.py", "jaxeit/linalg/nested_dissection.py"}
+    assert {(path, name) for path, name in found if path not in own} == set()
 
 
 def test_no_path_of_a_machine_in_the_project():
@@ -102,6 +97,65 @@ def test_no_path_of_a_machine_in_the_project():
         text = (ROOT / name).read_text()
         assert "/ro" + "ot/" not in text, name
         assert "/wo" + "rk/" not in text, name
+
+
+def _public_names():
+    """Public name -> the objects it stands for, over both packages and their rooms."""
+    found = {}
+    for package in (je, calib):
+        rooms = [getattr(package, name) for name in package.__all__ if isinstance(getattr(package, name), ModuleType)]
+        for room in [package, *rooms]:
+            for name in getattr(room, "__all__", ()):
+                thing = getattr(room, name)
+                found.setdefault(name, {})[id(thing)] = thing
+    return {name: tuple(things.values()) for name, things in found.items()}
+
+
+def test_no_module_hides_a_public_function():
+    functions = {name for name, things in _public_names().items() if any(isfunction(thing) for thing in things)}
+    modules = {path.stem for package in ("jaxeit", "calib") for path in (ROOT / package).rglob("*.py")}
+    assert modules & functions == set()
+
+
+def test_no_two_public_things_share_a_name():
+    assert {name: things for name, things in _public_names().items() if len(things) > 1} == {}
+
+
+def test_bases_that_users_derive_from_are_reachable():
+    """Every public class shows its abstract bases in the room that it is in."""
+    for name, things in _public_names().items():
+        for thing in things:
+            for base in thing.__mro__[1:] if isclass(thing) else ():
+                if base.__module__.startswith(("jaxeit.", "calib.")) and base.__name__.startswith("Abstract"):
+                    assert base.__name__ in _public_names(), f"{name}: {base}"
+
+
+def _own_methods(kind):
+    """Public methods and properties of a class that it or a base of this project defines."""
+    for base in kind.__mro__:
+        for name, thing in vars(base).items() if base.__module__.startswith(("jaxeit.", "calib.")) else ():
+            if name == "__call__" or not name.startswith("_"):
+                part = next((getattr(thing, at) for at in ("fget", "func", "__func__") if hasattr(thing, at)), thing)
+                yield unwrap(part)
+
+
+def _public_functions():
+    """Each public function and method of this project, without what compiles it."""
+    public = list(chain(*_public_names().values()))
+    things = chain(*(_own_methods(thing) if isclass(thing) else (unwrap(thing),) for thing in public))
+    return {thing for thing in things if isfunction(thing) and thing.__module__.startswith(("jaxeit.", "calib."))}
+
+
+def test_public_functions_are_annotated():
+    functions = _public_functions()
+    assert {je.fuse.__wrapped__, je.ContactFinder.__call__} <= functions
+    incomplete = {}
+    for function in functions:
+        names = {*signature(function).parameters, "return"} - {"self", "cls"}
+        if missing := names - set(function.__annotations__):
+            room = ".".join(function.__module__.split(".")[:2])
+            incomplete.setdefault(room, []).append(f"{function.__qualname__}: {', '.join(sorted(missing))}")
+    assert incomplete == {}
 
 
 def test_names_of_calib_are_there():
@@ -153,7 +207,7 @@ def test_float32_runs_without_x64():
     code = (
         "import jax, numpy as np, jaxeit as je\n"
         "skin = je.load_skin('testbed')\n"
-        "model = je.discretise(je.Scene(skin), je.Fidelity.draft(dtype='float32', solver=je.Dense()))\n"
+        "model = je.discretise(je.Scene(skin), je.Fidelity.draft(dtype='float32', solver=je.linalg.Dense()))\n"
         "recon = je.prepare(model, basis=je.Pixels(20))\n"
         "image = recon(je.forward(model, 1.1 * model.background) - je.forward(model))\n"
         "fmap = je.fuse(image, je.pad_masks(skin, recon), jax.numpy.ones(4))\n"

@@ -1,11 +1,14 @@
 """The README's program runs, and its commands and links exist."""
 
+import json
 import re
 
 import numpy as np
 import pytest
 
-from calib.cli import _COMMANDS
+from benchmarks.readme import MEASURED, PAGES
+from benchmarks.tables import filled
+from calib.cli import COMMANDS
 
 
 def test_the_program_of_the_first_screen_runs(root, capsys):
@@ -21,9 +24,10 @@ def test_the_program_of_the_first_screen_runs(root, capsys):
 
 def test_commands_and_links(root):
     text = (root / "README.md").read_text()
-    assert set(re.findall(r"`jaxeit (\w+)", text)) == set(_COMMANDS)
-    for link in re.findall(r"\]\(([^)]+)\)", text):
-        assert (root / link).exists(), link
+    (block,) = re.findall(r"^```\n(jaxeit .*?)^```", text, re.MULTILINE | re.DOTALL)
+    described = (root / "docs" / "commands.md").read_text()
+    assert set(re.findall(r"^jaxeit (\w+)", block, re.MULTILINE)) == set(COMMANDS)
+    assert set(re.findall(r"^`jaxeit (\w+)", described, re.MULTILINE)) == set(COMMANDS)
     for target in re.findall(r"^make (\w+)", text, re.MULTILINE):
         assert f"\n{target}:" in (root / "Makefile").read_text()
 
@@ -32,3 +36,9 @@ def test_results_table_is_filled(root):
     text = (root / "README.md").read_text()
     table = text[text.index("<!-- results") : text.index("<!-- end of results")]
     assert table.count("|") > 20
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_are_those_of_the_stored_results(page):
+    text = page.read_text(encoding="utf-8")
+    assert filled(text, json.loads(MEASURED.read_text(encoding="utf-8"))) == text

@@ -1,8 +1,6 @@
 """Recordings of others, on real hardware; skipped where they are not at hand."""
 
-import os
 import re
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +9,9 @@ import pytest
 import jaxeit as je
 from calib.cli import main
 
-from .helpers import skin_of
+from .helpers import REAL_DATA, skin_of
 
-DATA = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
-TANK = sorted((DATA / "pyeidors_tank" / "tank").glob("*_latest_tank_data/*/*_1000Hz.csv"))
+TANK = sorted((REAL_DATA / "pyeidors_tank" / "tank").glob("*_latest_tank_data/*/*_1000Hz.csv"))
 
 needs_tank = pytest.mark.skipif(not TANK, reason="pyeidors_tank is not at hand; set JAXEIT_REAL_DATA to its folder")
 
@@ -26,7 +23,7 @@ def tank():
     step, width = disc.perimeter / 16, 0.4 * disc.perimeter / 16
     starts = (np.arange(16) * step - width / 2) % disc.perimeter
     patches = [je.BoundaryPatch(float(s), float(s + width), 1e-3) for s in starts]
-    skin = skin_of(disc, patches, je.adjacent(16))
+    skin = skin_of(disc, patches, je.skin.adjacent(16))
     model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.05))
     return skin, model, je.Pixels(24).on(model)
 
@@ -96,7 +93,7 @@ LOGS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "streams", "curve", "limit"), LOGS)
 def test_logs_of_others_are_imported_and_fitted(name, streams, curve, limit, tmp_path, capsys):
-    path = DATA / name
+    path = REAL_DATA / name
     if not path.exists():
         pytest.skip(f"{name} is not at hand; set JAXEIT_REAL_DATA to its folder")
     session, clock = tmp_path / "log.h5", "0:s" if "eflesh" in name else "0:ms"

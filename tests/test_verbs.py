@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit import verbs
+from jaxeit import _compile as verbs
 
 
 @verbs.verb
@@ -21,7 +21,7 @@ def double(x):
 @pytest.fixture
 def first_call():
     """As in a process that has called no verb yet."""
-    verbs._outside.cache_clear()
+    verbs._untransformed_state.cache_clear()
     verbs.compiler_options.cache_clear()
 
 

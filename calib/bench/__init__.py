@@ -1,25 +1,25 @@
-"""A simulated bench: an indenter walks over a skin and everything is recorded, as on a real one.
+"""A simulated bench: an indenter presses a skin at many places, and all streams are recorded as on a real bench.
 
-The mesh that simulates is not the mesh that `calib.calibrate` inverts with, so that neither knows
-the other's discretisation error.
+The simulation uses another mesh than `calib.calibrate`, so that the calibration cannot compensate for the
+discretisation error of the simulation (no inverse crime).
 """
 
+from .bench import Bench, BenchError, Companion, Timing, load_bench, presets
+from .costs import PartCost, measure_costs, render_costs
 from .dataset import grid, simulate_contacts, write_data_set
-from .explain import Part, explain, render
-from .plan import Bench, BenchError, Companion, Timing, load_bench, presets
-from .recording import simulate
+from .simulation import simulate
 
 __all__ = [
     "Bench",
     "BenchError",
     "Companion",
-    "Part",
+    "PartCost",
     "Timing",
-    "explain",
     "grid",
     "load_bench",
+    "measure_costs",
     "presets",
-    "render",
+    "render_costs",
     "simulate",
     "simulate_contacts",
     "write_data_set",

@@ -1,5 +1,6 @@
-"""The paper's data set: voltages of Gaussian contacts on a grid of places, at a range of amplitudes, as one batch."""
+"""The paper's data set: voltages of Gaussian contacts on a grid of places, at a range of amplitudes."""
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -13,20 +14,20 @@ from jaxtyping import Array, Float
 import jaxeit as je
 
 from ..session import ArchiveWriter
-from .plan import BenchError
-from .recording import Progress
+from .bench import BenchError
+from .simulation import Progress
 
 FORMAT = "skin-dataset"
-_PIECE = 64  # contacts that each device is handed at a time
-_TOGETHER = 8  # of these, solved as one batch
+CONTACTS_PER_DEVICE = 64  # contacts that are sent to a device at a time
+SOLVE_BATCH = 8  # contacts that are solved together
 
 
 def grid(skin: je.Skin, columns: int = 41, rows: int = 41) -> Float[np.ndarray, "places 2"]:
-    """Places on a regular grid over the sheet's bounding box that lie on the sheet, m; 5 mm apart on the testbed."""
+    """Places (m) on the sheet on a regular grid over its bounding box; 5 mm apart on the testbed."""
     (x0, y0), (x1, y1) = skin.domain.bounds
     places = np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), -1).reshape(-1, 2)
     inward = places + 1e-9 * (np.array([[x0 + x1, y0 + y1]]) / 2 - places)
-    return places[skin.domain.contains(inward)]
+    return np.asarray(places[skin.domain.contains(inward)])
 
 
 def simulate_contacts(
@@ -37,16 +38,18 @@ def simulate_contacts(
     width: float = 0.012,
     progress: Progress = iter,
 ) -> Float[np.ndarray, "places amplitudes readings"]:
-    """Voltages, V, for ``sigma = sigma0 (1 + amplitude exp(-|r - place|^2 / (2 width^2)))``, sigma0 the scene's sheet.
+    """Voltages (V) for ``sigma = sigma0 (1 + amplitude exp(-|r - place|^2 / (2 width^2)))``, sigma0 that of the scene.
 
-    Solved in batches, the batches shared out over all devices that JAX sees.
+    The contacts are solved in batches, which are distributed over all devices of JAX.
 
     Args:
-        width: m.
+        places: centres of the contacts, m.
+        amplitudes: largest relative change of the conductivity.
+        width: of the Gaussian, m.
         progress: wraps the iteration over pieces of the data set.
     """
     devices = Mesh(np.array(jax.devices()), ("contacts",))
-    piece = _PIECE * devices.size
+    piece = CONTACTS_PER_DEVICE * devices.size
     at, size = np.repeat(np.arange(len(places)), len(amplitudes)), np.tile(amplitudes, len(places))
     out = np.empty((len(at), len(model.pattern)), model.dtype)
     split, whole = NamedSharding(devices, P("contacts")), NamedSharding(devices, P())
@@ -55,25 +58,29 @@ def simulate_contacts(
     for start in progress(range(0, len(at), piece)):
         rows = np.minimum(np.arange(start, start + piece), len(at) - 1)
         batch = np.column_stack([places[at[rows]], size[rows]]).astype(model.dtype)
-        voltages = _shared(devices)(model, sigma, spread, jax.device_put(batch, split))
+        voltages = _sharded_solver(devices)(model, sigma, spread, jax.device_put(batch, split))
         out[start : start + piece] = np.asarray(voltages)[: len(at) - start]
     return out.reshape(len(places), len(amplitudes), -1)
 
 
 @cache
-def _shared(devices: Mesh):
-    # Not checked: loops inside the solver start from constants, which the check takes for alike on all devices.
+def _sharded_solver(devices: Mesh) -> Callable[..., Array]:
+    # Without the check of replication, because loops in the solver start from constants, which the check takes for
+    # equal on all devices.
     specs = (P(), P(), P(), P("contacts"))
-    solved = jax.shard_map(_solved, mesh=devices, in_specs=specs, out_specs=P("contacts"), check_vma=False)
+    solved = jax.shard_map(_solve_contacts, mesh=devices, in_specs=specs, out_specs=P("contacts"), check_vma=False)
     return jax.jit(solved, compiler_options=je.compiler_options())
 
 
-def _solved(model: je.Model, sigma: Array, width: Array, batch: Float[Array, "n 3"]) -> Float[Array, "n readings"]:
-    def frame(contact):
+def _solve_contacts(
+    model: je.Model, sigma: Array, width: Array, batch: Float[Array, "n 3"]
+) -> Float[Array, "n readings"]:
+    def frame(contact: Array) -> Array:
         square = jnp.sum((model.centroids - contact[:2]) ** 2, -1)
         return je.forward(model, sigma * (1 + contact[2] * jnp.exp(-0.5 * square / width**2)))
 
-    return jax.lax.map(frame, batch, batch_size=_TOGETHER)
+    found: Float[Array, "n readings"] = jax.lax.map(frame, batch, batch_size=SOLVE_BATCH)
+    return found
 
 
 def write_data_set(
@@ -90,10 +97,10 @@ def write_data_set(
     """Simulate `simulate_contacts` on `grid` with amplitudes from 0 to 1 on the ideal sensor, and write it as HDF5.
 
     Returns:
-        How many places and amplitudes there are.
+        Number of places, and number of amplitudes.
 
     Raises:
-        BenchError: for a grid or amplitudes of less than one place or two steps.
+        BenchError: for less than one column or row, or less than two steps.
     """
     if columns < 1 or rows < 1 or steps < 2:
         raise BenchError(f"{columns} x {rows} places in {steps} steps make no data set; give one place and two steps")

@@ -1,23 +1,23 @@
-"""What the bench does to the skin at any time: loads, places, and the air around."""
+"""Motion of the simulated bench: loads, slides, temperature and air pressure at any time."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .plan import Bench
+from .bench import Bench
 
 
 class Motion(NamedTuple):
     """The plan of a bench as its stage follows it; a contact is a tip.
 
-    | meaning                                              | shape                  | unit |
-    |------------------------------------------------------|------------------------|------|
-    | bench                                                |                        |      |
-    | places of the tips at the start of each press        | (presses, contacts, 2) | m    |
-    | start of each press, rest included                   | (presses,)             | s    |
-    | pace of the ramps over the planned                   | (presses,)             | 1    |
-    | forces that the tips go to                           | (presses, contacts)    | N    |
+    | field  | meaning                                                  | shape                  | unit |
+    |--------|----------------------------------------------------------|------------------------|------|
+    | bench  |                                                          |                        |      |
+    | places | of the tips at the start of each press                   | (presses, contacts, 2) | m    |
+    | start  | of each press, including the rest before it              | (presses,)             | s    |
+    | pace   | speed of the ramps over the planned speed                | (presses,)             | 1    |
+    | forces | target forces of the tips                                | (presses, contacts)    | N    |
     """
 
     bench: Bench
@@ -27,15 +27,15 @@ class Motion(NamedTuple):
     forces: Float[np.ndarray, "presses contacts"]
 
 
-class Moment(NamedTuple):
-    """What acts at given times.
+class LoadState(NamedTuple):
+    """Loads at given times.
 
-    | meaning                                                | shape            | unit |
-    |--------------------------------------------------------|------------------|------|
-    | press under way; the first in the blank before it      | (time,)          |      |
-    | phase of that press, between changes of any tip's work | (time,)          |      |
-    | load of each tip                                       | (time, contacts) | N    |
-    | progress of its slide, 0 to 1; 0 if it has none        | (time, contacts) | 1    |
+    | field    | meaning                                                           | shape            | unit |
+    |----------|-------------------------------------------------------------------|------------------|------|
+    | press    | index of the press; that of the first during the blank before it  | (time,)          |      |
+    | phase    | phase of that press; a phase ends when any tip starts or stops    | (time,)          |      |
+    | load     | of each tip                                                       | (time, contacts) | N    |
+    | progress | along the slide, 0 to 1; 0 without a slide                        | (time, contacts) | 1    |
     """
 
     press: Int[np.ndarray, " time"]
@@ -44,8 +44,8 @@ class Moment(NamedTuple):
     progress: Float[np.ndarray, "time contacts"]
 
 
-def planned(bench: Bench) -> Motion:
-    """The motion of a stage that does as it is told."""
+def planned_motion(bench: Bench) -> Motion:
+    """The motion of an ideal stage, exactly as planned."""
     also = bench.companions
     offsets = np.array([(0.0, 0.0), *(c.offset for c in also)])
     forces = np.stack([bench.press_forces, *(np.full(len(bench.sites), c.force) for c in also)], 1)
@@ -53,8 +53,8 @@ def planned(bench: Bench) -> Motion:
     return Motion(bench, bench.sites[:, None] + offsets, start, np.ones(len(start)), forces)
 
 
-def moments(motion: Motion, times: Float[np.ndarray, " time"]) -> Moment:
-    """Loads and slides at these times, s."""
+def loads_at(motion: Motion, times: Float[np.ndarray, " time"]) -> LoadState:
+    """Loads and slides at the given times (s)."""
     timing = motion.bench.timing
     press = np.clip(np.searchsorted(motion.start, times, side="right") - 1, 0, None)
     delay = np.array([0.0, *(c.delay for c in motion.bench.companions)])
@@ -68,19 +68,19 @@ def moments(motion: Motion, times: Float[np.ndarray, " time"]) -> Moment:
     changes = np.sort((delay[:, None] + ends).ravel())
     phase = np.searchsorted(changes, since[:, 0], side="right")
     progress = 0.5 * (1 - np.cos(np.pi * slid)) * any(motion.bench.slide)
-    return Moment(press, phase, load, progress)
+    return LoadState(press, phase, load, progress)
 
 
-def phases(bench: Bench) -> int:
-    """How many phases a press has."""
+def phase_count(bench: Bench) -> int:
+    """Number of phases of a press."""
     return 4 * (1 + len(bench.companions)) + 1
 
 
-def temperature(bench: Bench, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    """Above that at the start, K."""
+def temperature_rise(bench: Bench, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+    """Temperature above that at the start, K."""
     return bench.temperature_rate * times
 
 
-def barometer(bench: Bench, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+def barometer_rise(bench: Bench, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
     """Air pressure above that at the start, Pa."""
     return bench.barometer_rate * times

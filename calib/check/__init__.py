@@ -1,8 +1,9 @@
 """`jaxeit check`: what is wrong with a recording, where, and what to do about it."""
 
-from calib.check.order import transfer_matrix
-from calib.check.report import ChannelTable, CheckReport, Finding, Severity, render, to_json
-from calib.check.verdict import check_session
+from .reading_order import transfer_matrix
+from .report import ChannelTable, CheckReport, Finding, Severity, to_json
+from .session import check_session
+from .text import render
 
 __all__ = [
     "ChannelTable",

@@ -1,48 +1,57 @@
-"""EIT readings of a recording: dead, saturated, noisy, irreciprocal, in the wrong order."""
+"""Check the EIT readings of a recording: dead, saturated, noisy or not reciprocal readings, and their order."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
 import jaxeit as je
-from calib.check.order import OrderCheck, check_order, transfer_matrix
-from calib.check.report import ChannelTable, Finding, Severity
-from calib.check.streams import Scan
-from calib.presses import SECOND, Presses
-from calib.session import Session, Status
 
-_SNR = 40.0  # dB; healthy benches reach 50 to 60
-_NOISY = 5.0  # times the median noise of the readings
-_RECIPROCITY = 0.02
-_SATURATED = 0.01  # fraction of samples at the converter's end
-_ALIKE = 3  # readings that share one extreme value: the converter's end, not chance
-_QUIET_FRAMES = 2000
-_FEWEST_QUIET = 8
+from ..presses.streams import finite_mean, true_runs
+from ..presses.times import PressColumns
+from ..session import Session, Status
+from ..session.units import SECOND
+from .reading_order import OrderCheck, check_order, transfer_matrix
+from .report import ChannelTable, Finding, Severity, listed
+from .streams import StreamStatistics
+
+MIN_SNR = 40.0  # dB; healthy benches reach 50 to 60
+NOISE_RATIO = 5.0  # over the median noise of the readings
+MAX_RECIPROCITY_ERROR = 0.02
+SATURATED_FRACTION = 0.01  # of the samples at the converter's end
+MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the converter's end; fewer may be chance
+MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
+AMPLITUDE_RATIO_RANGE = 0.03, 30.0  # of measured over modelled voltage: outside it, a unit is wrong
+MIN_CORRELATION = 0.9  # with the model: readings below it do not look like this skin
+MIN_SOUND_READINGS = 10  # for a comparison with the model
 
 
 def check_eit(
     session: Session,
-    scan: Scan | None,
-    presses: Presses | None,
+    stats: StreamStatistics | None,
+    presses: PressColumns | None,
     skin: je.Skin | None,
     transfer: np.ndarray | None,
     findings: list[Finding],
 ) -> tuple[ChannelTable | None, OrderCheck | None]:
+    """Check the readings against each other and against a model of the skin; add what is wrong to ``findings``.
+
+    Returns None for what was not checked: without EIT voltages, without a pattern or without a skin.
+    """
     pattern = session.pattern
-    if scan is None or pattern is None or scan.row.variable != "voltage":
+    if stats is None or pattern is None or stats.row.variable != "voltage":
         return None, None
-    findings += _frame_rate(session, scan, skin)
-    table = _channels(scan, pattern, presses)
-    findings += _channel_findings(scan, table)
+    findings += _frame_rate_findings(session, stats, skin)
+    table = _channel_table(stats, pattern, presses)
+    findings += _channel_findings(stats, table)
     if skin is None or pattern.max() >= len(skin.electrodes):
         return table, None
-    order = _order(session, table, pattern, skin, transfer, findings)
+    order = _check_order(session, table, pattern, skin, transfer, findings)
     if order is not None:
         findings += _order_findings(order)
     return table, order
 
 
-def _frame_rate(session: Session, scan: Scan, skin: je.Skin | None) -> Iterator[Finding]:
+def _frame_rate_findings(session: Session, stats: StreamStatistics, skin: je.Skin | None) -> Iterator[Finding]:
     """A scan cannot take longer than the time from one frame to the next."""
     if session.offset is not None:
         scan_time = float(np.ptp(session.offset))
@@ -50,40 +59,39 @@ def _frame_rate(session: Session, scan: Scan, skin: je.Skin | None) -> Iterator[
         scan_time = skin.protocol.frame_time
     else:
         return
-    if scan.row.rate * scan_time > 1.02:
+    if stats.row.rate * scan_time > 1.02:
         what = (
-            f"{scan.row.rate:.4g} frames a second, but one scan takes {1e3 * scan_time:.3g} ms "
+            f"{stats.row.rate:.4g} frames a second, but one scan takes {1e3 * scan_time:.3g} ms "
             f"({1 / scan_time:.4g} a second at most)"
         )
         yield Finding(Severity.WARNING, "/streams/eit", what, "correct reading_time, or the time stamps")
 
 
-def _quiet(time: np.ndarray, presses: Presses | None) -> slice:
-    """The longest run of frames clear of every press, or the first ones if none is clear."""
+def _rest_frames(time: np.ndarray, presses: PressColumns | None) -> slice:
+    """Longest run of frames without a press, or the first frames if there is no such run."""
     loaded = np.zeros(len(time), bool)
     if presses is not None:
         starts = np.searchsorted(time, np.asarray(presses.t_press) - SECOND // 10)
         stops = np.searchsorted(time, np.asarray(presses.t_release) + 3 * SECOND // 2)
         for start, stop in zip(starts, stops, strict=True):
             loaded[start:stop] = True
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], loaded, [True]]).astype(np.int8)))
-    runs = edges.reshape(-1, 2)
+    runs = true_runs(~loaded)
     sizes = runs[:, 1] - runs[:, 0]
-    if not len(runs) or sizes.max() < _FEWEST_QUIET:
-        return slice(0, min(len(time), _QUIET_FRAMES))
+    if not len(runs) or sizes.max() < MIN_REST_FRAMES:
+        return slice(0, min(len(time), MAX_REST_FRAMES))
     start = int(runs[sizes.argmax(), 0])
-    return slice(start, start + min(int(sizes.max()), _QUIET_FRAMES))
+    return slice(start, start + min(int(sizes.max()), MAX_REST_FRAMES))
 
 
-def _channels(scan: Scan, pattern: np.ndarray, presses: Presses | None) -> ChannelTable:
-    quiet = _quiet(scan.time, presses)
-    values = scan.stream.read(quiet.start, quiet.stop)
-    mean = _mean(values)
-    # from first differences, so that drift is not noise
-    noise = np.sqrt(_mean(np.diff(values, axis=0) ** 2) / 2)
+def _channel_table(stats: StreamStatistics, pattern: np.ndarray, presses: PressColumns | None) -> ChannelTable:
+    rest = _rest_frames(stats.time, presses)
+    values = stats.stream.read(rest.start, rest.stop)
+    mean = finite_mean(values)
+    # First differences suppress drift, which is no noise.
+    noise = np.sqrt(finite_mean(np.diff(values, axis=0) ** 2) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = 20 * np.log10(np.abs(mean) / noise)
-    partner, saturated = je.reciprocal_rows(pattern), _saturated(scan)
+    partner, saturated = je.skin.reciprocal_rows(pattern), _saturated(stats)
     typical = np.median(noise[np.isfinite(noise)]) if np.isfinite(noise).any() else np.inf
     return ChannelTable(
         frames=len(values),
@@ -93,87 +101,84 @@ def _channels(scan: Scan, pattern: np.ndarray, presses: Presses | None) -> Chann
         snr=snr,
         partner=partner,
         reciprocity=_reciprocity(mean, partner),
-        missing=scan.missing,
-        dead=scan.dead & ~saturated,
+        missing=stats.missing,
+        dead=stats.dead & ~saturated,
         saturated=saturated,
-        noisy=(noise > _NOISY * typical) & (snr < _SNR) & ~scan.dead,
+        noisy=(noise > NOISE_RATIO * typical) & (snr < MIN_SNR) & ~stats.dead,
     )
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Over frames, of what is there; NaN where nothing is."""
-    good = np.isfinite(values)
-    count = good.sum(0)
-    return np.where(good, values, 0).sum(0) / np.where(count > 0, count, np.nan)
 
 
 def _reciprocity(mean: np.ndarray, partner: np.ndarray) -> np.ndarray:
     other = np.where(partner >= 0, mean[partner], np.nan)
-    rms = np.sqrt(_mean(mean[:, None] ** 2))[0]
+    rms = np.sqrt(finite_mean(mean[:, None] ** 2))[0]
     size = np.fmax(np.fmax(np.abs(mean), np.abs(other)), 0.1 * rms)
-    return np.abs(mean - other) / np.where(size > 0, size, np.nan)
+    return np.asarray(np.abs(mean - other) / np.where(size > 0, size, np.nan))
 
 
-def _saturated(scan: Scan) -> np.ndarray:
-    """Channels that sit at the converter's ends: the extremes of all channels, shared by several.
+def _saturated(stats: StreamStatistics) -> np.ndarray:
+    """Channels that reach an end of the converter: an extreme value of all channels that several of them share.
 
-    One channel alone may rest at its own extreme; with the status flag it is known not to. Channels
-    that are always zero are dead, whatever the others do.
+    A single channel may rest at its own extreme; it counts only if the status flag says that some reading is
+    saturated. A channel that is always zero is dead.
     """
-    some = (scan.finite > 0) & ~((scan.low == 0) & (scan.high == 0))
+    some = (stats.finite > 0) & ~((stats.low == 0) & (stats.high == 0))
     out = np.zeros(len(some), bool)
-    for value, count in ((scan.low, scan.at_low), (-scan.high, scan.at_high)):
+    for value, count in ((stats.low, stats.at_low), (-stats.high, stats.at_high)):
         if some.any():
-            at_end = some & (value == value[some].min()) & (count > _SATURATED * len(scan.time))
-            if at_end.sum() >= _ALIKE or scan.flagged(Status.saturated):
+            at_end = some & (value == value[some].min()) & (count > SATURATED_FRACTION * len(stats.time))
+            if at_end.sum() >= MIN_SHARED_EXTREMES or stats.flagged(Status.saturated):
                 out |= at_end
     return out
 
 
-def _channel_findings(scan: Scan, table: ChannelTable) -> Iterator[Finding]:
+def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[Finding]:
     where = "/streams/eit"
-    dead = table.dead
-    yield from _listed(dead, table, Severity.ERROR, _how_dead(scan, dead), "see to their wires and bolts")
-    remedy = "lower the gain or the drive current"
-    yield from _listed(table.saturated, table, Severity.ERROR, "sit at the converter's end (saturated)", remedy)
-    what = f"are more than {_NOISY:g} times noisier than most and below {_SNR:g} dB"
-    yield from _listed(table.noisy, table, Severity.WARNING, what, "see to their wires and bolts")
+    dead, remedy = table.dead, "check the wires and terminals of these electrodes"
+    yield from _channel_list_finding(dead, table, Severity.ERROR, _dead_text(stats, dead), remedy)
+    what = "sit at the converter's end (saturated)"
+    gain = "lower the gain or the drive current"
+    yield from _channel_list_finding(table.saturated, table, Severity.ERROR, what, gain)
+    what = f"are more than {NOISE_RATIO:g} times noisier than most and below {MIN_SNR:g} dB"
+    yield from _channel_list_finding(table.noisy, table, Severity.WARNING, what, remedy)
     snr = table.snr[~table.bad & ~np.isnan(table.snr)]
-    if len(snr) and np.median(snr) < _SNR:
-        what = f"low signal: the median SNR of a reading is {np.median(snr):.1f} dB, below {_SNR:g} dB"
-        yield Finding(Severity.WARNING, where, what, "more current, averaging, better contacts, less mains hum")
+    if len(snr) and np.median(snr) < MIN_SNR:
+        what = f"low signal: the median SNR of a reading is {np.median(snr):.1f} dB, below {MIN_SNR:g} dB"
+        remedy = "raise the current or the averaging, improve the contacts, shield against mains hum"
+        yield Finding(Severity.WARNING, where, what, remedy)
     error = table.reciprocity[~table.bad & np.isfinite(table.reciprocity)]
-    if len(error) and np.median(error) > _RECIPROCITY:
+    if len(error) and np.median(error) > MAX_RECIPROCITY_ERROR:
         what = (
             f"reciprocity error: readings differ by {100 * np.median(error):.1f} % (median) when drive "
             "and sense are exchanged, where physics allows no difference"
         )
-        yield Finding(Severity.WARNING, where, what, "the wiring or the order of the readings is not as recorded")
+        remedy = "compare the wiring and the order of the readings with the recorded pattern"
+        yield Finding(Severity.WARNING, where, what, remedy)
 
 
-def _how_dead(scan: Scan, dead: np.ndarray) -> str:
-    if (scan.finite[dead] == 0).all():
+def _dead_text(stats: StreamStatistics, dead: np.ndarray) -> str:
+    if (stats.finite[dead] == 0).all():
         return "hold no finite value (dead)"
-    if (scan.low[dead] == 0).all():
+    if (stats.low[dead] == 0).all():
         return "are always zero (dead)"
     return "never change (dead)"
 
 
-def _listed(flag: np.ndarray, table: ChannelTable, severity: Severity, what: str, remedy: str) -> Iterator[Finding]:
+def _channel_list_finding(
+    flag: np.ndarray, table: ChannelTable, severity: Severity, what: str, remedy: str
+) -> Iterator[Finding]:
     rows = np.flatnonzero(flag)
     if not len(rows):
         return
-    names = ", ".join(map(str, rows[:6])) + (", ..." if len(rows) > 6 else "")
-    text = f"{len(rows)} of {len(table)} readings {what}: {names}"
+    text = f"{len(rows)} of {len(table)} readings {what}: {listed(rows)}"
     common = _common_electrodes(flag, table.pattern)
     if common:
         text += f"; all of them use electrode {' or '.join(map(str, common))}"
-        remedy = f"see to electrode {' and '.join(map(str, common))}: its bolt, wire and switch"
+        remedy = f"check electrode {' and '.join(map(str, common))}: its terminal, wire and switch"
     yield Finding(severity, "/streams/eit", text, remedy)
 
 
 def _common_electrodes(flag: np.ndarray, pattern: np.ndarray) -> list[int]:
-    """One or two electrodes in all flagged readings and hardly in others, found greedily."""
+    """One or two electrodes that occur in all flagged readings and in few others; found greedily."""
     left = flag.copy()
     found: list[int] = []
     while left.sum() >= 3 and len(found) < 2:
@@ -187,12 +192,19 @@ def _common_electrodes(flag: np.ndarray, pattern: np.ndarray) -> list[int]:
     return [] if left.any() else found
 
 
-def _order(session, table, pattern, skin, transfer, findings) -> OrderCheck | None:
-    """Comparison with a uniform sheet, on the readings that can be trusted."""
+def _check_order(
+    session: Session,
+    table: ChannelTable,
+    pattern: np.ndarray,
+    skin: je.Skin,
+    transfer: np.ndarray | None,
+    findings: list[Finding],
+) -> OrderCheck | None:
+    """Compare the sound readings with a uniform sheet; None if there are too few, or if the skin has no model."""
     good = np.isfinite(table.mean) & ~table.bad
-    if good.sum() < max(10, len(good) // 4):
+    if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
         what = f"only {good.sum()} readings are sound: order and signs were not checked"
-        findings.append(Finding(Severity.WARNING, "/streams/eit", what, "mend the readings above first"))
+        findings.append(Finding(Severity.WARNING, "/streams/eit", what, "correct the readings above first"))
         return None
     try:
         transfer = transfer_matrix(skin) if transfer is None else transfer
@@ -214,19 +226,20 @@ def _order(session, table, pattern, skin, transfer, findings) -> OrderCheck | No
 def _order_findings(order: OrderCheck) -> Iterator[Finding]:
     where = "/streams/eit"
     if order.claimed:
-        same = f" (or, which looks the same: {'; '.join(order.same)})" if order.same else ""
+        same = f" (or, with the same readings: {'; '.join(order.same)})" if order.same else ""
         what = (
             f"the order looks wrong: {order.what}{same}. Correlation with the model is "
-            f"{order.as_is:.3f} as recorded and {order.best:.3f} if so"
+            f"{order.as_is:.3f} as recorded and {order.best:.3f} in this order"
         )
         yield Finding(Severity.ERROR, where, what, order.remedy)
-    elif order.as_is < 0.9:
+    elif order.as_is < MIN_CORRELATION:
         what = (
             f"the readings do not look like this skin: correlation with its model {order.as_is:.2f}, "
             f"and no simple reordering explains it (best {order.best:.2f})"
         )
         remedy = "compare positions and numbering of the electrodes in the skin's file with the hardware"
         yield Finding(Severity.WARNING, where, what, remedy)
-    if order.as_is > 0 and not 0.03 < order.scale < 30:
-        what = f"amplitude {order.scale:.3g} times the model's: unit (V, mV), gain or current?"
+    low, high = AMPLITUDE_RATIO_RANGE
+    if order.as_is > 0 and not low < order.scale < high:
+        what = f"the amplitude is {order.scale:.3g} times the model's: unit (V, mV), gain or current is wrong"
         yield Finding(Severity.WARNING, where, what, "correct the unit at import, current or sheet_resistance")

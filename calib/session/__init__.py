@@ -1,21 +1,17 @@
-"""Session and result files: the only package that imports h5py.
+"""Session and result files. No other room imports h5py.
 
-The format is described in ``data/schema/README.md``. `open_session` reads, `SessionWriter` writes;
+``data/schema/README.md`` describes the format. `open_session` reads sessions and `SessionWriter` writes them;
 `read_archive` and `write_archive` do the same for results (calibrations, force maps).
 """
 
-from calib.session.archive import (
-    Archive,
-    ArchiveReader,
-    ArchiveWriter,
-    open_archive,
-    read_archive,
-    write_archive,
-)
-from calib.session.model import ClockTable, Events, PressTable, SessionError, Status
-from calib.session.reader import Session, Stream, open_session
-from calib.session.storage import file_hash, replacing
-from calib.session.writer import SessionWriter
+from .archive import Archive, ArchiveReader, ArchiveWriter, open_archive, read_archive, write_archive
+from .errors import SessionError
+from .facts import SessionFacts, StreamFacts
+from .reader import Session, open_session
+from .storage import file_hash, replacing
+from .stream import Stream
+from .tables import ClockTable, Events, PressTable, Status
+from .writer import SessionWriter
 
 __all__ = [
     "Archive",
@@ -26,9 +22,11 @@ __all__ = [
     "PressTable",
     "Session",
     "SessionError",
+    "SessionFacts",
     "SessionWriter",
     "Status",
     "Stream",
+    "StreamFacts",
     "file_hash",
     "open_archive",
     "open_session",

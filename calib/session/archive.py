@@ -1,38 +1,38 @@
-"""Result files (calibrations, force maps): named arrays with units, as guarded as sessions.
+"""Result files (calibrations, force maps): named arrays with units, checked like session files.
 
-An archive is an HDF5 file with ``format`` and ``format_version``, attributes that are single
-numbers or texts, and arrays, possibly in groups (``pads/0/covariance``). Arrays too large for
-memory are written row by row with `ArchiveWriter` and read in slices with `open_archive`.
+An archive is an HDF5 file with ``format`` and ``format_version``, attributes that are single numbers or texts, and
+arrays, possibly in groups (``pads/0/covariance``). An array larger than memory is written row by row with
+`ArchiveWriter` and read in slices with `open_archive`.
 """
 
-import contextlib
 import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 
 import h5py
 import numpy as np
 from h5py import h5g
 from numpy.typing import ArrayLike, DTypeLike
 
-from calib.session.chunks import MAX_RANK, GuardedArray
-from calib.session.guard import Node, open_guarded, root_node, translated
-from calib.session.model import FORMAT, SessionError, printable, problem
-from calib.session.reader import check_version
-from calib.session.storage import (
+from .chunks import MAX_RANK, GuardedArray
+from .errors import printable, problem
+from .guard import Node, open_guarded, root_node, translated
+from .reader import check_version
+from .storage import (
     DIMENSION_NAME,
+    AttributeValue,
+    FileWriter,
     GrowingArray,
-    Plain,
     make_array,
     make_dataset,
     make_group,
-    new_file,
     put_attributes,
     text_array,
 )
+from .tables import FORMAT
 
 ARCHIVE_VERSION = "1.0"
 MAX_DEPTH = 4
@@ -47,8 +47,8 @@ OWN_ATTRIBUTES = {"format", "format_version", "Conventions", "complete"}
 class Archive:
     """A result file in memory.
 
-    ``attrs`` name -> text or number; ``arrays`` name -> array (numbers, bool, or texts as ``U``);
-    ``units`` and ``long_names`` by the same names.
+    ``attrs`` maps names to texts or numbers; ``arrays`` maps names to arrays of numbers, bools or texts (``U``).
+    ``units`` and ``long_names`` describe the arrays under the same names.
     """
 
     attrs: Mapping[str, str | int | float]
@@ -60,14 +60,14 @@ class Archive:
 def write_archive(
     path: str | os.PathLike[str],
     format: str,
-    attrs: Mapping[str, Plain],
+    attrs: Mapping[str, AttributeValue],
     arrays: Mapping[str, tuple[ArrayLike, str, str]],
 ) -> None:
-    """Write a result file, whole or not at all.
+    """Write a result file, whole or not at all. Equal input gives equal bytes.
 
-    ``arrays`` maps a name, which may be nested as ``pads/0/covariance``, to (values, units, long
-    name); values are numbers, bools or texts of rank 0 to 4. Same input, same bytes. Raises
-    `SessionError` for names, types and attributes that the format cannot hold.
+    ``arrays`` maps a name, which may be nested (``pads/0/covariance``), to (values, units, long name). Values are
+    numbers, bools or texts of rank 0 to 4. Raises `SessionError` for names, types and attributes that the format
+    cannot hold.
     """
     with ArchiveWriter(path, format, attrs) as writer:
         for name, (values, units, long_name) in arrays.items():
@@ -77,7 +77,7 @@ def write_archive(
 def read_archive(path: str | os.PathLike[str], format: str) -> Archive:
     """Read a whole result file of the given ``format``; raises `SessionError`.
 
-    Arrays above 2 GiB together are refused: read those in slices with `open_archive`.
+    Files with more than 2 GiB of arrays are refused: read them in slices with `open_archive`.
     """
     with open_archive(path, format) as reader:
         total = sum(array.nbytes for array in reader.arrays.values())
@@ -95,56 +95,31 @@ def read_archive(path: str | os.PathLike[str], format: str) -> Archive:
         )
 
 
-class ArchiveWriter:
+class ArchiveWriter(FileWriter):
     """Write a result file piece by piece; use it as a context manager.
 
-    ``add`` writes an array at once; ``add_rows`` declares one that ``append`` extends, so that it
-    may be larger than memory. The file appears under its name only at a clean end.
+    ``add`` writes a whole array. ``add_rows`` declares an array that ``append`` extends, so that it may be larger
+    than memory. The file appears under its name only after a successful end.
     """
 
-    def __init__(self, path: str | os.PathLike[str], format: str, attrs: Mapping[str, Plain]):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike[str], format: str, attrs: Mapping[str, AttributeValue]):
+        super().__init__(Path(path))
         clash = OWN_ATTRIBUTES & set(attrs)
         if clash or format == FORMAT or not PART.fullmatch(format):
-            what = f"format {format!r} or attributes {sorted(clash)} are taken"
+            what = f"format {format!r} or attributes {sorted(clash)} are reserved"
             raise problem(self.path, "attributes", what, "use other names")
         own = {"format": format, "format_version": ARCHIVE_VERSION, "Conventions": "CF-1.11"}
         self._attrs = {**own, **attrs}
         self._names: set[str] = set()
-        self._growing: dict[str, tuple[GrowingArray, tuple[int, ...], dict[str, Plain]]] = {}
-        self._stack = contextlib.ExitStack()
-        self._file: h5py.File | None = None
+        self._growing: dict[str, tuple[GrowingArray, tuple[int, ...], dict[str, AttributeValue]]] = {}
 
-    def __enter__(self) -> "ArchiveWriter":
-        with contextlib.ExitStack() as stack:
-            self._file, self._check_disk = stack.enter_context(new_file(self.path))
-            put_attributes(self._file, self._attrs)
-            self._stack = stack.pop_all()
-        return self
+    def _start(self, file: h5py.File) -> None:
+        put_attributes(file, self._attrs)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with self._stack:
-            if error is not None:
-                self._stack.__exit__(kind, error, trace)
-            else:
-                self._finish()
-        self._file = None
-
-    def _finish(self) -> None:
+    def _finish(self, file: h5py.File) -> None:
         for growing, _, attrs in self._growing.values():
             self._name_axes(growing.finish(attrs))
-        put_attributes(self._open(), {"complete": True})
-
-    def _open(self) -> h5py.File:
-        if self._file is None:
-            what = "is not open"
-            raise problem(self.path, "writer", what, "use it as `with ArchiveWriter(...) as w`")
-        return self._file
+        put_attributes(file, {"complete": True})
 
     def add(self, name: str, values: ArrayLike, units: str, long_name: str = "") -> None:
         """Write one array of numbers, bools or texts."""
@@ -168,7 +143,7 @@ class ArchiveWriter:
         if dtype.kind == "b":
             raise problem(self.path, name, "bool rows", "use dtype u1")
         group, leaf = self._place(name)
-        attrs: dict[str, Plain] = {"units": units, "long_name": long_name}
+        attrs: dict[str, AttributeValue] = {"units": units, "long_name": long_name}
         self._growing[name] = (GrowingArray(group, leaf, tail, dtype), tail, attrs)
 
     def append(self, name: str, rows: ArrayLike) -> None:
@@ -183,7 +158,7 @@ class ArchiveWriter:
         self._check_disk()
 
     def _place(self, name: str) -> tuple[h5py.Group, str]:
-        """The group an array belongs in (made if need be) and its name there."""
+        """The group of an array, created if it does not exist, and the name of the array in it."""
         parts = name.split("/")
         bad = [p for p in parts if not PART.fullmatch(p) or DIMENSION.fullmatch(p)]
         taken = any(name == n or name.startswith(n + "/") or n.startswith(name + "/")
@@ -197,16 +172,16 @@ class ArchiveWriter:
         return group, parts[-1]
 
     def _name_axes(self, dataset: h5py.Dataset) -> None:
-        """Give every axis a dimension; axes of equal length in one array stay distinct."""
+        """Attach a dimension to every axis; axes of equal length in one array get different ones."""
         seen: list[int] = []
         for axis, size in enumerate(dataset.shape):
-            again = seen.count(size)
+            repeats = seen.count(size)
             seen.append(size)
-            scale = self._dimension(f"dim_{size}" + ("" if not again else "abcd"[again]), size)
+            scale = self._dimension(f"dim_{size}" + ("" if not repeats else "abcd"[repeats]), size)
             dataset.dims[axis].attach_scale(scale)
 
     def _dimension(self, name: str, size: int) -> h5py.Dataset:
-        """A dimension without values, as netCDF-4 writes them."""
+        """A dimension without values, in the form that netCDF-4 writes."""
         file = self._open()
         if name in file:
             return file[name]
@@ -215,8 +190,8 @@ class ArchiveWriter:
         return scale
 
 
-def _storable(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, dict[str, Plain]]:
-    """Values in a type the format has, with an attribute if that type is a stand-in."""
+def _storable(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, dict[str, AttributeValue]]:
+    """Values in a type that the format has, and an attribute if that type replaces another one (u1 for bool)."""
     plain = values.dtype.kind == "U" or (values.dtype.kind in "biuf" and values.itemsize <= 8)
     if values.ndim > MAX_RANK or not plain:
         what = f"has type {values.dtype} and rank {values.ndim}"
@@ -229,7 +204,7 @@ def _storable(path: Path, name: str, values: np.ndarray) -> tuple[np.ndarray, di
 
 
 class ArchiveArray:
-    """One array of an open archive: ``shape``, ``units``, ``long_name``; rows by ``read``."""
+    """One array of an open archive: ``shape``, ``units`` and ``long_name``; ``read`` returns rows."""
 
     def __init__(self, node: Node):
         self._array = GuardedArray(node)
@@ -238,7 +213,7 @@ class ArchiveArray:
         self._bool = node.text("kind", "") == "bool"
 
     def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows ``start:stop`` (all by default); texts come as ``U``."""
+        """Rows ``start:stop``, all by default; texts have the NumPy kind ``U``."""
         values = self._array.read(start, stop)
         if values.dtype.kind == "S":
             with translated(self._array.node.path, self._array.node.where):
@@ -247,7 +222,7 @@ class ArchiveArray:
 
 
 class ArchiveReader:
-    """An open archive: ``attrs``, and ``arrays`` by name, read when asked for."""
+    """An open archive: ``attrs``, and ``arrays`` by name, which are read on request."""
 
     def __init__(self, path: Path, file: h5py.File, format: str):
         self.path, self._file = path, file
@@ -281,11 +256,11 @@ def _check_archive(root: Node, format: str) -> None:
         raise problem(root.path, "file", what, f"name a {format} file")
     check_version(root)
     if root.number("complete", 0) != 1:
-        raise problem(root.path, "file", "is not complete", "make it again")
+        raise problem(root.path, "file", "is not complete", "create it again")
 
 
 def _walk(root: Node) -> Iterator[tuple[str, Node]]:
-    """Every array with its name, within limits of depth and number."""
+    """All arrays with their names, within limits of depth and number."""
     waiting, found = [("", root, 0)], 0
     while waiting:
         prefix, node, depth = waiting.pop(0)
@@ -301,14 +276,3 @@ def _walk(root: Node) -> Iterator[tuple[str, Node]]:
                 waiting.append((f"{prefix}{name}/", member, depth + 1))
             else:
                 yield prefix + name, member
-
-
-__all__ = [
-    "Archive",
-    "ArchiveReader",
-    "ArchiveWriter",
-    "SessionError",
-    "open_archive",
-    "read_archive",
-    "write_archive",
-]

@@ -1,8 +1,8 @@
-"""Bounded reading of one dataset, chunk by chunk.
+"""Guarded reading of one dataset, chunk by chunk, in bounded memory.
 
-The library is asked for a chunk's stored bytes only. Checksum, inflating and unshuffling are done
-here: the library's own inflate grows its buffer to whatever the stream holds (1 MB to 1 GB), trusts
-a chunk to have the size it should, and returns zeros for a chunk that was never written.
+The HDF5 library only delivers the stored bytes of a chunk. This module verifies the checksum, inflates and
+unshuffles, because the library's own inflate expands its buffer to whatever the stream holds (1 MB becomes 1 GB),
+trusts the size of a chunk, and returns zeros for a chunk that was never written.
 """
 
 import itertools
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from h5py import h5d, h5p, h5s, h5t, h5z
 
-from calib.session.guard import DAMAGED, Node, plain_type, translated, type_kind
+from .guard import DAMAGED, Node, plain_type, translated, type_kind
 
 MAX_RANK = 4
 MAX_CHUNK_BYTES = 16 << 20
@@ -27,10 +27,10 @@ ALLOWED = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 
 @dataclass
 class GuardedArray:
-    """A dataset whose claims were checked: `shape`, `dtype`, `chunk`; rows by `read`.
+    """A dataset whose `shape`, `dtype` and `chunk` were checked; `read` returns rows.
 
-    Raises `SessionError` on construction for types, layouts, filters and sizes that are not on the
-    list, and on reading for a chunk that is missing, damaged or larger than it may be.
+    The constructor raises `SessionError` for types, layouts, filters and sizes that are not allowed. Reading raises
+    it for a chunk that is missing, damaged or too large.
     """
 
     node: Node
@@ -145,8 +145,8 @@ class GuardedArray:
             raise self.node.error(f"chunk {origin} has the wrong size", DAMAGED)
         return np.frombuffer(raw, self.dtype).reshape(self.chunk)
 
-    def _undo(self, code: int, skipped: bool, raw: bytes, size: int, at: tuple) -> bytes:
-        """Undo one filter; a writer may skip any but the checksum for one chunk."""
+    def _undo(self, code: int, skipped: bool, raw: bytes, size: int, at: tuple[int, ...]) -> bytes:
+        """Undo one filter. For a single chunk, a writer may have skipped any filter but the checksum."""
         if code == h5z.FILTER_FLETCHER32:
             if skipped or not checksum_holds(raw):
                 raise self.node.error(f"the checksum of chunk {at} does not hold", DAMAGED)
@@ -162,7 +162,7 @@ class GuardedArray:
 
 
 def inflate(raw: bytes, size: int) -> bytes | None:
-    """Inflate `raw` to exactly `size` bytes, never more; None if that is not what it holds."""
+    """Inflate `raw` to exactly `size` bytes; None if it holds more or fewer, or is damaged."""
     stream = zlib.decompressobj()
     try:
         plain = stream.decompress(raw, size + 1)
@@ -172,14 +172,14 @@ def inflate(raw: bytes, size: int) -> bytes | None:
 
 
 def unshuffle(raw: bytes, itemsize: int) -> bytes:
-    """Undo HDF5's byte shuffle: first bytes of all items, then second bytes, and so on."""
+    """Undo the byte shuffle of HDF5, which stores the first bytes of all items, then the second bytes, and so on."""
     if itemsize == 1 or len(raw) % itemsize:
         return raw
     return np.frombuffer(raw, np.uint8).reshape(itemsize, -1).T.tobytes()
 
 
 def checksum_holds(raw: bytes) -> bool:
-    """Whether the last four bytes are the Fletcher-32 sum of the rest.
+    """Whether the last four bytes are the Fletcher-32 checksum of the others.
 
     Sums over 16-bit big-endian words w_1..w_n modulo 65535: s1 = sum w_i, s2 = sum (n-i+1) w_i
     (J. Fletcher, IEEE Trans. Commun. 30, 1982; byte order as in HDF5's H5checksum.c).

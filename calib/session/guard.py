@@ -1,10 +1,9 @@
-"""The door: nothing in a file is believed before it has been checked.
+"""Guarded access to HDF5 files: nothing in a file is trusted before it has been checked.
 
-A session may come from anywhere, and the HDF5 library follows links to other files, loads
-plug-ins, allocates what a header claims and does not check every number. So a file is looked at
-here first: what it is, whether it is whole, then only groups and datasets on a list of names,
-through hard links only, with bounded numbers of members and attributes, and only plain numbers and
-fixed-length texts.
+A session may come from anywhere, and the HDF5 library follows links to other files, loads plug-ins, allocates
+what a header claims and does not check every number. This module therefore checks the header first, without the
+library, and whether the file is whole. Then it opens groups and datasets by name, through hard links only, with
+bounded numbers of members and attributes. Values are plain numbers and fixed-length texts only.
 """
 
 import contextlib
@@ -19,7 +18,7 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5t
 
-from calib.session.model import SessionError, printable, problem
+from .errors import SessionError, printable, problem
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MAX_LOGICAL_BYTES = 64 << 30
@@ -28,7 +27,7 @@ MAX_ATTRIBUTE_BYTES = 256 << 10
 MAX_ATTRIBUTE_ITEMS = 64
 MAX_MEMBERS = 1024
 DEFLATE_RATIO = 1040
-"""A byte of deflate stands for at most 1032 bytes; a file cannot hold more than that."""
+"""Limit of stored over compressed size: one byte of deflate expands to at most 1032 bytes."""
 
 REWRITE = 'write it with h5py.File(..., libver=("v110", "v110"))'
 DAMAGED = "the file is damaged; take another copy, or record it again"
@@ -36,7 +35,7 @@ DAMAGED = "the file is damaged; take another copy, or record it again"
 
 @dataclass
 class Budget:
-    """How many bytes the arrays of one file may claim together, and how many they have claimed."""
+    """Limit of the bytes that the arrays of one file may claim together, and the bytes claimed so far."""
 
     path: Path
     limit: int = MAX_LOGICAL_BYTES
@@ -44,7 +43,7 @@ class Budget:
     seen: set[str] = field(default_factory=set)
 
     def claim(self, where: str, size: int) -> None:
-        """Count `size` bytes of the array `where` once; `SessionError` beyond the limit."""
+        """Count the `size` bytes of the array `where`, once for each array; `SessionError` beyond the limit."""
         if where in self.seen:
             return
         self.seen.add(where)
@@ -60,7 +59,7 @@ class Budget:
 
 @contextlib.contextmanager
 def translated(path: Path, where: str) -> Iterator[None]:
-    """Turn whatever the HDF5 library raises into one `SessionError`."""
+    """Turn any error of the HDF5 library into one `SessionError`."""
     try:
         yield
     except SessionError:
@@ -68,11 +67,11 @@ def translated(path: Path, where: str) -> Iterator[None]:
     except UnicodeDecodeError as error:
         raise problem(path, where, "a text is not UTF-8", DAMAGED) from error
     except (OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise problem(path, where, f"HDF5 says {printable(error, 120)}", DAMAGED) from error
+        raise problem(path, where, f"HDF5 reports {printable(error, 120)}", DAMAGED) from error
 
 
 def check_file(path: Path) -> None:
-    """Refuse what is not a whole HDF5 file with checksums, without calling the library."""
+    """Refuse a file that is not a whole HDF5 file with checksums, without calling the library."""
     head = _first_bytes(path)
     if not head:
         raise problem(path, "file", "is empty", "check the recorder, or take another copy")
@@ -98,7 +97,7 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def _foreign_kind(head: bytes) -> tuple[str, str]:
-    """What a file without the HDF5 signature looks like, and what to do about it."""
+    """Kind of a file without the HDF5 signature, and what to do about it."""
     sessions = "give a session file (.h5)"
     if head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
         return "is a Python pickle, which could run any code", "it is never read; " + sessions
@@ -114,7 +113,7 @@ def _foreign_kind(head: bytes) -> tuple[str, str]:
 
 
 def _check_superblock(path: Path, head: bytes) -> None:
-    """Version, lengths, open flag and end of file, as in the HDF5 format, section II.A."""
+    """Check version, lengths, open flag and end of file (HDF5 file format specification, section II.A)."""
     if len(head) < 48:
         raise problem(path, "file", f"is truncated after {len(head)} bytes", DAMAGED)
     version, offsets, lengths, flags = head[8:12]
@@ -133,7 +132,7 @@ def _check_superblock(path: Path, head: bytes) -> None:
 
 
 def open_guarded(path: Path) -> h5py.File:
-    """The file, opened for reading after `check_file`; raises `SessionError`."""
+    """Open a file for reading after `check_file`; raises `SessionError`."""
     check_file(path)
     with translated(path, "file"):
         return h5py.File(path, "r", locking="best-effort", rdcc_nbytes=1 << 20)
@@ -141,7 +140,7 @@ def open_guarded(path: Path) -> h5py.File:
 
 @dataclass(frozen=True)
 class Node:
-    """A group or dataset that has been reached through the door: its file, its path, its handle."""
+    """A group or dataset that was reached by guarded access: its file, its path in it, and its handle."""
 
     path: Path
     where: str
@@ -153,7 +152,7 @@ class Node:
         return problem(self.path, self.where, what, todo)
 
     def child(self, name: str) -> "Node | None":
-        """The member `name`, or None; links to elsewhere are refused by name."""
+        """The member `name`, or None. A link to elsewhere is refused."""
         where = f"{self.where.rstrip('/')}/{name}"
         with translated(self.path, where):
             if not self.id.links.exists(name.encode()):
@@ -203,14 +202,14 @@ class Node:
             return sorted(n.decode() if isinstance(n, bytes) else n for n in found)
 
     def attribute(self, name: str) -> str | int | float | np.ndarray | None:
-        """The attribute's value, or None if it is not there; `SessionError` for other types."""
+        """Value of an attribute, or None if it is missing; `SessionError` for types that are not plain."""
         with translated(self.path, f"{self.where}@{name}"):
             if not h5a.exists(self.id, name.encode()):
                 return None
             return _attribute_value(self, name, h5a.open(self.id, name.encode()))
 
     def plain_attributes(self) -> dict[str, str | int | float]:
-        """Every attribute that is one number or one fixed-length text; others are left alone."""
+        """All attributes that are one number or one fixed-length text; others are ignored."""
         found = {}
         for name in self.attribute_names():
             with contextlib.suppress(ValueError):
@@ -220,7 +219,7 @@ class Node:
         return found
 
     def text(self, name: str, default: str | None = None) -> str:
-        """A text attribute; `SessionError` if it is missing (without default) or not a text."""
+        """Value of a text attribute; `SessionError` if it is missing without a default, or not a text."""
         value = self.attribute(name)
         if value is None and default is not None:
             return default
@@ -230,7 +229,7 @@ class Node:
         return value
 
     def number(self, name: str, default: float | None = None) -> float | int:
-        """A finite number attribute; `SessionError` if missing (without default) or not one."""
+        """Value of a number attribute; `SessionError` if it is missing without a default, or not a finite number."""
         value = self.attribute(name)
         if value is None and default is not None:
             return default
@@ -268,11 +267,11 @@ def plain_type(kind: h5t.TypeID) -> bool:
         return not kind.is_variable_str()
     if kind.get_class() not in (h5t.INTEGER, h5t.FLOAT) or kind.get_size() not in (1, 2, 4, 8):
         return False
-    return h5t.py_create(kind.dtype).equal(kind)
+    return bool(h5t.py_create(kind.dtype).equal(kind))
 
 
 def type_kind(kind: h5t.TypeID) -> str:
-    """A few words for an HDF5 type that is refused."""
+    """Describe an HDF5 type that is refused."""
     if kind.get_class() == h5t.STRING and kind.is_variable_str():
         return "a variable-length text"
     names = {

@@ -1,11 +1,11 @@
-"""Writing HDF5 the one way all our files are written.
+"""Write HDF5 files; all session and result files are written by these functions.
 
-Format bounds v110 (checksums on metadata), gzip 1 + shuffle + fletcher32 and chunks of about 256 kB
-on every dataset, fixed-length UTF-8 texts, no time stamps (same input, same bytes), and dimension
-scales, so that netCDF4, h5netcdf and xarray open the file. A file appears under its name only when
-it is whole.
+Format bounds are v110 (checksums on metadata). Every dataset has chunks of about 256 kB with gzip 1, shuffle and
+fletcher32. Texts are fixed-length UTF-8. There are no time stamps, so that equal input gives equal bytes.
+Dimension scales let netCDF4, h5netcdf and xarray open the file. A file appears under its name only when it is whole.
 """
 
+import abc
 import contextlib
 import functools
 import hashlib
@@ -14,24 +14,24 @@ import os
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
 from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 
-from calib.session.guard import MAX_ATTRIBUTE_BYTES
-from calib.session.model import printable, problem
+from .errors import printable, problem
+from .guard import MAX_ATTRIBUTE_BYTES
 
 CHUNK_BYTES = 256 << 10
 DIMENSION_NAME = "This is a netCDF dimension but not a netCDF variable. %9d"
-"""The name by which netCDF-4 knows a dimension scale that has no values of its own."""
+"""Name that netCDF-4 gives to a dimension scale without values."""
 
-Plain = str | bool | int | float | Sequence[str]
+AttributeValue = str | bool | int | float | Sequence[str]
 
 
 def file_hash(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of the file as hexadecimal digits, read in bounded pieces."""
+    """SHA-256 of a file as hexadecimal digits. The file is read in bounded pieces."""
     digest = hashlib.sha256()
     with open(path, "rb") as stream:
         while piece := stream.read(1 << 20):
@@ -41,9 +41,9 @@ def file_hash(path: str | os.PathLike[str]) -> str:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`: synced and renamed to it at the end, removed on failure."""
+    """Yield a temporary name beside `path`. The file is synced and renamed to `path`, or removed on failure."""
     if not path.parent.is_dir():
-        raise problem(path, "file", f"the folder {path.parent} does not exist", "create it first")
+        raise problem(path, "file", f"the folder {path.parent} does not exist", "create the folder first")
     if path.is_dir():
         raise problem(path, "file", "is a folder", "give a file name")
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp")
@@ -58,7 +58,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Bring a file, or the entries of a folder, to the disk; raises OSError."""
+    """Flush a file, or the entries of a folder, to the disk; raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -68,7 +68,7 @@ def sync(path: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn a failure to write (disk full, no permission) into one `SessionError`."""
+    """Turn a failed write (disk full, no permission) into one `SessionError`."""
     try:
         yield
     except OSError as error:
@@ -77,11 +77,11 @@ def writing(path: Path) -> Iterator[None]:
         raise problem(path, "file", what, todo) from error
 
 
-class _Sink(io.RawIOBase):
-    """The file that the HDF5 library writes to; it never learns that a disk is full.
+class _FailureTolerantFile(io.RawIOBase):
+    """File object for the HDF5 library that hides failed writes from it.
 
-    Told of a failed write, the library crashes when the process ends. So the first failure is kept
-    in `error`, what could not be written is remembered instead, and the writer raises it.
+    The library crashes at the end of the process if a write has failed. This object therefore keeps the first
+    failure in `error` and the data that could not be written in memory; the writer raises the failure by `check`.
     """
 
     def __init__(self, raw: io.FileIO):
@@ -91,17 +91,17 @@ class _Sink(io.RawIOBase):
         self.error: tuple[int, str] | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to `offset`; the end is that of what was meant to be written."""
+        """Move to `offset`. The end of the file includes data that could not be written."""
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
         self._at = base + offset
         return self._at
 
     def tell(self) -> int:
-        """Where the next read or write goes."""
+        """Position of the next read or write."""
         return self._at
 
     def write(self, data: Any) -> int:
-        """Write all of `data`, or remember it and why it could not be written."""
+        """Write all of `data`, or keep it in memory together with the failure."""
         view = memoryview(data).cast("B")
         if self.error is None:
             try:
@@ -115,11 +115,11 @@ class _Sink(io.RawIOBase):
         return len(view)
 
     def _note(self, error: OSError) -> None:
-        # not the exception itself: its traceback would keep library handles alive in a cycle
+        # The exception itself would keep library handles alive, in a cycle with its traceback.
         self.error = (error.errno or 0, error.strerror or "write failed")
 
     def check(self) -> None:
-        """Raise OSError if anything could not be written."""
+        """Raise OSError if a write has failed."""
         if self.error is not None:
             raise OSError(*self.error)
 
@@ -130,7 +130,7 @@ class _Sink(io.RawIOBase):
             done += self._raw.write(view[done:]) or 0
 
     def readinto(self, buffer: Any) -> int:
-        """Read back, from the file and from what could not be written to it."""
+        """Read from the file, and from the data that could not be written to it."""
         view = memoryview(buffer).cast("B")
         self._raw.seek(self._at)
         found = self._raw.read(len(view))
@@ -143,7 +143,7 @@ class _Sink(io.RawIOBase):
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the length, unless writing has failed already."""
+        """Set the length of the file, unless a write has failed already."""
         self._size = self._at if size is None else size
         if self.error is None:
             try:
@@ -153,8 +153,8 @@ class _Sink(io.RawIOBase):
         return self._size
 
 
-def _create(path: Path, sink: _Sink) -> h5py.File:
-    """An HDF5 file on `sink`: format bounds v110, no time stamps."""
+def _create(path: Path, sink: _FailureTolerantFile) -> h5py.File:
+    """Create an HDF5 file on `sink`, with format bounds v110 and without time stamps."""
     access = h5p.create(h5p.FILE_ACCESS)
     access.set_libver_bounds(h5f.LIBVER_V110, h5f.LIBVER_V110)
     access.set_fclose_degree(h5f.CLOSE_STRONG)
@@ -164,27 +164,65 @@ def _create(path: Path, sink: _Sink) -> h5py.File:
     return h5py.File(h5f.create(os.fsencode(path), h5f.ACC_TRUNC, creation, access))
 
 
-def _checked(path: Path, sink: _Sink) -> None:
+def _checked(path: Path, sink: _FailureTolerantFile) -> None:
     with writing(path):
         sink.check()
 
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
-    """A new HDF5 file that appears as `path` at a clean end, and not at all after an error.
+    """Create an HDF5 file that appears as `path` after a successful end, and not at all after an error.
 
-    Yields the file and a function that raises `SessionError` once a write has failed. Raises
-    `SessionError` if the folder or the disk does not allow it.
+    Yields the file, and a function that raises `SessionError` if a write has failed. Raises `SessionError` if the
+    folder or the disk does not allow the file.
     """
     with writing(path), replacing(path) as temporary, open(temporary, "xb+", buffering=0) as raw:
-        sink = _Sink(raw)
+        sink = _FailureTolerantFile(raw)
         with _create(path, sink) as file:
             yield file, functools.partial(_checked, path, sink)
         sink.check()
 
 
-def make_group(parent: h5py.Group, name: str, attrs: Mapping[str, Plain]) -> h5py.Group:
-    """A new group with attributes and without time stamps."""
+class FileWriter(abc.ABC):
+    """Base of writers that are context managers: the file appears only after a successful end."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._stack = contextlib.ExitStack()
+        self._file: h5py.File | None = None
+
+    @abc.abstractmethod
+    def _start(self, file: h5py.File) -> None:
+        """Write what is known at the beginning."""
+
+    @abc.abstractmethod
+    def _finish(self, file: h5py.File) -> None:
+        """Write what is known only at the end."""
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            self._file, self._check_disk = stack.enter_context(new_file(self.path))
+            self._start(self._file)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        with self._stack:
+            if error[1] is not None:
+                self._stack.__exit__(*error)
+            else:
+                self._finish(self._open())
+        self._file = None
+
+    def _open(self) -> h5py.File:
+        if self._file is None:
+            use = f"use it as `with {type(self).__name__}(...) as w`"
+            raise problem(self.path, "writer", "is not open", use)
+        return self._file
+
+
+def make_group(parent: h5py.Group, name: str, attrs: Mapping[str, AttributeValue]) -> h5py.Group:
+    """Create a group with attributes and without time stamps."""
     creation = h5p.create(h5p.GROUP_CREATE)
     creation.set_obj_track_times(False)
     group = h5py.Group(h5g.create(parent.id, name.encode(), None, creation))
@@ -192,8 +230,8 @@ def make_group(parent: h5py.Group, name: str, attrs: Mapping[str, Plain]) -> h5p
     return group
 
 
-def put_attributes(obj: h5py.Group | h5py.Dataset, attrs: Mapping[str, Plain]) -> None:
-    """Attributes as fixed-length UTF-8, u1 (bool), i8, f8, or a list of texts."""
+def put_attributes(obj: h5py.Group | h5py.Dataset, attrs: Mapping[str, AttributeValue]) -> None:
+    """Write attributes as fixed-length UTF-8, u1 (bool), i8, f8, or a list of texts."""
     for name, value in attrs.items():
         if isinstance(value, str | list | tuple):
             _put_text(obj, name, value)
@@ -221,7 +259,7 @@ def _put_text(obj: h5py.Group | h5py.Dataset, name: str, value: str | Sequence[s
 
 
 def chunk_shape(shape: Sequence[int], itemsize: int) -> tuple[int, ...]:
-    """Chunks of at most about 256 kB, split along the first axes first."""
+    """Shape of chunks of at most about 256 kB; the first axes are split first."""
     chunk = [max(1, n) for n in shape]
     for axis in range(len(chunk)):
         rest = int(np.prod(chunk[axis + 1 :], dtype=np.int64)) * itemsize
@@ -232,11 +270,11 @@ def chunk_shape(shape: Sequence[int], itemsize: int) -> tuple[int, ...]:
 
 
 def _creation(chunk: tuple[int, ...] | None, itemsize: int) -> h5p.PropDCID:
-    """Creation properties: no time stamps; chunks with filters, or compact for a scalar."""
+    """Creation properties without time stamps: chunks with filters, or compact storage for a scalar."""
     plist = h5p.create(h5p.DATASET_CREATE)
     plist.set_obj_track_times(False)
     if chunk is None:
-        plist.set_layout(h5d.COMPACT)  # in the object header, which has a checksum
+        plist.set_layout(h5d.COMPACT)  # stored in the object header, which has a checksum
         return plist
     plist.set_chunk(chunk)
     if itemsize > 1:
@@ -247,7 +285,7 @@ def _creation(chunk: tuple[int, ...] | None, itemsize: int) -> h5p.PropDCID:
 
 
 def _file_type(dtype: np.dtype) -> h5t.TypeID:
-    """Little-endian numbers, or fixed-length UTF-8."""
+    """HDF5 type: little-endian numbers, or fixed-length UTF-8."""
     if dtype.kind == "S":
         return h5t.py_create(h5py.string_dtype("utf-8", dtype.itemsize), logical=True)
     return h5t.py_create(dtype.newbyteorder("<"))
@@ -256,7 +294,7 @@ def _file_type(dtype: np.dtype) -> h5t.TypeID:
 def make_dataset(
     parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype, growing: bool = False
 ) -> h5py.Dataset:
-    """A new dataset as described above; `growing` lets the first axis be extended later."""
+    """Create a dataset; with `growing`, its first axis can be extended later."""
     dtype = np.dtype(dtype)
     maximum = (h5s.UNLIMITED, *shape[1:]) if growing else shape
     space = h5s.create_simple(shape, maximum) if shape else h5s.create(h5s.SCALAR)
@@ -265,37 +303,37 @@ def make_dataset(
     return h5py.Dataset(h5d.create(parent.id, name.encode(), kind, space, plist))
 
 
-def make_array(parent: h5py.Group, name: str, values: np.ndarray, attrs: Mapping[str, Plain]) -> h5py.Dataset:
-    """A dataset holding `values` at once."""
+def make_array(parent: h5py.Group, name: str, values: np.ndarray, attrs: Mapping[str, AttributeValue]) -> h5py.Dataset:
+    """Create a dataset that holds `values`."""
     values = np.asarray(values)
     dataset = make_dataset(parent, name, values.shape, values.dtype)
     if values.size:
-        dataset[...] = values.astype(dataset.dtype)  # texts: S in memory is ASCII to the library
+        dataset[...] = values.astype(dataset.dtype)  # the library takes the type S of texts in memory for ASCII
     put_attributes(dataset, attrs)
     return dataset
 
 
 def make_index(parent: h5py.Group, name: str, size: int) -> h5py.Dataset:
-    """The numbers 0..size-1 as the dimension scale `name`."""
+    """Create the dimension scale `name` with the numbers 0..size-1."""
     index = make_array(parent, name, np.arange(size, dtype="i4"), {"units": "1"})
     index.make_scale(name)
     return index
 
 
 def attach(dataset: h5py.Dataset, *scales: h5py.Dataset) -> None:
-    """Name the axes of `dataset` by these dimension scales."""
+    """Attach dimension scales to the axes of `dataset`, in order."""
     for axis, scale in enumerate(scales):
         dataset.dims[axis].attach_scale(scale)
 
 
 def text_array(texts: Sequence[str]) -> np.ndarray:
-    """Texts as fixed-length UTF-8 bytes, as wide as the longest."""
+    """Texts as fixed-length UTF-8 bytes; the longest text determines the length."""
     raw = [text.encode() for text in texts]
     return np.array(raw, dtype=f"S{max([1, *map(len, raw)])}")
 
 
 class GrowingArray:
-    """Rows appended to a dataset in whole chunks; at most one chunk waits in memory."""
+    """Dataset to which rows are appended in whole chunks; at most one chunk is kept in memory."""
 
     def __init__(self, parent: h5py.Group, name: str, tail: tuple[int, ...], dtype: np.dtype):
         self._parent, self._name, self._tail = parent, name, tail
@@ -308,15 +346,15 @@ class GrowingArray:
         self.dataset: h5py.Dataset | None = None
 
     def append(self, rows: np.ndarray) -> None:
-        """Add rows; the caller has checked their shape and range."""
+        """Append rows; the caller has checked their shape and range."""
         self._waiting.append(np.array(rows, self._dtype))
         self._rows_waiting += len(rows)
         self.rows += len(rows)
         if self._rows_waiting >= self._chunk_rows:
             self._write(self._rows_waiting - self._rows_waiting % self._chunk_rows)
 
-    def finish(self, attrs: Mapping[str, Plain]) -> h5py.Dataset:
-        """Write what waits, then the attributes."""
+    def finish(self, attrs: Mapping[str, AttributeValue]) -> h5py.Dataset:
+        """Write the remaining rows and the attributes."""
         self._write(self._rows_waiting)
         assert self.dataset is not None
         put_attributes(self.dataset, attrs)
@@ -325,7 +363,7 @@ class GrowingArray:
     def _write(self, count: int) -> None:
         block = np.concatenate([np.empty((0, *self._tail), self._dtype), *self._waiting])
         if self.dataset is None:
-            # Before any chunk is full the final size is known: a small file gets small chunks.
+            # A first write of less than a chunk is also the last one: a small file gets small chunks.
             rows = count if count < self._chunk_rows else self._chunk_rows
             shape = (rows, *self._tail)
             self.dataset = make_dataset(self._parent, self._name, shape, self._dtype, growing=True)

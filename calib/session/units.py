@@ -1,6 +1,9 @@
-"""Units: known by name, converted once, at the file's door."""
+"""Units of files: converted to SI once, when a value is read or imported."""
 
 from dataclasses import dataclass
+
+SECOND = 1_000_000_000
+"""ns; all time stamps are int64 nanoseconds."""
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2, exact by definition (3rd CGPM, 1901): a load of 1 g weighs 9.80665 mN."""
@@ -8,7 +11,7 @@ STANDARD_GRAVITY = 9.80665
 
 @dataclass(frozen=True)
 class Unit:
-    """``value_in_SI = factor * value + offset``, in the unit named `si`."""
+    """Conversion to the SI unit named `si`: ``value_in_SI = factor * value + offset``."""
 
     si: str
     factor: float = 1.0
@@ -54,7 +57,7 @@ UNITS = {
     "degC": Unit("K", 1.0, 273.15),
     "rad": Unit("rad"),
 }
-"""Every unit that is understood; ``g`` and ``kg`` are loads (gram-force), as scales print them."""
+"""All accepted units by name; ``g`` and ``kg`` are loads (gram-force), as scales display them."""
 
 VARIABLE_UNIT = {
     "voltage": "V",
@@ -64,6 +67,6 @@ VARIABLE_UNIT = {
     "temperature": "K",
     "counts": "1",
 }
-"""The SI unit that a main variable of this name must have."""
+"""SI unit that a main variable of this name must have."""
 
 KNOWN_UNITS = ", ".join(UNITS)

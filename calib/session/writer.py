@@ -1,6 +1,5 @@
 """Writing a session file: streams row by row, whole or not at all."""
 
-import contextlib
 import os
 import re
 import uuid
@@ -9,13 +8,26 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
+from numpy.typing import ArrayLike
 
-from calib.session.model import (
+from calib.session.errors import SessionError, printable, problem
+from calib.session.facts import SessionFacts, StreamFacts
+from calib.session.storage import (
+    AttributeValue,
+    FileWriter,
+    GrowingArray,
+    attach,
+    make_array,
+    make_group,
+    make_index,
+    put_attributes,
+    text_array,
+)
+from calib.session.tables import (
     CLOCK_ATTRIBUTES,
     FORMAT,
     PRESS_COLUMNS,
@@ -25,21 +37,7 @@ from calib.session.model import (
     Column,
     Events,
     PressTable,
-    SessionError,
     Status,
-    printable,
-    problem,
-)
-from calib.session.storage import (
-    GrowingArray,
-    Plain,
-    attach,
-    make_array,
-    make_group,
-    make_index,
-    new_file,
-    put_attributes,
-    text_array,
 )
 from calib.session.units import UNITS, VARIABLE_UNIT
 
@@ -66,109 +64,65 @@ class _Stream:
     dtype: np.dtype
     scale: float
     offset: float
-    attrs: dict[str, Plain]
+    attrs: dict[str, AttributeValue]
     columns: dict[str, GrowingArray]
     last: int | None = None
 
 
-class SessionWriter:
+class SessionWriter(FileWriter):
     """Write a session file; use it as a context manager.
 
-    ``path`` appears only when the block ends without an error, complete and synced to disk; after
-    an error nothing is left and an existing file is as it was. ``pattern`` (M, 4) holds zero-based
-    electrodes drive+, drive-, sense+, sense-; ``current`` in A, ``frequency`` in Hz, ``offset``
-    (M,) in s after the frame's time; ``epoch`` is a datetime with a time zone. A simulated session
-    must state ``scene`` and ``seed``. A recording that broke off is marked by ``complete=False``, one
-    made whole from what a crash left by ``recovered=True``. Two sessions of equal content, `session_id` and `epoch` are
-    equal byte by byte. Raises `SessionError` for what the format cannot hold.
+    The file appears only when the block ends without an error, complete and synced to disk; after an error nothing is
+    left, and an existing file is as it was. Two sessions of equal content, `session_id` and `epoch` are equal byte by
+    byte.
+
+    Raises:
+        SessionError: for what the format cannot hold.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        title: str,
-        skin_name: str,
-        skin_toml: str,
-        pattern: ArrayLike | None = None,
-        current: float | None = None,
-        frequency: float | None = None,
-        offset: ArrayLike | None = None,
-        epoch: datetime,
-        simulated: bool = False,
-        scene: str | None = None,
-        seed: int | None = None,
-        creator: str | None = None,
-        license: str = "",
-        session_id: str | None = None,
-        complete: bool = True,
-        recovered: bool = False,
-    ):
-        self.path = Path(path)
-        self._epoch = _utc(self.path, epoch)
-        if simulated and (scene is None or seed is None):
+    def __init__(self, path: str | os.PathLike[str], facts: SessionFacts):
+        super().__init__(Path(path))
+        self._epoch = _utc(self.path, facts.epoch)
+        if facts.simulated and (facts.scene is None or facts.seed is None):
             raise self._problem("scene", "a simulated session does not say how", "give scene, seed")
-        self._root: dict[str, Plain] = {
-            "format": FORMAT,
-            "format_version": VERSION,
-            "Conventions": "CF-1.11",
-            "NX_class": "NXroot",
-            "session_id": session_id or str(uuid.uuid4()),
-            "title": title,
-            "created_utc": self._epoch,
-            "time_epoch_utc": self._epoch,
-            "creator": creator or program(),
-            "license": license,
-            "recovered": bool(recovered),
-            "simulated": bool(simulated),
-        }
-        self._root |= {} if scene is None else {"scene": scene}
-        self._root |= {} if seed is None else {"seed": seed}
-        self._device = {"NX_class": "NXinstrument", "skin": skin_name, "skin_toml": skin_toml}
-        self._protocol = _protocol(self.path, pattern, current, frequency, offset)
+        self._facts = facts
+        self._protocol = _protocol(self.path, facts.pattern, facts.current, facts.frequency, facts.offset)
         self._streams: dict[str, _Stream] = {}
         self._presses: PressTable | None = None
         self._truth: dict[str, tuple[np.ndarray, str]] = {}
         self._events: list[Events] = []
         self._clocks: dict[str, ClockTable] = {}
-        self._complete = bool(complete)
-        self._stack = contextlib.ExitStack()
-        self._file: h5py.File | None = None
+
+    def _root(self) -> dict[str, AttributeValue]:
+        facts = self._facts
+        out: dict[str, AttributeValue] = {
+            "format": FORMAT,
+            "format_version": VERSION,
+            "Conventions": "CF-1.11",
+            "NX_class": "NXroot",
+            "session_id": facts.session_id or str(uuid.uuid4()),
+            "title": facts.title,
+            "created_utc": self._epoch,
+            "time_epoch_utc": self._epoch,
+            "creator": facts.creator or program(),
+            "license": facts.license,
+            "recovered": bool(facts.recovered),
+            "simulated": bool(facts.simulated),
+        }
+        out |= {} if facts.scene is None else {"scene": facts.scene}
+        return out | ({} if facts.seed is None else {"seed": facts.seed})
 
     def _problem(self, where: str, what: str, todo: str) -> SessionError:
         return problem(self.path, where, what, todo)
 
     # --- the file's life -----------------------------------------------------------------------
 
-    def __enter__(self) -> "SessionWriter":
-        with contextlib.ExitStack() as stack:
-            self._file, self._check_disk = stack.enter_context(new_file(self.path))
-            put_attributes(self._file, self._root)
-            self._write_device(self._file)
-            make_group(self._file, "streams", {"NX_class": "NXcollection"})
-            self._stack = stack.pop_all()
-        return self
+    def _start(self, file: h5py.File) -> None:
+        put_attributes(file, self._root())
+        self._write_device(file)
+        make_group(file, "streams", {"NX_class": "NXcollection"})
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with self._stack:
-            if error is not None:
-                self._stack.__exit__(kind, error, trace)
-            else:
-                self._finish()
-        self._file = None
-
-    def _open(self) -> h5py.File:
-        if self._file is None:
-            raise self._problem("writer", "is not open", "use it as `with SessionWriter(...) as w`")
-        return self._file
-
-    def _finish(self) -> None:
-        file = self._open()
+    def _finish(self, file: h5py.File) -> None:
         if not self._streams:
             raise self._problem("/streams", "the session has no stream", "add at least one")
         for stream in self._streams.values():
@@ -177,12 +131,13 @@ class SessionWriter:
         self._write_events(file)
         self._write_truth(file)
         self._write_clocks(file)
-        put_attributes(file, {"complete": self._complete})
+        put_attributes(file, {"complete": bool(self._facts.complete)})
 
     # --- what the session is about -------------------------------------------------------------
 
     def _write_device(self, file: h5py.File) -> None:
-        device = make_group(file, "device", self._device)
+        about = {"NX_class": "NXinstrument", "skin": self._facts.skin_name, "skin_toml": self._facts.skin_toml}
+        device = make_group(file, "device", about)
         if not self._protocol:
             return
         numbers = {k: v for k, v in self._protocol.items() if isinstance(v, float)}
@@ -203,46 +158,34 @@ class SessionWriter:
 
     # --- streams -------------------------------------------------------------------------------
 
-    def add_stream(
-        self,
-        name: str,
-        variable: str,
-        *,
-        units: str,
-        channels: int,
-        rate_hz: float,
-        dtype: DTypeLike = "f4",
-        scale_factor: float | None = None,
-        add_offset: float | None = None,
-        long_name: str = "",
-        clock: str = "host",
-        transport: str = "",
-    ) -> None:
-        """Declare a stream of `channels` columns in SI `units`, nominally at `rate_hz` (Hz).
+    def add_stream(self, name: str, facts: StreamFacts) -> None:
+        """Declare a stream.
 
-        Integer types are packed as ``stored = (value - add_offset) / scale_factor`` (CF), their
+        Values are in SI units. Integer types are packed as ``stored = (value - add_offset) / scale_factor`` (CF), their
         lowest number meaning missing.
         """
-        where, dtype = f"/streams/{name}", np.dtype(dtype)
+        where, dtype = f"/streams/{name}", np.dtype(facts.dtype)
+        variable, channels = facts.variable, facts.channels
         for text in (name, variable):
             if not NAME.fullmatch(text) or text in RESERVED or name in self._streams:
                 raise self._problem(where, f"name {text!r} cannot be used", "use a new plain name")
-        self._check_units(where, variable, units)
+        self._check_units(where, variable, facts.units)
         kind = f"{dtype.kind}{dtype.itemsize}"
-        if kind not in STREAM_TYPES or channels < 1 or not np.isfinite(rate_hz) or rate_hz <= 0:
-            what = f"{channels} channels of {kind} at {rate_hz} Hz cannot be stored"
+        if kind not in STREAM_TYPES or channels < 1 or not np.isfinite(facts.rate_hz) or facts.rate_hz <= 0:
+            what = f"{channels} channels of {kind} at {facts.rate_hz} Hz cannot be stored"
             raise self._problem(where, what, f"use {sorted(STREAM_TYPES)}, >= 1 channel, a rate > 0")
-        scale, offset = self._packing(where, dtype, units, scale_factor, add_offset)
-        attrs: dict[str, Plain] = {"NX_class": "NXdata", "signal": variable}
+        scale, offset = self._packing(where, dtype, facts)
+        attrs: dict[str, AttributeValue] = {"NX_class": "NXdata", "signal": variable}
         attrs["axes"] = ["time", "channel"]
-        attrs |= {"nominal_rate_hz": float(rate_hz), "clock": clock, "transport": transport}
+        attrs |= {"nominal_rate_hz": float(facts.rate_hz), "clock": facts.clock, "transport": facts.transport}
         group = make_group(self._open()["streams"], name, attrs)
         columns = {
             "time": GrowingArray(group, "time", (), np.dtype("i8")),
             variable: GrowingArray(group, variable, (channels,), dtype),
             "status": GrowingArray(group, "status", (), np.dtype("u2")),
         }
-        about: dict[str, Plain] = {"units": units, "long_name": long_name or f"{name} {variable}"}
+        about: dict[str, AttributeValue] = {"units": facts.units}
+        about["long_name"] = facts.long_name or f"{name} {variable}"
         self._streams[name] = _Stream(group, variable, channels, dtype, scale, offset, about, columns)
 
     def _check_units(self, where: str, variable: str, units: str) -> None:
@@ -252,9 +195,8 @@ class SessionWriter:
             todo = f"convert it to {UNITS[units].si if units in UNITS else expected} before writing"
             raise self._problem(where, what, todo)
 
-    def _packing(
-        self, where: str, dtype: np.dtype, units: str, scale: float | None, offset: float | None
-    ) -> tuple[float, float]:
+    def _packing(self, where: str, dtype: np.dtype, facts: StreamFacts) -> tuple[float, float]:
+        units, scale, offset = facts.units, facts.scale_factor, facts.add_offset
         if dtype.kind == "f" and (scale is not None or offset is not None):
             raise self._problem(where, "floats are not packed", "leave scale_factor, add_offset out")
         if dtype.kind == "i" and scale is None and units != "1":
@@ -379,7 +321,7 @@ class SessionWriter:
 
     def set_truth(self, truth: Mapping[str, tuple[ArrayLike, str]]) -> None:
         """What was simulated: name -> (numbers, units). Only a simulated session has a truth."""
-        if not self._root["simulated"]:
+        if not self._facts.simulated:
             raise self._problem("/truth", "is for simulated sessions", "give simulated=True")
         for name, (values, units) in truth.items():
             array = np.asarray(values)
@@ -490,7 +432,7 @@ def _protocol(
     current: float | None,
     frequency: float | None,
     offset: ArrayLike | None,
-) -> dict:
+) -> dict[str, Any]:
     """The protocol's arrays and numbers, checked; empty without a pattern."""
     if pattern is None:
         if current is not None or frequency is not None or offset is not None:
@@ -501,7 +443,7 @@ def _protocol(
         raise problem(path, "pattern", f"has shape {array.shape}", "give (M, 4) integers")
     if array.min() < 0 or array.max() > np.iinfo("i2").max:
         raise problem(path, "pattern", "names impossible electrodes", "count electrodes from 0")
-    found: dict = {"pattern": array.astype("i2")}
+    found: dict[str, Any] = {"pattern": array.astype("i2")}
     for name, value in (("current", current), ("frequency", frequency)):
         if value is not None:
             found[name] = float(value)

@@ -1,10 +1,11 @@
 """Effects: departures from the ideal sensor, one small class each, listed in a scene one by one.
 
-An effect that a scene does not list is neither computed nor compiled.  To add one: a class in the
-file of its family, a line here, a row in tests/test_effects.py.
+An effect that a scene does not list is neither computed nor compiled.  A new effect is one class in the file of its
+family, or in a file of its own, and its import here: `EFFECTS`, scene files and the tests find it from there.
 """
 
-from ._base import (
+from ..registry import Registry
+from .base import (
     AbstractClockEffect,
     AbstractCoatEffect,
     AbstractContactEffect,
@@ -20,18 +21,19 @@ from ._base import (
     AbstractStageEffect,
     AbstractTerminalEffect,
     Circuit,
+    Indenter,
     Line,
     Packets,
     Path,
     Sheet,
-    Stream,
-    Touch,
+    StreamKind,
     chosen,
     fold,
     history,
     history_start,
     keys,
     laid,
+    parameter,
 )
 from .clocks import ClockError, DropOut
 from .coating import ContinuousCoating
@@ -71,47 +73,8 @@ from .readout import (
     ScanSkew,
 )
 
-EFFECTS: dict[str, type[AbstractEffect]] = {
-    effect.__name__: effect
-    for effect in (
-        StageError,
-        LoadSpreading,
-        IndentationSpreading,
-        Creep,
-        Hysteresis,
-        CoatingNonUniformity,
-        SheetTemperature,
-        ContactGain,
-        ProtrusionGrid,
-        ContactPiezoresistance,
-        HomogenisedIslands,
-        ContinuousCoating,
-        ContactScatter,
-        ElectrodeFault,
-        CommonMode,
-        PadEdgeDip,
-        PadCrosstalk,
-        TpuRelaxation,
-        GasLaw,
-        GasRelaxation,
-        PadTemperature,
-        PadLeak,
-        SensorError,
-        ScanSkew,
-        IntermittentElectrode,
-        MuxSettling,
-        BaselineDrift,
-        GainError,
-        LoadCellError,
-        MultiplicativeNoise,
-        Noise,
-        PinkNoise,
-        Quantisation,
-        AdcRanges,
-        ClockError,
-        DropOut,
-    )
-}
+EFFECTS = Registry(AbstractEffect, "effect", "jaxeit.effects", spell=str)
+"""All effects by the names that scene files use: those of the class."""
 
 __all__ = [
     "EFFECTS",
@@ -148,6 +111,7 @@ __all__ = [
     "HomogenisedIslands",
     "Hysteresis",
     "IndentationSpreading",
+    "Indenter",
     "IntermittentElectrode",
     "Line",
     "LoadCellError",
@@ -169,8 +133,7 @@ __all__ = [
     "Sheet",
     "SheetTemperature",
     "StageError",
-    "Stream",
-    "Touch",
+    "StreamKind",
     "TpuRelaxation",
     "chosen",
     "fold",
@@ -178,4 +141,5 @@ __all__ = [
     "history_start",
     "keys",
     "laid",
+    "parameter",
 ]

@@ -1,15 +1,15 @@
-"""Clocks and links: when a sample says it was taken, when it arrives, and whether it does."""
+"""Clocks and links: the time stamps of samples, their arrival at the host, and losses on the way."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
-from ._base import AbstractClockEffect, Stream, parameter
+from .base import AbstractClockEffect, Packets, StreamKind, parameter
 
 
 class ClockError(AbstractClockEffect):
-    """The device's clock runs on its own, and what it sends arrives late.
+    """The device's clock is independent of the host's, and samples arrive late.
 
     ``device <- (1 + skew) device + offset``; ``host <- host + latency + x``, x exponential with mean ``jitter``,
     no earlier in a block than the sample before; where ``batch`` is not 0, at the next whole multiple of it.
@@ -28,9 +28,9 @@ class ClockError(AbstractClockEffect):
     latency: Float[Array, ""] = parameter(1e-3)
     jitter: Float[Array, ""] = parameter(5e-4)
     batch: Float[Array, ""] = parameter(0.0)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, packets, key):
+    def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:
         late = jax.random.exponential(key, packets.host.shape, jnp.float32).astype(packets.host.dtype)
         sent = jax.lax.cummax(packets.host + self.latency + self.jitter * late)
         period = jnp.where(self.batch > 0, self.batch, 1)
@@ -47,8 +47,8 @@ class DropOut(AbstractClockEffect):
     """
 
     probability: Float[Array, ""] = parameter(1e-3)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, packets, key):
+    def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:
         lost = jax.random.uniform(key, packets.lost.shape, jnp.float32) < self.probability
         return packets._replace(lost=packets.lost | lost)

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from ._base import AbstractCoatEffect, Sheet, parameter
+from .base import AbstractCoatEffect, Sheet, parameter
 from .material import power
 
 
@@ -12,12 +12,12 @@ class ContinuousCoating(AbstractCoatEffect):
     """The metal is one sheet, not islands: pressed places far apart are joined through it.
 
     Sheet and metal, with potentials u and m, exchange current where they are pressed together
-    (`jaxeit.coat`):
+    (`jaxeit.model.metal_sheet`):
 
         ``-div(sigma grad u) + g (u - m) = 0``,  ``-div(grad m) / R_m + g (m - u) = 0``,
         ``g = f / rho``,  ``rho = rho_r (p / p_r)^-n``.
 
-    Stands for `ContactPiezoresistance` and `HomogenisedIslands`, which are local: list one of the
+    It replaces `ContactPiezoresistance` and `HomogenisedIslands`, which are local: list one of the
     three.  The metal has no contact to any electrode.
 
     | meaning                                    | default | range      | unit    | source              |

@@ -5,12 +5,12 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._base import AbstractContactEffect, AbstractTerminalEffect, Circuit, parameter
-from ._chance import own_normal
+from .base import AbstractContactEffect, AbstractTerminalEffect, Circuit, parameter
+from .random import own_normal
 
 
 class ContactScatter(AbstractContactEffect):
-    """No two bolts touch alike: contact conductances vary from electrode to electrode, log-normally.
+    """Contact conductances vary from electrode to electrode, log-normally.
 
     ``g <- g exp(std n)``; perfect contacts stay perfect.
 
@@ -23,7 +23,7 @@ class ContactScatter(AbstractContactEffect):
     std: Float[Array, ""] = parameter(0.5)
     seed: Int[Array, ""] = parameter(0)
 
-    def __call__(self, contact):
+    def __call__(self, contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
         return contact * jnp.exp(self.std * own_normal(self, self.seed, contact.shape, contact.dtype))
 
 
@@ -51,7 +51,7 @@ class ElectrodeFault(AbstractTerminalEffect):
     compliance: Float[Array, ""] = parameter(5.0)
     input_resistance: Float[Array, ""] = parameter(1e7)
 
-    def __call__(self, voltage, circuit):
+    def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:
         lost = self.electrode
         wired = circuit._replace(z=circuit.z.at[lost, lost].add(self.resistance))
         source, _, plus, minus = circuit.pattern.T
@@ -88,7 +88,7 @@ class CommonMode(AbstractTerminalEffect):
 
     gain: Float[Array, ""] = parameter(1e-3)
 
-    def __call__(self, voltage, circuit):
+    def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:
         source, _, plus, minus = circuit.pattern.T
         mean = (_potential(circuit, plus, source) + _potential(circuit, minus, source)) / 2
         return voltage + self.gain * circuit.current * mean
@@ -97,12 +97,12 @@ class CommonMode(AbstractTerminalEffect):
 def _potential(
     circuit: Circuit, at: Int[Array, " readings"], into: Int[Array, " readings"]
 ) -> Float[Array, " readings"]:
-    """Above drive-, per ampere into one electrode and out at drive-, in ohm."""
+    """Potential above drive-, per ampere into one electrode and out at drive-, in ohm."""
     z, sink = circuit.z, circuit.pattern[:, 1]
     return (z[at, into] - z[sink, into]) - (z[at, sink] - z[sink, sink])
 
 
 def _difference(circuit: Circuit, into: Int[Array, " readings"]) -> Float[Array, " readings"]:
-    """Of sense+ above sense-, per ampere into one electrode and out at drive-, in ohm."""
+    """Voltage of sense+ above sense-, per ampere into one electrode and out at drive-, in ohm."""
     z, (_, sink, plus, minus) = circuit.z, circuit.pattern.T
     return (z[plus, into] - z[minus, into]) - (z[plus, sink] - z[minus, sink])

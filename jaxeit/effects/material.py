@@ -8,11 +8,15 @@ import jax.numpy as jnp
 from jax.scipy.special import i0e, i1e
 from jaxtyping import Array, Float, Int
 
-from ._base import AbstractMemoryEffect, AbstractSheetEffect, Sheet, parameter
-from ._chance import own_field
+from ..registry import computed
+from .base import AbstractMemoryEffect, AbstractSheetEffect, Line, Series, Sheet, State, parameter
+from .random import own_field
 
-_PLAYS = 8  # steps in which a loop of hysteresis opens
-_TERMS = 8  # of a continued fraction: exact to rounding where it is used
+PLAY_OPERATORS = 8
+"""Number of steps in which a hysteresis loop opens."""
+
+FRACTION_TERMS = 8
+"""Terms of a continued fraction, which is exact to rounding where it is used."""
 
 
 class CoatingNonUniformity(AbstractSheetEffect):
@@ -28,16 +32,16 @@ class CoatingNonUniformity(AbstractSheetEffect):
     std: Float[Array, ""] = parameter(0.15)
     length: Float[Array, ""] = parameter(30e-3)
     seed: Int[Array, ""] = parameter(0)
-    field: Float[Array, " elements"] | None = None  # set by `laid`
+    field: Float[Array, " elements"] | None = computed()  # by `laid`
 
     def __call__(self, sheet: Sheet) -> Sheet:
         field = self._field(sheet.centroids)
         return sheet._replace(sigma=sheet.sigma * jnp.exp(self.std * field))
 
-    def laid(self, centroids):
+    def laid(self, centroids: Float[Array, "elements 2"]) -> "CoatingNonUniformity":
         return dataclasses.replace(self, field=self._field(centroids))
 
-    def _field(self, places):
+    def _field(self, places: Float[Array, "places 2"]) -> Float[Array, " places"]:
         return own_field(self, self.seed, self.length, places) if self.field is None else self.field
 
 
@@ -56,16 +60,16 @@ class ContactGain(AbstractSheetEffect):
     std: Float[Array, ""] = parameter(0.12)
     length: Float[Array, ""] = parameter(15e-3)
     seed: Int[Array, ""] = parameter(0)
-    field: Float[Array, " elements"] | None = None  # set by `laid`
+    field: Float[Array, " elements"] | None = computed()  # by `laid`
 
     def __call__(self, sheet: Sheet) -> Sheet:
         field = self._field(sheet.centroids)
         return sheet._replace(pressure=sheet.pressure * jnp.exp(self.std * field))
 
-    def laid(self, centroids):
+    def laid(self, centroids: Float[Array, "elements 2"]) -> "ContactGain":
         return dataclasses.replace(self, field=self._field(centroids))
 
-    def _field(self, places):
+    def _field(self, places: Float[Array, "places 2"]) -> Float[Array, " places"]:
         return own_field(self, self.seed, self.length, places) if self.field is None else self.field
 
 
@@ -180,9 +184,9 @@ class SheetTemperature(AbstractSheetEffect):
 class Creep(AbstractMemoryEffect):
     """A contact grows with its age: the sheet feels ``load (1 + c log10(1 + age / t0))``.
 
-    Age is the mean over the load of how long it has been there: what is added is new, what is taken
-    away had the mean age, and a contact lifted has none.  After a step this is the logarithmic creep
-    of printed force sensors; it leaves nothing behind at zero load.
+    Age is the mean over the load of the time that it has been there: added load is new, removed load
+    had the mean age, and a lifted contact has no age.  After a step this is the logarithmic creep
+    of printed force sensors; nothing remains at zero load.
 
     | meaning                            | default | range      | unit | source                           |
     |------------------------------------|---------|------------|------|----------------------------------|
@@ -193,14 +197,14 @@ class Creep(AbstractMemoryEffect):
     rate: Float[Array, ""] = parameter(0.05)
     onset: Float[Array, ""] = parameter(0.1)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros_like(first)
 
-    def __call__(self, series, state, line):
-        def older(state, load):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+        def older(state: tuple[Array, Array], load: Array) -> tuple[tuple[Array, Array], Array]:
             before, age = state
             grown = load > before
-            old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)  # share of it that was there before
+            old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)  # share of the load that was there before
             age = jnp.where(load > 0, old * (age + line.interval.astype(age.dtype)), 0.0)
             return (load, age), age
 
@@ -209,7 +213,7 @@ class Creep(AbstractMemoryEffect):
 
 
 class Hysteresis(AbstractMemoryEffect):
-    """On its way down a load is felt more than on its way up, at any speed: a Prandtl-Ishlinskii sum.
+    """The sheet feels a falling load more than a rising one, at any speed: a Prandtl-Ishlinskii sum.
 
     The operators play in the logarithm of the load, so that the loop is a share of the load and
     closes at zero load.  Each has an excess e over the way up,
@@ -217,7 +221,7 @@ class Hysteresis(AbstractMemoryEffect):
         ``e_i <- clip(e_i + ln(load before / load), 0, r_i)``,  ``felt = load exp(w sum of e_i)``,
 
     with evenly spaced ``r_i`` up to ``ln(reach)`` and w such that all of them open the loop by
-    ``loop``.  A rising load is felt as it is.
+    ``loop``.  A rising load is felt unchanged.
 
     | meaning                                          | default | range     | unit | source              |
     |--------------------------------------------------|---------|-----------|------|---------------------|
@@ -228,13 +232,13 @@ class Hysteresis(AbstractMemoryEffect):
     loop: Float[Array, ""] = parameter(0.1)
     reach: Float[Array, ""] = parameter(4.0)
 
-    def start(self, first):
-        return _logarithm(first), jnp.zeros((_PLAYS, *first.shape), first.dtype)
+    def start(self, first: Float[Array, " channels"]) -> State:
+        return _logarithm(first), jnp.zeros((PLAY_OPERATORS, *first.shape), first.dtype)
 
-    def __call__(self, series, state, line):
-        widths = jnp.log(self.reach) * jnp.arange(1, _PLAYS + 1).astype(series.dtype)[:, None] / _PLAYS
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+        widths = jnp.log(self.reach) * jnp.arange(1, PLAY_OPERATORS + 1).astype(series.dtype)[:, None] / PLAY_OPERATORS
 
-        def play(state, log):
+        def play(state: tuple[Array, Array], log: Array) -> tuple[tuple[Array, Array], Array]:
             before, excess = state
             excess = jnp.clip(excess + (before - log), 0, widths)
             return (log, excess), jnp.sum(excess, 0)
@@ -244,7 +248,7 @@ class Hysteresis(AbstractMemoryEffect):
 
 
 def _logarithm(load: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Its logarithm; no load is one too small to matter."""
+    """Logarithm of the load; no load counts as one too small to matter."""
     return jnp.log(jnp.maximum(load, jnp.finfo(load.dtype).tiny))
 
 
@@ -272,7 +276,7 @@ def _island_dipole(square: Float[Array, " elements"]) -> Float[Array, " elements
     small = square < 1
     quarter = jnp.where(small, square, 0.0) / 4
     tail = jnp.zeros_like(quarter)
-    for n in range(_TERMS, 1, -1):
+    for n in range(FRACTION_TERMS, 1, -1):
         tail = quarter / (n + tail)
     k = jnp.sqrt(jnp.where(small, 1.0, square))
     return jnp.where(small, tail / (1 + tail), 1 - 2 * i1e(k) / (k * i0e(k)))

@@ -5,16 +5,17 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
-from ._base import AbstractLoadEffect, AbstractStageEffect, Touch, parameter
-from ._chance import normal
+from .base import AbstractLoadEffect, AbstractStageEffect, Indenter, Path, parameter
+from .random import normal
 
-_DIRECTIONS = np.cos(np.pi * (np.arange(32) + 0.5) / 32)  # error 3e-6 of the pressure at depth a / 5
+RIM_COSINES = np.cos(np.pi * (np.arange(32) + 0.5) / 32)
+"""Cosines of the directions in which a rim is sampled; the error is 3e-6 of the pressure at depth a / 5."""
 
 
 class StageError(AbstractStageEffect):
-    """No stage goes where and when it is told: each press has its own errors, all normal.
+    """The stage misses its target places and times: each press has its own errors, all normal.
 
     ``place <- place + position n``, ``delay <- delay + jitter n``, ``pace <- pace exp(ripple n)``
 
@@ -29,7 +30,7 @@ class StageError(AbstractStageEffect):
     jitter: Float[Array, ""] = parameter(5e-3)
     ripple: Float[Array, ""] = parameter(0.02)
 
-    def __call__(self, path, key):
+    def __call__(self, path: Path, key: Key[Array, ""]) -> Path:
         place, start, speed = jax.random.split(key, 3)
         return path._replace(
             places=path.places + self.position * normal(place, path.places),
@@ -42,7 +43,7 @@ class LoadSpreading(AbstractLoadEffect):
     """The pad spreads the load: the tip's pressure arrives as a Gaussian.
 
     ``p / load = exp(-r^2 / (2 s^2)) / (2 pi s^2)``, whose integral over the plane is one; the part
-    that falls outside the sheet is carried by the frame and lost, not renormalised.
+    that falls outside the sheet is carried by the frame and lost; the rest is not renormalised.
 
     | meaning                                  | default | range   | unit | source          |
     |------------------------------------------|---------|---------|------|-----------------|
@@ -54,7 +55,9 @@ class LoadSpreading(AbstractLoadEffect):
 
     width: Float[Array, ""] = parameter(12e-3)
 
-    def __call__(self, spread, touch: Touch, centroids):
+    def __call__(
+        self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]
+    ) -> Float[Array, " elements"]:
         square = jnp.sum((centroids - touch.centre) ** 2, -1)
         return jnp.exp(-0.5 * square / self.width**2) / (2 * jnp.pi * self.width**2)
 
@@ -81,12 +84,14 @@ class IndentationSpreading(AbstractLoadEffect):
 
     depth: Float[Array, ""] = parameter(10e-3)
 
-    def __call__(self, spread, touch: Touch, centroids):
+    def __call__(
+        self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]
+    ) -> Float[Array, " elements"]:
         a, z = touch.diameter / 2, self.depth
         square = jnp.sum((centroids - touch.centre) ** 2, -1)
         off = square > 0  # the root has no slope on the axis, where the pressure has none either
         r = jnp.where(off, jnp.sqrt(jnp.where(off, square, 1.0)), 0.0)[:, None]
-        cosine = jnp.asarray(_DIRECTIONS, r.dtype)
+        cosine = jnp.asarray(RIM_COSINES, r.dtype)
         rim = a**2 + square[:, None] - 2 * a * r * cosine
         distance = jnp.sqrt(rim + z**2)
         kernel = (distance**2 + distance * z + z**2) / (distance**3 * (distance + z))

@@ -1,8 +1,8 @@
 """Pneumatics: from the pressure on a pad to the pressure in it.
 
-A pad's load is shared by the gas and by the structure around it.  The series that the history effects are
-given is what an ideal pad would show: isothermal, at rest at all times, linear and sealed.  Each effect takes
-what the others describe as ideal.
+The gas in a pad and the structure around it share the load.  The history effects are given the series of an
+ideal pad: isothermal, always at rest, linear and sealed.  Each effect assumes that everything which the other
+effects describe is ideal.
 """
 
 from typing import ClassVar
@@ -10,10 +10,10 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, DTypeLike, Float, Int
 
-from ._base import AbstractPadEffect, AbstractPneumaticEffect, parameter
-from ._chance import own_normal
+from .base import AbstractPadEffect, AbstractPneumaticEffect, Line, Series, State, parameter
+from .random import own_normal
 
 
 class PadEdgeDip(AbstractPadEffect):
@@ -28,25 +28,27 @@ class PadEdgeDip(AbstractPadEffect):
     depth: Float[Array, ""] = parameter(0.4)
     width: Float[Array, ""] = parameter(10e-3)
 
-    def __call__(self, response, distance):
+    def __call__(
+        self, response: Float[Array, "pads elements"], distance: Float[Array, "pads elements"]
+    ) -> Float[Array, "pads elements"]:
         return response * (1 - self.depth * jnp.exp(-distance / self.width))
 
 
 class PadCrosstalk(AbstractPneumaticEffect):
-    """Pads share walls: each feels its own pressure and a fraction of the mean of the others'.
+    """Pads share walls: each feels its own pressure and a fraction of the mean of the other pads' pressures.
 
-    A series does not say which pads are neighbours: all others count alike, as they nearly do in a square of four.
+    A series does not tell which pads are neighbours: all other pads count alike, as they nearly do in a square of four.
 
     | meaning                         | default | range    | unit | source     |
     |---------------------------------|---------|----------|------|------------|
     | fraction of the others' mean    | 0.02    | 0 to 0.1 | 1    | assumption |
     """
 
-    rank: ClassVar[int] = -4  # a matter of the load on the pad, before anything in it
+    rank: ClassVar[int] = -4  # acts on the load, before everything in the pad
 
     fraction: Float[Array, ""] = parameter(0.02)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         others = (series.sum(1, keepdims=True) - series) / max(series.shape[1] - 1, 1)
         return series + self.fraction * others, state
 
@@ -72,15 +74,15 @@ class TpuRelaxation(AbstractPneumaticEffect):
     times: Float[Array, " elements"] = eqx.field(converter=jnp.asarray, default=(0.1, 1.0, 10.0))
     gas_share: Float[Array, ""] = parameter(0.5)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros((self.times.size, first.size), first.dtype)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         excess = (1 - self.gas_share) * self.shares / (1 - self.shares.sum())
         weight = excess.astype(series.dtype)[:, None]
         keep, gain = (part[:, None] for part in _relaxation(line.interval, self.times, series.dtype))
 
-        def step(state, ideal):
+        def step(state: tuple[Array, Array], ideal: Array) -> tuple[tuple[Array, Array], Array]:
             before, h = state
             left = ideal - (weight * (keep * h - gain * before)).sum(0)
             now = left / (1 + (weight * gain).sum())
@@ -96,7 +98,7 @@ class GasLaw(AbstractPneumaticEffect):
     The structure gives way by its compliance C under what the gas does not carry, so that the gas's share of a
     small load is ``s = C / (C + V0 / P0)`` and the ideal pressure p makes a compression ``y = dV / V0`` with
     ``p / P0 = s y / (1 - y) + (1 - s) y``.  Its smaller root gives ``P = P0 y / (1 - y)``, which is p for small p,
-    and for every p where the gas carries all.  `GasRelaxation` has what comes before the temperature is even.
+    and for every p where the gas carries all.  `GasRelaxation` describes the time before temperatures are equal.
 
     | meaning                               | default | range       | unit   | source                       |
     |---------------------------------------|---------|-------------|--------|------------------------------|
@@ -111,7 +113,7 @@ class GasLaw(AbstractPneumaticEffect):
     compliance: Float[Array, ""] = parameter(7e-10)
     pressure: Float[Array, ""] = parameter(101325.0)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         structure = 1 / (1 + self.compliance * self.pressure / self.volume)
         q = series / self.pressure
         y = 2 * q / (1 + q + jnp.sqrt((1 + q) ** 2 - 4 * structure * q))
@@ -119,7 +121,7 @@ class GasLaw(AbstractPneumaticEffect):
 
 
 class GasRelaxation(AbstractPneumaticEffect):
-    """Squeezed quickly, the gas warms, is stiffer, and cools to its walls: adiabatic at first, isothermal in the end.
+    """A quick squeeze warms the gas, which then cools to its walls: adiabatic at first, isothermal in the end.
 
     With s the gas's share of a lasting load, p the ideal pressure and P that in the gas, ``P = p + (1 - s) e``,
     where the warmth's pressure follows ``m e' = (gamma - 1) p' - e / tau``, ``m = 1 + s (gamma - 1)``: exactly for a
@@ -138,10 +140,10 @@ class GasRelaxation(AbstractPneumaticEffect):
     heat_ratio: Float[Array, ""] = parameter(1.4)
     gas_share: Float[Array, ""] = parameter(0.5)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros_like(first)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         stiffer = 1 + self.gas_share * (self.heat_ratio - 1)
         warmth, state = _transient(series, state, line.interval, stiffer * self.time)
         return series + (1 - self.gas_share) * (self.heat_ratio - 1) / stiffer * warmth, state
@@ -161,7 +163,7 @@ class PadTemperature(AbstractPneumaticEffect):
     sensitivity: Float[Array, ""] = parameter(346.0)
     barometer: Float[Array, ""] = parameter(1.0)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         shift = self.sensitivity * line.temperature - self.barometer * line.barometer
         return series + shift.astype(series.dtype)[:, None], state
 
@@ -169,7 +171,7 @@ class PadTemperature(AbstractPneumaticEffect):
 class PadLeak(AbstractPneumaticEffect):
     """A pad leaks: ``P' = p' - P / tau``, for p linear between samples exactly.
 
-    What heat and barometer do to the pad leaks away as well.
+    Pressure from heat and barometer leaks away as well.
 
     | meaning   | default | range     | unit | source     |
     |-----------|---------|-----------|------|------------|
@@ -180,15 +182,15 @@ class PadLeak(AbstractPneumaticEffect):
 
     time: Float[Array, ""] = parameter(300.0)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return first, first
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return _transient(series, state, line.interval, self.time)
 
 
 class SensorError(AbstractPneumaticEffect):
-    """The sensor of each pad has an offset and an error of its span: ``a + (1 + b) P``, both normal, the same for ever.
+    """The sensor of each pad has an offset and an error of its span: ``a + (1 + b) P``, both normal and constant.
 
     | meaning                              | default | range        | unit | source                               |
     |--------------------------------------|---------|--------------|------|--------------------------------------|
@@ -203,23 +205,28 @@ class SensorError(AbstractPneumaticEffect):
     span: Float[Array, ""] = parameter(0.0025)
     seed: Int[Array, ""] = parameter(0)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         a, b = own_normal(self, self.seed, (2, series.shape[1]), series.dtype)
         return self.offset * a + (1 + self.span * b) * series, state
 
 
-def _relaxation(interval, time, dtype):
-    """Of ``h' = x' - h / time``, x linear over an interval: what is kept of h, what is gained per change of x."""
-    steps = interval / time
-    gain = jnp.where(steps > 0, -jnp.expm1(-steps) / jnp.where(steps > 0, steps, 1), 1)  # nothing goes in endless time
+def _relaxation(
+    interval: Float[Array, ""], time: Float[Array, "*times"], dtype: DTypeLike
+) -> tuple[Float[Array, "*times"], Float[Array, "*times"]]:
+    """Factors of ``h' = x' - h / time`` over an interval in which x is linear: the part of h that is kept, and the
+    gain of h per change of x."""
+    steps = interval / time  # zero for an infinite time, in which nothing decays
+    gain = jnp.where(steps > 0, -jnp.expm1(-steps) / jnp.where(steps > 0, steps, 1), 1)
     return jnp.exp(-steps).astype(dtype), gain.astype(dtype)
 
 
-def _transient(series, state, interval, time):
-    """What is left of the changes of a series: ``h' = series' - h / time``; the state is (last sample, h)."""
+def _transient(
+    series: Series, state: tuple[Array, Array], interval: Float[Array, ""], time: Float[Array, ""]
+) -> tuple[Series, tuple[Array, Array]]:
+    """The decaying changes h of a series, ``h' = series' - h / time``; the state is (last sample, h)."""
     keep, gain = _relaxation(interval, time, series.dtype)
 
-    def step(state, now):
+    def step(state: tuple[Array, Array], now: Array) -> tuple[tuple[Array, Array], Array]:
         before, h = state
         h = keep * h + gain * (now - before)
         return (now, h), h

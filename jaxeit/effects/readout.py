@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._base import AbstractReadoutEffect, AbstractScanEffect, Stream, parameter
-from ._chance import normal, own_normal
+from .base import AbstractReadoutEffect, AbstractScanEffect, Line, Series, State, StreamKind, parameter
+from .random import normal, own_normal
 
-_POLE_RATIO = 4.0
-_POLES = 1.08 * _POLE_RATIO ** -np.arange(12)  # rad per sample; the first is chosen for what is near half the rate
+POLE_RATIO = 4.0
+"""Ratio of the corner frequencies of neighbouring low passes."""
+
+POLES = 1.08 * POLE_RATIO ** -np.arange(12)
+"""Corner frequencies in rad per sample; the first is chosen for the spectrum near half the sample rate."""
 
 
 class ScanSkew(AbstractScanEffect):
@@ -25,59 +28,60 @@ class ScanSkew(AbstractScanEffect):
 
     stretch: Float[Array, ""] = parameter(1.0)
 
-    def __call__(self, when, nominal):
+    def __call__(
+        self, when: Float[Array, " readings"], nominal: Float[Array, " readings"]
+    ) -> Float[Array, " readings"]:
         return when + self.stretch * nominal
 
 
 class IntermittentElectrode(AbstractReadoutEffect):
     """A loose electrode opens and closes at random, frame by frame: a telegraph process with two rates.
 
-    While it is open, readings that drive through it see no current and are 0, and readings that sense with it see
-    an input afloat: a potential drawn anew for each frame, the same for all that sense with it, with their sign.
-    A frame is closed or open as a whole.  An electrode that is always open, and what source and amplifier then do,
-    belongs to the electrical effects.
+    While it is open, readings that drive through it have no current and are 0, and readings that sense with it have
+    a floating input: a potential drawn for each frame, equal for all readings that sense with it, with their sign.
+    A frame is closed or open as a whole.  `ElectrodeFault` describes an electrode that is always open.
 
     | meaning                                | default | range        | unit | source     |
     |----------------------------------------|---------|--------------|------|------------|
     | electrode, counted from 0              | 0       |              |      |            |
     | rate of opening while it is closed     | 0.1     | 0 to 10      | 1/s  | assumption |
     | duration of a gap, its mean            | 0.2     | 0.005 to 10  | s    | assumption |
-    | floating: std of the input afloat      | 0.01    | 0 to 1       | V    | assumption |
+    | floating: std of the floating input    | 0.01    | 0 to 1       | V    | assumption |
     """
 
     rank: ClassVar[int] = -3  # at the skin, before all electronics
-    stream: ClassVar[Stream] = Stream.EIT  # type: ignore[misc]
+    stream: ClassVar[StreamKind] = StreamKind.EIT  # type: ignore[misc]
 
     electrode: Int[Array, ""] = parameter(0)
     rate: Float[Array, ""] = parameter(0.1)
     duration: Float[Array, ""] = parameter(0.2)
     floating: Float[Array, ""] = parameter(0.01)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return jnp.zeros((), bool)
 
-    def __call__(self, series, state, line):
-        chance, afloat = jax.random.split(line.key)
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+        chance, floating = jax.random.split(line.key)
         numbers = jax.random.uniform(chance, series.shape[:1], jnp.float32)
         # Exact for the two-state process: it tends to its mean share at the sum of both rates.
         both = self.rate + 1 / self.duration
         turned = -jnp.expm1(-both * line.interval) / both
         to_open, to_stay = self.rate * turned, 1 - turned / self.duration
 
-        def step(was_open, number):
+        def step(was_open: Array, number: Array) -> tuple[Array, Array]:
             is_open = number < jnp.where(was_open, to_stay, to_open)
             return is_open, is_open
 
         state, is_open = jax.lax.scan(step, state, numbers)
         touches = line.pattern == self.electrode
         sign = touches[:, 2].astype(series.dtype) - touches[:, 3].astype(series.dtype)
-        lost = jnp.outer(self.floating * normal(afloat, series[:, 0]), sign)
+        lost = jnp.outer(self.floating * normal(floating, series[:, 0]), sign)
         lost = jnp.where(touches[:, :2].any(1), 0, lost).astype(series.dtype)
         return jnp.where(is_open[:, None] & touches.any(1), lost, series), state
 
 
 class MuxSettling(AbstractReadoutEffect):
-    """The output has not quite left the reading before: ``v + (v_before - v) exp(-settle / time_constant)``.
+    """The output has not fully settled from the previous reading: ``v + (v_before - v) exp(-settle / time_constant)``.
 
     The channels are in the order of the scan; the first of a frame comes after the last of the frame before.
 
@@ -91,13 +95,13 @@ class MuxSettling(AbstractReadoutEffect):
 
     time_constant: Float[Array, ""] = parameter(0.5e-6)
     settle: Float[Array, ""] = parameter(10e-6)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return first[-1]
 
-    def __call__(self, series, state, line):
-        # All frames at once from zero, then what each hands to the next: 550 + 1024 short steps instead of 563,200.
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+        # All frames settle from zero at once; then each passes its end to the next: 550 + 1024 steps, not 563,200.
         times = self.settle / self.time_constant * jnp.arange(1, series.shape[1] + 1)
         left = jnp.exp(-times).astype(series.dtype)
         alone = _decaying_sums(left[0], jnp.zeros_like(series[:, 0]), (1 - left[0]) * series.T).T
@@ -117,20 +121,20 @@ class BaselineDrift(AbstractReadoutEffect):
     rank: ClassVar[int] = -1
 
     rate: Float[Array, ""] = parameter(1e-4)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         return jnp.zeros_like(first), jnp.abs(first)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         walked, size = state
         std = (self.rate * jnp.sqrt(line.interval)).astype(series.dtype)
-        walk = _decaying_sums(1, walked, std * normal(line.key, series))
+        walk = _decaying_sums(1.0, walked, std * normal(line.key, series))
         return series + size * walk, (walk[-1], size)
 
 
 class GainError(AbstractReadoutEffect):
-    """Each channel has an error of gain, the same for ever: ``v (1 + g)``, g normal.
+    """Each channel has an error of gain that does not change with time: ``v (1 + g)``, g normal.
 
     | meaning                     | default | range     | unit | source               |
     |-----------------------------|---------|-----------|------|----------------------|
@@ -142,14 +146,14 @@ class GainError(AbstractReadoutEffect):
 
     std: Float[Array, ""] = parameter(2e-3)
     seed: Int[Array, ""] = parameter(0)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return series * (1 + self.std * own_normal(self, self.seed, series.shape[1:], series.dtype)), state
 
 
 class LoadCellError(AbstractReadoutEffect):
-    """A load cell is bowed between its ends: ``F + 4 n F_max x (1 - |x|)``, ``x = F / F_max``, n the largest error.
+    """The characteristic of a load cell is bowed: ``F + 4 n F_max x (1 - |x|)``, ``x = F / F_max``, largest error n.
 
     | meaning                                  | default | range     | unit | source                  |
     |------------------------------------------|---------|-----------|------|-------------------------|
@@ -158,12 +162,12 @@ class LoadCellError(AbstractReadoutEffect):
     """
 
     rank: ClassVar[int] = -1
-    stream: ClassVar[Stream] = Stream.FORCE  # type: ignore[misc]
+    stream: ClassVar[StreamKind] = StreamKind.FORCE  # type: ignore[misc]
 
     nonlinearity: Float[Array, ""] = parameter(1e-3)
     full_scale: Float[Array, ""] = parameter(50.0)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return series * (1 + 4 * self.nonlinearity * (1 - jnp.abs(series) / self.full_scale)), state
 
 
@@ -176,9 +180,9 @@ class MultiplicativeNoise(AbstractReadoutEffect):
     """
 
     std: Float[Array, ""] = parameter(1e-3)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return series * (1 + self.std * normal(line.key, series)), state
 
 
@@ -191,9 +195,9 @@ class Noise(AbstractReadoutEffect):
     """
 
     std: Float[Array, ""] = parameter(1.0)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return series + self.std * normal(line.key, series), state
 
 
@@ -201,8 +205,8 @@ class PinkNoise(AbstractReadoutEffect):
     """1/f noise: of spectral density ``amplitude^2 / f``, one-sided, whatever the rate of the stream.
 
     White noise through twelve first-order low passes, their corners a factor of four apart (Keshner 1982): within
-    10 % of 1/f from 1e-5 of the rate to half of it.  The filters start at rest: what is slower than the recording
-    is not in it.
+    10 % of 1/f from 1e-5 of the rate to half of it.  The filters start at rest: noise slower than the recording is
+    missing.
 
     | meaning                                  | default | unit               | source |
     |------------------------------------------|---------|--------------------|--------|
@@ -210,16 +214,16 @@ class PinkNoise(AbstractReadoutEffect):
     """
 
     amplitude: Float[Array, ""] = parameter(1.0)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def start(self, first):
-        return jnp.zeros((len(_POLES), first.size), first.dtype)
+    def start(self, first: Float[Array, " channels"]) -> State:
+        return jnp.zeros((len(POLES), first.size), first.dtype)
 
-    def __call__(self, series, state, line):
-        keep = jnp.asarray(np.exp(-_POLES), series.dtype)[:, None]
-        weight = jnp.asarray(np.log(_POLE_RATIO) * np.sqrt(_POLES / np.pi), series.dtype)[:, None]
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+        keep = jnp.asarray(np.exp(-POLES), series.dtype)[:, None]
+        weight = jnp.asarray(np.log(POLE_RATIO) * np.sqrt(POLES / np.pi), series.dtype)[:, None]
 
-        def step(state, white):
+        def step(state: Array, white: Array) -> tuple[Array, Array]:
             state = keep * state + white
             return state, (weight * state).sum(0)
 
@@ -241,9 +245,9 @@ class Quantisation(AbstractReadoutEffect):
     step: Float[Array, ""] = parameter(1.0)
     lowest: Float[Array, ""] = parameter(-jnp.inf)
     highest: Float[Array, ""] = parameter(jnp.inf)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return jnp.clip(jnp.round(series / self.step) * self.step, self.lowest, self.highest), state
 
 
@@ -267,22 +271,24 @@ class AdcRanges(AbstractReadoutEffect):
     full_scale: Float[Array, ""] = parameter(2.5)
     gains: Float[Array, " gains"] = eqx.field(converter=jnp.asarray, default=tuple(2.0**k for k in range(8)))
     headroom: Float[Array, ""] = parameter(2.0)
-    stream: Stream = eqx.field(static=True, default=Stream.EIT)
+    stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def start(self, first):
+    def start(self, first: Float[Array, " channels"]) -> State:
         fits = jnp.abs(first)[:, None] * self.headroom * self.gains <= self.full_scale
         return jnp.where(fits, self.gains, self.gains.min()).max(1).astype(first.dtype)
 
-    def __call__(self, series, state, line):
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         half = jnp.exp2(self.bits - 1.0)
         step = (self.full_scale / half / state).astype(series.dtype)
         return jnp.clip(jnp.round(series / step), -half, half - 1) * step, state
 
 
-def _decaying_sums(keep, start, parts):
+def _decaying_sums(
+    keep: Float[Array, ""] | float, start: Float[Array, "*channels"], parts: Float[Array, "n *channels"]
+) -> Float[Array, "n *channels"]:
     """``s = keep s + part`` for each of the parts, from ``start``."""
 
-    def step(total, part):
+    def step(total: Array, part: Array) -> tuple[Array, Array]:
         total = keep * total + part
         return total, total
 

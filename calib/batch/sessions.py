@@ -1,0 +1,348 @@
+"""Many sessions at once: a calibration, and a report if wanted, of each, by any `concurrent.futures.Executor`.
+
+A session is done when its calibration lies in the output folder and names, by their hash, the session's bytes, the
+recipe, the skin and the version it was made with.  So a batch that was killed goes on where it was.  Each result
+appears whole or not at all, and is made by whoever holds the lock file beside it: two batches into one folder share
+the work.
+"""
+
+import contextlib
+import hashlib
+import multiprocessing
+import os
+import pickle
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxeit as je
+
+from ..calibration.calibration import Calibration, load_calibration
+from ..calibration.procedure import calibrate
+from ..calibration.recipe import Recipe
+from ..report.document import write_report
+from ..report.figures import require_matplotlib
+from ..runtime import settings, take_over
+from ..session import SessionError, open_session
+from .workers import begin
+
+try:
+    import fcntl
+except ImportError:  # a system without it
+    fcntl = None  # type: ignore[assignment]
+
+_DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
+_RENEWED = 16  # sessions after which a worker is replaced, so that its memory stays bounded
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one session.
+
+    | meaning                                                              |
+    |----------------------------------------------------------------------|
+    | session, calibration: their files                                    |
+    | reason: why it failed, in one line; empty: the calibration is there  |
+    | skipped: it was there already                                        |
+    | simulated: so its calibration says                                   |
+    | seconds: that it took                                                |
+    | summary: of the calibration's evaluation; empty if it failed         |
+    """
+
+    session: str
+    calibration: str
+    reason: str = ""
+    skipped: bool = False
+    simulated: bool = False
+    seconds: float = 0.0
+    summary: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A session, where its results go, and all that a worker needs to know.
+
+    The choices (skin, recipe) are pickled, so that a worker takes over the settings of JAX before it reads numbers of
+    64 bits; the mark is a digest of them.
+    """
+
+    session: str
+    calibration: str
+    report: bool
+    choices: bytes
+    mark: str
+    settings: Mapping[str, Any]
+
+
+def calibrate_many(
+    paths: Sequence[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    *,
+    recipe: Recipe | None = None,
+    skin: je.Skin | None = None,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    report: bool = False,
+    tell: Callable[[Outcome], object] = lambda outcome: None,
+) -> tuple[Outcome, ...]:
+    """Calibrate every session by itself: ``out/NAME.h5`` for ``NAME.h5``, in the order given.
+
+    Args:
+        paths: of session files.
+        out: a folder, made if need be; sessions that are done there already are skipped.
+        recipe, skin: as for `calibrate`.
+        executor: what runs the work; default: a pool of spawned processes with one thread of computation each.
+            `distributed.Client(address).get_executor(pure=False)` is one too; its workers must see the same files.
+        jobs: processes of the default pool; default: one a core.
+        report: write ``out/NAME.html`` too.
+        tell: told of each session as it ends.
+
+    A session that fails is named in its outcome and the rest complete; so is one that kills its worker, if the pool is
+    the default one. Call it below ``if __name__ == "__main__":``, as spawned processes import the main module.
+
+    Raises:
+        SessionError: two sessions would have one result, or the folder cannot be made.
+        ReportError: a report is wanted and matplotlib is not installed.
+    """
+    if report:
+        require_matplotlib()
+    tasks = _tasks(paths, Path(out), report, skin, recipe or Recipe())
+    outcomes: dict[str, Outcome] = {}
+
+    def note(outcome: Outcome) -> None:
+        outcomes[outcome.session] = outcome
+        tell(outcome)
+
+    if executor is None:
+        _in_own_pools(tasks, jobs or os.cpu_count() or 1, note)
+    else:
+        for task in _run(executor, tasks, note):
+            note(_failed(task, _DIED))
+    return tuple(outcomes[task.session] for task in tasks)
+
+
+def _tasks(
+    paths: Sequence[str | os.PathLike[str]], out: Path, report: bool, skin: je.Skin | None, recipe: Recipe
+) -> list[_Task]:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
+    mark = _digest(recipe.to_toml(), _described(skin), je.__version__, jax.__version__)
+    shared: dict[str, Any] = {
+        "report": report,
+        "choices": pickle.dumps((skin, recipe)),
+        "mark": mark,
+        "settings": settings(),
+    }
+    names: dict[str, str] = {}
+    tasks = []
+    for session in dict.fromkeys(os.path.abspath(path) for path in paths):
+        name = f"{Path(session).stem}.h5"
+        if name in names:
+            raise SessionError(
+                f"{session}: its result would be {name}, as that of {names[name]}; rename one, or calibrate them into "
+                "folders of their own"
+            )
+        names[name] = session
+        if os.path.abspath(out / name) == session:
+            raise SessionError(f"{session}: its result would take its place; choose another folder for the output")
+        tasks.append(_Task(session, os.path.abspath(out / name), **shared))
+    return tasks
+
+
+def _described(value: Any) -> str:
+    """All that an object says, arrays bit by bit: equal texts mean equal objects, on every run."""
+    if isinstance(value, Mapping):
+        return _described(sorted(value.items()))
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(map(_described, value))}]"
+    if isinstance(value, (np.ndarray, jax.Array)):
+        array = np.asarray(value)
+        return f"{array.dtype}{array.shape}{array.tobytes().hex()}"
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = (f"{f.name}={_described(getattr(value, f.name))}" for f in fields(value))
+        return f"{type(value).__qualname__}({','.join(parts)})"
+    return repr(value)
+
+
+def _digest(*texts: str) -> str:
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def render_outcomes(outcomes: Sequence[Outcome], out: str | os.PathLike[str]) -> str:
+    """The results as a table for a terminal."""
+    width = max([len("session"), *(len(Path(o.session).name) for o in outcomes)])
+    head = f"{'session':<{width}}  presses      CV (calibrated)   RMSE, N   % of largest"
+    failed = sum(bool(o.reason) for o in outcomes)
+    skipped = sum(o.skipped for o in outcomes)
+    ended = f"{len(outcomes) - failed} calibrations in {out}" + (f", {skipped} of them done before" if skipped else "")
+    return "\n".join([head, *(_line(o, width) for o in outcomes), "", ended + (f"; {failed} failed" if failed else "")])
+
+
+def _line(outcome: Outcome, width: int) -> str:
+    name = f"{Path(outcome.session).name:<{width}}"
+    if outcome.reason:
+        return f"{name}  FAILED: {outcome.reason}"
+    s = outcome.summary
+    cv = s.get("cv_calibrated_ddof1", float("nan"))
+    numbers = f"{s['presses']:9.0f}{cv:21.3f}{s['force_rmse']:10.2f}{s['force_rmse_percent_full_scale']:15.1f}"
+    return name + numbers + ("   SIMULATED" if outcome.simulated else "")
+
+
+# --- running -------------------------------------------------------------------------------------
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=begin)
+
+
+def _in_own_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
+    """In pools that are renewed; sessions whose worker died are tried once more, each in a process of its own."""
+    left = list(tasks)
+    while left:
+        now, later = left[: jobs * _RENEWED], left[jobs * _RENEWED :]
+        with _pool(min(jobs, len(now))) as pool:
+            broken = _run(pool, now, note)
+        suspects = [task for task in broken if _lock_of(task.calibration).exists()] or broken[:1]
+        for task in suspects:
+            with _pool(1) as alone:
+                died = bool(_run(alone, [task], note))
+            if died:
+                _lock_of(task.calibration).unlink(missing_ok=True)
+                note(_failed(task, _DIED))
+        left = [task for task in broken if task not in suspects] + later
+
+
+def _run(executor: Executor, tasks: Sequence[_Task], note: Callable[[Outcome], None]) -> list[_Task]:
+    """Hand over all tasks and note what comes of them; those that a broken executor did not do are given back."""
+    futures: dict[Future[Outcome], _Task] = {}
+    broken = list(tasks)
+    try:
+        with contextlib.suppress(BrokenExecutor):
+            for task in tasks:
+                futures[executor.submit(calibrate_one, task)] = task
+        for future in as_completed(futures):
+            task = futures[future]
+            try:
+                outcome = future.result()
+            except BrokenExecutor:
+                continue
+            except Exception as error:  # the scheduler's own
+                outcome = _failed(task, _said(error))
+            broken.remove(task)
+            note(outcome)
+    finally:
+        for future in futures:
+            future.cancel()  # those not begun, when interrupted
+    return broken
+
+
+def _failed(task: _Task, reason: str, seconds: float = 0.0) -> Outcome:
+    return Outcome(task.session, task.calibration, reason, seconds=seconds)
+
+
+def _said(error: Exception) -> str:
+    """One line."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, (ValueError, OSError)) and text else f"{type(error).__name__}: {text}"
+
+
+# --- in the worker -------------------------------------------------------------------------------
+
+_ONE_AT_A_TIME = threading.Lock()  # compiled linear algebra called by two threads at once can hang
+
+
+def calibrate_one(task: _Task) -> Outcome:
+    """Do one task, unless it is done; never raises for a session that cannot be calibrated."""
+    start = time.perf_counter()
+    with _ONE_AT_A_TIME:
+        take_over(task.settings)
+        try:
+            with _claimed(task.calibration):
+                calibration, skipped = _calibrated(task)
+                skipped &= not _reported(task, calibration)
+        except Exception as error:
+            reason = _said(error).removeprefix(f"{Path(task.session).name}: ")
+            return _failed(task, reason, time.perf_counter() - start)
+    return Outcome(
+        session=task.session,
+        calibration=task.calibration,
+        skipped=skipped,
+        simulated=calibration.simulated,
+        seconds=time.perf_counter() - start,
+        summary=calibration.evaluation.summary(),
+    )
+
+
+def _calibrated(task: _Task) -> tuple[Calibration, bool]:
+    """The calibration of a task, and whether it was there."""
+    with open_session(task.session) as session:
+        mark = _digest(session.hash, task.mark)
+        with contextlib.suppress(SessionError):
+            found = load_calibration(task.calibration)
+            if found.provenance.get("batch") == mark:
+                return found, True
+        _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
+        skin, recipe = pickle.loads(task.choices)
+        made = calibrate([session], skin, recipe=recipe)
+    made = replace(made, provenance=made.provenance | {"batch": mark})
+    made.save(task.calibration)
+    return made, False
+
+
+def _reported(task: _Task, calibration: Calibration) -> bool:
+    """Whether a report had to be written; its page is the last of its files."""
+    if not task.report or _page_of(task).exists():
+        return False
+    write_report(calibration, _page_of(task))
+    return True
+
+
+def _page_of(task: _Task) -> Path:
+    return Path(task.calibration).with_suffix(".html")
+
+
+def _lock_of(calibration: str) -> Path:
+    path = Path(calibration)
+    return path.with_name(f".{path.name}.lock")
+
+
+@contextlib.contextmanager
+def _claimed(calibration: str) -> Iterator[None]:
+    """While others wait, and without what they left half made; the lock file goes with a clean end.
+
+    A worker that dies leaves the file, but not the lock.
+    """
+    lock = _lock_of(calibration)
+    file = _locked(lock)
+    try:
+        own = re.compile(rf"\.{re.escape(Path(calibration).stem)}(\.h5|\.html|_[a-z]+\.png)\.[0-9a-f]+\.tmp")
+        for name in filter(own.fullmatch, os.listdir(lock.parent)):
+            lock.with_name(name).unlink(missing_ok=True)
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(file)
+
+
+def _locked(path: Path) -> int:
+    """The lock file, open and ours: it is the one under that name, not one that its last owner has removed."""
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        if fcntl is None:
+            return file
+        with contextlib.suppress(OSError):  # some file systems know no locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file), os.stat(path)):
+                return file
+        os.close(file)

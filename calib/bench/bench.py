@@ -1,0 +1,180 @@
+"""Description of a simulated bench: a scene, the presses on it, and the streams that are recorded."""
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxeit as je
+
+
+class BenchError(ValueError):
+    """A bench cannot be simulated as described."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Timing of one press in seconds. The paper states 2 s of hold; the other times are assumed."""
+
+    rest: float = 1.0
+    ramp: float = 1.0
+    hold: float = 2.0
+    release: float = 1.0
+    recovery: float = 1.5
+
+    @property
+    def period(self) -> float:
+        """Time in s from the start of one press to the start of the next."""
+        return self.rest + self.ramp + self.hold + self.release + self.recovery
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A further tip at ``offset`` (2,) m from the first one, which presses with ``force`` N, ``delay`` s later."""
+
+    offset: tuple[float, float]
+    force: float
+    delay: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A scene, the presses on it, and the streams that are recorded.
+
+    | field                                | meaning                                       | shape      | unit      |
+    |--------------------------------------|-----------------------------------------------|------------|-----------|
+    | sites                                | centres of the tip                            | (sites, 2) | m         |
+    | forces                               | target forces, repeated over the sites        | (any,)     | N         |
+    | tip_diameter                         | of all tips                                   | ()         | m         |
+    | companions                           | further tips that press together with it      |            |           |
+    | slide                                | displacement of all tips during the hold      | (2,)       | m         |
+    | blank                                | time without contact at the start             | ()         | s         |
+    | eit_rate, pad_rate                   | of EIT frames; of pressures and forces        | ()         | Hz        |
+    | eit_step, pressure_step, force_step  | SI value of one stored count                  | ()         | V, Pa, N  |
+    | temperature_rate, barometer_rate     | change of the surrounding air                 | ()         | K/s, Pa/s |
+    | seed                                 | of all random numbers                         |            |           |
+    | toml                                 | the scene file as text                        |            |           |
+
+    Raises:
+        BenchError: for a tip that would leave the sheet.
+    """
+
+    scene: je.Scene
+    sites: np.ndarray
+    forces: np.ndarray
+    title: str = "simulated bench session"
+    tip_diameter: float = 0.02
+    companions: tuple[Companion, ...] = ()
+    slide: tuple[float, float] = (0.0, 0.0)
+    timing: Timing = field(default_factory=Timing)
+    blank: float = 60.0
+    eit_rate: float = 180.0
+    pad_rate: float = 200.0
+    eit_step: float = 1e-6
+    pressure_step: float = 1.0
+    force_step: float = 0.01
+    temperature_rate: float = 0.0
+    barometer_rate: float = 0.0
+    seed: int = 0
+    epoch: datetime = datetime(2026, 1, 1, tzinfo=UTC)
+    toml: str = ""
+
+    def __post_init__(self) -> None:
+        for name, offset in (("", (0.0, 0.0)), *((" of a companion", c.offset) for c in self.companions)):
+            for way, moved in (("", (0.0, 0.0)), (", after its slide,", self.slide)):
+                places = self.sites + np.add(offset, moved)
+                outside = ~self.scene.skin.domain.contains(places)
+                if outside.any():
+                    number = int(np.argmax(outside))
+                    raise BenchError(f"site {number}{name}{way} at {places[number]} m lies outside the sheet")
+
+    @property
+    def period(self) -> float:
+        """Time in s from the start of one press to the start of the next."""
+        return self.timing.period + max((c.delay for c in self.companions), default=0.0)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the whole recording, s."""
+        return self.blank + len(self.sites) * self.period
+
+    @property
+    def press_forces(self) -> np.ndarray:
+        """Target force of each press (sites,) N."""
+        return np.resize(self.forces, len(self.sites))
+
+
+def load_bench(path: str | Path) -> Bench:
+    """Load a bench from a scene file, or a shipped preset by its name (see `presets`).
+
+    Raises:
+        ValueError: naming the file, the key and the reason.
+    """
+    path = str(path)
+    if path in presets() and not Path(path).exists():
+        text = (SCENE_FOLDER / f"{path}.toml").read_text(encoding="utf-8")
+    elif not path.endswith(".toml") and not Path(path).exists():
+        raise BenchError(f"{path}: no such scene file or preset; presets: {', '.join(presets())}")
+    else:
+        text = je.toml.read_text(Path(path))
+    return je.toml.parse_toml(text, path, lambda table: _bench(table, text), allow_import=True)
+
+
+SCENE_FOLDER = resources.files(__package__) / "scenes"
+
+
+def presets() -> tuple[str, ...]:
+    """Names of the shipped scenes."""
+    return tuple(
+        sorted(entry.name.removesuffix(".toml") for entry in SCENE_FOLDER.iterdir() if entry.name.endswith(".toml"))
+    )
+
+
+def _bench(top: je.toml.TomlTable, text: str) -> Bench:
+    top.choice("format", "jaxeit-scene")
+    top.get("version", lambda v: v == 1, "1, the version this jaxeit reads")
+    skin = je.load_skin(top.get("skin", lambda v: isinstance(v, str), "a skin's name or path"))
+    title = top.get("title", lambda v: isinstance(v, str), "the session's title")
+    seed = top.get("seed", lambda v: type(v) is int and 0 <= v < 2**31, "a whole number")
+    effects = je.model.read_effects(top)
+    table = top.table("bench")
+    top.done()
+    names = ("blank", "eit_rate", "pad_rate", "eit_step", "pressure_step", "force_step")
+    numbers: dict[str, Any] = {n: table.positive(n, "a number") for n in names if table.has(n)}
+    if table.has("tip_diameter"):
+        numbers["tip_diameter"] = table.positive("tip_diameter", "a length in m")
+    if table.has("slide"):
+        numbers["slide"] = table.vector("slide", 2, "[dx, dy] in m, moved during the hold")
+    for name in ("temperature_rate", "barometer_rate"):
+        if table.has(name):
+            numbers[name] = table.number(name, "a rate per second", least=float("-inf"))
+    numbers["companions"] = tuple(_companion(entry) for entry in table.tables("companions"))
+    forces = table.array("forces", None, "[N, ...], target forces of the presses")
+    sites = _sites(table, skin.domain)
+    times = [n for n in Timing.__dataclass_fields__ if table.has(n)]
+    timing = Timing(**{n: table.positive(n, "s") for n in times})
+    table.done()
+    scene = je.Scene(skin, effects)
+    return Bench(scene, sites, forces, title, timing=timing, seed=seed, toml=text, **numbers)
+
+
+def _sites(table: je.toml.TomlTable, domain: je.geometry.Domain) -> np.ndarray:
+    if table.has("sites"):
+        return table.array("sites", 2, "[[x, y], ...] in m")
+    columns, rows = table.count("columns"), table.count("rows")
+    margin = table.number("margin", "least distance of the tip's centre from the rim, m")
+    (x0, y0), (x1, y1) = domain.bounds
+    x = np.linspace(x0 + margin, x1 - margin, columns)
+    y = np.linspace(y0 + margin, y1 - margin, rows)
+    grid = np.stack(np.meshgrid(x, y), -1)
+    return grid.reshape(-1, 2)
+
+
+def _companion(table: je.toml.TomlTable) -> Companion:
+    offset = table.vector("offset", 2, "[dx, dy] in m, from the first tip")
+    force, delay = table.positive("force", "N"), table.number("delay", "s", 0.0)
+    table.done()
+    return Companion((offset[0], offset[1]), force, delay)

@@ -1,0 +1,131 @@
+"""The calibration of a skin: the numbers that turn its frames and pressures into newtons, and their file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+import jaxeit as je
+
+from ..fitting.fields import FittedField, Places
+from ..fitting.fitted_curve import FittedCurve
+from ..fitting.pads import Hybrid
+from ..fitting.selection import Candidate
+from ..presses.table import Processing
+from ..session import SessionError, read_archive, write_archive
+from .evaluation import Evaluation
+from .hysteresis_loops import Loops
+from .localisation import AbstractLocator, locate
+from .recipe import Recipe
+from .storage import fields_from_archive, recorded_processing, recorded_recipe, to_archive
+
+FORMAT = "skin-calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Everything needed to turn frames and pressures into force maps, with its provenance.
+
+    | meaning                                                                  |
+    |--------------------------------------------------------------------------|
+    | skin: the hardware                                                       |
+    | recon: frames to images, by a matrix or by an iterative method           |
+    | masks: which pad carries which pixel                                     |
+    | curves: the fitted pressure-force curve of each pad, with covariance     |
+    | evaluation: of the presses fitted, forces held out by location           |
+    | provenance: sessions, their hashes, versions, recipe, date               |
+    | simulated: some session it rests on was simulated                        |
+    | notes: what a person should know                                         |
+    | field: of gain over the place pressed; None: no correction by location   |
+    | locator: tells that place from a frame; None with no field               |
+    | baseline: the paper's curves, one slope a pad, for comparison            |
+    | image_gain: force over the integral of the image, N / (S m^2), likewise  |
+    | loops: a whole press of each pad, loading and unloading                  |
+    | tried: the curves and fields that were chosen from, with held-out errors |
+    """
+
+    skin: je.Skin
+    recon: je.Reconstructor | je.imaging.IterativeReconstructor
+    masks: je.PadMasks
+    curves: FittedCurve
+    evaluation: Evaluation
+    provenance: dict[str, str]
+    simulated: bool
+    notes: tuple[str, ...] = ()
+    field: FittedField | None = None
+    locator: AbstractLocator | None = None
+    baseline: FittedCurve | None = None
+    image_gain: float = float("nan")
+    loops: Loops | None = None
+    tried: tuple[Candidate, ...] = ()
+
+    @property
+    def hybrid(self) -> Hybrid:
+        """Curves and field together."""
+        return Hybrid(self.curves, self.field)
+
+    @property
+    def recipe(self) -> Recipe | None:
+        """The recipe that this calibration was made by; None for one of before recipes were kept.
+
+        Raises:
+            ValueError: if the recipe names a class that is not installed.
+        """
+        return recorded_recipe(self.provenance)
+
+    @property
+    def processing(self) -> Processing:
+        """How sessions were cut and corrected, which others that are evaluated or mapped by it should be too."""
+        return recorded_processing(self.provenance)
+
+    def pad_forces(
+        self, pressures: ArrayLike, places: Places | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Force on each pad, its standard error (N) and validity from pressures (n, pads) Pa.
+
+        With a correction by location, `places` (from `locate`) say where; left out, the gain is 1 and the standard
+        error says how much that may be wrong. Not valid: outside the range that was calibrated, or a failed fit.
+        """
+        return self.hybrid.pad_forces(pressures, places)
+
+    def locate(self, frames: ArrayLike, image: Array | None = None, *, single: bool = False) -> Places | None:
+        """Where difference frames (n, readings) V are touched; None without a correction by location.
+
+        `single`: each frame is known to hold one contact, as a press on a bench does.
+        """
+        if self.locator is None:
+            return None
+        return locate(self.locator.single() if single else self.locator, frames, self.recon, self.masks, image)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Precision of the fitted curves."""
+        return self.curves.parameters.dtype
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration, whole or not at all, as HDF5 in the format skin-calibration."""
+        write_archive(path, FORMAT, *to_archive(self))
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration that `Calibration.save` wrote.
+
+    Raises:
+        SessionError: if the file is damaged or of another kind.
+    """
+    archive = read_archive(path, FORMAT)
+    try:
+        return Calibration(**fields_from_archive(archive))
+    except (KeyError, IndexError) as error:
+        raise SessionError(
+            f"{Path(path).name}: {error.args[0]}: missing from the calibration; calibrate again"
+        ) from None
+    except je.imaging.StoreError as error:
+        raise SessionError(f"{Path(path).name}: image/{error}; calibrate again") from None
+    except (je.registry.RegistryError, je.toml.TomlError) as error:  # a class or a text that cannot be used
+        raise SessionError(f"{Path(path).name}: {' '.join(str(error).split())}") from None
+    except (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        why = " ".join(str(error).split())[:200]
+        raise SessionError(f"{Path(path).name}: its numbers do not fit each other ({why}); calibrate again") from None

@@ -1,0 +1,315 @@
+"""Applying a calibration: from frames and pressures to force maps in newtons."""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+import jaxeit as je
+
+from ..fitting.fields import FittedField, Places
+from ..fitting.fitted_curve import FittedCurve
+from ..fitting.pads import nowhere, pad_forces
+from ..fitting.samples import bucket
+from ..presses.corrections import AbstractCorrection, correct
+from ..presses.streams import resample
+from ..presses.table import Processing, resting_levels
+from ..session import ArchiveWriter, Session, SessionError, Stream
+from .calibration import Calibration
+from .localisation import AbstractLocator
+
+FORMAT = "skin-forcemap"
+_BLOCK = 512  # frames held in memory at once
+_MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
+
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+
+
+class ForceEstimate(NamedTuple):
+    """Forces on the skin, frame by frame.
+
+    | meaning                                                                  | shape        | unit |
+    |--------------------------------------------------------------------------|--------------|------|
+    | map: force on each pixel, its standard error, the validity of its shape  | (n, pixels)  | N    |
+    | force on each pad                                                        | (n, pads)    | N    |
+    | standard_error of a new reading: of the curve and about it               | (n, pads)    | N    |
+    | valid: pressure within the calibrated range                              | (n, pads)    |      |
+    | position of each contact found; NaN: none                                | (n, K, 2)    | m    |
+    | contact_force: its shares of the forces on pads that it lies on          | (n, K)       | N    |
+
+    Contacts are found by a calibration with a correction by location; K is 0 without. A pad shares its force between
+    them by the parts of their fitted bumps on it; what pads beside all contacts seem to bear is noise or crosstalk.
+    """
+
+    map: je.ForceMap
+    force: Any
+    standard_error: Any
+    valid: Any
+    position: Any
+    contact_force: Any
+
+
+class ForceLaw(eqx.Module):
+    """What of a calibration turns numbers into forces, as one pytree for compiled programs; see `Calibration`."""
+
+    recon: je.Reconstructor | je.imaging.IterativeReconstructor
+    masks: je.PadMasks
+    curves: FittedCurve
+    field: FittedField | None
+    locator: AbstractLocator | None
+
+    @property
+    def remembers(self) -> bool:
+        """Whether forces depend on the pressures that came before."""
+        return self.curves.curve.path
+
+
+def law_of(calibration: Calibration) -> ForceLaw:
+    """What of a calibration turns numbers into forces."""
+    c = calibration
+    return ForceLaw(c.recon, c.masks, c.curves, c.field, c.locator)
+
+
+def force_map(
+    calibration: Calibration,
+    frames: ArrayLike,
+    pressures: ArrayLike,
+    *,
+    gate: float = 0.6,
+    before: np.ndarray | None = None,
+) -> ForceEstimate:
+    """Force maps of frames and pad pressures, each less its value without contact.
+
+    Args:
+        frames: change of the readings, (n, readings) V.
+        pressures: change of the pads' gage pressure at the same times, (n, pads) Pa.
+        gate: as in `jaxeit.fuse`.
+        before: pressures that came earlier, (m, pads) Pa, for curves that remember them; see `remembered`.
+
+    Raises:
+        ValueError: if the shapes do not fit the calibration.
+    """
+    frames, pressures = np.atleast_2d(frames), np.atleast_2d(pressures)
+    readings, pads = calibration.recon.readings, len(calibration.skin.pads)
+    if frames.shape[1] != readings or pressures.shape != (len(frames), pads):
+        raise ValueError(
+            f"frames {frames.shape} and pressures {pressures.shape} do not fit this calibration: "
+            f"give (n, {readings}) V and (n, {pads}) Pa"
+        )
+    law = law_of(calibration)
+    frames = jnp.asarray(frames, law.recon.dtype)
+    pressures = jnp.asarray(pressures, law.curves.parameters.dtype)
+    earlier = filled(law, before)
+    found = _force_map(law, frames, pressures, None if earlier is None else jnp.asarray(earlier), gate)
+    return ForceEstimate(found.map, *map(np.asarray, found[1:]))
+
+
+def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
+    """Earlier pressures (m, pads) after rows that move nothing, so that lengths recur; None for curves that forget."""
+    if before is None or not law.remembers:
+        return None
+    first = bucket(len(before))
+    rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
+    return rows.astype(law.curves.parameters.dtype)
+
+
+@je.verb
+def _force_map(law: ForceLaw, frames: Array, pressures: Array, before: Array | None, gate: float) -> ForceEstimate:
+    image = law.recon(frames)
+    places = None
+    if law.locator is not None:
+        touched = jnp.any(is_loaded(law, pressures), 1, keepdims=True)
+        places = law.locator(jnp.where(touched, frames, 0), image, law.recon, law.masks)
+    return fused(law, image, pressures, places, before, gate)
+
+
+def fused(
+    law: ForceLaw,
+    image: Float[Array, "n pixels"],
+    pressures: Float[Array, "n pads"],
+    places: Places | None,
+    before: Float[Array, "m pads"] | None,
+    gate: float,
+) -> ForceEstimate:
+    """`force_map` from images and places that are known (None: nothing known); pure."""
+    force, error, valid = _pad_forces(law, pressures, places, before)
+    error = jnp.hypot(error, law.curves.residual_rms)
+    numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
+    if places is None:
+        places = nowhere(pressures, 0)
+    else:
+        shares = je.fusion.contact_shares(places.position, places.width, places.amplitude, law.recon.centres, law.masks)
+    pad_force, pad_error = numbers
+    found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
+    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places, shares))
+
+
+_BESIDE = 0.1  # part of a contact on a pad up to which it lies beside the pad
+
+
+def _of_contacts(
+    force: Float[Array, "n pads"], places: Places, shares: je.fusion.ContactShares | None
+) -> Float[Array, "n K"]:
+    """Each contact's part of the forces of pads that it lies on; 0 where there is none."""
+    weight = places.weight
+    if shares is not None:
+        on = (shares.lies > _BESIDE) | jnp.all(shares.lies <= _BESIDE, -1, keepdims=True)
+        weight = jnp.where(on, weight, 0)
+    return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)
+
+
+def _pad_forces(law: ForceLaw, pressures: Array, places: Places | None, before: Array | None) -> Iterable[Array]:
+    """Forces, errors and validity (n, pads), of curves that remember after what came `before`."""
+    if before is None:
+        return pad_forces(law.curves, law.field, pressures, places)
+    first, whole = len(before), jnp.concatenate([before, pressures])
+    if places is not None:
+        places = places[jnp.maximum(jnp.arange(len(whole)) - first, 0)]
+    return (part[first:] for part in pad_forces(law.curves, law.field, whole, places))
+
+
+_LOADED = 3.0  # times the scatter of single samples: pads below are taken as idle, and their frames not searched
+
+
+def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
+    """Whether a pad carries more than its pressure's scatter, wherever it is touched; pure."""
+    return pad_forces(law.curves, None, pressures).force > _LOADED * law.curves.residual_rms
+
+
+def remembered(pressures: np.ndarray) -> np.ndarray:
+    """The turns (m, pads) of pressures (n, pads) that a curve with hysteresis still remembers; NaN fills up.
+
+    A turn is forgotten as soon as a later excursion goes back beyond it (Preisach's wiping out), so that few are left.
+    """
+    turns = [_turns(column) for column in np.asarray(pressures).T]
+    longest = max(map(len, turns), default=0)
+    return np.stack([np.r_[np.full(longest - len(t), np.nan), t] for t in turns], 1)
+
+
+def _turns(column: np.ndarray) -> list[float]:
+    kept: list[float] = [0.0]  # at rest
+    for value in column[np.isfinite(column)].tolist():
+        kept.append(value)
+        while len(kept) > 3 and abs(kept[-1] - kept[-2]) >= abs(kept[-2] - kept[-3]):
+            del kept[-3:-1]
+        while len(kept) > 2 and (kept[-1] - kept[-2]) * (kept[-2] - kept[-3]) >= 0:
+            del kept[-2]
+    return kept
+
+
+def apply(
+    calibration: Calibration,
+    session: Session,
+    path: str | Path,
+    *,
+    processing: Processing | None = None,
+    progress: Progress = iter,
+) -> Path:
+    """Write the force map of every EIT frame of a session; memory does not grow with its length.
+
+    The file, format skin-forcemap, appears only when complete.
+
+    Raises:
+        SessionError: if the session was recorded on another skin or lacks a stream.
+    """
+    processing = processing or calibration.processing
+    levels = resting_levels(session, calibration.skin, processing)
+    eit, pressure = session.stream("eit"), session.stream("pressure")
+    filters = {s.name: processing.of(s)[0] for s in (eit, pressure)}
+    recon = calibration.recon
+    attrs: dict[str, str | int] = {
+        "skin": calibration.skin.name,
+        "session": session.name,
+        "session_sha256": session.hash,
+        "simulated": int(session.simulated or calibration.simulated),
+        "time_epoch_utc": session.epoch,
+        "image_rows": recon.shape[0],
+        "image_columns": recon.shape[1],
+        "calibration_created_utc": calibration.provenance["created_utc"],
+    }
+    kinds = _rows(calibration)
+    with ArchiveWriter(path, FORMAT, attrs) as writer:
+        writer.add("centres", np.asarray(recon.centres), "m", "centres of the pixels")
+        writer.add("areas", np.asarray(recon.areas), "m2", "areas of the pixels")
+        for name, kind in kinds.items():
+            writer.add_rows(name, *kind)
+        before = np.zeros((1, len(calibration.skin.pads)))
+        for first in progress(range(0, len(eit), _BLOCK)):
+            span = slice(first, min(first + _BLOCK, len(eit)))
+            time, frames = _corrected(eit, span, filters["eit"])
+            around = _around(pressure, time)
+            pressure_time, values = _corrected(pressure, around, filters["pressure"])
+            at_frames = resample(pressure_time, values, time)
+            pressed = at_frames - levels["pressure"](time)
+            found = force_map(calibration, frames - levels["eit"](time), pressed, before=before)
+            if calibration.curves.curve.path:
+                before = remembered(np.concatenate([before, pressed]))
+            rows = _of_block(time, found)
+            for name in kinds:
+                writer.append(name, rows[name])
+    return Path(path)
+
+
+def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str, str]]:
+    """What a force map file says of every frame: shape, unit, meaning and type."""
+    pixels, pads = calibration.recon.areas.shape, (len(calibration.skin.pads),)
+    rows = {
+        "time": ((), "ns", "since time_epoch_utc", "i8"),
+        "force": (pixels, "N", "force on each pixel", "f4"),
+        "force_se": (pixels, "N", "standard error of a pixel's force, for the shape as it is", "f4"),
+        "pad_force": (pads, "N", "force on each pad", "f8"),
+        "pad_force_se": (pads, "N", "standard error of a pad's force", "f8"),
+        "pad_valid": (pads, "1", "pressure in the calibrated range", "u1"),
+        "shape_valid": (pads, "1", "1: shape from the image; 0: even", "u1"),
+    }
+    if calibration.locator is None:
+        return rows
+    contacts = (calibration.locator.contacts,)
+    return rows | {
+        "contact_position": ((*contacts, 2), "m", "of each contact found; NaN: none", "f8"),
+        "contact_force": (contacts, "N", "its shares of the forces on pads that it lies on", "f8"),
+    }
+
+
+def _of_block(time: np.ndarray, found: ForceEstimate) -> dict[str, np.ndarray]:
+    """Rows under the names of `_rows`."""
+    parts = {
+        "time": time,
+        "force": found.map.force,
+        "force_se": found.map.standard_error,
+        "pad_force": found.force,
+        "pad_force_se": found.standard_error,
+        "pad_valid": found.valid,
+        "shape_valid": found.map.valid,
+        "contact_position": found.position,
+        "contact_force": found.contact_force,
+    }
+    return {name: np.asarray(part) for name, part in parts.items()}
+
+
+def _corrected(stream: Stream, span: slice, corrections: Sequence[AbstractCorrection]) -> tuple[np.ndarray, np.ndarray]:
+    """Times and corrected values of a block, read with a margin for the filters."""
+    time = stream.time
+    margin = round(_MARGIN * 1e9)
+    first = int(np.searchsorted(time, time[span.start] - margin))
+    last = int(np.searchsorted(time, time[span.stop - 1] + margin, side="right"))
+    values = correct(corrections, time[first:last], stream.read(first, last), stream.name)
+    kept = slice(span.start - first, span.stop - first)
+    return time[span], values[kept]
+
+
+def _around(stream: Stream, time: np.ndarray) -> slice:
+    """Samples of a stream that surround the given times."""
+    first = max(int(np.searchsorted(stream.time, time[0])) - 1, 0)
+    last = min(int(np.searchsorted(stream.time, time[-1])) + 1, len(stream))
+    if last <= first:
+        raise SessionError(
+            f"/streams/{stream.name}: no sample at the time of the EIT frames; the streams do not "
+            "overlap: check their clocks"
+        )
+    return slice(first, last)

@@ -1,0 +1,163 @@
+"""The procedure: sessions to a calibration, and a calibration judged on another session."""
+
+import platform
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+
+import jax
+import numpy as np
+
+import jaxeit as je
+
+from ..fitting.fields import single_places
+from ..fitting.pads import Hybrid
+from ..fitting.response import (
+    PadResponse,
+    fit_response,
+    fitting_problem,
+    hold_out_response,
+    require_every_pad_pressed,
+)
+from ..presses.pooled import pool_presses
+from ..presses.table import PressMeasurements, Processing, measure
+from ..session import Session, SessionError
+from .calibration import Calibration
+from .evaluation import Evaluation, centre_of
+from .hysteresis_loops import typical_loops
+from .press_images import Imager, PressImages, prepare_imager
+from .recipe import Recipe
+from .storage import describe
+
+STAGES = ("reading", "model and images", "fitting", "holding out")
+
+
+def calibrate(
+    sessions: Sequence[Session],
+    skin: je.Skin | None = None,
+    *,
+    recipe: Recipe | None = None,
+    progress: Callable[[str], object] = lambda stage: None,
+) -> Calibration:
+    """Fit one pressure-force curve per pad, and a correction by location, and prepare the image reconstruction.
+
+    Args:
+        sessions: recorded on one skin, from `open_session`.
+        skin: default: the one described in the first session.
+        recipe: all choices on the way; default: those of the paper.
+        progress: told the name of each of the `STAGES` as it begins.
+
+    Raises:
+        SessionError: a session cannot be used, or was recorded on another skin.
+        FitError: a pad was not pressed enough to fit its curve, or there are too few presses for a field.
+        InverseError, HyperparameterError: no image can be made as the recipe asks.
+    """
+    if not sessions:
+        raise SessionError("calibrate: no session given; give one or more session files")
+    recipe = recipe or Recipe()
+    skin = skin or je.skin.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
+    progress("reading")
+    presses = pool_presses(sessions, skin, recipe.processing)
+    require_every_pad_pressed(skin, presses.data)
+    progress("model and images")
+    imager = prepare_imager(skin, presses, recipe)
+    images = imager.presses(presses.dv)
+    progress("fitting")
+    problem = fitting_problem(skin, presses.data, images.places, recipe.loss, recipe.folds)
+    response = fit_response(problem, skin, recipe.curves, recipe.locations)
+    progress("holding out")
+    true_position = presses.position if presses.true_place else None
+    held_out = hold_out_response(problem, response, presses.groups, images.integral, true_position)
+    choice, hybrid = response.choice, response.hybrid
+    return Calibration(
+        skin=skin,
+        recon=imager.recon,
+        masks=imager.masks,
+        curves=hybrid.curves,
+        evaluation=Evaluation(
+            position=presses.position,
+            estimated=images.estimated,
+            force=presses.data.force,
+            pressure=presses.data.pressure,
+            pad_force=held_out.pad_force,
+            image_sum=images.integral,
+            centre=centre_of(skin),
+            held_out_by="location",
+            others=held_out.others,
+            recipe=choice.title,
+            splits=held_out.splits,
+        ),
+        provenance=_provenance(sessions, recipe, imager, response),
+        simulated=any(s.simulated for s in sessions),
+        notes=(*presses.notes, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
+        field=hybrid.field,
+        locator=imager.locator if hybrid.field is not None else None,
+        baseline=response.baseline,
+        image_gain=float(presses.data.force.sum() / images.integral.sum()),
+        loops=typical_loops(presses, _gains(hybrid, images)),
+        tried=choice.tried,
+    )
+
+
+def _gains(hybrid: Hybrid, images: PressImages) -> np.ndarray | None:
+    """Gain of each pad at each press, (presses, pads); None without a correction by location."""
+    if hybrid.field is None or images.places is None:
+        return None
+    return np.asarray(np.exp(hybrid.log_gains(images.places)))
+
+
+def _provenance(sessions: Sequence[Session], recipe: Recipe, imager: Imager, response: PadResponse) -> dict[str, str]:
+    return {
+        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, Python {platform.python_version()}",
+        "sessions": "\n".join(f"{s.hash}  {s.name}" for s in sessions),
+        **describe(recipe, imager.recon, response.choice),
+    }
+
+
+def evaluate(calibration: Calibration, session: Session, processing: Processing | None = None) -> Evaluation:
+    """How well a calibration does on the presses of another session.
+
+    Args:
+        processing: how the session is cut and corrected; default: as those that were calibrated from.
+
+    Raises:
+        SessionError: if the session was recorded on another skin or cannot be used.
+    """
+    found = measure(session, calibration.skin, processing or calibration.processing)
+    _require_channels(calibration, found)
+    images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
+    force, _, _ = calibration.pad_forces(found.pressure, images.places)
+    return Evaluation(
+        position=found.position,
+        estimated=images.estimated,
+        force=found.force,
+        pressure=found.pressure,
+        pad_force=force,
+        image_sum=images.integral,
+        centre=centre_of(calibration.skin),
+        held_out_by="session",
+        notes=found.notes,
+        others=_by_others(calibration, found, images.integral),
+        recipe=calibration.evaluation.recipe,
+    )
+
+
+def _require_channels(calibration: Calibration, found: PressMeasurements) -> None:
+    lost = np.asarray(calibration.recon.channels) & ~found.channels
+    if lost.any():
+        raise SessionError(
+            f"{found.session.name}: /streams/eit: channels {np.flatnonzero(lost)[:8].tolist()} hold no finite "
+            "value but the calibration uses them; calibrate again with this session's channels"
+        )
+
+
+def _by_others(calibration: Calibration, found: PressMeasurements, image_sum: np.ndarray) -> dict[str, np.ndarray]:
+    """Total force by the methods to compare with; none for a calibration of before they were kept."""
+    if calibration.baseline is None:
+        return {}
+    papers = Hybrid(calibration.baseline).pad_forces(found.pressure)[0].sum(1)
+    others = {"eit": calibration.image_gain * image_sum, "hybrid": papers}
+    if calibration.field is not None and "contact_position" in found.session.truth:
+        true = single_places(found.position, len(calibration.skin.pads))
+        others["true_place"] = calibration.pad_forces(found.pressure, true)[0].sum(1)
+    return others

@@ -1,0 +1,109 @@
+"""The recipe of a calibration: every choice that is made on the way from sessions to newtons, as one object."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import jaxeit as je
+from jaxeit.toml import parse_toml, read_text
+
+from ..fitting.curves import AbstractCurve, Linear
+from ..fitting.fields import AbstractField
+from ..fitting.losses import AbstractLoss, SoftL1
+from ..presses.table import Processing
+from .localisation import AbstractLocatorChoice, FittedContact
+from .recipe_text import recipe_fields, recipe_to_toml
+
+
+class RecipeError(ValueError):
+    """Choices that do not make a recipe; the message says which, and what to give."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How sessions become a calibration.
+
+    | meaning                                                                                     | default          |
+    |---------------------------------------------------------------------------------------------|------------------|
+    | curve: the law of force from pressure; of several, one is chosen by cross-validation        | `Linear`         |
+    | location: the field of gain over the place pressed, or None; of several, one is chosen      | None             |
+    | locator: how the place is told from a frame, if there is a field                            | `FittedContact`  |
+    | loss: of the curve fits                                                                     | `SoftL1`         |
+    | processing: how sessions are cut into presses and corrected                                 | `Processing`     |
+    | folds: parts into which the places are divided; each is predicted from the others           | 5                |
+    | imaging: how images are made of frames                                                      | `jaxeit.Imaging` |
+    | fidelity: how well the model is computed that images are made with                          | standard         |
+
+    The default is the recipe of the paper (arXiv 2605.28468). Sequences of curves and locations become tuples.
+
+    Raises:
+        RecipeError: for no curve or location at all, fewer than one fold, a basis without pixels, or a hyperparameter
+            that has frames of its own: those to choose by are the presses of the sessions.
+    """
+
+    curve: AbstractCurve | Sequence[AbstractCurve] = field(default_factory=Linear)
+    location: AbstractField | Sequence[AbstractField | None] | None = None
+    locator: AbstractLocatorChoice = field(default_factory=FittedContact)
+    loss: AbstractLoss = field(default_factory=SoftL1)
+    processing: Processing = field(default_factory=Processing)
+    folds: int = 5
+    imaging: je.Imaging = field(default_factory=je.Imaging)
+    fidelity: je.Fidelity = field(default_factory=je.Fidelity.standard)
+
+    def __post_init__(self) -> None:
+        for name in ("curve", "location"):
+            choice = getattr(self, name)
+            if isinstance(choice, Sequence):
+                object.__setattr__(self, name, tuple(choice))
+                if not choice:
+                    raise RecipeError(f"recipe: {name} is empty; give one or more to choose from")
+        if self.folds < 1:
+            raise RecipeError(f"recipe: folds is {self.folds}; give a whole number above zero")
+        if isinstance(self.imaging.basis, je.model.Elements):
+            raise RecipeError("recipe: pads are laid on an image of pixels; choose the basis Pixels or Bumps")
+        weight = self.imaging.hyperparameter
+        if isinstance(weight, je.imaging.AbstractFrameChoice) and weight.frames is not None:
+            name = type(weight).__name__
+            raise RecipeError(f"recipe: {name} has frames of its own; give {name}(), which looks at the presses")
+
+    @classmethod
+    def from_toml(
+        cls, text: str, source: str = "recipe", *, base: "Recipe | None" = None, allow_import: bool = False
+    ) -> "Recipe":
+        """The recipe that a TOML text describes.
+
+        Args:
+            source: what the text is called in messages.
+            base: gives what the text leaves out; default: `Recipe()`.
+            allow_import: whether the text may name classes of the user's own by import path, whose modules are then
+                imported; not for a text that a data file holds.
+
+        Raises:
+            TomlError: naming the source, the key and the reason.
+        """
+        start = base or cls()
+        return parse_toml(text, source, lambda table: replace(start, **recipe_fields(table, start)), allow_import)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Recipe":
+        """The recipe of a TOML file, as `from_toml`; the file may name classes by import path."""
+        return cls.from_toml(read_text(Path(path)), str(path), allow_import=True)
+
+    def to_toml(self) -> str:
+        """The recipe as TOML, from which `from_toml` makes it again."""
+        return recipe_to_toml(self)
+
+    @property
+    def curves(self) -> tuple[AbstractCurve, ...]:
+        """The curves to choose from."""
+        return self.curve if isinstance(self.curve, tuple) else (self.curve,)
+
+    @property
+    def locations(self) -> tuple[AbstractField | None, ...]:
+        """The fields to choose from."""
+        return self.location if isinstance(self.location, tuple) else (self.location,)
+
+    @property
+    def locates(self) -> bool:
+        """Whether the place of a press is needed."""
+        return any(location is not None for location in self.locations)

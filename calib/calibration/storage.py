@@ -1,0 +1,220 @@
+"""A calibration as attributes and arrays, for its file."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from jaxeit.toml import TomlTable, parse_toml
+
+from ..fitting.curves import CURVES, AbstractCurve, Linear
+from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry, restored
+from ..fitting.fitted_curve import FittedCurve
+from ..fitting.selection import Candidate, Choice
+from ..presses.table import Processing
+from ..session import Archive
+from .evaluation import Evaluation
+from .hysteresis_loops import Loops
+from .localisation import AbstractLocator, locator_from_numbers, locator_numbers
+from .recipe import Recipe
+from .recipe_text import read_imaging, read_processing
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
+
+T = TypeVar("T")
+
+
+def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
+    """The attributes and the arrays that hold a calibration."""
+    attrs: dict[str, Any] = {
+        "skin": cal.skin.name,
+        "skin_toml": cal.skin.toml,
+        "simulated": int(cal.simulated),
+        "notes": "\n".join(cal.notes),
+        "image_rows": cal.recon.shape[0],
+        "image_columns": cal.recon.shape[1],
+        "tried": json.dumps([candidate._asdict() for candidate in cal.tried]),
+        **{f"provenance_{k}": v for k, v in cal.provenance.items()},
+        **{f"evaluation_{k}": v for k, v in cal.evaluation.attributes().items()},
+    }
+    recon, masks, curves = cal.recon, cal.masks, cal.curves
+    arrays = {
+        **{
+            f"image/{name}": (array, *je.imaging.NUMBERS[name][1:])
+            for name, array in je.imaging.to_numbers(recon).items()
+        },
+        "image/extent": (recon.extent, "m", "x0, x1, y0, y1 of the picture"),
+        "image/masks": (masks.weights, "1", "share of each pad in each pixel"),
+    }
+    for name, meaning in _CURVE_FIELDS.items():
+        arrays[f"pads/{name}"] = (getattr(curves, name), "", meaning)
+    for f in fields(curves.curve):
+        arrays[f"pads/curve-{f.name}"] = (getattr(curves.curve, f.name), "Pa", "what the curve left open, as fitted")
+    if cal.baseline is not None:
+        attrs["image_gain"] = cal.image_gain
+        for name, meaning in _CURVE_FIELDS.items():
+            arrays[f"baseline/{name}"] = (getattr(cal.baseline, name), "", meaning)
+    if cal.field is not None and cal.locator is not None:
+        arrays |= _field_arrays(cal.field)
+        for name, array in locator_numbers(cal.locator).items():
+            arrays[f"locator/{name}"] = (array, "", "of the estimator of the place, as the library names it")
+    for name, value in cal.evaluation.arrays().items():
+        arrays[f"presses/{name}"] = value
+    if cal.loops is not None:
+        arrays |= {f"loops/{name}": value for name, value in cal.loops.arrays().items()}
+    return attrs, {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
+
+
+def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: Choice) -> dict[str, str]:
+    """What a calibration's provenance says of its recipe, and of what was chosen by it."""
+    return {
+        "curve": CURVES.name_of(choice.curve),
+        "location": "none" if choice.field is None else FIELDS.name_of(choice.field),
+        "choice": choice.why,
+        "pixels": "x".join(map(str, recon.shape[::-1])),
+        "hyperparameter": recon.provenance["hyperparameter"],
+        "image_rank": recon.provenance["rank"],
+        "recipe": recipe.to_toml(),
+    }
+
+
+def recorded_recipe(provenance: Mapping[str, str]) -> Recipe | None:
+    """The recipe that `describe` wrote down; None of a calibration of before."""
+    text = provenance.get("recipe")
+    return None if text is None else Recipe.from_toml(text, "calibration: recipe")
+
+
+def recorded_processing(provenance: Mapping[str, str]) -> Processing:
+    """How the sessions were cut and corrected; the default of a calibration of before."""
+    return _part(provenance, "processing", lambda table: read_processing(table, Processing()), Processing())
+
+
+def _imaging(provenance: Mapping[str, str]) -> je.Imaging | None:
+    return _part(provenance, "imaging", lambda table: read_imaging(table, je.Imaging()), None)
+
+
+def _part(provenance: Mapping[str, str], key: str, read: Callable[[TomlTable], T], otherwise: T) -> T:
+    """A part of the recipe by itself: whoever needs it does not need the classes that other parts name."""
+    if "recipe" not in provenance:
+        return otherwise
+    return parse_toml(provenance["recipe"], "calibration: recipe", lambda table: read(table.table(key)))
+
+
+def _field_arrays(found: FittedField) -> dict[str, tuple[Any, str, str]]:
+    choice = {f"choice-{f.name}": getattr(found.field, f.name) for f in fields(found.field)}
+    place = {f"geometry-{f.name}": getattr(found.geometry, f.name) for f in fields(Geometry)}
+    out: dict[str, tuple[Any, str, str]] = {
+        f"location/{name}": (value, "", "setting of the field") for name, value in choice.items()
+    }
+    out |= {f"location/{name}": (value, "m", "outlines of pads and rim") for name, value in place.items()}
+    return out | {f"location/{name}": (getattr(found, name), u, text) for name, (u, text) in _FIELD_FIELDS.items()}
+
+
+_FIELD_FIELDS = {
+    "coefficients": ("1", "of the centred features, in log gain"),
+    "covariance": ("1", "of the coefficients"),
+    "reach": ("m", "lowest and highest corner of the box of each pad that was pressed"),
+    "centre": ("1", "mean features of each pad's presses"),
+    "noise": ("1", "scatter of single presses about the field, in log force"),
+    "spread": ("1", "scatter of single presses about no field, in log force"),
+    "evidence": ("1", "log of the largest marginal likelihood, over that of no field"),
+    "n": ("1", "places fitted"),
+    "result": ("1", "0: success"),
+}
+
+_CURVE_FIELDS = {
+    "parameters": "parameters of the pressure-force curve, in the curve's own units",
+    "covariance": "of the parameters",
+    "pressure_range": "lowest and highest pressure fitted, Pa",
+    "scale": "robust standard deviation of the residuals, N",
+    "residual_rms": "root mean square residual, N",
+    "n": "samples fitted",
+    "n_missing": "samples not finite",
+    "n_groups": "places fitted",
+    "rank": "parameters that the samples determine",
+    "result": "0: success",
+}
+
+
+def fields_from_archive(archive: Archive) -> dict[str, Any]:
+    """The fields of the calibration that `to_archive` described.
+
+    Raises:
+        KeyError, ValueError: for what is missing, or does not fit; `StoreError` for the image's numbers.
+    """
+    attrs, arrays = archive.attrs, archive.arrays
+    skin = je.skin.parse_skin(str(attrs["skin_toml"]), "calibration: skin_toml")
+    numbers = {k.removeprefix("image/"): v for k, v in arrays.items() if k.startswith("image/")}
+    shape = int(attrs["image_rows"]), int(attrs["image_columns"])
+    provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
+    imaging = _imaging(provenance) if "jacobian" in numbers else None
+    recon = je.imaging.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])), None, imaging)
+    kind = CURVES.find(provenance["curve"])
+    old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
+    choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
+    for name, array in choices.items():
+        _shaped(choices, name, (len(skin.pads), *array.shape[1:]), "f")
+    curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
+    fitted = _fitted(arrays, "pads/", len(skin.pads), kind())
+    located = provenance.get("location", "none") != "none"
+    return {
+        "skin": skin,
+        "recon": recon,
+        "masks": je.PadMasks(
+            jnp.asarray(_shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")), recon.areas
+        ),
+        "curves": FittedCurve(curve=curve, **fitted),
+        "evaluation": Evaluation.restore(attrs, arrays, "evaluation_", "presses/"),
+        "provenance": provenance,
+        "simulated": bool(attrs["simulated"]),
+        "notes": tuple(filter(None, str(attrs["notes"]).split("\n"))),
+        "field": _field_from(arrays, FIELDS.find(provenance["location"])) if located else None,
+        "locator": _locator_from(arrays, recon.dtype) if located else None,
+        "baseline": _baseline_from(arrays, len(skin.pads)),
+        "image_gain": float(attrs.get("image_gain", "nan")),
+        "loops": Loops.restore(arrays, "loops/"),
+        "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
+    }
+
+
+def _field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:
+    choice = {f.name: arrays[f"location/choice-{f.name}"] for f in fields(kind)}
+    geometry = {f.name: jnp.asarray(arrays[f"location/geometry-{f.name}"]) for f in fields(Geometry)}
+    numbers = {name: jnp.asarray(arrays[f"location/{name}"]) for name in _FIELD_FIELDS}
+    return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
+
+
+def _locator_from(arrays: Mapping[str, np.ndarray], dtype: Any) -> AbstractLocator:
+    numbers = {k.removeprefix("locator/"): v for k, v in arrays.items() if k.startswith("locator/")}
+    return locator_from_numbers(numbers, dtype)
+
+
+def _baseline_from(arrays: Mapping[str, np.ndarray], pads: int) -> FittedCurve | None:
+    """None: a calibration written before the paper's recipe was kept beside it."""
+    if "baseline/parameters" not in arrays:
+        return None
+    return FittedCurve(curve=Linear(), **_fitted(arrays, "baseline/", pads, Linear()))
+
+
+def _fitted(arrays: Mapping[str, np.ndarray], where: str, pads: int, curve: AbstractCurve) -> dict[str, jax.Array]:
+    """The numbers of `FittedCurve` for all pads."""
+    tails = {"parameters": (curve.size,), "covariance": (curve.size, curve.size), "pressure_range": (2,)}
+    kinds = dict.fromkeys(("n", "n_missing", "n_groups", "rank", "result"), "iu")
+    return {
+        name: jnp.asarray(_shaped(arrays, where + name, (pads, *tails.get(name, ())), kinds.get(name, "f")))
+        for name in _CURVE_FIELDS
+    }
+
+
+def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray:
+    """An array that is used as it is, once it has been looked at."""
+    array = arrays[name]
+    if array.shape != shape or array.dtype.kind not in kinds:
+        raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not numbers of shape {shape}")
+    return array

@@ -1,0 +1,85 @@
+"""Check the skin that a session describes, and the protocol of its scan."""
+
+import tomllib
+from collections.abc import Iterator
+
+import numpy as np
+
+import jaxeit as je
+
+from ..session import Session
+from .report import Finding, Severity, listed
+
+
+def check_skin(session: Session, given: je.Skin | None, findings: list[Finding]) -> je.Skin | None:
+    """The skin to check against, or None. What is wrong with it, or with the protocol, is added to ``findings``."""
+    own = _own_skin(session, findings)
+    if given is not None and own is not None:
+        findings += _differences(own.toml, given.toml, f"the given skin {given.name!r}")
+    elif own is not None and own.name in je.skin.shipped_skins():
+        findings += _differences(own.toml, je.load_skin(own.name).toml, f"the shipped {own.name!r}")
+    skin = own if given is None else given
+    if skin is not None:
+        findings += _protocol_findings(session, skin)
+    return skin
+
+
+def _own_skin(session: Session, findings: list[Finding]) -> je.Skin | None:
+    if not session.skin_toml.strip():
+        severity = Severity.WARNING if "eit" in session.streams else Severity.OK
+        what = "describes no skin: pads, numbering and signs are not checked without one"
+        findings.append(Finding(severity, "/device", what, "give the skin that was recorded (--skin FILE)"))
+        return None
+    try:
+        return je.skin.parse_skin(session.skin_toml, "skin_toml")
+    except ValueError as error:
+        what = f"the skin's text cannot be used: {error}"
+        findings.append(Finding(Severity.ERROR, "/device", what, "give a corrected skin (--skin FILE)"))
+        return None
+
+
+def _differences(text: str, other: str, name: str) -> Iterator[Finding]:
+    a, b = _flat(tomllib.loads(text)), _flat(tomllib.loads(other))
+    keys = sorted(k for k in a.keys() | b.keys() if a.get(k) != b.get(k))
+    if keys:
+        what = f"the recorded skin differs from {name} in: {listed(keys)}"
+        yield Finding(Severity.WARNING, "/device", what, "if the change is intended, give the edited skin its own name")
+
+
+def _flat(value: object, key: str = "") -> dict[str, object]:
+    """Flatten a TOML document to one level of dotted keys."""
+    if isinstance(value, dict):
+        items = [(f"{key}.{k}" if key else k, v) for k, v in value.items()]
+    elif isinstance(value, list) and any(isinstance(v, dict) for v in value):
+        items = [(f"{key}[{i}]", v) for i, v in enumerate(value)]
+    else:
+        return {key: value}
+    return {k: v for name, part in items for k, v in _flat(part, name).items()}
+
+
+def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:
+    where, pattern, own = "/device/eit_protocol", session.pattern, skin.protocol
+    if pattern is None:
+        if "eit" in session.streams:
+            remedy = "write the pattern of the scan: no reading has a meaning without it"
+            yield Finding(Severity.ERROR, where, "no pattern was recorded", remedy)
+        return
+    if pattern.max() >= len(skin.electrodes):
+        what = f"the pattern names electrode {pattern.max()}; the skin has 0 to {len(skin.electrodes) - 1}"
+        yield Finding(Severity.ERROR, where, what, "electrodes are counted from 0")
+    elif pattern.shape != own.pattern.shape or (pattern != own.pattern).any():
+        remedy = "calibrate with the skin that was recorded (--skin FILE), or correct its protocol"
+        yield Finding(Severity.ERROR, where, _pattern_difference(pattern, own.pattern), remedy)
+    if session.current is not None and not np.isclose(session.current, own.current, rtol=0.01):
+        what = f"the drive current is {session.current:g} A, but {own.current:g} A in the skin's file"
+        yield Finding(Severity.WARNING, where, what, "correct the wrong one of the two")
+
+
+def _pattern_difference(pattern: np.ndarray, own: np.ndarray) -> str:
+    if pattern.shape != own.shape:
+        return f"the pattern has {len(pattern)} readings, the skin's protocol {len(own)}"
+    rows = np.flatnonzero((pattern != own).any(1))
+    same = sorted(map(tuple, pattern.tolist())) == sorted(map(tuple, own.tolist()))
+    kind = "holds the same readings in another order" if same else "is not the skin's protocol"
+    first = f"row {rows[0]} is {pattern[rows[0]].tolist()}, the skin's {own[rows[0]].tolist()}"
+    return f"the pattern {kind}: {len(rows)} rows differ ({first})"

@@ -1,0 +1,39 @@
+"""`jaxeit apply`."""
+
+import argparse
+
+from .arguments import prepare_outputs
+from .recipe_options import add_low_pass_argument, processing_of
+from .terminal import progress_bar
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """A calibration, a session, and the file to write."""
+    parser.add_argument("calibration", metavar="CALIBRATION.h5")
+    parser.add_argument("session", metavar="SESSION.h5")
+    parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
+    add_low_pass_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the force map of every frame."""
+    from ..runtime import set_up
+
+    set_up()
+    from ..calibration.calibration import load_calibration
+    from ..calibration.force_maps import apply
+    from ..session import open_session
+
+    prepare_outputs(args.output)
+    calibration = load_calibration(args.calibration)
+    with open_session(args.session) as session:
+        apply(
+            calibration,
+            session,
+            args.output,
+            processing=processing_of(args, calibration.processing),
+            progress=progress_bar("frames"),
+        )
+        frames = len(session.stream("eit"))
+    print(f"{args.output}: {frames} force maps in newtons")
+    return 0

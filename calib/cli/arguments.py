@@ -1,0 +1,59 @@
+"""Arguments that several commands take, and checks of them before the work begins."""
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, overload
+
+if TYPE_CHECKING:
+    import jaxeit as je
+
+
+def count(text: str) -> int:
+    """A whole number above zero."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: give a whole number above zero")
+    return int(text)
+
+
+def above_zero(text: str) -> float:
+    """A number above zero."""
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: give a number above zero")
+    return value
+
+
+@overload
+def skin_of(name: str) -> "je.Skin": ...
+
+
+@overload
+def skin_of(name: str | None) -> "je.Skin | None": ...
+
+
+def skin_of(name: str | None) -> "je.Skin | None":
+    """A shipped skin by its name, or that of a TOML file; None for None."""
+    if name is None:
+        return None
+    import jaxeit as je
+
+    return je.load_skin(name)
+
+
+def prepare_outputs(*paths: str | None) -> None:
+    """Make the folders of what will be written, and say before the work begins if that cannot be."""
+    for path in map(Path, filter(None, paths)):
+        if path.is_dir():
+            raise ValueError(f"{path}: is a folder; give a file name")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK):
+            raise ValueError(f"{path}: the folder cannot be written to; choose another")
+
+
+def require_matplotlib_for(option: str) -> None:
+    """Say before the work begins that an option needs matplotlib, if it is not installed."""
+    from importlib.util import find_spec
+
+    if find_spec("matplotlib") is None:
+        raise ImportError(f"{option} needs matplotlib: pip install 'jaxeit[report]'")

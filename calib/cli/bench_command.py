@@ -1,0 +1,105 @@
+"""`jaxeit bench`."""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .arguments import above_zero, prepare_outputs, require_matplotlib_for
+from .recipe_options import add_imaging_arguments, imaging_of
+from .terminal import progress_bar
+
+if TYPE_CHECKING:
+    from jaxeit.accuracy import Choice, Ladder
+    from jaxeit.model import Scene
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What to study, and what to recommend."""
+    text = "a shipped skin or scene by its name, or the TOML file of your own; default: testbed"
+    parser.add_argument("what", nargs="?", default="testbed", metavar="SKIN|SCENE.toml", help=text)
+    text = "recommend the most accurate rung that solves in this time"
+    parser.add_argument("--budget-ms", type=above_zero, metavar="MS", help=text)
+    text = "recommend the quickest rung whose error of a touch is no more than this, such as 2e-3"
+    parser.add_argument("--error", type=above_zero, metavar="E", help=text)
+    parser.add_argument("--smoke", action="store_true", help="a few coarse rungs, within a minute")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    parser.add_argument("-o", "--output", metavar="FIGURE.png", help="draw error against time")
+    add_imaging_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table, the advice, or both as JSON."""
+    from shutil import get_terminal_size
+
+    import jax
+
+    import jaxeit as je
+
+    prepare_outputs(args.output)
+    if args.output:
+        require_matplotlib_for("-o")
+    rungs, budget = _rungs(args), 0.1 if args.smoke else 0.5
+    scene = bench_scene(args.what)
+    with jax.enable_x64(True):  # and no cache of programs: how long they take to compile is measured
+        found = je.ladder(scene, rungs, budget=budget, progress=progress_bar("rungs"))
+    if args.output:
+        _write_ladder_figure(found, Path(args.output))
+    wishes = {"budget_ms": args.budget_ms, "error": args.error}
+    wanted = any(wish is not None for wish in wishes.values())
+    if not args.json:
+        print(found.table(get_terminal_size((110, 24)).columns), flush=True)
+        if wanted:
+            print("\n" + found.advice(**wishes))
+        return 0
+    report = found.summary()
+    try:
+        if wanted:
+            report["recommended"] = found.recommend(**wishes).choice.label
+    finally:  # what was measured is told even where no rung is good enough
+        print(json.dumps(report, indent=2))
+    return 0
+
+
+def _rungs(args: argparse.Namespace) -> tuple["Choice", ...] | None:
+    """The usual rungs, with the images that the options choose; None: the usual images."""
+    import jaxeit as je
+
+    imaging = imaging_of(args, je.Imaging())
+    usual = je.accuracy.few_choices() if args.smoke else None
+    if imaging == je.Imaging():
+        return usual
+    if imaging.noise.needs_frames or (args.hyperparameter or "").startswith("discrepancy"):
+        raise ValueError("the study's readings have no noise to be measured; leave --noise and discrepancy out")
+    standard = je.accuracy.Choice("usual images", je.Fidelity.standard())
+    rungs = usual or (*je.accuracy.fidelity_choices(), standard)
+    return tuple(
+        replace(rung, imaging=imaging) if rung.imaging is not None and rung is not standard else rung for rung in rungs
+    )
+
+
+def bench_scene(what: str) -> "Scene":
+    """A scene by name or file; of a skin, the ideal sensor."""
+    import re
+
+    import jaxeit as je
+
+    from ..bench import load_bench, presets
+
+    path = Path(what)
+    if what in je.skin.shipped_skins():
+        return je.Scene(je.load_skin(what))
+    if not path.exists() and what not in presets():
+        known = ", ".join((*je.skin.shipped_skins(), *presets()))
+        raise ValueError(f"{what}: no such file, skin or scene; shipped are {known}")
+    if path.is_file() and re.search(r'^format\s*=\s*"jaxeit-skin"', je.toml.read_text(path), re.MULTILINE):
+        return je.Scene(je.load_skin(path))
+    return load_bench(what).scene
+
+
+def _write_ladder_figure(found: "Ladder", path: Path) -> None:
+    from ..report.accuracy_figure import ladder_figure
+    from ..report.figures import write_figure
+
+    write_figure(ladder_figure([found.summary()]), path)

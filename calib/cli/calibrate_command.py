@@ -1,0 +1,138 @@
+"""`jaxeit calibrate`."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from ..calibration import Recipe
+from ..calibration.recipe_text import AUTO, NONE
+from ..fitting import CURVES
+from ..session import Session
+from .arguments import count, prepare_outputs, require_matplotlib_for, skin_of
+from .recipe_options import IMAGING, add_recipe_arguments, recipe_of
+from .terminal import stage_bar, title
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Sessions, outputs, and every choice of a recipe."""
+    parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
+    text = "one calibration of all sessions together; with --jobs or --scheduler the folder for one of each"
+    parser.add_argument("-o", "--output", required=True, metavar="CALIBRATION.h5", help=text)
+    text = "write a page with figures; with --jobs or --scheduler without a name, one beside each calibration"
+    parser.add_argument("--report", nargs="?", const="", metavar="REPORT.html", help=text)
+    text = "sessions the fit does not see, to judge it on"
+    parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
+    parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    many = parser.add_mutually_exclusive_group()
+    text = "calibrate every session by itself, N at a time; those that are done in the output folder are skipped"
+    many.add_argument("--jobs", type=count, metavar="N", help=text)
+    text = "the same by the workers of a Dask scheduler, which must see the same files"
+    many.add_argument("--scheduler", metavar="ADDRESS", help=text)
+    add_recipe_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate from all sessions together, or from each by itself."""
+    from ..runtime import set_up
+
+    set_up()
+    if args.report is not None:
+        require_matplotlib_for("--report")
+    if args.jobs or args.scheduler:
+        return _calibrate_many(args)
+    if args.report == "":
+        raise ValueError("--report: give the name of the page, as --report report.html")
+    return _calibrate_together(args)
+
+
+def _calibrate_together(args: argparse.Namespace) -> int:
+    from ..calibration.evaluation import render_table
+    from ..calibration.procedure import STAGES, calibrate, evaluate
+    from ..session import open_session
+
+    prepare_outputs(args.output, args.report)
+    recipe, skin = recipe_of(args), skin_of(args.skin)
+    with ExitStack() as stack:
+        sessions = [stack.enter_context(open_session(path)) for path in args.sessions]
+        if all("eit" not in session.streams for session in sessions):
+            return _calibrate_logs(args, recipe, sessions)
+        stages = stack.enter_context(stage_bar(len(STAGES)))
+        calibration = calibrate(sessions, skin, recipe=recipe, progress=stages)
+        tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}
+        tried = {name: evaluate(calibration, session) for name, session in tests.items()}
+    calibration.save(args.output)
+    if args.report:
+        from ..report.document import write_report
+
+        write_report(calibration, Path(args.report), evaluations=tried)
+    if args.json:
+        results = {"calibration": calibration.evaluation.summary()} | {n: e.summary() for n, e in tried.items()}
+        print(json.dumps(results, indent=2, sort_keys=True))
+        return 0
+    names = ", ".join(Path(path).name for path in args.sessions)
+    print(render_table(calibration.evaluation, title(names, calibration.simulated)))
+    for note in calibration.notes:
+        print(f"  note: {note}")
+    for name, found in tried.items():
+        print("\n" + render_table(found, title(name, tests[name].simulated)))
+    print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
+    return 0
+
+
+def _calibrate_many(args: argparse.Namespace) -> int:
+    """Each session by itself; status 2 if one failed, when all others are done."""
+    from tqdm import tqdm
+
+    from ..batch.cluster import dask_executor
+    from ..batch.sessions import Outcome, calibrate_many, render_outcomes
+
+    if args.test:
+        raise ValueError("--test is for one calibration; try those of a folder with jaxeit evaluate")
+    if args.report:
+        raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
+    with ExitStack() as stack:
+        executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
+        bar = stack.enter_context(tqdm(total=len(args.sessions), desc="sessions", disable=None, leave=False))
+
+        def tell(outcome: Outcome) -> None:
+            bar.update()
+            if outcome.reason:
+                tqdm.write(f"jaxeit: {Path(outcome.session).name}: {outcome.reason}", file=sys.stderr)
+
+        outcomes = calibrate_many(
+            args.sessions,
+            args.output,
+            executor=executor,
+            jobs=args.jobs,
+            report=args.report is not None,
+            tell=tell,
+            recipe=recipe_of(args),
+            skin=skin_of(args.skin),
+        )
+    if args.json:
+        print(json.dumps({o.session: o.summary or {"failed": o.reason} for o in outcomes}, indent=2, sort_keys=True))
+    else:
+        print(render_outcomes(outcomes, args.output))
+    return 2 if any(outcome.reason for outcome in outcomes) else 0
+
+
+_NEED_EIT = ("report", "test", "skin", "location", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
+
+
+def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
+    """Sessions without EIT: one curve per log, tested on its second half."""
+    from ..calibration.logs import fit_session, render_log, save_logs
+
+    given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, [], NONE)]
+    if given:
+        raise ValueError(f"{', '.join(given)}: for sessions with EIT, and these hold none; leave it out")
+    curves = tuple(CURVES.make(name) for name in CURVES.shipped) if args.curve == AUTO else recipe.curves
+    fits = {session.name: fit_session(session, curves, recipe.loss) for session in sessions}
+    save_logs(fits, args.output)
+    print("\n".join(render_log(name, fit) for name, fit in fits.items()))
+    print(f"\nwrote {args.output}")
+    return 0

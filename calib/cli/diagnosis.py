@@ -1,0 +1,166 @@
+"""`jaxeit doctor`: what this machine has, each line ok or with its mend.
+
+Every check stands alone: what is broken must not keep the others from being told.
+"""
+
+import importlib
+import os
+import platform
+import re
+import shutil
+import socket
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from serial.tools import list_ports
+
+from ..record.priority import refusal
+
+_FREE = 2e9  # bytes; an hour of 928 readings at 100 Hz takes 1.4 GB
+_SLOW_SYNC = 0.1  # s
+_REQUIREMENT = re.compile(r"([A-Za-z0-9_.\-]+)\s*>=\s*([0-9.]+)")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One finding: ``mend`` says what to do, and is empty where all is well; a ``note`` breaks nothing."""
+
+    name: str
+    text: str
+    mend: str = ""
+    note: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is broken."""
+        return not self.mend or self.note
+
+    def render(self) -> str:
+        """One line, two if there is something to do."""
+        mark = "ok  " if not self.mend else "note" if self.note else "BAD "
+        return f"{mark}  {self.name}: {self.text}" + (f"\n      -> {self.mend}" if self.mend else "")
+
+
+def examine() -> list[Line]:
+    """All checks, one after the other."""
+    return [line for check in _CHECKS for line in _guarded(check)]
+
+
+def _guarded(check: Callable[[], Iterator[Line]]) -> list[Line]:
+    name = check.__name__.strip("_")
+    try:
+        return list(check())
+    except Exception as error:  # the patient may have anything
+        return [Line(name, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}", "install jaxeit again")]
+
+
+def _python() -> Iterator[Line]:
+    text = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    yield Line("python", text, "" if sys.version_info >= (3, 11) else "use Python 3.11 or later")
+
+
+def _packages() -> Iterator[Line]:
+    yield Line("jaxeit", metadata.version("jaxeit"))
+    for requirement in metadata.requires("jaxeit") or []:
+        found = _REQUIREMENT.match(requirement)
+        if found and "extra ==" not in requirement:
+            yield _package(found[1], found[2])
+    try:
+        yield Line("matplotlib", metadata.version("matplotlib"))
+    except metadata.PackageNotFoundError:
+        yield Line("matplotlib", "not there, needed for --report", "pip install 'jaxeit[report]'", note=True)
+
+
+def _package(name: str, least: str) -> Line:
+    try:
+        version = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return Line(name, "not there", f"pip install '{name}>={least}'")
+    old = _numbers(version) < _numbers(least)
+    return Line(name, version, f"pip install --upgrade '{name}>={least}'" if old else "")
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(n) for n in re.findall(r"\d+", version)[:3])
+
+
+def _device() -> Iterator[Line]:
+    jax = importlib.import_module("jax")
+    devices = ", ".join(f"{d.platform} ({d.device_kind})" for d in jax.devices())
+    yield Line("device", f"JAX computes on {devices}")
+    skin = importlib.import_module("jaxeit").load_skin("testbed")
+    yield Line("skins", f"{skin.name} is readable, {skin.protocol.readings} readings")
+
+
+def _threads() -> Iterator[Line]:
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Line("processors", str(count), "" if count > 1 else "recording and live want two", note=True)
+    pinned = any(os.environ.get(name) == "1" for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"))
+    mend = "" if pinned else "for jaxeit live on a busy machine: export OPENBLAS_NUM_THREADS=1"
+    yield Line("BLAS threads", "one" if pinned else "as many as processors", mend, note=True)
+
+
+def _priority() -> Iterator[Line]:
+    refused = refusal()
+    found = "refused; only jaxeit live --realtime wants it" if refused else "allowed, for jaxeit live --realtime"
+    yield Line("real-time priority", found, refused or "", note=bool(refused))
+
+
+def _cache() -> Iterator[Line]:
+    runtime = importlib.import_module("calib.runtime")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        folder = runtime.cache_folder()
+    if folder is None:
+        reason = str(caught[-1].message) if caught else "no folder for compiled programs"
+        yield Line("cache", reason, "make ~/.cache/jaxeit yours alone: chmod 700 ~/.cache/jaxeit", note=True)
+    else:
+        size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+        yield Line("cache", f"{folder}, {size / 1e6:.0f} MB")
+
+
+def _disk() -> Iterator[Line]:
+    here = Path.cwd()
+    free = shutil.disk_usage(here).free
+    mend = "" if free > _FREE else "free some space: an hour of 928 readings at 100 Hz takes 1.4 GB"
+    yield Line("disk", f"{free / 1e9:.1f} GB free in {here}", mend)
+    if not os.access(here, os.W_OK):
+        yield Line("folder", f"{here} cannot be written to", "record into another folder", note=True)
+        return
+    longest = max(_sync_times(here))
+    mend = "" if longest < _SLOW_SYNC else "record to a disk of this machine: a power cut costs as much more"
+    yield Line("sync", f"{1e3 * longest:.1f} ms at most to bring a record to the disk", mend, note=True)
+
+
+def _sync_times(folder: Path) -> Iterator[float]:
+    with tempfile.TemporaryFile(dir=folder) as file:
+        for _ in range(5):
+            file.write(bytes(4096))
+            file.flush()
+            begin = time.monotonic()
+            os.fsync(file.fileno())
+            yield time.monotonic() - begin
+
+
+def _ports() -> Iterator[Line]:
+    ports = sorted(list_ports.comports())
+    if not ports:
+        yield Line("serial ports", "none is plugged in")
+    for port in ports:
+        mine = os.name == "nt" or os.access(port.device, os.R_OK | os.W_OK)
+        mend = "" if mine else "sudo usermod -aG dialout $USER, then log in again"
+        yield Line("serial port", f"{port.device} ({port.description})", mend)
+
+
+def _network() -> Iterator[Line]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield Line("loopback", f"listens on {server.getsockname()[0]}")
+
+
+_CHECKS = (_python, _packages, _device, _threads, _priority, _cache, _disk, _ports, _network)

@@ -1,0 +1,91 @@
+"""`jaxeit live`."""
+
+import argparse
+import os
+import sys
+from contextlib import ExitStack
+
+from .arguments import above_zero, prepare_outputs
+from .signals import orderly_end
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """A calibration, the URLs of its streams, and who is shown the results."""
+    parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
+    parser.add_argument("--eit", required=True, metavar="URL", help="as for jaxeit record")
+    parser.add_argument("--pressure", required=True, metavar="URL")
+    parser.add_argument("--rest", type=above_zero, default=2.0, metavar="S", help="untouched at first; default: 2")
+    parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help="for devices to begin; default: 10")
+    parser.add_argument("--seconds", type=above_zero, help="how long; default: until Ctrl-C")
+    parser.add_argument("--host", default="127.0.0.1", help="to listen on; default: this machine only")
+    parser.add_argument("--port", type=int, default=8765, help="of the page; 0: any; default: 8765")
+    parser.add_argument("--publish", type=int, metavar="PORT", help="send results there as lines of JSON; 0: any")
+    parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
+    text = "show results in a rerun viewer that runs there (default: 127.0.0.1:9876), or write them to FILE.rrd"
+    parser.add_argument("--rerun", nargs="?", const="127.0.0.1:9876", metavar="HOST:PORT|FILE.rrd", help=text)
+    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record what arrives as well")
+    text = "tell the device what to read next: few readings at rest, those around a contact while there is one"
+    parser.add_argument("--event-driven", action="store_true", help=text)
+    text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
+    parser.add_argument("--realtime", action="store_true", help=text)
+
+
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show force maps until somebody stops it."""
+    from ..record.priority import real_time
+
+    with real_time(args.realtime):
+        pass  # refused at once or not at all
+    for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
+        os.environ.setdefault(name, "1")
+    if args.rerun is not None:
+        _require_rerun()
+    from ..runtime import set_up_live
+
+    set_up_live()
+    from threading import Timer
+
+    from ..calibration.calibration import load_calibration
+    from ..live.loop import LiveControl, LiveSettings, Publish
+    from ..live.presentation import Presentation, present
+    from ..record.planning import plan_recording
+    from ..record.recorder import StopRequest
+
+    prepare_outputs(args.output)
+    calibration = load_calibration(args.calibration)
+    plan, sources = plan_recording({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
+    orders = StopRequest()
+    show = LiveControl(stop=orders.stop)
+    also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
+    timer = Timer(args.seconds or 0.0, orders.stop_recording)
+    timer.daemon = True
+    with orderly_end(orders, planned=False), ExitStack() as stack:
+        if args.rerun is not None:
+            from ..live.rerun_view import RerunView
+
+            also.append(stack.enter_context(RerunView(calibration, show, args.rerun)).show_result)
+        if args.seconds is not None:
+            timer.start()
+        count = present(
+            calibration,
+            plan,
+            sources,
+            show,
+            Presentation(host=args.host, port=args.port, publish=args.publish, output=args.output),
+            LiveSettings(event_driven=args.event_driven, realtime=args.realtime, rest=args.rest, wait=args.wait),
+            also=also,
+            tell=lambda line: print(f"jaxeit: {line}", file=sys.stderr),
+        )
+        timer.cancel()
+    print(f"jaxeit: {count} frames", file=sys.stderr)
+    return orders.status
+
+
+def _require_rerun() -> None:
+    from importlib.util import find_spec
+
+    if find_spec("rerun") is None:
+        raise ImportError("--rerun needs rerun: pip install 'jaxeit[viewer]'")

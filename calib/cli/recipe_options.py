@@ -1,0 +1,134 @@
+"""Options that name the choices of a recipe, and the recipe that they make.
+
+Names come from the registries, so that a new class is known here at once.  An option overrides the recipe file, and the
+recipe file the defaults.
+"""
+
+import argparse
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import jaxeit as je
+
+from ..calibration import Recipe
+from ..calibration.localisation import LOCATORS
+from ..calibration.recipe_text import (
+    AUTO,
+    LEVELS,
+    NONE,
+    curve_choice,
+    fidelity_choice,
+    hyperparameter_choice,
+    location_choice,
+)
+from ..fitting import CURVES, FIELDS, LOSSES
+from ..presses.corrections import BASELINES, LowPass
+from ..presses.table import Processing
+from .arguments import count
+
+T = TypeVar("T")
+
+IMAGING = ("method", "prior", "hyperparameter", "pixels", "basis", "noise")
+"""Options that choose how images are made."""
+
+
+def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options for every choice of a recipe."""
+    about = "a choice is a name, or a name with settings such as power:reference=900; module:Class is a class of yours"
+    group = parser.add_argument_group("recipe", about)
+    text = "take the choices from a TOML file; options given beside it override the file"
+    group.add_argument("--recipe", metavar="RECIPE.toml", help=text)
+    text = "force from pressure; with auto it is chosen by cross-validation over locations"
+    _choice(group, "--curve", (*CURVES, AUTO), text, default="linear")
+    text = "correction by the place pressed, as the image tells it; the paper's recipe has none"
+    _choice(group, "--location", (NONE, *FIELDS, AUTO), text, default=NONE)
+    _choice(group, "--locator", LOCATORS, "how that place is found in a frame", default="fitted-contact")
+    _choice(group, "--loss", LOSSES, "how much a bad sample counts in the fit of a curve", default="soft-l1")
+    text = "parts into which the places are divided, each predicted from the others; from the number of places on, "
+    group.add_argument("--folds", type=count, metavar="K", help=text + "one place at a time; default: 5")
+    _choice(group, "--fidelity", LEVELS, "how well the model is computed", default="standard")
+    _choice(group, "--baseline", BASELINES, "what is taken off a press", default="two-sided")
+    add_low_pass_argument(group)
+    add_imaging_arguments(parser)
+
+
+def add_low_pass_argument(parser: Any) -> None:
+    """The option of the low-pass filter."""
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
+
+
+def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options for how images are made."""
+    group = parser.add_argument_group("images")
+    imaging = je.imaging
+    _choice(group, "--method", imaging.METHODS, "how data and prior are weighed", default="one-step")
+    _choice(group, "--prior", imaging.PRIORS, "what is expected of an image", default="noser")
+    text = "weight of the prior, or a way to choose it such as noise-figure:0.5"
+    names = ("a number", *imaging.HYPERPARAMETERS)
+    _choice(group, "--hyperparameter", names, text, default="0.1")
+    either = group.add_mutually_exclusive_group()
+    either.add_argument("--pixels", type=count, metavar="N", help="pixels along x; default: 40")
+    _choice(either, "--basis", je.model.BASES, "what an image consists of", default="pixels")
+    text = "how readings are weighed: alike, by their noise at rest, or by the covariance of that noise"
+    _choice(group, "--noise", imaging.NOISES, text, default="equal")
+
+
+def _choice(parser: Any, option: str, names: Iterable[str], text: str, default: str) -> None:
+    parser.add_argument(option, metavar="NAME", help=f"{text} (default: {default}); one of {', '.join(names)}")
+
+
+def recipe_of(args: argparse.Namespace) -> Recipe:
+    """The recipe that the options make, on top of the recipe file if there is one.
+
+    Raises:
+        ValueError: naming the option or the file, what is wrong with it, and what to give.
+    """
+    recipe = Recipe() if args.recipe is None else Recipe.load(args.recipe)
+    make: dict[str, Callable[[str, bool], Any]] = {
+        "curve": curve_choice,
+        "location": location_choice,
+        "locator": LOCATORS.make,
+        "loss": LOSSES.make,
+        "fidelity": fidelity_choice,
+    }
+    given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name) is not None}
+    given |= {} if args.folds is None else {"folds": args.folds}
+    processing = processing_of(args, recipe.processing)
+    recipe = replace(recipe, **given, processing=processing, imaging=imaging_of(args, recipe.imaging))
+    if args.locator is not None and not recipe.locates:
+        raise ValueError(f"--locator {args.locator}: nothing asks for the place; give --location too, such as edge")
+    return recipe
+
+
+def imaging_of(args: argparse.Namespace, base: je.Imaging) -> je.Imaging:
+    """The imaging that the options make, with the rest as in ``base``."""
+    make: dict[str, Callable[[str, bool], Any]] = {
+        "method": je.imaging.METHODS.make,
+        "prior": je.imaging.PRIORS.make,
+        "hyperparameter": hyperparameter_choice,
+        "basis": je.model.BASES.make,
+        "noise": je.imaging.NOISES.make,
+    }
+    given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name) is not None}
+    if args.pixels is not None:
+        given["basis"] = je.Pixels(args.pixels)
+    try:
+        return replace(base, **given)
+    except ValueError as error:
+        options = ", ".join(f"--{name} {getattr(args, name)}" for name in given)
+        raise ValueError(f"{options}: {error}") from None
+
+
+def processing_of(args: argparse.Namespace, base: Processing) -> Processing:
+    """The processing that the options make, with the rest as in ``base``."""
+    if getattr(args, "baseline", None) is not None:
+        base = replace(base, baseline=_made(args, "baseline", BASELINES.make))
+    return base if args.low_pass is None else replace(base, corrections=(LowPass(args.low_pass),))
+
+
+def _made(args: argparse.Namespace, name: str, make: Callable[[str, bool], T]) -> T:
+    try:
+        return make(getattr(args, name), True)
+    except ValueError as error:
+        raise ValueError(f"--{name}: {error}") from None

@@ -1,0 +1,77 @@
+"""`jaxeit simulate`."""
+
+import argparse
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from .arguments import prepare_outputs, skin_of
+from .terminal import progress_bar
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """A scene, or a skin for a data set, and what to do with it."""
+    parser.add_argument("scene", metavar="SCENE.toml", help="a scene file, or a shipped scene by its name")
+    parser.add_argument("-o", "--output", metavar="SESSION.h5")
+    text = "print what the scene simulates and what each part costs, and simulate nothing"
+    parser.add_argument("--explain", action="store_true", help=text)
+    text = "then play SESSION.h5, simulated only if it is not there, as the skin would send it, at local TCP ports"
+    parser.add_argument("--serve", action="store_true", help=text)
+    text = "SCENE is a skin: Gaussian contacts on a grid over it, from 0 to 100 %%, as one data set (HDF5)"
+    parser.add_argument("--data-set", nargs="?", type=int, const=41, metavar="N", help=f"{text}; N x N places, 41")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, explain, or serve a scene."""
+    if bool(args.output) == args.explain:
+        raise ValueError("give either -o SESSION.h5 to simulate, or --explain")
+    from ..runtime import set_up
+
+    set_up()
+    from ..bench import load_bench, measure_costs, render_costs, simulate
+
+    if args.data_set:
+        return _simulate_data_set(args)
+    bench = load_bench(args.scene)
+    if args.explain:
+        print(render_costs(bench, measure_costs(bench)))
+        return 0
+    prepare_outputs(args.output)
+    if args.serve and Path(args.output).exists():
+        return _serve(args.output)
+    try:
+        simulate(bench, args.output, progress=progress_bar("blocks"))
+    except KeyboardInterrupt:
+        print(f"jaxeit: interrupted; the same command goes on from {args.output}.part", file=sys.stderr)
+        return 130
+    print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
+    return _serve(args.output) if args.serve else 0
+
+
+def _serve(path: str) -> int:
+    """Be a device until interrupted."""
+    import threading
+
+    from ..record.device import SimulatedDevice, recording_packets
+    from ..session import open_session
+
+    with open_session(path) as session:
+        names = [name for name in ("eit", "pressure", "force") if name in session.streams]
+    with SimulatedDevice([recording_packets(path, [name], rounds=10**6) for name in names]) as device:
+        where = " ".join(f"--{name} {url}" for name, url in zip(names, device.urls, strict=True))
+        with suppress(KeyboardInterrupt):
+            print(f"serving {path}, SIMULATED; in another terminal: jaxeit record {where} -o session.h5", flush=True)
+            threading.Event().wait()
+    return 0
+
+
+def _simulate_data_set(args: argparse.Namespace) -> int:
+    from ..bench import write_data_set
+
+    if args.explain or args.serve:
+        raise ValueError("--explain and --serve are for scenes; leave them out")
+    prepare_outputs(args.output)
+    skin, progress = skin_of(str(args.scene)), progress_bar("contacts")
+    places, steps = write_data_set(skin, args.output, columns=args.data_set, rows=args.data_set, progress=progress)
+    print(f"{args.output}: {places} places, {steps} amplitudes, SIMULATED")
+    return 0

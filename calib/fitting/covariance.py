@@ -1,0 +1,109 @@
+"""Covariance of fitted parameters: of independent samples, or of samples that depend on each other within groups."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxeit.linalg.lapack import eigh, svd
+
+from .curve_problem import CurveProblem, residuals
+
+
+def independent_covariance(
+    left: Float[Array, "n k"], psi: Float[Array, " n"], dpsi: Float[Array, " n"], valid: Bool[Array, " n"]
+) -> Float[Array, "k k"]:
+    """Huber's covariance in whitened coordinates: independent residuals of one size."""
+    n, k = jnp.sum(valid).astype(psi.dtype), left.shape[1]
+    mean = jnp.sum(dpsi) / n
+    variance = jnp.sum(jnp.where(valid, (dpsi - mean) ** 2, 0.0)) / n
+    correction = 1 + k / n * variance / mean**2
+    size = (correction / mean) ** 2 * jnp.sum(psi**2) / (n - k)
+    return size * jnp.eye(k, dtype=left.dtype)
+
+
+def cluster_covariance(
+    left: Float[Array, "n k"], psi: Float[Array, " n"], dpsi: Float[Array, " n"], group: Int[Array, " n"], n_groups: int
+) -> tuple[Float[Array, "k k"], Bool[Array, ""]]:
+    """Sandwich over presses in whitened coordinates, and whether there are presses enough for it.
+
+    Scores are corrected for what their press itself decided (CR2). With G = U S V' the corrected score
+    U_g' (I - U_g U_g')^(-1/2) psi_g equals (I - U_g' U_g)^(-1/2) U_g' psi_g, a k x k matter per press. A press that
+    alone decides a direction (an eigenvalue of one) leaves no scatter to learn from. The bread weighs each sample
+    with its own psi', since residuals grow with load and so does the slope.
+    """
+    score = jax.ops.segment_sum(left * psi[:, None], group, n_groups)
+    leverage = jax.ops.segment_sum(left[:, :, None] * left[:, None, :], group, n_groups)
+    values, vectors = jax.vmap(eigh)(leverage)
+    decided = values > 1 - 1e-3
+    root = jax.lax.rsqrt(1 - values)
+    adjusted = jnp.einsum("gij,gj,gkj,gk->gi", vectors, root, vectors, score)
+    steepness, axes = eigh(left.T @ (left * dpsi[:, None]))
+    bread = axes / steepness @ axes.T
+    enough = ~jnp.any(decided) & (steepness[0] > 0.05)
+    return bread @ adjusted.T @ adjusted @ bread, enough
+
+
+def thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, " k"], Float[Array, "k k"]]:
+    """U, singular values and V' of a tall matrix of few columns, by Gram-Schmidt done twice (Giraud et al. 2005)."""
+    columns: list[Array] = []
+    for column in matrix.T:
+        for _ in range(2):
+            for earlier in columns:
+                column = column - earlier * (earlier @ column)
+        length = jnp.sqrt(column @ column)
+        columns.append(column / jnp.where(length > 0, length, 1))
+    q = jnp.stack(columns, 1)
+    left, singular, right = svd(q.T @ matrix)
+    return q @ left, singular, right
+
+
+class CurveMinimum(NamedTuple):
+    """Where a fit ended: free parameters (k,), scale of the residuals, weight of the bends, which slopes vanished."""
+
+    free: Float[Array, " k"]
+    spread: Float[Array, ""]
+    bend_weight: Float[Array, ""]
+    vanished: Bool[Array, " k"]
+
+
+class CurveCovariance(NamedTuple):
+    """Covariance of the parameters in their units (k, k); how many directions the samples determine; whether the groups
+    suffice; and the share of the residuals' influence that lies along the Jacobian, which is zero at a minimum.
+
+    There is such a share only for slopes that vanished: what the samples and the expected bends both want below zero.
+    """
+
+    covariance: Float[Array, "k k"]
+    rank: Int[Array, ""]
+    enough: Bool[Array, ""]
+    missed: Float[Array, ""]
+
+
+def covariance_at(end: CurveMinimum, problem: CurveProblem) -> CurveCovariance:
+    """Covariance at the end of a fit.
+
+    The Jacobian is that of slopes themselves, as multiples of their start, not of their logarithms: a slope on its
+    bound is not degenerate.
+    """
+    curve, samples, scale, loss = problem.curve, problem.samples, problem.scale, problem.loss
+    unit = jnp.where(curve.positive, jnp.exp(problem.start - end.free), 1.0)
+    r = residuals(end.free, curve, samples, scale, end.spread)
+    jacobian = jax.jacfwd(residuals)(end.free, curve, samples, scale, end.spread) * unit
+    left, singular, right = thin_svd(jacobian)
+    tiny = singular[0] * max(jacobian.shape) * jnp.finfo(r.dtype).eps
+    psi = jnp.where(samples.valid, loss.psi(r), 0.0)
+    dpsi = jnp.where(samples.valid, loss.dpsi(r), 0.0)
+    if problem.n_groups:
+        inner, enough = cluster_covariance(left, psi, dpsi, samples.group, problem.n_groups)
+    else:
+        inner, enough = independent_covariance(left, psi, dpsi, samples.valid), jnp.array(True)
+    units = jax.jacfwd(curve.bound)(end.free, scale) * unit @ (right.T / singular)
+    bends = end.bend_weight * problem.bends
+    push = psi @ jacobian
+    wanted = jnp.minimum(push, push + bends.T @ (bends @ (1 / unit)))
+    less = jnp.where(end.vanished, jnp.maximum(wanted, 0), 0)
+    _, size, axes = thin_svd(jnp.concatenate([jacobian, bends])) if len(bends) else (left, singular, right)
+    missed = jnp.sum(jnp.where(size > tiny, axes @ less / size, 0) ** 2) / jnp.sum(psi**2)
+    return CurveCovariance(units @ inner @ units.T, jnp.sum(singular > tiny), enough, missed)

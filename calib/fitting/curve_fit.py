@@ -1,0 +1,257 @@
+"""Robust fit of a curve to pressure and force samples, with covariance and a result code.
+
+For residuals r_i = (F_i - h(P_i)) / (sigma_i s), s a robust scale, the fit minimises sum_i w^2 rho(r_i^2 / w^2) / 2
+(an M-estimate of width w). The loss goes to `optimistix.least_squares` as transformed residuals
+sign(r) w sqrt(rho(r^2 / w^2)), whose squares *are* the loss: any solver of least squares will do, and none needs a
+reweighting loop; the default one is told the loss's own curvature, and ends sooner. The scale is 1.4826 times the
+median absolute residual (MAD), found again after each of a few rounds and then held.
+
+Slopes and exponents are above zero. They are looked for as multiples of their start, down to next to nothing: a slope
+that the samples want at zero or below has its logarithm at minus infinity, and no solver arrives there. Where the
+samples want a slope at zero or just below, it ends on its bound, and the curve is flat there: a fit like any other,
+with the standard errors of slopes that may be below zero. Where they want it far below - the bound explains a good part
+of what is left - the curve is the wrong one, and the result says AT_BOUND.
+
+A spline's bends are expected to be of a known size (`AbstractCurve.bends`), as one more residual each. Samples that
+err together, by presses or by stretches of time, as they do on the two branches of a loop, weigh as the few that they
+are then; else the spline would follow one branch here and the other there. Many samples that err each for itself leave
+the bends to the samples, and the covariance is that of the samples alone.
+
+Samples of one press are near-duplicates. Given `groups` (a press or location per sample), the covariance is the
+cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), so that it is honest for a dozen presses; the
+sample count then hardly matters, which is the point. Without groups it is Huber's (Robust Statistics, 1981, 7.6).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int
+
+import jaxeit as je
+from jaxeit.least_squares import ImplicitStep, LevenbergMarquardt
+
+from .covariance import CurveMinimum, covariance_at
+from .curve_problem import CurveProblem
+from .curves import AbstractCurve, scale_of
+from .fitted_curve import FittedCurve
+from .losses import AbstractLoss, SoftL1
+from .results import FitError, FitResult
+from .samples import Numbers, Samples, bucket, gather
+
+Solver = optx.AbstractLeastSquaresSolver[Any, Any, Any, Any]
+Flag = Bool[Array, ""] | bool
+
+# Relative precision of all rounds but the last, which only serve to find the scale of the residuals.
+ROUND_PRECISION = 1e-4
+# Part of the residuals' influence that slopes below zero may explain; beyond it, a rising curve is the wrong one.
+MAX_CONTRADICTION = 0.25
+
+
+def default_solver(dtype: DTypeLike) -> LevenbergMarquardt:
+    """The solver with tolerances that `dtype` can reach."""
+    tolerance = 1e-9 if dtype == jnp.float64 else 1e-4
+    return LevenbergMarquardt(tolerance, tolerance)
+
+
+def _solve(problem: CurveProblem, solver: Solver, max_steps: int, rounds: int) -> tuple[CurveMinimum, Bool[Array, ""]]:
+    """The minimum after so many rounds, in each of which the scale of the residuals is held; and whether the last round
+    converged.
+    """
+    dtype = problem.start.dtype
+    slack = jnp.ones(rounds, dtype).at[:-1].set(max(ROUND_PRECISION / solver.rtol, 1.0))
+    bent = jnp.ones(rounds, dtype).at[0].set(0)  # the first round's residuals tell only what the start lacks
+    options = {"lower": problem.lower, "curvature": problem.curvature}
+
+    def one_round(multiple: Array, settings: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
+        slack, bent = settings
+        weights = problem.weights(multiple, bent)
+        tolerances = (solver.rtol * slack, solver.atol * slack)
+        looser = eqx.tree_at(lambda s: (s.rtol, s.atol), solver, tolerances)
+        solution: Any = optx.least_squares(
+            lambda multiple, args: args[0].objective(multiple, *args[1]),
+            looser,
+            multiple,
+            (problem, weights),
+            options,
+            max_steps=max_steps,
+            adjoint=ImplicitStep(),
+            throw=False,
+        )
+        return solution.value, (*weights, solution.result == optx.RESULTS.successful)
+
+    multiple, (spread, weight, ended) = jax.lax.scan(one_round, problem.first, (slack, bent))
+    return CurveMinimum(problem.free(multiple), spread[-1], weight[-1], problem.vanished(multiple)), ended[-1]
+
+
+def _groups_used(samples: Samples, n_groups: int) -> Int[Array, ""]:
+    if not n_groups:
+        return jnp.zeros((), jnp.int32)
+    counts = jax.ops.segment_sum(samples.valid.astype(jnp.int32), samples.group, n_groups)
+    return jnp.sum(counts > 0)
+
+
+def held_pressure(pressure: Float[Array, " n"], present: Bool[Array, " n"]) -> Float[Array, " n"]:
+    """Pressures with the last one before each gap held: what a curve with memory has been through."""
+    last = jax.lax.cummax(jnp.where(present, jnp.arange(len(pressure)), -1))
+    return jnp.where(last >= 0, jnp.where(present, pressure, 0.0)[last], 0.0)
+
+
+def _pressure_range(samples: Samples) -> Float[Array, "2"]:
+    p = samples.pressure
+    low = jnp.min(jnp.where(samples.valid, p, jnp.inf))
+    high = jnp.max(jnp.where(samples.valid, p, -jnp.inf))
+    return jnp.stack([low, high])
+
+
+def _judge(finite: Flag, enough: Flag, ended: Flag, rises: Flag, determined: Flag, inside: Flag) -> Int[Array, ""]:
+    """The first thing that went wrong, as a FitResult code."""
+    checks = [
+        (finite, FitResult.NOT_FINITE),
+        (enough, FitResult.TOO_FEW),
+        (rises, FitResult.NO_RESPONSE),
+        (inside, FitResult.AT_BOUND),
+        (ended, FitResult.MAX_STEPS),
+        (determined, FitResult.SINGULAR),
+    ]
+    bad = [~jnp.asarray(ok) for ok, _ in checks]
+    return jnp.select(bad, [jnp.int32(code) for _, code in checks], jnp.int32(FitResult.SUCCESS))
+
+
+def fit_samples(
+    curve: AbstractCurve,
+    samples: Samples,
+    loss: AbstractLoss,
+    solver: Solver,
+    *,
+    n_groups: int,
+    max_steps: int = 64,
+    rounds: int = 4,
+) -> FittedCurve:
+    """The pure fit of one pad: fixed shapes, works under jit, vmap and grad, never raises; see `fit_curves`.
+
+    A valid sample that is not finite makes the whole fit NOT_FINITE, with NaN parameters. `n_groups` 0 means
+    that samples are independent.
+    """
+    present = jnp.isfinite(samples.pressure) & jnp.isfinite(samples.force)
+    clean = jnp.all(present | ~samples.valid)
+    valid = samples.valid & present
+    used = Samples(
+        held_pressure(samples.pressure, present) if curve.path else jnp.where(valid, samples.pressure, 0.0),
+        jnp.where(valid, samples.force, 0.0),
+        samples.sigma,
+        valid,
+        samples.group,
+    )
+    scale = scale_of(used.pressure, used.force, valid)
+    curve = curve.at(scale)
+    start = curve.free(curve.initial(used.pressure, used.force, valid, scale), scale)
+    seen = eqx.tree_at(lambda s: s.pressure, used, curve.seen(used.pressure))
+    problem = CurveProblem(curve, seen, scale, loss, start, n_groups)
+    end, ended = _solve(problem, solver, max_steps, rounds)
+    found = covariance_at(end, problem)
+
+    n, k = jnp.sum(valid), end.free.size
+    params = curve.bound(end.free, scale)
+    limits = _pressure_range(used)
+    groups = _groups_used(used, n_groups)
+    rise = jnp.diff(curve(params, limits))[0]
+    raw = jnp.where(valid, used.force - curve.given(params, seen.pressure), 0.0)
+    result = _judge(
+        finite=clean & (n > 0) & jnp.all(jnp.isfinite(params)),
+        enough=(n > k) & ((groups > k) if n_groups else True),
+        ended=ended,
+        rises=rise > 1e-3 * scale.force,
+        determined=(found.rank == k) & found.enough,
+        inside=~jnp.any(end.vanished) | (found.missed < MAX_CONTRADICTION),
+    )
+    unusable = (result == FitResult.NOT_FINITE) | (result == FitResult.TOO_FEW)
+    failed = result != FitResult.SUCCESS
+    return FittedCurve(
+        curve=curve,
+        parameters=jnp.where(unusable, jnp.nan, params),
+        covariance=jnp.where(failed, jnp.nan, found.covariance),
+        pressure_range=jnp.where(n > 0, limits, jnp.nan),
+        scale=jnp.where(unusable, jnp.nan, end.spread),
+        residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / (n - k))),
+        n=n,
+        n_missing=jnp.sum(~present),
+        n_groups=groups,
+        rank=found.rank,
+        result=result,
+    )
+
+
+@je.verb
+def _fit_pads(
+    curve: AbstractCurve,
+    samples: Samples,
+    loss: AbstractLoss,
+    solver: Solver,
+    n_groups: int,
+    max_steps: int,
+    rounds: int,
+) -> FittedCurve:
+    found: FittedCurve = eqx.filter_vmap(
+        lambda s: fit_samples(curve, s, loss, solver, n_groups=n_groups, max_steps=max_steps, rounds=rounds)
+    )(samples)
+    return found
+
+
+def fit_curves(
+    curve: AbstractCurve,
+    pressures: Numbers,
+    forces: Numbers,
+    *,
+    mask: Numbers | None = None,
+    groups: Numbers | None = None,
+    sigma: Numbers | None = None,
+    loss: AbstractLoss | None = None,
+    solver: Solver | None = None,
+    max_steps: int = 64,
+    dtype: DTypeLike | None = None,
+) -> FittedCurve:
+    """Fit one curve per pad, all pads in one compiled call.
+
+    Args:
+      pressures: (pads, n) Pa, baseline removed. NaN: missing.
+      forces: (n,) or (pads, n) N. NaN: missing.
+      mask: (n,) or (pads, n) samples to use; left out, all finite ones are. A sample the mask vouches for
+        but that is not finite makes its pad NOT_FINITE.
+      groups: (n,) or (pads, n) press or location of each sample; samples of a group are taken as dependent.
+      sigma: (n,) or (pads, n) noise of the force, relative is enough (left out: equal).
+      loss: `SoftL1()` by default; also `Huber`, `Cauchy`, `Squared`.
+      solver: an optimistix least-squares solver (default: `default_solver`).
+      dtype: None keeps that of the input; float64 with 64-bit numbers off is refused.
+
+    Returns: a `FittedCurve` with a leading pad axis. Look at `result` before anything else; a bad pad does not
+      change its neighbours by one bit.
+
+    Raises: `FitError` for shapes that do not fit together, or sigma not above zero.
+    """
+    shape = np.shape(pressures)
+    length = bucket(shape[1]) if len(shape) == 2 else None
+    samples, n_groups = gather(pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype, length=length)
+    loss = SoftL1() if loss is None else loss
+    solver = default_solver(samples.pressure.dtype) if solver is None else solver
+    return _fit_pads(curve, samples, loss, solver, bucket(n_groups) if n_groups else 0, max_steps, 4)
+
+
+def fit_curve(
+    curve: AbstractCurve,
+    pressure: Numbers,
+    force: Numbers,
+    *,
+    groups: Numbers | None = None,
+    mask: Numbers | None = None,
+    **options: Any,
+) -> FittedCurve:
+    """`fit_curves` for one pad: pressure (n,) Pa, force (n,) N."""
+    p, f = np.asarray(pressure), np.asarray(force)
+    if p.ndim != 1 or p.shape != f.shape:
+        raise FitError(f"pressure and force must both be (samples,), not {p.shape} and {f.shape}.")
+    return fit_curves(curve, p[None], f[None], groups=groups, mask=mask, **options).pad(0)

@@ -1,0 +1,38 @@
+"""What became of a fit, and what to do about it."""
+
+import enum
+
+
+class FitError(ValueError):
+    """Samples that cannot be handed to a fit at all: wrong shapes, weights that are not positive."""
+
+
+class FitResult(enum.IntEnum):
+    """What became of a fit. Anything but SUCCESS: do not use its numbers; `message` says what to do."""
+
+    SUCCESS = 0
+    NOT_FINITE = 1
+    TOO_FEW = 2
+    MAX_STEPS = 3
+    NO_RESPONSE = 4
+    SINGULAR = 5
+    AT_BOUND = 6
+
+    @property
+    def message(self) -> str:
+        """One sentence for a person."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    FitResult.SUCCESS: "fitted",
+    FitResult.NOT_FINITE: "no finite samples, or the fit diverged: is this pad connected? see `jaxeit check`",
+    FitResult.TOO_FEW: "too few samples or presses for this curve: record more presses, or choose a curve "
+    "with fewer parameters",
+    FitResult.MAX_STEPS: "the solver ran out of steps: raise max_steps, or choose a curve with fewer parameters",
+    FitResult.NO_RESPONSE: "force does not rise with pressure, or there is only one pressure: check the pad's tube, "
+    "its sign and its number, and record presses at more load levels",
+    FitResult.SINGULAR: "the samples do not determine all parameters: record presses at more load levels",
+    FitResult.AT_BOUND: "somewhere the force falls with pressure or does not rise, and this curve must: choose a curve "
+    "with fewer parameters, and check the range of the pressure sensor",
+}

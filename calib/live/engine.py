@@ -1,0 +1,278 @@
+"""Compute forces, force map and contacts of one frame after the other, by programs compiled for one frame.
+
+The force map of a frame waits for nothing else. Contacts take several times as long to fit. They are fitted to the
+newest frame if there is time before the next one is due (`Engine.use_spare_time`), and are used until the next fit.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import jaxeit as je
+
+from ..calibration.calibration import Calibration
+from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of, remembered
+from ..calibration.localisation import ContactLocator
+from ..fitting.fields import Places
+from ..fitting.pads import nowhere
+from ..presses.streams import finite_mean
+from .results import NO_TOUCHES, FrameResult, TouchEstimates
+
+TOUCH_SIGNIFICANCE = 3.0  # a force above this many standard errors is a touch
+MAX_SEARCH_DELAY = 0.1  # s; then contacts are fitted even if a frame is dropped for it
+MAX_PLACE_AGE = 0.3  # s; older contacts do not describe the present frame
+GATE = 0.6  # see `jaxeit.fuse`
+IMAGE_DTYPE = "float32"  # of the image product; its matrices are built in float64, but read in half the memory
+
+T = TypeVar("T")
+
+
+class ReceivedFrame(NamedTuple):
+    """A frame: voltages (readings,) V, mean pressure since the frame before (pads,) Pa, and arrival (ns)."""
+
+    voltage: np.ndarray
+    pressure: np.ndarray
+    host: int
+
+
+class RestLevels:
+    """Rest levels: means of voltages and pressures over `seconds` of frames without contact, of finite values only."""
+
+    def __init__(self, seconds: float):
+        self._seconds = seconds
+        self._since: int | None = None
+        self._rows: list[tuple[np.ndarray, np.ndarray]] = []
+        self.levels: tuple[np.ndarray, np.ndarray] | None = None
+
+    def add(self, arrival: ReceivedFrame) -> None:
+        """Add a frame without contact."""
+        self._since = arrival.host if self._since is None else self._since
+        self._rows.append((arrival.voltage, arrival.pressure))
+        if arrival.host - self._since >= self._seconds * 1e9:
+            voltages, pressures = zip(*self._rows, strict=True)
+            self.levels = finite_mean(np.stack(voltages)), finite_mean(np.stack(pressures))
+            self._rows = []
+
+
+class FrameForces(NamedTuple):
+    """Forces of one frame, on the host.
+
+    | field                 | meaning                                           | shape     | unit |
+    |-----------------------|---------------------------------------------------|-----------|------|
+    | map                   | force on each pixel                               | (pixels,) | N    |
+    | force, standard_error | of each pad                                       | (pads,)   | N    |
+    | valid                 | whether the pressure is within the fitted range   | (pads,)   |      |
+    | loaded                | whether the pad is pressed                        | (pads,)   |      |
+    | image                 | change of conductivity from which the map is made | (pixels,) | S    |
+    """
+
+    map: np.ndarray
+    force: np.ndarray
+    standard_error: np.ndarray
+    valid: np.ndarray
+    loaded: np.ndarray
+    image: np.ndarray
+
+
+class FramePrograms:
+    """Programs that process a single frame.
+
+    The image is a NumPy product, which takes less time than a call of JAX. Forces and contacts are one compiled
+    program each. `warm_up` runs all of them once before the first frame arrives.
+    """
+
+    def __init__(self, law: ForceLaw):
+        self._law = law
+        self._image = law.recon.on_host(IMAGE_DTYPE)
+        self._dtypes = law.recon.dtype, law.curves.parameters.dtype
+        # The numbers of the force law are constants of the program, which takes two thirds off the overhead of a call.
+        self._map = _compiled(lambda *a: _packed_forces(law, *a))
+        leaves, tree = jax.tree.flatten(law)
+        search = _compiled(lambda leaves, *a: _find_contacts(jax.tree.unflatten(tree, leaves), *a))
+        self._search = partial(search, leaves)  # not constants, because the table of responses takes megabytes
+        contacts = law.locator.finder.most if isinstance(law.locator, ContactLocator) else 1
+        self.nowhere = nowhere(jnp.zeros((1, law.masks.weights.shape[0]), self._dtypes[0]), contacts)
+
+    @property
+    def searches(self) -> bool:
+        """Whether contacts are located."""
+        return self._law.locator is not None
+
+    def warm_up(self) -> None:
+        """Run all programs once, also for a frame without readings."""
+        readings, pads = self._law.recon.readings, self._law.masks.weights.shape[0]
+        frame = np.zeros(readings)
+        self.map(frame, np.zeros(pads), self.nowhere, np.zeros((1, pads)))
+        self._image(np.full(readings, np.nan))
+        if self.searches:
+            self.search(frame)
+
+    def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> FrameForces:
+        """Forces from a difference frame (readings,) V, pressures (pads,) Pa and those ``before`` (m, pads)."""
+        image = self._image(frame)
+        row = self._map(image[None], self._row(pressure, 1), places, filled(self._law, before))
+        return _unpack_forces(np.asarray(row), pressure.size, image)
+
+    def search(self, frame: np.ndarray) -> tuple[Places, TouchEstimates]:
+        """Locate the contacts of a difference frame (readings,) V."""
+        places, found = self._search(self._row(frame, 0))
+        return jax.block_until_ready(places), NO_TOUCHES if found is None else _touch_estimates(jax.device_get(found))
+
+    def _row(self, values: np.ndarray, which: int) -> np.ndarray:
+        return np.asarray(values[None], self._dtypes[which])
+
+
+def _compiled(function: Callable[..., T]) -> Callable[..., T]:
+    return jax.jit(function, compiler_options=je.compiler_options())
+
+
+def _packed_forces(law: ForceLaw, image: Array, pressure: Array, places: Places, before: Array | None) -> Array:
+    """The fields of `FrameForces` in one row, so that one transfer from the device suffices."""
+    image = image.astype(law.recon.dtype)
+    found = fused(law, image, pressure, places if law.field is not None else None, before, GATE)
+    parts = found.map.force, found.force, found.standard_error, found.valid, is_loaded(law, pressure)
+    return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])
+
+
+def _unpack_forces(row: np.ndarray, pads: int, image: np.ndarray) -> FrameForces:
+    force, error, valid, loaded = row[-4 * pads :].reshape(4, pads)
+    return FrameForces(row[: -4 * pads], force, error, valid > 0, loaded > 0, image)
+
+
+def _find_contacts(law: ForceLaw, frame: Array) -> tuple[Places, je.Contacts | None]:
+    """Places, and the contacts from which they come; None for a locator that fits no contacts."""
+    if isinstance(law.locator, ContactLocator):
+        found = law.locator.finder(frame)
+        return law.locator.placed(found, law.recon, law.masks), found
+    assert law.locator is not None
+    return law.locator(frame, law.recon(frame), law.recon, law.masks), None
+
+
+def _touch_estimates(found: je.Contacts) -> TouchEstimates:
+    present, position, covariance, result = (
+        np.asarray(part[0]) for part in (found.present, found.position, found.covariance, found.result)
+    )
+    return TouchEstimates(
+        position[present], covariance[present, :2, :2], result[present] == je.contacts.ContactResult.CONVERGED, 0
+    )
+
+
+def placement_covariance(calibration: Calibration) -> np.ndarray:
+    """Mean square error (2, 2) m^2 of the fitted places of the calibration's presses.
+
+    It contains errors of the model, which the covariance of a fit, made from noise alone, does not.
+    """
+    found = calibration.evaluation
+    if calibration.locator is None or "fitted" not in found.estimated:
+        return np.zeros((2, 2))
+    error = np.asarray(found.estimated["fitted"] - found.position, float)
+    error = error[np.isfinite(error).all(1)]
+    return np.asarray(error.T @ error / max(len(error), 1))
+
+
+class Engine:
+    """Turns frames into results with one calibration. Only the thread that created it may use it."""
+
+    def __init__(
+        self, calibration: Calibration, rest: float = 2.0, programs: Callable[[ForceLaw], FramePrograms] = FramePrograms
+    ):
+        self._rest = rest
+        self._rest_levels = RestLevels(rest)
+        self._number = 0
+        recon = calibration.recon
+        self._used_readings, self._centres = np.asarray(recon.channels), np.asarray(recon.centres)
+        self._pad_weights = np.asarray(calibration.masks.weights)
+        self._law = law_of(calibration)
+        self._programs = programs(self._law)
+        self._programs.warm_up()
+        self._before = np.zeros((1, len(self._pad_weights)))
+        self._waiting_frame: np.ndarray | None = None  # a touched frame whose contacts are not fitted yet
+        self._places, self._touches, self._search_end = self._programs.nowhere, NO_TOUCHES, 0.0
+        self._placement_covariance = placement_covariance(calibration)
+        self._search_time = 0.0
+        self.unsearched = 0
+
+    @property
+    def resting(self) -> bool:
+        """Whether the rest levels are still being measured."""
+        return self._rest_levels.levels is None
+
+    def tare(self) -> None:
+        """Measure the rest levels again."""
+        self._rest_levels = RestLevels(self._rest)
+
+    def pressed(self, arrival: ReceivedFrame) -> np.ndarray:
+        """Change of pressure on each pad (pads,) Pa; only once the rest levels are measured."""
+        assert self._rest_levels.levels is not None
+        return np.asarray(arrival.pressure - self._rest_levels.levels[1])
+
+    def step(self, arrival: ReceivedFrame, dropped: int = 0) -> FrameResult | None:
+        """Process one frame; None while the rest levels are being measured."""
+        if self._rest_levels.levels is None:
+            self._rest_levels.add(arrival)
+            return None
+        frame, pressure = arrival.voltage - self._rest_levels.levels[0], self.pressed(arrival)
+        lost, silent = ~np.isfinite(frame), ~np.isfinite(pressure)
+        pressed = np.where(silent, 0.0, pressure)
+        found = self._programs.map(frame, pressed, self._current_places(), self._before)
+        if self._law.remembers:
+            self._before = remembered(np.concatenate([self._before, pressure[None]]))
+        self._schedule_search(frame, bool(found.loaded.any()))
+        force = np.where(silent, np.nan, found.force)
+        error = np.where(silent, np.nan, found.standard_error)
+        self._number += 1
+        return FrameResult(
+            number=self._number,
+            host=arrival.host,
+            latency=(time.monotonic_ns() - arrival.host) / 1e9,
+            force=force,
+            standard_error=error,
+            valid=found.valid & ~silent,
+            centre=self._centre(found.map, force > TOUCH_SIGNIFICANCE * error),
+            map=found.map,
+            image=found.image,
+            missing=int((lost & self._used_readings).sum()),
+            dropped=dropped,
+            touches=self._touches,
+            unsearched=self.unsearched,
+        )
+
+    def _current_places(self) -> Places:
+        return self._places if time.monotonic() - self._search_end < MAX_PLACE_AGE else self._programs.nowhere
+
+    def _schedule_search(self, frame: np.ndarray, touched: bool) -> None:
+        """Keep a touched frame for the next fit of contacts, and forget contacts without a touch."""
+        if self._touches.age is not None:
+            self._touches = replace(self._touches, age=self._touches.age + 1)
+        if not self._programs.searches:
+            return
+        self.unsearched += self._waiting_frame is not None
+        self._waiting_frame = frame if touched else None
+        if not touched:
+            self._places, self._touches = self._programs.nowhere, replace(NO_TOUCHES, age=0)
+
+    def use_spare_time(self, seconds: float) -> None:
+        """Fit contacts of the newest frame if `seconds`, the time until the next frame, allow it."""
+        if self._waiting_frame is not None and (
+            seconds > self._search_time or time.monotonic() - self._search_end > MAX_SEARCH_DELAY
+        ):
+            begin = time.monotonic()
+            self._places, touches = self._programs.search(self._waiting_frame)
+            self._touches = replace(touches, covariance=touches.covariance + self._placement_covariance)
+            self._search_end, self._waiting_frame = time.monotonic(), None
+            self._search_time = max(self._search_end - begin, 0.95 * self._search_time)
+
+    def _centre(self, image: np.ndarray, touched: np.ndarray) -> np.ndarray:
+        """Mean position (pads, 2) m of the force on each touched pad; NaN on the others."""
+        each = self._pad_weights * np.maximum(image, 0.0)
+        total = each.sum(1)
+        ok = touched & (total > 0)
+        middle = each @ self._centres / np.where(ok, total, 1.0)[:, None]
+        return np.where(ok[:, None], middle, np.nan)

@@ -1,0 +1,206 @@
+"""Live force maps: each frame becomes a force map as it arrives. One thread owns JAX; the others only move bytes.
+
+Frames that arrive together are processed one after the other. A frame that has waited for 10 ms while a newer one is
+there is dropped and counted. Rest levels are the means of the first seconds (`engine`), and are measured again on
+request.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..calibration.calibration import Calibration
+from ..record.intake import NullSink, RecordSink, explain_silence
+from ..record.plan import RecordingPlan, StreamPlan
+from ..record.priority import real_time
+from ..record.recorder import Recorder
+from ..record.sources import Source
+from ..record.wire import Frame
+from .engine import Engine, ReceivedFrame
+from .results import FrameResult
+from .scan_control import ScanDirector, prepare_director
+
+MAX_WAIT = 10_000_000  # ns
+MAX_QUEUED_FRAMES = 16
+PERIOD_SMOOTHING = 0.1  # weight of a new interval in the mean interval between frames
+
+
+class LiveError(ValueError):
+    """The streams do not fit the calibration, do not begin, or fail."""
+
+
+class FrameQueue:
+    """Frames on their way from the threads that receive them to the thread that computes; stale ones are dropped."""
+
+    def __init__(self, eit: StreamPlan, pressure: StreamPlan):
+        self._plans = (eit, pressure)
+        self._ready = threading.Condition()
+        self._frames: deque[tuple[np.ndarray, int]] = deque()
+        self._sum, self._count = np.zeros(pressure.channels), 0
+        self._pressure: np.ndarray | None = None
+        self._last, self._period = 0, 0.0
+        self.dropped = 0
+
+    def put(self, number: int, frame: Frame, host: int) -> None:
+        """Add a frame of stream 0 (eit) or 1 (pressure); returns at once."""
+        values = self._plans[number].in_si(frame.values)
+        with self._ready:
+            if number:
+                self._sum, self._count = self._sum + values, self._count + 1
+                return
+            self._frames.append((values, host))
+            self._drop_stale(host)
+            self._period += PERIOD_SMOOTHING * (host - self._last - self._period) if self._last else 0.0
+            self._last = host
+            self._ready.notify()
+
+    def take(self, timeout: float) -> ReceivedFrame | None:
+        """The next frame, after waiting for at most `timeout` s; None without a frame or before the first pressure."""
+        with self._ready:
+            if not self._frames:
+                self._ready.wait(timeout)
+            self._drop_stale(time.monotonic_ns())
+            if self._count:
+                self._pressure = self._sum / self._count
+                self._sum, self._count = np.zeros_like(self._sum), 0
+            if not self._frames or self._pressure is None:
+                return None
+            voltage, host = self._frames.popleft()
+            return ReceivedFrame(voltage, self._pressure, host)
+
+    def _drop_stale(self, now: int) -> None:
+        """Drop frames that have waited too long; the newest frame stays."""
+        while len(self._frames) > 1 and (now - self._frames[0][1] > MAX_WAIT or len(self._frames) > MAX_QUEUED_FRAMES):
+            self._frames.popleft()
+            self.dropped += 1
+
+    def time_to_next(self) -> float:
+        """Time in s until the next frame is expected; 0 if a frame waits."""
+        with self._ready:
+            if self._frames:
+                return 0.0
+            return max(0.0, (self._last + self._period - time.monotonic_ns()) / 1e9)
+
+
+@dataclass
+class LiveControl:
+    """Controls of a running live view (stop, measure rest levels again), and its state for viewers."""
+
+    stop: threading.Event = field(default_factory=threading.Event)
+    tare: threading.Event = field(default_factory=threading.Event)
+    state: str = "waiting for the devices"
+    lost: int = 0  # frames that were sent and did not arrive
+    simulated: bool = False  # whether a device reports that its values are simulated
+
+
+Publish = Callable[[FrameResult], object]
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How frames are processed.
+
+    | field        | meaning                                                                      | default | unit |
+    |--------------|------------------------------------------------------------------------------|---------|------|
+    | rest         | duration without contact at the beginning, in which rest levels are measured | 2       | s    |
+    | wait         | time within which the devices must begin                                     | 10      | s    |
+    | event_driven | whether to request readings frame by frame, which the device must support    | False   |      |
+    | realtime     | whether to use real-time scheduling once everything is compiled              | False   |      |
+    """
+
+    rest: float = 2.0
+    wait: float = 10.0
+    event_driven: bool = False
+    realtime: bool = False
+
+
+def run_live(
+    calibration: Calibration,
+    plan: RecordingPlan,
+    sources: Sequence[Source],
+    viewers: Sequence[Publish],
+    control: LiveControl,
+    settings: LiveSettings | None = None,
+    *,
+    log: RecordSink | None = None,
+    begun: Callable[[], object] = lambda: None,
+) -> int:
+    """Process frames until a stop is requested; returns the number of processed frames.
+
+    Args:
+        plan, sources: of the streams eit and pressure, in this order, from `plan_recording`.
+        viewers: functions that are called with each result; they must return at once.
+        control: lets other threads stop the loop or measure rest levels again, and shows them its state.
+        settings: how frames are processed.
+        log: destination of all frames as they arrive, such as a journal (`session_journal`); default: none.
+        begun: called when everything is compiled and the devices are connected.
+
+    Raises:
+        LiveError: if the streams do not fit the calibration, do not begin, or fail.
+        PriorityError: if real-time scheduling is refused.
+    """
+    settings = settings or LiveSettings()
+    _check(calibration, sources)
+    queue = FrameQueue(*(source.plan for source in sources))
+    engine = Engine(calibration, settings.rest)
+    recorder = Recorder(plan, sources, log or NullSink(), queue.put)
+    director = None
+    if settings.event_driven:
+        control.state = "choosing the readings for each place of the skin"
+        director = prepare_director(calibration, sources[0].plan.number, recorder.receivers[0].send)
+    with real_time(settings.realtime), recorder:
+        begun()
+        count = _process_frames(engine, queue, recorder, viewers, control, settings.wait, director)
+    if recorder.failure is not None:
+        raise LiveError(f"live: {recorder.failure}") from recorder.failure
+    return count
+
+
+def _check(calibration: Calibration, sources: Sequence[Source]) -> None:
+    eit, pressure = (source.plan for source in sources)
+    readings, pads = calibration.recon.readings, len(calibration.skin.pads)
+    if (eit.channels, pressure.channels) != (readings, pads):
+        what = f"{eit.channels} readings and {pressure.channels} pressures"
+        raise LiveError(
+            f"live: {what}, but this calibration is for {readings} and {pads}; give the calibration of this skin"
+        )
+
+
+def _process_frames(
+    engine: Engine,
+    queue: FrameQueue,
+    recorder: Recorder,
+    viewers: Sequence[Publish],
+    control: LiveControl,
+    wait: float,
+    director: ScanDirector | None,
+) -> int:
+    count, begun, until = 0, False, time.monotonic() + wait
+    while not (control.stop.is_set() or recorder.stop.is_set() or recorder.ended):
+        if control.tare.is_set():
+            control.tare.clear()
+            engine.tare()
+            if director is not None:
+                director.request_all()
+        arrival = queue.take(0.1)
+        if arrival is None:
+            if not begun and time.monotonic() > until:
+                raise LiveError("; ".join(map(explain_silence, recorder.silent_receivers)))
+            continue
+        begun = True
+        result = engine.step(arrival, queue.dropped)
+        control.lost = sum(receiver.counters.lost for receiver in recorder.receivers)
+        control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)
+        control.state = "measuring the rest levels: do not touch the skin" if engine.resting else "running"
+        if result is not None:
+            count += 1
+            for publish in viewers:
+                publish(result)
+            if director is not None:
+                director.update(engine.pressed(arrival), result.centre)
+            engine.use_spare_time(queue.time_to_next())
+    return count

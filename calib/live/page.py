@@ -1,0 +1,163 @@
+"""The live page: one self-contained file over HTTP, with results pushed as server-sent events.
+
+A viewer gets the newest result whenever it is ready, so that a slow viewer sees fewer results, never older ones. By
+default the server listens on this machine only. The page loads nothing from other servers.
+"""
+
+import json
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..calibration.calibration import Calibration
+from .loop import LiveControl
+from .results import FrameResult
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+PAGE_FILE = Path(__file__).with_name("page.html")
+MIN_RESULT_INTERVAL = 0.04  # s between two results for a viewer; the eye sees no more
+KEEP_ALIVE_INTERVAL = 1.0  # s between messages without results, which reveal closed connections
+REQUEST_TIMEOUT = 5.0  # s
+SECURITY_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+
+
+def page_scene(calibration: Calibration) -> dict[str, object]:
+    """Fixed contents of the page: pads, electrodes and grid, in m."""
+    skin, recon = calibration.skin, calibration.recon
+    centres = np.asarray(recon.centres)
+    return {
+        "skin": skin.name,
+        "simulated": calibration.simulated,
+        "rows": recon.shape[0],
+        "columns": recon.shape[1],
+        "low": centres.min(0).tolist(),
+        "high": centres.max(0).tolist(),
+        "pads": [pad.name for pad in skin.pads],
+        "electrodes": np.asarray(skin.electrode_positions)[:, :2].tolist(),
+    }
+
+
+class Page(ThreadingHTTPServer):
+    """The HTTP server of the page, a context manager. `show_result` hands over the newest result."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, calibration: Calibration, control: LiveControl, host: str = "127.0.0.1", port: int = 0):
+        self.control, self.scene = control, json.dumps(page_scene(calibration)).encode()
+        self._result: FrameResult | None = None
+        self._fresh = threading.Condition()
+        self._host = host
+        super().__init__((host, port), _Handler)
+        self._thread = threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True)
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{self._host}:{self.server_address[1]}/"
+
+    @property
+    def host_names(self) -> set[str] | None:
+        """Host names that a request may use; None for all.
+
+        A server on this machine only refuses other names, so that no foreign web page can reach it by DNS rebinding.
+        """
+        port = self.server_address[1]
+        return {f"{name}:{port}" for name in LOOPBACK} if self._host in LOOPBACK else None
+
+    def show_result(self, result: FrameResult) -> None:
+        """Hand over the newest result; returns at once, and viewers take the result when they are ready."""
+        with self._fresh:
+            self._result = result
+            self._fresh.notify_all()
+
+    def newest(self, after: int) -> FrameResult | None:
+        """The newest result with a number above `after`, or None after `KEEP_ALIVE_INTERVAL` without one."""
+        with self._fresh:
+            self._fresh.wait_for(lambda: self._number > after or self.control.stop.is_set(), KEEP_ALIVE_INTERVAL)
+            return self._result if self._number > after else None
+
+    @property
+    def _number(self) -> int:
+        return 0 if self._result is None else self._result.number
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing when a viewer disconnects."""
+
+    def __enter__(self) -> "Page":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.control.stop.set()
+        self.shutdown()
+        self.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Page
+    server_version, sys_version = "jaxeit", ""
+    timeout = REQUEST_TIMEOUT
+
+    def do_GET(self) -> None:
+        """Send the page, its fixed contents, or the results."""
+        if not self._is_allowed():
+            return
+        if self.path == "/":
+            self._reply(PAGE_FILE.read_bytes(), "text/html; charset=utf-8")
+        elif self.path == "/scene":
+            self._reply(self.server.scene, "application/json")
+        elif self.path == "/results":
+            self._push()
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def do_POST(self) -> None:
+        """Measure the rest levels again, if the request comes from the page itself."""
+        if not self._is_allowed():
+            return
+        origin = self.headers.get("Origin")
+        if self.path != "/tare" or origin not in (None, f"http://{self.headers.get('Host')}"):
+            self.send_error(HTTPStatus.FORBIDDEN)
+            return
+        self.server.control.tare.set()
+        self._reply(b"{}", "application/json")
+
+    def _is_allowed(self) -> bool:
+        host_names = self.server.host_names
+        if host_names is None or self.headers.get("Host") in host_names:
+            return True
+        self.send_error(HTTPStatus.FORBIDDEN)
+        return False
+
+    def _reply(self, body: bytes, kind: str) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Security-Policy", SECURITY_POLICY)
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _push(self) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", "text/event-stream")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        number, stop = 0, self.server.control.stop
+        while not stop.is_set():
+            result = self.server.newest(number)
+            control = self.server.control
+            about = json.dumps({"state": control.state, "simulated": control.simulated, "lost": control.lost})
+            text = result.to_json(image=True) if result is not None else "null"
+            number = number if result is None else result.number
+            self.wfile.write(f'data: {{"about": {about}, "result": {text}}}\n\n'.encode())
+            self.wfile.flush()
+            stop.wait(MIN_RESULT_INTERVAL)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing."""

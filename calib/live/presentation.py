@@ -1,0 +1,71 @@
+"""Present live results to people and programs: the page, lines of JSON on a socket, and further viewers."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.calibration.calibration import Calibration
+
+from ..record.broadcast import Broadcaster
+from ..record.plan import RecordingPlan
+from ..record.recorder import session_journal
+from ..record.sources import Source
+from .loop import LiveControl, LiveSettings, Publish, run_live
+from .page import LOOPBACK, Page
+
+
+@dataclass(frozen=True)
+class Presentation:
+    """Where results are shown.
+
+    | field    | meaning                                                                                   |
+    |----------|-------------------------------------------------------------------------------------------|
+    | host     | address that the page and the lines of JSON listen on; default: this machine only           |
+    | port     | port of the page; 0: any free port                                                        |
+    | publish  | port of the lines of JSON, 0: any free port; None: no lines                                |
+    | output   | session file to which the streams are recorded at the same time; None: no recording        |
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8765
+    publish: int | None = None
+    output: str | Path | None = None
+
+
+def present(
+    calibration: Calibration,
+    plan: RecordingPlan,
+    sources: Sequence[Source],
+    control: LiveControl,
+    where: Presentation | None = None,
+    settings: LiveSettings | None = None,
+    *,
+    also: Sequence[Publish] = (),
+    tell: Callable[[str], object] = lambda line: None,
+) -> int:
+    """Show results until a stop is requested; returns the number of processed frames.
+
+    Args:
+        plan, sources: of the streams eit and pressure, from `plan_recording`.
+        where: where results are shown.
+        settings: how frames are processed.
+        also: further functions that are called with each result.
+        tell: called with messages for the operator, such as the address of the page.
+
+    Raises:
+        LiveError, PriorityError: as `run_live`. RecordError: as `session_journal`. OSError: if a port is in use.
+    """
+    where = where or Presentation()
+    with ExitStack() as stack:
+        page = stack.enter_context(Page(calibration, control, where.host, where.port))
+        viewers: list[Publish] = [page.show_result, *also]
+        tell(f"look at {page.url}")
+        if where.publish is not None:
+            lines = stack.enter_context(Broadcaster(where.host, where.publish))
+            tell(f"lines of JSON at {lines.address[0]}:{lines.address[1]}")
+            viewers.append(lambda result: lines.publish([result.to_json().encode() + b"\n"]))
+        if where.host not in LOOPBACK:
+            tell("anyone who can reach this machine can view the page and measure the rest levels again")
+        log = None if where.output is None else stack.enter_context(session_journal(where.output, tell))
+        return run_live(calibration, plan, sources, viewers, control, settings, log=log)

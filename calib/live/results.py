@@ -1,0 +1,100 @@
+"""Result of one frame: forces, force map, image and fitted contacts."""
+
+import base64
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class TouchEstimates:
+    """Contacts fitted to a frame.
+
+    | field      | meaning                                                              | shape     | unit |
+    |------------|----------------------------------------------------------------------|-----------|------|
+    | position   | of the contact                                                       | (k, 2)    | m    |
+    | covariance | of the position                                                      | (k, 2, 2) | m^2  |
+    | sure       | whether the fit converged; otherwise the covariance is a guess       | (k,)      |      |
+    | age        | frames since the one of the fit; None if contacts were never fitted  | ()        |      |
+    """
+
+    position: np.ndarray
+    covariance: np.ndarray
+    sure: np.ndarray
+    age: int | None = None
+
+    def to_list(self) -> list[dict[str, object]]:
+        """The contacts as values for JSON, each with the standard errors of x and y."""
+        return [
+            {
+                "position": _json_numbers(position),
+                "standard_error": _json_numbers(np.sqrt(np.diag(covariance))),
+                "covariance": [_json_numbers(row) for row in covariance],
+                "sure": bool(sure),
+            }
+            for position, covariance, sure in zip(self.position, self.covariance, self.sure, strict=True)
+        ]
+
+
+NO_TOUCHES = TouchEstimates(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, bool))
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """Result of one frame.
+
+    | field          | meaning                                                                | shape     | unit |
+    |----------------|------------------------------------------------------------------------|-----------|------|
+    | number         | of the frame among the processed ones                                  | ()        |      |
+    | host           | time of arrival on the monotonic clock                                 | ()        | ns   |
+    | latency        | from arrival to this result                                            | ()        | s    |
+    | force          | on each pad; NaN without pressure                                      | (pads,)   | N    |
+    | standard_error | of the force                                                           | (pads,)   | N    |
+    | valid          | whether the pressure is within the calibrated range                    | (pads,)   |      |
+    | centre         | mean position of the force on each pressed pad; NaN on the others      | (pads, 2) | m    |
+    | map            | force on each pixel; its sum is that of the pad forces                 | (pixels,) | N    |
+    | image          | change of sheet conductivity from which the map is made                | (pixels,) | S    |
+    | missing        | number of readings that were not finite and were left out              | ()        |      |
+    | dropped        | number of frames that were not processed so far                        | ()        |      |
+    | touches        | contacts, if the calibration fits contacts                             |           |      |
+    | unsearched     | number of frames so far for which there was no time to fit contacts    | ()        |      |
+    """
+
+    number: int
+    host: int
+    latency: float
+    force: np.ndarray
+    standard_error: np.ndarray
+    valid: np.ndarray
+    centre: np.ndarray
+    map: np.ndarray
+    image: np.ndarray
+    missing: int
+    dropped: int
+    touches: TouchEstimates = NO_TOUCHES
+    unsearched: int = 0
+
+    def to_json(self, *, image: bool = False) -> str:
+        """The result as one line of JSON; ``image`` adds map and image as base64 of little-endian f4."""
+        out: dict[str, object] = {
+            "number": self.number,
+            "host_ns": self.host,
+            "latency_ms": round(1e3 * self.latency, 3),
+            "force": _json_numbers(self.force),
+            "standard_error": _json_numbers(self.standard_error),
+            "valid": self.valid.tolist(),
+            "centre": [_json_numbers(row) for row in self.centre],
+            "missing": self.missing,
+            "dropped": self.dropped,
+            "contacts": self.touches.to_list(),
+            "contacts_age": self.touches.age,
+            "unsearched": self.unsearched,
+        }
+        if image:
+            out |= {name: base64.b64encode(getattr(self, name).astype("<f4")).decode() for name in ("map", "image")}
+        return json.dumps(out, allow_nan=False)
+
+
+def _json_numbers(values: np.ndarray) -> list[float | None]:
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]

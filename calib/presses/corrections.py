@@ -1,0 +1,224 @@
+"""Corrections: objects that remove a physical effect from a recording, applied to a stream in order.
+
+    values = correct([LowPass(50.0)], time, values, "pressure")
+
+The values of a stream are (time, channels). A missing sample is NaN before and after, and never affects others.
+A baseline is no correction of a stream but a rule: it weights the two rest means around a press (`AbstractBaseline`).
+"""
+
+import abc
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise
+
+import numpy as np
+from scipy import signal
+
+from jaxeit.registry import Registry
+
+from .streams import finite_mean
+
+
+class CorrectionError(ValueError):
+    """The correction cannot be applied to this stream."""
+
+
+class AbstractCorrection(abc.ABC):
+    """Maps the values of a stream to corrected values of the same shape."""
+
+    @abc.abstractmethod
+    def apply(self, time: np.ndarray, values: np.ndarray, name: str) -> np.ndarray:
+        """Correct `values` (n, channels) recorded at `time` (n,) ns; `name` is the stream's, for error messages."""
+
+
+def correct(
+    corrections: Iterable[AbstractCorrection],
+    time: np.ndarray,
+    values: np.ndarray,
+    name: str = "stream",
+) -> np.ndarray:
+    """Apply corrections in order; `values` is not changed."""
+    return reduce(lambda v, c: c.apply(time, v, name), corrections, values)
+
+
+def sample_rate(time: np.ndarray) -> float:
+    """Median rate in Hz of time stamps in ns.
+
+    Raises: `CorrectionError` for fewer than two samples, or if most time stamps repeat or go back.
+    """
+    if len(time) < 2:
+        raise CorrectionError("a stream of fewer than two samples has no sample rate: record a longer stream.")
+    period = float(np.median(np.diff(time)))
+    if not period > 0:
+        raise CorrectionError("times repeat or go back more often than they rise; check the clock, sort the samples.")
+    return 1e9 / period
+
+
+def bridge(column: np.ndarray) -> np.ndarray:
+    """Interpolate missing samples of one channel and hold its ends. A channel of missing samples only is unchanged."""
+    good = np.isfinite(column)
+    if good.all() or not good.any():
+        return column
+    index = np.arange(len(column))
+    return np.asarray(np.interp(index, index[good], column[good]))
+
+
+def _continuous_runs(time: np.ndarray, rate: float) -> list[slice]:
+    """Runs of samples without a gap of more than five periods and without a backward step of the clock.
+
+    Each run is filtered on its own, because a filter across a gap would invent the samples within it.
+    """
+    steps = np.diff(time)
+    breaks = np.flatnonzero((steps > 5e9 / rate) | (steps < 0)) + 1
+    edges = [0, *breaks.tolist(), len(time)]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+@dataclass(frozen=True)
+class LowPass(AbstractCorrection):
+    """Butterworth low-pass of `cutoff` Hz, per channel.
+
+    With `causal=False` (offline) the filter runs forwards and backwards: no delay, half the amplitude (-6 dB) at the
+    cutoff. With `causal=True` (online) it has -3 dB at the cutoff and a delay; it starts at rest at the first sample.
+    The default of 50 Hz is that of the paper which this bench reproduces.
+
+    Raises: `CorrectionError` if the cutoff is not below half the sample rate. At 50 Hz this refuses a stream of
+    100 Hz, where the paper's filter would be exactly at the Nyquist frequency.
+    """
+
+    cutoff: float = 50.0
+    order: int = 2
+    causal: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.cutoff > 0 or self.order < 1:
+            raise CorrectionError(
+                f"a low-pass needs a cutoff above 0 Hz and an order of at least 1, not {self.cutoff} and {self.order}."
+            )
+
+    def sections(self, rate: float, name: str = "stream") -> np.ndarray:
+        """Second-order sections for a stream of `rate` Hz."""
+        if self.cutoff >= rate / 2:
+            raise CorrectionError(
+                f"{name}: a low-pass of {self.cutoff:g} Hz needs samples faster than {2 * self.cutoff:g} Hz, "
+                f"and these come at {rate:.4g} Hz; choose a cutoff below {rate / 2:.4g} Hz, or leave the low-pass out."
+            )
+        return np.asarray(signal.butter(self.order, self.cutoff, fs=rate, output="sos"))
+
+    def apply(self, time: np.ndarray, values: np.ndarray, name: str = "stream") -> np.ndarray:
+        if len(time) < 2:
+            return values
+        rate = sample_rate(time)
+        sections = self.sections(rate, name)
+        filled = np.apply_along_axis(bridge, 0, values)
+        smooth = np.concatenate([self._filter(sections, filled[s]) for s in _continuous_runs(time, rate)])
+        return np.where(np.isfinite(values), smooth, np.nan)
+
+    def _filter(self, sections: np.ndarray, values: np.ndarray) -> np.ndarray:
+        if self.causal:
+            start = signal.sosfilt_zi(sections)[:, :, None] * values[0]
+            return np.asarray(signal.sosfilt(sections, values, axis=0, zi=start)[0])
+        pad = min(3 * (2 * len(sections) + 1), len(values) - 1)
+        return np.asarray(signal.sosfiltfilt(sections, values, axis=0, padlen=pad))
+
+
+@dataclass(frozen=True)
+class WindowMeans:
+    """Means over windows, their standard errors, and counts of finite samples, each (windows, channels).
+
+    A channel without a finite sample in a window has NaN and a count of zero there.
+    """
+
+    mean: np.ndarray
+    standard_error: np.ndarray
+    count: np.ndarray
+
+
+class AbstractBaseline(abc.ABC):
+    """The baseline of a press, as weights of the mean before it and the mean after it."""
+
+    @abc.abstractmethod
+    def weights(
+        self, time: np.ndarray | float, before: np.ndarray | float, after: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Weights of both rest means at `time`; `before` and `after` are the centres of the rest windows (all ns)."""
+
+    def remove(
+        self, held: WindowMeans, before: WindowMeans, after: WindowMeans, centres: tuple[np.ndarray, ...]
+    ) -> WindowMeans:
+        """Subtract the baseline from the hold means. Errors of the three windows are independent and add in squares.
+
+        `centres`: centres (windows,) ns of the held, before and after windows.
+        """
+        at, t0, t1 = centres
+        w0, w1 = (w[:, None] for w in self.weights(at, t0, t1))
+        mean = held.mean - weighted(w0, before.mean) - weighted(w1, after.mean)
+        variance = held.standard_error**2
+        variance = variance + weighted(w0, before.standard_error) ** 2
+        variance = variance + weighted(w1, after.standard_error) ** 2
+        return WindowMeans(mean, np.sqrt(variance), held.count)
+
+
+def weighted(weight: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """weight * value, where a weight of zero gives zero even for NaN."""
+    return np.where(weight == 0, 0.0, weight * value)
+
+
+@dataclass(frozen=True)
+class TwoSided(AbstractBaseline):
+    """Linear between the rest means before and after the press. Removes drift; slow recovery of the pad biases it."""
+
+    def weights(
+        self, time: np.ndarray | float, before: np.ndarray | float, after: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        share = (time - before) / np.maximum(after - before, 1)
+        return np.asarray(1 - share), np.asarray(share)
+
+
+@dataclass(frozen=True)
+class PreOnly(AbstractBaseline):
+    """The rest mean before the press: the only baseline available in real time. Drift during the press stays."""
+
+    def weights(
+        self, time: np.ndarray | float, before: np.ndarray | float, after: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return np.ones(np.shape(time)), np.zeros(np.shape(time))
+
+
+CORRECTIONS = Registry(AbstractCorrection, "correction", "calib.corrections")
+BASELINES = Registry(AbstractBaseline, "baseline", "calib.baselines")
+"""Corrections and baselines by the names that recipes use."""
+
+
+# Samples within a window are correlated (filters, drift); means over this many blocks are nearly independent.
+BLOCKS_PER_WINDOW = 8
+
+
+def _window_mean(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, standard error and count of finite samples per channel of one window (n, channels)."""
+    good = np.isfinite(values)
+    count = good.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = finite_mean(values)
+        return mean, _standard_error(np.where(good, values - mean, 0.0), good, count), count
+
+
+def _standard_error(residual: np.ndarray, good: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Standard error of a mean from the scatter of block sums (batch means); NaN with fewer than two blocks."""
+    edges = np.linspace(0, len(residual), min(BLOCKS_PER_WINDOW, len(residual)) + 1).astype(int)[:-1]
+    if not len(edges):
+        return np.full(count.shape, np.nan)
+    sums = np.add.reduceat(residual, edges, axis=0)
+    used = (np.add.reduceat(good.astype(int), edges, axis=0) > 0).sum(axis=0)
+    scatter = (sums**2).sum(axis=0) * used / np.where(used > 1, used - 1, np.nan)
+    return np.asarray(np.sqrt(scatter) / count)
+
+
+def window_means(values: np.ndarray, ranges: np.ndarray) -> WindowMeans:
+    """Means of `values` (n, channels) over half-open index `ranges` (windows, 2)."""
+    parts = [_window_mean(values[a:b]) for a, b in ranges]
+    if not parts:
+        empty = np.empty((0, values.shape[1]))
+        return WindowMeans(empty, empty, empty.astype(int))
+    return WindowMeans(*(np.stack(column) for column in zip(*parts, strict=True)))

@@ -1,0 +1,107 @@
+"""Mean change of each stream over the hold of each press, with the baseline removed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ..session.units import SECOND
+from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, WindowMeans, correct, window_means
+from .streams import ReadableStream, index_ranges
+from .times import PressColumns
+from .windows import PressWindows
+
+FILTER_MARGIN = SECOND // 2  # ns read beyond the outermost windows, so that edge effects of filters stay outside them
+AVERAGED_WINDOWS = ("hold", "rest_before", "rest_after")
+
+
+@dataclass(frozen=True, eq=False)
+class PressMeans:
+    """Hold means of one stream with the baseline removed; rows are presses.
+
+    | field    | meaning                                                        | shape               | unit       |
+    |----------|----------------------------------------------------------------|---------------------|------------|
+    | change   | hold mean minus baseline, with standard errors and counts      | (presses, channels) | stream's   |
+    | baseline | baseline at the middle of the hold                             | (presses, channels) | stream's   |
+    | rest     | mean of the rest window before the press                       | (presses, channels) | stream's   |
+    """
+
+    change: WindowMeans
+    baseline: np.ndarray
+    rest: np.ndarray
+
+    def missing(self) -> np.ndarray:
+        """Number of presses (channels,) in which a channel has no value."""
+        return np.asarray(np.isnan(self.change.mean).sum(axis=0))
+
+
+def _span(time: np.ndarray, windows: PressWindows, i: int) -> tuple[int, int]:
+    start, stop = windows.rest_before[i, 0] - FILTER_MARGIN, windows.rest_after[i, 1] + FILTER_MARGIN
+    return tuple(int(k) for k in np.searchsorted(time, [start, stop]))  # type: ignore[return-value]
+
+
+def read_press(
+    stream: ReadableStream, windows: PressWindows, i: int, corrections: Sequence[AbstractCorrection]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Time stamps (n,) ns and corrected values (n, channels) around press `i`; nothing else is read into memory."""
+    a, b = _span(stream.time, windows, i)
+    time = stream.time[a:b]
+    return time, correct(corrections, time, stream.read(a, b), stream.name)
+
+
+def _averaged_windows(
+    stream: ReadableStream, windows: PressWindows, i: int, corrections: Sequence[AbstractCorrection]
+) -> WindowMeans:
+    """Means of one press over the three averaged windows, in the order of `AVERAGED_WINDOWS`."""
+    time, values = read_press(stream, windows, i, corrections)
+    times = np.stack([getattr(windows, name)[i] for name in AVERAGED_WINDOWS])
+    return window_means(values, index_ranges(time, times))
+
+
+def press_means(
+    stream: ReadableStream,
+    windows: PressWindows,
+    *,
+    baseline: AbstractBaseline | None = None,
+    corrections: Sequence[AbstractCorrection] = (),
+) -> PressMeans:
+    """Average each press over its hold and remove the baseline. The stream is read press by press, never as a whole.
+
+    Args:
+      baseline: `TwoSided()` by default.
+      corrections: applied to each press separately, from half a second before its windows to half a second after.
+    Returns: rows for all presses; NaN where a channel has no finite sample in a window that the baseline uses.
+    """
+    rule = TwoSided() if baseline is None else baseline
+    parts = [_averaged_windows(stream, windows, i, corrections) for i in range(len(windows.hold))]
+    held, before, after = (_nth_window(parts, k, stream.channels) for k in range(3))
+    centres = tuple(windows.centre(name) for name in AVERAGED_WINDOWS)
+    change = rule.remove(held, before, after, centres)
+    return PressMeans(change, held.mean - change.mean, before.mean)
+
+
+def _nth_window(parts: list[WindowMeans], k: int, width: int) -> WindowMeans:
+    """The k-th window of every press."""
+    return WindowMeans(
+        *(np.array([getattr(p, f.name)[k] for p in parts]).reshape(len(parts), width) for f in fields(WindowMeans))
+    )
+
+
+def hold_positions(presses: PressColumns, stage: ReadableStream) -> np.ndarray:
+    """Median stage position (presses, channels) in m over each hold; NaN where the stage has no sample in the hold."""
+    hold = np.stack([presses.t_hold0, presses.t_hold1], axis=1)
+    rows = [stage.read(int(a), int(b)) for a, b in index_ranges(stage.time, hold)]
+    with np.errstate(all="ignore"):
+        return np.stack([np.median(r, axis=0) if len(r) else np.full(r.shape[1], np.nan) for r in rows])
+
+
+def dominant_pad(pressure: np.ndarray, share: float = 0.9) -> np.ndarray:
+    """Pad (presses,) that carries at least `share` of the positive pressure change (presses, pads); -1 without one.
+
+    A press across the edge between two pads loads both, and so determines the curve of neither.
+    """
+    positive = np.maximum(np.nan_to_num(pressure), 0.0)
+    total = positive.sum(axis=1)
+    best = positive.argmax(axis=1)
+    part = positive[np.arange(len(best)), best] / np.where(total > 0, total, np.inf)
+    return np.where(part >= share, best, -1)

@@ -1,0 +1,237 @@
+"""Pool the presses of several sessions into one table, to which curves and fields are fitted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+import jaxeit as je
+
+from ..session import Session
+from .corrections import correct
+from .means import FILTER_MARGIN, dominant_pad
+from .streams import finite_mean, index_ranges
+from .table import PressMeasurements, Processing, measure
+
+MEANS_PER_PRESS = 24  # that replace the samples of a press, because neighbouring samples are nearly equal
+
+
+class PressSeries(NamedTuple):
+    """Samples along all presses, in order of time.
+
+    | field    | meaning                              | shape     | unit |
+    |----------|--------------------------------------|-----------|------|
+    | press    | row of the sample's press            | (n,)      |      |
+    | pressure | change of the pads' pressures        | (n, pads) | Pa   |
+    | force    | from the load cell                   | (n,)      | N    |
+    """
+
+    press: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+
+
+class PadSamples(NamedTuple):
+    """Samples to which the curve of each pad is fitted, in order of time; padding is not in `mask`.
+
+    | field    | meaning                          | shape     | unit |
+    |----------|----------------------------------|-----------|------|
+    | rows     | of the samples in `PressData`    | (pads, m) |      |
+    | pressure | of the pad                       | (pads, m) | Pa   |
+    | force    |                                  | (pads, m) | N    |
+    | mask     | samples to be fitted             | (pads, m) |      |
+    | place    | number of the place pressed      | (pads, m) |      |
+    """
+
+    rows: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+    mask: np.ndarray
+    place: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PressData:
+    """Presses of one or more sessions: their samples, and the means over their holds.
+
+    | field           | meaning                                                      | shape           | unit |
+    |-----------------|--------------------------------------------------------------|-----------------|------|
+    | sample_pressure | along the presses                                            | (pads, n)       | Pa   |
+    | sample_force    |                                                              | (n,)            | N    |
+    | sample_press    | row of the sample's press                                    | (n,)            |      |
+    | mask            | samples from which a pad's curve is fitted                   | (pads, n)       |      |
+    | pressure        | over the hold                                                | (presses, pads) | Pa   |
+    | force           |                                                              | (presses,)      | N    |
+    | place           | number of the place pressed                                  | (presses,)      |      |
+    | reach           | lowest and highest corner of the box of places               | (2, 2)          | m    |
+    """
+
+    sample_pressure: np.ndarray
+    sample_force: np.ndarray
+    sample_press: np.ndarray
+    mask: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+    place: np.ndarray
+    reach: np.ndarray
+
+    @property
+    def sample_place(self) -> np.ndarray:
+        """Number of the place of each sample, (n,)."""
+        return np.asarray(self.place[self.sample_press])
+
+    def pad_samples(self, *, with_history: bool) -> PadSamples:
+        """Samples of each pad; all samples ``with_history``, for a curve that depends on earlier pressures."""
+        everything = np.broadcast_to(np.arange(len(self.sample_force)), self.mask.shape)
+        rows = everything if with_history else self._own
+        pressure, mask = (np.take_along_axis(a, rows, 1) for a in (self.sample_pressure, self.mask))
+        return PadSamples(rows, pressure, self.sample_force[rows], mask, self.sample_place[rows])
+
+    @cached_property
+    def _own(self) -> np.ndarray:
+        """Rows (pads, m) of each pad's samples in `mask`, of missing samples, and of padding, in order of time."""
+        wanted = self.mask | ~(np.isfinite(self.sample_pressure) & np.isfinite(self.sample_force))
+        most = wanted.sum(1).max(initial=0)
+        return np.argsort(~wanted, axis=1, kind="stable")[:, :most]
+
+
+@dataclass(frozen=True, eq=False)
+class PooledPresses:
+    """Presses of several sessions, concatenated in the order of the sessions.
+
+    | field      | meaning                                                    | shape               | unit |
+    |------------|------------------------------------------------------------|---------------------|------|
+    | recordings | measurements of each session                               |                     |      |
+    | series     | all samples along the presses                              |                     |      |
+    | data       | samples and means to which curves and fields are fitted    |                     |      |
+    | dv         | change of the readings over the hold                       | (presses, readings) | V    |
+    | position   | true position of the tip                                   | (presses, 2)        | m    |
+    | owner      | pad that carries the press alone, -1 without one           | (presses,)          |      |
+    | groups     | number of the pad, indenter and session of each press      | (presses,) each     |      |
+    | channels   | whether a reading was finite in every press                | (readings,)         |      |
+    | noise      | of a frame: the largest of the sessions                    | (readings,)         | V    |
+    | untouched  | readings without contact                                   | (readings,)         | V    |
+    | true_place | whether the position comes from a simulation, and is exact |                     |      |
+    | notes      | remarks for the operator, by session                       |                     |      |
+    """
+
+    recordings: tuple[PressMeasurements, ...]
+    series: PressSeries
+    data: PressData
+    dv: np.ndarray
+    position: np.ndarray
+    owner: np.ndarray
+    groups: Mapping[str, np.ndarray]
+    channels: np.ndarray
+    noise: np.ndarray
+    untouched: np.ndarray
+    true_place: bool
+    notes: tuple[str, ...]
+
+    def quiet_frames(self, processing: Processing) -> np.ndarray:
+        """Frames (n, readings) V before the presses, minus the mean of each rest; the noise is estimated from them."""
+        return np.concatenate([_quiet_frames(recording, processing) for recording in self.recordings])
+
+
+def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Processing | None = None) -> PooledPresses:
+    """Cut the presses out of all sessions and concatenate them.
+
+    Raises:
+        SessionError: if a session was not recorded on this skin, lacks a stream, or holds no press that can be used.
+    """
+    recordings = tuple(measure(session, skin, processing) for session in sessions)
+    position = np.concatenate([m.position for m in recordings])
+    pressure = np.concatenate([m.pressure for m in recordings])
+    owner = dominant_pad(pressure)
+    series = PressSeries(
+        _press_of_samples(recordings),
+        np.concatenate([m.samples.pressure for m in recordings]),
+        np.concatenate([m.samples.force for m in recordings]),
+    )
+    tip = np.concatenate([m.presses.tip_diameter[m.presses.accepted] for m in recordings])
+    return PooledPresses(
+        recordings=recordings,
+        series=series,
+        data=_press_data(recordings, position, pressure, owner, thinned(series, MEANS_PER_PRESS)),
+        dv=np.concatenate([m.dv for m in recordings]),
+        position=position,
+        owner=owner,
+        groups={
+            "pad": owner,
+            "indenter": np.unique(np.round(tip, 6), return_inverse=True)[1].ravel(),
+            "session": np.repeat(np.arange(len(recordings)), [len(m.force) for m in recordings]),
+        },
+        channels=np.logical_and.reduce([m.channels for m in recordings]),
+        noise=np.max([m.noise for m in recordings], 0),
+        untouched=np.mean([m.untouched for m in recordings], 0),
+        true_place=any("contact_position" in m.session.truth for m in recordings),
+        notes=tuple(f"{m.session.name}: {note}" for m in recordings for note in m.notes),
+    )
+
+
+def _press_data(
+    recordings: Sequence[PressMeasurements],
+    position: np.ndarray,
+    pressure: np.ndarray,
+    owner: np.ndarray,
+    means: PressSeries,
+) -> PressData:
+    finite = np.isfinite(means.pressure).all(1) & np.isfinite(means.force)
+    return PressData(
+        sample_pressure=means.pressure.T,
+        sample_force=means.force,
+        sample_press=means.press,
+        mask=finite & (owner[means.press] == np.arange(pressure.shape[1])[:, None]),
+        pressure=pressure,
+        force=np.concatenate([m.force for m in recordings]),
+        place=np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel(),
+        reach=np.stack([position.min(0), position.max(0)]),
+    )
+
+
+def _press_of_samples(recordings: Sequence[PressMeasurements]) -> np.ndarray:
+    """Row (n,) of the press of each sample, among all accepted presses."""
+    rows, first = [], 0
+    for m in recordings:
+        number = np.cumsum(m.presses.accepted) - 1
+        rows.append(first + number[m.samples.press])
+        first += len(m.force)
+    return np.concatenate(rows)
+
+
+def thinned(series: PressSeries, most: int) -> PressSeries:
+    """Replace the samples of each press by at most `most` means over equal parts of it, in order of time.
+
+    A part with a missing sample has no mean (NaN).
+    """
+    press, pressure, force = series
+    starts = np.flatnonzero(np.r_[True, press[1:] != press[:-1]]) if len(press) else np.empty(0, int)
+    ends = np.append(starts[1:], len(press))
+    cuts = [np.linspace(a, b, min(most, b - a) + 1).astype(int)[:-1] for a, b in zip(starts, ends, strict=True)]
+    first = np.concatenate([*cuts, np.empty(0, int)]).astype(int)
+    count = np.diff(np.append(first, len(press)))
+    if not len(first):
+        return series
+    return PressSeries(
+        press[first], np.add.reduceat(pressure, first) / count[:, None], np.add.reduceat(force, first) / count
+    )
+
+
+def _quiet_frames(recording: PressMeasurements, processing: Processing) -> np.ndarray:
+    """Corrected frames of the rests before the accepted presses, minus the mean of each rest.
+
+    Subtracting the mean of n frames removes one degree of freedom; the factor sqrt(n / (n - 1)) restores the variance.
+    """
+    stream, windows = recording.session.stream("eit"), recording.windows.rest_before[recording.presses.accepted]
+    corrections, _ = processing.of(stream)
+    rests = [np.empty((0, stream.channels))]
+    for window in windows:
+        first, last = index_ranges(stream.time, window + np.array([-FILTER_MARGIN, FILTER_MARGIN]))
+        time = stream.time[first:last]
+        frames = correct(corrections, time, stream.read(int(first), int(last)), stream.name)
+        frames = frames[(time >= window[0]) & (time < window[1])]
+        if len(frames) > 1:
+            rests.append((frames - finite_mean(frames)) * np.sqrt(len(frames) / (len(frames) - 1)))
+    return np.concatenate(rests)

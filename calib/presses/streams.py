@@ -1,0 +1,93 @@
+"""Streams that presses are cut from. Times are int64 nanoseconds since the session's epoch; one row per sample."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+
+
+class PressError(ValueError):
+    """The streams or the times do not allow a search for presses."""
+
+
+@runtime_checkable
+class ReadableStream(Protocol):
+    """The interface of a stream; `calib.session.Stream` and `ArrayStream` implement it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def channels(self) -> int: ...
+    @property
+    def time(self) -> np.ndarray: ...
+    def read(self, start: int = 0, stop: int | None = None) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayStream:
+    """A stream held in memory: `time` (n,) ns, `values` (n, channels) in SI units, NaN where a value is missing."""
+
+    name: str
+    time: np.ndarray
+    values: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or len(self.time) != len(self.values):
+            raise PressError(
+                f"{self.name}: values must be (time, channels) with one row per time stamp, "
+                f"not {self.values.shape} for {len(self.time)} time stamps."
+            )
+
+    @property
+    def channels(self) -> int:
+        return int(self.values.shape[1])
+
+    def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+        return self.values[start:stop]
+
+
+def recording_end(streams: Iterable[ReadableStream]) -> int:
+    """Earliest end of the streams in ns. A stream ends one ns after its last sample, since windows are half open."""
+    return min(int(stream.time[-1]) + 1 for stream in streams)
+
+
+def index_ranges(time: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """Half-open index ranges (windows, 2) of the samples whose time stamps lie within time `windows` (windows, 2)."""
+    return np.searchsorted(time, windows, side="left")
+
+
+def true_runs(flag: np.ndarray) -> np.ndarray:
+    """Half-open index ranges (runs, 2) in which `flag` (n,) is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flag, [False]]).astype(np.int8)))
+    return edges.reshape(-1, 2)
+
+
+def finite_mean(values: np.ndarray) -> np.ndarray:
+    """Mean over the first axis of the finite values; NaN where there is none."""
+    good = np.isfinite(values)
+    count = good.sum(axis=0)
+    return np.asarray(np.where(good, values, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan))
+
+
+def resample(time: np.ndarray, values: np.ndarray, at: np.ndarray, max_gap: float = 3.0) -> np.ndarray:
+    """Interpolate `values` (n, channels) linearly at the times `at`.
+
+    The result (times, channels) is NaN outside the stream, and where the distance between the two nearest finite
+    samples exceeds `max_gap` median sample periods.
+    """
+    limit = max_gap * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    columns = [_resample_one(time, v, at, limit) for v in values.T]
+    return np.stack(columns, axis=1) if columns else np.empty((len(at), 0))
+
+
+def _resample_one(time: np.ndarray, column: np.ndarray, at: np.ndarray, limit: float) -> np.ndarray:
+    good = np.isfinite(column)
+    if good.sum() < 2:
+        return np.full(len(at), np.nan)
+    t = time[good]
+    right = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    inside = (at >= t[0]) & (at <= t[-1]) & (t[right] - t[right - 1] <= limit)
+    return np.where(inside, np.interp(at - t[0], t - t[0], column[good]), np.nan)

@@ -1,0 +1,286 @@
+"""Measure the presses of a session: position, change of the readings, pad pressures and force of each press."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import jaxeit as je
+
+from ..session import PressTable, Session, SessionError, Stream
+from ..session.units import SECOND
+from .corrections import AbstractBaseline, AbstractCorrection, LowPass, TwoSided, WindowMeans, sample_rate
+from .detection import find_presses
+from .means import hold_positions, press_means
+from .samples import PressSamples, press_samples
+from .streams import finite_mean, index_ranges, recording_end
+from .times import reject
+from .windows import PressWindows, WindowLengths, press_windows, reject_without_samples
+
+DEFAULT_CUTOFF = 50.0  # Hz, the low-pass of the paper
+
+
+@dataclass(frozen=True)
+class Processing:
+    """How the presses of a session are cut out and corrected before a fit.
+
+    | field       | meaning                                                                    | default         |
+    |-------------|----------------------------------------------------------------------------|-----------------|
+    | corrections | applied to every stream; None: a 50 Hz low-pass on the streams that are    | None            |
+    |             | sampled fast enough, and a note for the others                             |                 |
+    | baseline    | rule for what is subtracted from a press                                   | `TwoSided`      |
+    | windows     | lengths of the windows                                                     | `WindowLengths` |
+    """
+
+    corrections: tuple[AbstractCorrection, ...] | None = None
+    baseline: AbstractBaseline = field(default_factory=TwoSided)
+    windows: WindowLengths = field(default_factory=WindowLengths)
+
+    def of(self, stream: Stream) -> tuple[tuple[AbstractCorrection, ...], str]:
+        """Corrections for one stream, and a note if the default correction does not apply to it."""
+        if self.corrections is not None:
+            return self.corrections, ""
+        rate = sample_rate(stream.time)
+        if rate > 2 * DEFAULT_CUTOFF:
+            return (LowPass(DEFAULT_CUTOFF),), ""
+        return (), (
+            f"{stream.name} is recorded at {rate:.3g} Hz: the {DEFAULT_CUTOFF:g} Hz low-pass has nothing "
+            "to remove and is left out"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PressMeasurements:
+    """Measurements of one session, press by press. Rows are the presses that can be used.
+
+    | field     | meaning                                                       | shape               | unit |
+    |-----------|---------------------------------------------------------------|---------------------|------|
+    | position  | true position of the tip                                      | (presses, 2)        | m    |
+    | dv        | change of the readings over the hold                          | (presses, readings) | V    |
+    | pressure  | change of the gage pressure of the pads over the hold         | (presses, pads)     | Pa   |
+    | force     | force of the load cell over the hold                          | (presses,)          | N    |
+    | untouched | readings without contact, mean over the presses               | (readings,)         | V    |
+    | noise     | standard deviation of the readings of a single frame          | (readings,)         | V    |
+    | channels  | whether a reading was finite in every press                   | (readings,)         |      |
+    | samples   | pressure and force over whole presses, sample by sample       |                     |      |
+    | presses   | all presses, with the reasons of those that were set aside    |                     |      |
+    | windows   | windows of all presses                                        |                     |      |
+    | notes     | remarks for the operator                                      |                     |      |
+    """
+
+    session: Session
+    position: np.ndarray
+    dv: np.ndarray
+    pressure: np.ndarray
+    force: np.ndarray
+    untouched: np.ndarray
+    noise: np.ndarray
+    channels: np.ndarray
+    samples: PressSamples
+    presses: PressTable
+    windows: PressWindows
+    notes: tuple[str, ...]
+
+
+def measure(session: Session, skin: je.Skin, processing: Processing | None = None) -> PressMeasurements:
+    """Cut the presses out of the streams of a session, correct them and average each over its hold.
+
+    Args:
+        session: with eit, pressure and force streams; a stage stream if it has no table of presses.
+        skin: the skin that the session was recorded on.
+        processing: `Processing()` by default.
+
+    Raises:
+        SessionError: if the session was not recorded on this skin, lacks a stream, or no press can be used.
+    """
+    processing = processing or Processing()
+    streams = {name: session.stream(name) for name in ("eit", "pressure", "force")}
+    _require_skin(session, skin, streams)
+    presses = _presses(session, streams["force"])
+    windows = press_windows(presses, processing.windows, recording_end(streams.values()))
+    presses = reject_without_samples(presses, windows, streams.values(), processing.baseline)
+    chosen = {name: processing.of(stream) for name, stream in streams.items()}
+    held = {
+        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0])
+        for name, stream in streams.items()
+    }
+    means = {name: found.change.mean for name, found in held.items()}
+    channels, lost = _finite_channels(means["eit"], presses.accepted)
+    _require_pads(session, skin, means["pressure"][presses.accepted])
+    force = means["force"][:, 0]
+    presses = reject(presses, _without_force(force, means["pressure"]))
+    kept = presses.accepted
+    if not kept.any():
+        raise _error(session, "/presses", _why_none(presses), "see jaxeit check")
+    samples = press_samples(
+        streams["force"],
+        streams["pressure"],
+        presses,
+        windows,
+        baseline=processing.baseline,
+        corrections=chosen["force"][0],
+    )
+    position = np.stack([presses.x, presses.y], 1)[kept]
+    notes = [note for _, note in chosen.values() if note]
+    return PressMeasurements(
+        session=session,
+        position=position,
+        dv=means["eit"][kept],
+        pressure=means["pressure"][kept],
+        force=force[kept],
+        untouched=held["eit"].baseline[kept].mean(0),
+        noise=_frame_noise(held["eit"].change, kept),
+        channels=channels,
+        samples=samples,
+        presses=presses,
+        windows=windows,
+        notes=(*notes, *lost, *_set_aside(presses)),
+    )
+
+
+def _error(session: Session, where: str, what: str, todo: str) -> SessionError:
+    return SessionError(f"{session.name}: {where}: {what}; {todo}")
+
+
+def _require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) -> None:
+    pattern = session.pattern
+    if pattern is None:
+        raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
+    if pattern.shape != skin.protocol.pattern.shape or (pattern != skin.protocol.pattern).any():
+        raise _error(
+            session,
+            "/device/eit_protocol/pattern",
+            f"is not that of the skin {skin.name!r}",
+            "calibrate with the skin that was recorded (--skin FILE)",
+        )
+    pads = streams["pressure"].channels
+    if pads != len(skin.pads):
+        raise _error(
+            session,
+            "/streams/pressure",
+            f"has {pads} columns, the skin {skin.name!r} has {len(skin.pads)} pads",
+            "record every pad, or describe the skin as it is in its TOML file",
+        )
+
+
+def _presses(session: Session, force: Stream) -> PressTable:
+    if session.presses is not None and len(session.presses):
+        return session.presses
+    if "stage" not in session.streams:
+        raise _error(
+            session,
+            "/presses",
+            "no table of presses, and no stage stream that tells where presses were",
+            "record the stage, or write the table",
+        )
+    found = find_presses(force.time, force.read()[:, 0])
+    place = hold_positions(found, session.streams["stage"])
+    count = len(found)
+    return PressTable(
+        x=place[:, 0],
+        y=place[:, 1],
+        tip_diameter=np.zeros(count),
+        target_force=np.zeros(count),
+        t_press=found.t_press,
+        t_hold0=found.t_hold0,
+        t_hold1=found.t_hold1,
+        t_release=found.t_release,
+        pad=np.full(count, -1),
+        accepted=found.accepted,
+        reason=found.reason,
+    )
+
+
+def _finite_channels(dv: np.ndarray, accepted: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    good = np.isfinite(dv[accepted]).all(0)
+    lost = np.flatnonzero(~good)
+    if not len(lost):
+        return good, []
+    some = ", ".join(map(str, lost[:8])) + (", ..." if len(lost) > 8 else "")
+    return good, [f"eit channels without a finite value in every press, left out: {some}"]
+
+
+def _frame_noise(change: WindowMeans, kept: np.ndarray) -> np.ndarray:
+    """Noise of one frame from the standard errors of the hold means; a channel without one gets the median."""
+    each = (change.standard_error * np.sqrt(change.count))[kept]
+    good = np.isfinite(each) & (each > 0)
+    overall = np.median(each[good]) if good.any() else np.nanmax(np.abs(change.mean[kept])) * 1e-6
+    noise = np.array([np.median(e[g]) if g.any() else overall for e, g in zip(each.T, good.T, strict=True)])
+    return np.asarray(np.maximum(noise, 0.1 * overall))
+
+
+def _require_pads(session: Session, skin: je.Skin, pressure: np.ndarray) -> None:
+    silent = ~np.isfinite(pressure).any(0)
+    if len(pressure) and silent.any():
+        number = int(np.argmax(silent))
+        raise _error(
+            session,
+            "/streams/pressure",
+            f"column {number}, pad {skin.pads[number].name!r}, holds no finite sample",
+            "repair its sensor and record again, or remove the pad from the skin's file",
+        )
+
+
+def _without_force(force: np.ndarray, pressure: np.ndarray) -> Sequence[str]:
+    finite = np.isfinite(force) & np.isfinite(pressure).all(1)
+    return [
+        "" if ok and f > 0 else ("no force" if ok else "force or pressure missing in the hold")
+        for ok, f in zip(finite, force, strict=True)
+    ]
+
+
+def _why_none(presses: PressTable) -> str:
+    reasons = sorted({r for r in presses.reason if r})
+    return f"none of {len(presses)} presses can be used" + (f": {reasons[0]}" if reasons else "")
+
+
+def _set_aside(presses: PressTable) -> list[str]:
+    bad = np.flatnonzero(~presses.accepted)
+    if not len(bad):
+        return []
+    first = f"press {bad[0]}: {presses.reason[bad[0]]}"
+    return [f"{len(bad)} of {len(presses)} presses set aside ({first})"]
+
+
+def resting_levels(
+    session: Session, skin: je.Skin, processing: Processing
+) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """Level without contact of the eit and pressure streams, as functions of time: (n,) ns -> (n, channels).
+
+    A level is linear between the means of the rest windows around the presses and constant outside them.
+    In a session without a table of presses it is the mean of the first second.
+
+    Raises:
+        SessionError: if the session was not recorded on this skin, or a stream is missing.
+    """
+    streams = {name: session.stream(name) for name in ("eit", "pressure")}
+    _require_skin(session, skin, streams)
+    return {name: _level(stream, _rest_windows(session, stream, processing)) for name, stream in streams.items()}
+
+
+def _rest_windows(session: Session, stream: Stream, processing: Processing) -> np.ndarray:
+    """Rest windows (rests, 2) in ns, in order of time, that hold at least one sample of the stream."""
+    table = session.presses
+    if table is None or not len(table):
+        start = int(stream.time[0])
+        return np.array([[start, start + SECOND]])
+    windows = press_windows(table, processing.windows, recording_end([stream]))
+    both = np.concatenate([windows.rest_before, windows.rest_after])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    ranges = index_ranges(stream.time, both)
+    return both[ranges[:, 1] > ranges[:, 0]]
+
+
+def _level(stream: Stream, rests: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    means = np.array([finite_mean(stream.read(int(a), int(b))) for a, b in index_ranges(stream.time, rests)])
+    centres = rests.astype(float).mean(1)
+
+    def level(time: np.ndarray) -> np.ndarray:
+        right = np.clip(np.searchsorted(centres, time), 1, max(len(centres) - 1, 1))
+        left = right - 1
+        right = np.minimum(right, len(centres) - 1)
+        step = np.where(right > left, centres[right] - centres[left], 1.0)
+        share = np.clip((time - centres[left]) / step, 0.0, 1.0)[:, None]
+        return np.asarray((1 - share) * means[left] + share * means[right])
+
+    return level

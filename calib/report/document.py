@@ -1,0 +1,328 @@
+"""A calibration as one HTML page that needs nothing else, with the paper's figures beside it."""
+
+import base64
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from ..calibration.calibration import Calibration
+from ..calibration.evaluation import METHODS, Evaluation
+from ..fitting.selection import Candidate
+from ..session import replacing
+from .captions import about_curves, about_gain, about_localisation, about_loops, about_sensitivity
+from .figures import (
+    ESTIMATOR_MEANING,
+    localisation_figure,
+    png,
+    require_matplotlib,
+    sensitivity_figure,
+)
+from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text, with_error
+from .pad_figures import curves_figure, gain_figure, has_loops, loops_figure
+
+_NO_EVALUATIONS: Mapping[str, Evaluation] = MappingProxyType({})
+SHOWN_ESTIMATORS = (
+    "quarter",
+    "fitted",
+)  # the image's estimator nearest to the paper's figure, and what the field goes by
+
+
+def write_report(
+    calibration: Calibration,
+    path: str | Path,
+    *,
+    evaluations: Mapping[str, Evaluation] = _NO_EVALUATIONS,
+) -> list[Path]:
+    """Write the page and, beside it, its figures as PNG; each file whole or not at all.
+
+    Args:
+        calibration: what the page is about.
+        path: of the page; for ``report.html`` the figures are ``report_localisation.png``,
+            ``report_sensitivity.png`` and ``report_curves.png``, of presses that were released also
+            ``report_loops.png``, with a correction by location ``report_gain.png``.
+        evaluations: of the calibration on other sessions, by name.
+
+    Returns: the paths written, the page first.
+
+    Raises:
+        ReportError: matplotlib is not installed.
+        SessionError, OSError: a file cannot be written.
+    """
+    require_matplotlib()
+    page = Path(path)
+    figures = _figures(calibration, evaluations)
+    text = _page(calibration, evaluations, figures)
+    pictures = [page.with_name(f"{page.stem}_{figure.name}.png") for figure in figures]
+    for target, figure in zip(pictures, figures, strict=True):
+        _write(target, figure.data)
+    _write(page, text.encode())
+    return [page, *pictures]
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+# --- figures -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A PNG file with its title, what it shows for who cannot see it, and what to look for; `single`: of one panel."""
+
+    name: str
+    title: str
+    data: bytes
+    alt: str
+    caption: str
+    single: bool = False
+
+
+def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[_Picture]:
+    found, skin, simulated = calibration.evaluation, calibration.skin, calibration.simulated
+    estimators = [name for name in SHOWN_ESTIMATORS if name in found.estimated] or list(found.estimated)[:1]
+    localisation = localisation_figure(found, skin, *estimators, simulated=simulated)
+    sensitivity = sensitivity_figure(found, skin, simulated=simulated)
+    curves = curves_figure(calibration, evaluations)
+    about, single = about_localisation(found, estimators), len(estimators) == 1
+    pictures = [
+        _Picture("localisation", "Localisation", png(localisation), *about, single),
+        _Picture("sensitivity", "Sensitivity over the sheet", png(sensitivity), *about_sensitivity(found)),
+        _Picture("curves", "Curves and force errors", png(curves), *about_curves(calibration, evaluations)),
+    ]
+    if has_loops(calibration):
+        pictures.append(_Picture("loops", "Hysteresis", png(loops_figure(calibration)), *about_loops(calibration)))
+    if calibration.field is not None:
+        gain = png(gain_figure(calibration))
+        pictures.append(_Picture("gain", "Gain by location", gain, *about_gain(calibration.field)))
+    return pictures
+
+
+# --- the page ------------------------------------------------------------------------------------------------------
+
+
+def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figures: Iterable[_Picture]) -> str:
+    mark = "SIMULATED: " if calibration.simulated else ""
+    title = escape(f"{mark}Calibration of the skin {calibration.skin.name}")
+    parts = [
+        f"<h1>{escape(f'Calibration of the skin {calibration.skin.name}')}</h1>",
+        _banner(calibration.simulated),
+        f"<p>{escape(_lead(calibration))}</p>",
+        _results(calibration, evaluations),
+        _localisation(_all(calibration, evaluations)),
+        _left_out(calibration.evaluation),
+        _choice(calibration),
+        *map(_figure, figures),
+        _pads(calibration),
+        _notes(calibration, evaluations),
+        _provenance(calibration),
+    ]
+    return PAGE.format(title=title, style=STYLE, body="\n".join(filter(None, parts)))
+
+
+def _banner(simulated: bool) -> str:
+    if not simulated:
+        return ""
+    return (
+        '<p class="banner" role="note"><strong>SIMULATED</strong> This calibration rests on simulated recordings. '
+        "Its numbers say how the method behaves on a model of the skin, not what a real skin does.</p>"
+    )
+
+
+def _lead(calibration: Calibration) -> str:
+    skin, found = calibration.skin, calibration.evaluation
+    rows, columns = calibration.recon.shape
+    return (
+        f"{len(skin.pads)} pads, {len(skin.electrodes)} electrodes, {len(skin.protocol.pattern)} readings a frame, "
+        f"image of {columns} x {rows} pixels. {len(found.force)} presses at {_places(found)} places, held at "
+        f"{_levels(found.force)}. All forces below are predictions for presses that "
+        f"the fit had not seen (held out by {found.held_out_by})."
+    )
+
+
+def _levels(force: np.ndarray) -> str:
+    low, high = f"{force.min():.3g}", f"{force.max():.3g}"
+    return f"about {low} N" if low == high else f"{low} to {high} N"
+
+
+def _places(evaluation: Evaluation) -> int:
+    return len(np.unique(np.round(evaluation.position, 6), axis=0))
+
+
+def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> str:
+    groups = {
+        f"{name}: {len(e.force)} presses, held out by {e.held_out_by}": _method_rows(e)
+        for name, e in _all(calibration, evaluations).items()
+    }
+    groups[_PAPER] = [(METHODS[name], cv, *["—"] * 4) for name, cv in _PAPER_CV.items()]
+    head = ["total force by", "CV, ddof 1", "RMSE, N", "RMSE, % of largest", "mean absolute, N", "worst, N"]
+    about = (
+        "EIT only: the integral of the image times one number; hybrid: the paper's recipe, one slope a pad; "
+        "calibrated: this calibration; true place: the same, told the true place instead of the estimated one, which "
+        "only a simulation knows exactly. CV: standard deviation over mean of the sensitivity over the presses; after "
+        "±: its standard error over places (bootstrap). The paper is arXiv 2605.28468; it does not state its ddof, "
+        "nor errors of force."
+    )
+    if calibration.simulated:
+        about += (
+            " Its numbers were measured on a real skin, ours come from a simulation whose parameters were chosen to "
+            "resemble it: likeness is consistency, not validation."
+        )
+    return f"<h2>Results</h2>{html_table(head, groups)}<p class='small'>{escape(about)}</p>"
+
+
+_PAPER = "the paper: 225 presses on hardware"
+_PAPER_CV = {"eit": "0.31", "hybrid": "0.14"}
+
+
+def _all(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
+    return {"this calibration": calibration.evaluation, **evaluations}
+
+
+def _method_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """What each way to a total force is worth on one session."""
+    return [
+        (
+            worth.label,
+            with_error(worth.cv, worth.cv_error, 3),
+            number_text(worth.rmse, 2),
+            number_text(worth.percent, 1),
+            number_text(worth.mean_absolute, 2),
+            number_text(worth.worst, 2),
+        )
+        for worth in evaluation.by_method()
+    ]
+
+
+def _left_out(evaluation: Evaluation) -> str:
+    """What comes of leaving out a pad, an indenter or a session; of those there is only one of, a sentence."""
+    rows = [
+        (
+            split.by,
+            str(split.parts),
+            str(split.presses),
+            f"{number_text(split.rmse, 2)} ({number_text(split.low, 2)} to {number_text(split.high, 2)})",
+            number_text(split.worst, 2),
+        )
+        for split in evaluation.splits
+        if not split.note
+    ]
+    notes = "".join(f"<li>{escape(split.note)}</li>" for split in evaluation.splits if split.note)
+    head = ["left out at a time", "parts", "presses", "RMSE, N (90 % interval)", "worst part, N"]
+    about = (
+        "Each part is predicted by fits that had not seen it; a pad by the curve of all others together. Intervals are "
+        "of a bootstrap over places: all presses of a place are drawn together."
+    )
+    table = f"{html_table(head, {'': rows})}<p class='small'>{about}</p>" if rows else ""
+    return f"<h2>Beyond what was pressed</h2>{table}<ul>{notes}</ul>" if rows or notes else ""
+
+
+def _choice(calibration: Calibration) -> str:
+    """Why this curve and this field, where there was something to choose from."""
+    why = calibration.provenance.get("choice", "")
+    if not why:
+        return ""
+    about = "Chosen by cross-validation over places, each predicted by fits that had not seen it: "
+    return f"<h2>Choice of the model</h2><p>{escape(about + why)}.</p>{_tried(calibration)}"
+
+
+_PARTS = {"location": "correction by location, with the first curve", "curve": "curve, with the correction chosen"}
+
+
+def _tried(calibration: Calibration) -> str:
+    """All candidates and their errors; calibrations of before have none to show."""
+    parts = dict.fromkeys(candidate.part for candidate in calibration.tried)
+    groups = {_PARTS.get(p, p): [_candidate(c) for c in calibration.tried if c.part == p] for p in parts}
+    head = ["candidate", "coefficients", "held-out RMSE, N", "one standard error about, N", ""]
+    return html_table(head, groups) if groups else ""
+
+
+def _candidate(tried: Candidate) -> tuple[str, ...]:
+    if tried.rmse is None or tried.low is None or tried.high is None:
+        return tried.name, str(tried.size), "not determined", "—", ""
+    about = f"{number_text(tried.low, 2)} to {number_text(tried.high, 2)}"
+    return tried.name, str(tried.size), number_text(tried.rmse, 2), about, "chosen" if tried.chosen else ""
+
+
+def _localisation(found: Mapping[str, Evaluation]) -> str:
+    groups = {name: _localisation_rows(e) for name, e in found.items()}
+    groups[_PAPER] = [("not stated", "6.9", "—", "—", "—")]
+    head = ["estimator", "mean, mm", "median, mm", "95th percentile, mm", "inward bias, mm"]
+    used = {name for e in found.values() for name in e.estimated}
+    meaning = "; ".join(f"{name}: {text}" for name, text in ESTIMATOR_MEANING.items() if name in used)
+    return (
+        f"<h2>Localisation by estimator</h2>{html_table(head, groups)}<p class='small'>{escape(meaning)}. Inward bias: "
+        "how much nearer to the centre of the sheet the estimate lies than the truth.</p>"
+    )
+
+
+def _localisation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    s = evaluation.summary()
+    out = []
+    for name in sorted(evaluation.estimated, key=[*ESTIMATOR_MEANING, *evaluation.estimated].index):
+        mean, error, *rest = (
+            1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
+        )
+        out.append((name, with_error(mean, error, 1), *(number_text(value, 1) for value in rest)))
+    return out
+
+
+def _figure(picture: _Picture) -> str:
+    data = base64.b64encode(picture.data).decode()
+    kind = " class='single'" if picture.single else ""
+    return (
+        f"<h2>{escape(picture.title)}</h2><figure{kind}>"
+        f'<img alt="{escape(picture.alt)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
+    )
+
+
+def _pads(calibration: Calibration) -> str:
+    curve = calibration.curves.curve
+    head = [
+        "pad",
+        *(f"{n}, {u}" if u != "1" else n for n, u in zip(curve.names, curve.units, strict=True)),
+        "pressures fitted, Pa",
+        "samples",
+        "places",
+        "residual RMS, N",
+        "fit",
+    ]
+    rows = [_pad_row(calibration, number) for number in range(len(calibration.skin.pads))]
+    kind = escape(calibration.provenance.get("curve", type(curve).__name__))
+    return (
+        f"<h2>Pads</h2>{html_table(head, {'': rows})}<p class='small'>Curve: {kind}. After ±: standard error, from the "
+        "scatter between places. Residual RMS: of all samples fitted, not held out. Outside the pressures fitted a "
+        "force is marked as not valid.</p>"
+    )
+
+
+def _pad_row(calibration: Calibration, number: int) -> tuple[str, ...]:
+    fitted = calibration.curves.pad(number)
+    values, errors = np.asarray(fitted.parameters, float), np.asarray(fitted.standard_errors, float)
+    low, high = np.asarray(fitted.pressure_range, float)
+    return (
+        f"{number} {calibration.skin.pads[number].name}",
+        *(f"{significant_text(v, 5)}{PLUS_MINUS}{significant_text(e, 2)}" for v, e in zip(values, errors, strict=True)),
+        f"{number_text(low, 0)} to {number_text(high, 0)}",
+        str(int(fitted.n)),
+        str(int(fitted.n_groups)),
+        number_text(float(fitted.residual_rms), 2),
+        fitted.message(),
+    )
+
+
+def _notes(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> str:
+    notes = list(calibration.notes) + [f"{name}: {note}" for name, e in evaluations.items() for note in e.notes]
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes) or "<li>none</li>"
+    return f"<h2>Notes</h2><ul>{items}</ul>"
+
+
+def _provenance(calibration: Calibration) -> str:
+    rows = [(key.replace("_", " "), value) for key, value in calibration.provenance.items() if value]
+    return f"<h2>Provenance</h2>{html_table(['what', 'value'], {'': rows}, 'provenance')}"

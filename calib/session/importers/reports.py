@@ -1,0 +1,79 @@
+"""What an import read, left out and found suspicious."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class StreamReport:
+    """What became of one stream; counts are of values, over all its channels."""
+
+    name: str
+    variable: str
+    unit: str
+    rows: int
+    channels: int
+    rate_hz: float
+    declared_missing: int
+    not_numbers: int
+    first_not_number: int | None
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FileReport:
+    """What became of one file; ``first_*`` are line numbers counted from 1."""
+
+    path: Path
+    rows_read: int
+    rows_without_time: int
+    first_without_time: int | None
+    equal_times: int
+    first_equal_time: int | None
+    rows_sorted: int
+    streams: tuple[StreamReport, ...]
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What an import read, left out and found suspicious."""
+
+    output: Path
+    epoch: datetime
+    epoch_known: bool
+    files: tuple[FileReport, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Lines a person should act on."""
+        found = [w for f in self.files for s in f.streams for w in s.warnings]
+        if not self.epoch_known:
+            found.append("the clock does not say when the recording began; give --epoch if known")
+        return tuple(found)
+
+    def summary(self) -> str:
+        """The report as text, one line per stream, loss and warning."""
+        lines = [line for f in self.files for line in _file_lines(f)]
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join([*lines, f"wrote {self.output}"])
+
+
+def _file_lines(report: FileReport) -> Iterator[str]:
+    yield f"{report.path.name}: {report.rows_read:,} rows"
+    if report.rows_without_time:
+        first = report.first_without_time
+        yield f"  {report.rows_without_time:,} rows without a time left out (first: line {first})"
+    if report.equal_times:
+        first = report.first_equal_time
+        yield f"  {report.equal_times:,} rows with a repeated time left out (first: line {first})"
+    if report.rows_sorted:
+        yield f"  {report.rows_sorted:,} rows went back in time and were sorted"
+    for s in report.streams:
+        shape = f"{s.rows:,} x {s.channels}"
+        yield f"  {s.name}: {s.variable} in {s.unit}, {shape}, about {s.rate_hz:.4g} Hz"
+        if s.declared_missing:
+            yield f"    {s.declared_missing:,} values declared missing"
+        if s.not_numbers:
+            yield f"    {s.not_numbers:,} cells are not numbers (first: line {s.first_not_number})"

@@ -1,0 +1,25 @@
+"""What accuracy costs in time: settings to compare, the study, and the recommendation drawn from it."""
+
+from .recommendation import Ladder, Rung
+from .settings import (
+    Choice,
+    LadderError,
+    Touch,
+    few_choices,
+    fidelity_choices,
+    image_choices,
+)
+from .study import fit_fidelity, ladder
+
+__all__ = [
+    "Choice",
+    "Ladder",
+    "LadderError",
+    "Rung",
+    "Touch",
+    "few_choices",
+    "fidelity_choices",
+    "fit_fidelity",
+    "image_choices",
+    "ladder",
+]

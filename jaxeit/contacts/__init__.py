@@ -1,0 +1,19 @@
+"""Where the skin is touched, and by how many contacts."""
+
+from .preparation import prepare_contacts
+from .refinement import refine_contacts
+from .regions import RegionError, Regions, find_regions
+from .result import ContactResult, Contacts, strongest
+from .search import ContactFinder
+
+__all__ = [
+    "ContactFinder",
+    "ContactResult",
+    "Contacts",
+    "RegionError",
+    "Regions",
+    "find_regions",
+    "prepare_contacts",
+    "refine_contacts",
+    "strongest",
+]

@@ -1,0 +1,192 @@
+"""Whitened readings of Gaussian bumps, from a table.
+
+A contact multiplies the conductivity by ``1 + a g(r - p; s) / mean(sigma_0)``, g a Gaussian bump of height one and
+standard deviation s: pressed together, sheet and metal conduct better in proportion to the coat.  To second order, and
+measured against the full forward map, the readings see K contacts as if the sheet had changed by sigma_0 e,
+
+    e = u - c u^2 / (1 + d u),        u = sum_k a_k g_k / mean(sigma_0),   c = 0.8,  d = 0.7,
+
+through the linear response (the field inside a conductive spot falls).  Up to +100 % this leaves out 1 to 3 % of a
+single contact's signal, where the linear response, scaled at best, leaves 4 to 11 %.  The product of two Gaussians is a
+Gaussian,
+
+    g(p, s) g(q, t) = exp(-|p - q|^2 / 2(s^2 + t^2)) g((p t^2 + q s^2) / (s^2 + t^2), s t / sqrt(s^2 + t^2)),
+
+so that K contacts are K + K (K + 1) / 2 bumps.  The table holds cubic B-splines over place and log width, with exact
+derivatives, in the few directions of the whitened readings (`whitening`) that bumps reach.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..model.discretisation import Model
+
+# c and d above: part of the second order, and its saturation.
+SECOND_ORDER, SATURATION = 0.8, 0.7
+# Pitch of the table in log width.
+WIDTH_PITCH = 0.25
+
+
+class Responses(eqx.Module):
+    """Whitened readings of a bump anywhere, as B-splines; see the head of this file.
+
+    | meaning                                                                     | shape               | unit |
+    |-----------------------------------------------------------------------------|---------------------|------|
+    | table: coefficients over y, x and log width; of bumps of unit u (s / scale)^2 | (ny, nx, nw, r)   | 1    |
+    | origin, pitch of its nodes: y, x, log width                                 | (3,), (3,)          | m, 1 |
+    | scale: the width of which strengths are counted                             | ()                  | m    |
+    | background: mean of sigma_0                                                 | ()                  | S    |
+    """
+
+    table: Float[Array, "ny nx nw r"]
+    origin: Float[Array, "3"]
+    pitch: Float[Array, "3"]
+    scale: Float[Array, ""]
+    background: Float[Array, ""]
+
+    def bump(self, place: Float[Array, "3"]) -> tuple[Float[Array, " r"], Float[Array, "3 r"]]:
+        """Response of one bump at x, y, log width, and its slopes with respect to these."""
+        t = (place[jnp.array([1, 0, 2])] - self.origin) / self.pitch
+        cells = jnp.array(self.table.shape[:3]) - 4
+        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(t)), 0, cells).astype(int)
+        value, slope = _cubic(t - cell)
+        block = jax.lax.dynamic_slice(self.table, (*cell, 0), (4, 4, 4, self.table.shape[3])).reshape(64, -1)
+        (a, b, c), (da, db, dc) = value, slope / self.pitch[:, None]
+        weights = jnp.stack([_outer(*abc) for abc in ((a, b, c), (a, db, c), (da, b, c), (a, b, dc))])
+        found = weights @ block
+        return found[0], found[1:]
+
+    def contacts(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, " r"], Float[Array, "r n 4"]]:
+        """Response of n contacts (x, y, log width, strength in units of sigma_0 scale^2), and its slopes."""
+        place, weight = self._bumps(theta)
+        places, weights = jax.jacfwd(self._bumps)(theta)
+        value, slope = jax.vmap(self.bump)(place)
+        by_place = jnp.einsum("m,mcr,mcnp->rnp", weight, slope, places)
+        return weight @ value, by_place + jnp.einsum("mr,mnp->rnp", value, weights)
+
+    def _bumps(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
+        """The bumps that n contacts amount to: x, y, log width, and their strengths."""
+        centre, width, strength = theta[:, :2], theta[:, 2], theta[:, 3]
+        square = jnp.exp(2 * width)
+        u = strength * self.scale**2 / square
+        i, j = np.triu_indices(len(theta))
+        total = square[i] + square[j]
+        place = (centre[i] * square[j, None] + centre[j] * square[i, None]) / total[:, None]
+        product = square[i] * square[j] / total
+        overlap = jnp.exp(-0.5 * jnp.sum((centre[i] - centre[j]) ** 2, 1) / total)
+        pairs = jnp.where(i == j, 1, 2) * u[i] * u[j] * overlap / (1 + SATURATION * 0.5 * (u[i] + u[j]))
+        second = jnp.concatenate([place, 0.5 * jnp.log(product)[:, None]], 1)
+        weight = -SECOND_ORDER * pairs * product / self.scale**2
+        return jnp.concatenate([theta[:, :3], second]), jnp.concatenate([strength, weight])
+
+
+def _outer(a: Float[Array, " i"], b: Float[Array, " j"], c: Float[Array, " k"]) -> Float[Array, " ijk"]:
+    return (a[:, None, None] * b[:, None] * c).ravel()
+
+
+def _cubic(t: Float[Array, "..."]) -> tuple[Float[Array, "... 4"], Float[Array, "... 4"]]:
+    """The four cubic B-splines that are not zero at t in [0, 1], (..., 4), and their slopes."""
+    t = t[..., None]
+    u = 1 - t
+    value = [u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]
+    slope = [-3 * u**2, 9 * t**2 - 12 * t, 12 * u - 9 * u**2, 3 * t**2]
+    return jnp.concatenate(value, -1) / 6, jnp.concatenate(slope, -1) / 6
+
+
+class Nodes(NamedTuple):
+    """Nodes of the table along y, x and log width, and the scale of `Responses`."""
+
+    axes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    scale: float
+
+    def fewer(self, stride: int) -> "Nodes":
+        """Every so many along each axis."""
+        y, x, log_width = self.axes
+        return self._replace(axes=(y[::stride], x[::stride], log_width[::stride]))
+
+
+def mean_conductivity(model: Model, sigma: np.ndarray) -> float:
+    """The mean conductivity of the sheet, S."""
+    return float(np.average(sigma, weights=np.asarray(model.areas, float)))
+
+
+def nodes_of(model: Model, widths: tuple[float, float], columns: int) -> Nodes:
+    """Nodes for bumps of widths (smallest, largest), with so many columns along x."""
+    chart = np.asarray(model.chart, float)
+    low, high = chart.min(0), chart.max(0)
+    rows = max(5, round((columns - 1) * (high[1] - low[1]) / (high[0] - low[0])) + 1)
+    lowest, highest = np.log(widths[0] / np.sqrt(2)), np.log(widths[1])  # the square of a bump is narrower by sqrt(2)
+    levels = max(5, int(np.ceil((highest - lowest) / WIDTH_PITCH)) + 1)
+    x, y = np.linspace(low[0], high[0], columns), np.linspace(low[1], high[1], rows)
+    return Nodes((y, x, np.linspace(lowest, highest, levels)), float(np.sqrt(widths[0] * widths[1])))
+
+
+def tabulate(model: Model, jacobian: np.ndarray, nodes: Nodes) -> np.ndarray:
+    """Responses at the nodes, (ny, nx, nw, r): the Jacobian times the means of the bumps over the elements."""
+    shape = [len(axis) for axis in nodes.axes]
+    out = np.empty((*shape, len(jacobian)))
+    for level, log_width in enumerate(nodes.axes[2]):
+        width = np.exp(log_width)
+        points, weights = points_of(model, width)
+        along = [np.exp(-0.5 * ((points[..., 1 - k, None] - nodes.axes[k]) / width) ** 2) for k in (0, 1)]
+        means = (along[0] * weights[:, None]).swapaxes(1, 2) @ along[1]  # (elements, y, x)
+        found = jacobian @ means.reshape(len(means), -1)
+        out[:, :, level] = (nodes.scale / width) ** 2 * np.moveaxis(found.reshape(-1, *shape[:2]), 0, -1)
+    return out
+
+
+# Symmetric rule of degree 4 on a triangle (Dunavant 1985): barycentric coordinates and weights.
+_A, _B = 0.445948490915965, 0.091576213509771
+_RULE = np.array([[1 - 2 * c if i == k else c for i in range(3)] for c in (_A, _B) for k in range(3)])
+_RULE_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
+
+
+def points_of(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points of each element, (elements, q, 2), as close as the width asks for, and their weights, (q,)."""
+    corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max()
+    parts = int(np.clip(np.ceil(longest / (3 * width)), 1, 3))
+    small = _parts(parts)
+    rule = np.einsum("qk,pkc->pqc", _RULE, small).reshape(-1, 3)
+    return np.einsum("qk,ekd->eqd", rule, corners), np.tile(_RULE_WEIGHTS, len(small)) / len(small)
+
+
+def _parts(n: int) -> np.ndarray:
+    """The reference triangle cut into n^2 alike: barycentric coordinates of their corners, (n^2, 3, 3)."""
+    cuts = [(i, j) for i in range(n) for j in range(n - i)]
+    upright = [[(i, j), (i + 1, j), (i, j + 1)] for i, j in cuts]
+    turned = [[(i + 1, j), (i + 1, j + 1), (i, j + 1)] for i, j in cuts if i + j < n - 1]
+    corners = np.array(upright + turned) / n
+    return np.concatenate([corners, 1 - corners.sum(2, keepdims=True)], 2)
+
+
+def reached(values: np.ndarray, least: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of whitened readings in which bumps are seen above ``least`` of the noise, and the others."""
+    flat = values.reshape(-1, values.shape[-1])
+    squares, vectors = np.linalg.eigh(flat.T @ flat / len(flat))
+    seen = squares > max(least**2, 1e-14 * squares[-1])
+    return vectors[:, seen], vectors[:, ~seen]
+
+
+def responses_of(values: np.ndarray, nodes: Nodes, background: float, dtype: np.dtype) -> Responses:
+    """The splines through a table of `tabulate`."""
+    numbers = ([axis[0] for axis in nodes.axes], [axis[1] - axis[0] for axis in nodes.axes], nodes.scale, background)
+    return Responses(jnp.asarray(splines(values), dtype), *(jnp.asarray(number, dtype) for number in numbers))
+
+
+def splines(values: np.ndarray) -> np.ndarray:
+    """Coefficients of the cubic splines through values on a grid, along the first three axes."""
+    for axis, n in enumerate(values.shape[:3]):
+        matrix = np.zeros((n + 2, n + 2))
+        matrix[0, :5] = matrix[-1, -5:] = [1, -4, 6, -4, 1]  # the third derivative does not jump next to the ends
+        for i in range(n):
+            matrix[i + 1, i : i + 3] = 1 / 6, 4 / 6, 1 / 6
+        moved = np.moveaxis(values, axis, 0)
+        padded = np.pad(moved.reshape(n, -1), ((1, 1), (0, 0)))
+        values = np.moveaxis(np.linalg.solve(matrix, padded).reshape(n + 2, *moved.shape[1:]), 0, axis)
+    return values

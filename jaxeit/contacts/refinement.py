@@ -1,0 +1,131 @@
+"""Contacts of one frame fitted again through the full forward map."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from .._compile import require_known, verb
+from ..imaging.noise import InverseError, Whitening, whitened_readings
+from ..least_squares import ImplicitStep
+from ..least_squares.searches import normal_inverse
+from ..model.discretisation import Model
+from ..model.forward_model import conductivity, forward
+from .bump_responses import mean_conductivity, points_of
+from .fit import MAX_STEPS, SOLVER, bounds_of
+from .result import ContactResult, Contacts
+
+
+def refine_contacts(
+    model: Model,
+    dv: Float[ArrayLike, " readings"],
+    contacts: Contacts,
+    *,
+    noise: Float[ArrayLike, "..."],
+    widths: tuple[float, float] = (0.003, 0.05),
+    sigma: Float[Array, " elements"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
+) -> Contacts:
+    """Fit the contacts of one frame again through the full forward map, for use offline.
+
+    Each step of Levenberg-Marquardt solves the forward problem once; derivatives cost no further solve (`forward`).
+
+    Args:
+        dv: difference of frames, (readings,) V.
+        contacts: from a `ContactFinder`, of one frame; which are present is not looked at again.
+        noise, sigma, channels: as for `prepare_contacts`.
+        widths: bounds, m.
+
+    Raises:
+        InverseError: if shapes do not fit, or a reading that is used is not finite.
+    """
+    require_known("refine_contacts", InverseError, model, dv, contacts, noise, sigma, channels)
+    found = whitened_readings(model, noise, channels)
+    readings, dv, used = model.pattern.shape[0], np.asarray(dv, float), np.asarray(found.whitening.channels)
+    if dv.shape != (readings,) or contacts.present.ndim != 1:
+        raise InverseError(f"dv has shape {dv.shape}; refine one frame of {readings} readings at a time")
+    if not np.isfinite(dv[used]).all():
+        raise InverseError(f"reading {int(np.argmax(used & ~np.isfinite(dv)))} is not finite; leave its channel out")
+    count = int(contacts.present.sum())
+    if not count:
+        return contacts
+    sigma = conductivity(model) if sigma is None else jnp.asarray(sigma, model.dtype)
+    chart = np.asarray(model.chart, float)
+    points, weights = (jnp.asarray(a, model.dtype) for a in points_of(model, widths[0] * 2))
+    background = jnp.asarray(mean_conductivity(model, np.asarray(sigma, float)), model.dtype)
+    compress = jnp.asarray(found.compress, model.dtype)
+    problem = _ForwardProblem(
+        model, sigma, background, forward(model, sigma), found.whitening, compress, points, weights
+    )
+    named = [contacts.position, jnp.log(contacts.width)[:, None], contacts.amplitude[:, None]]
+    start = jnp.concatenate(named, 1)[:count].astype(model.dtype)
+    low, high = (jnp.asarray(bound, model.dtype) for bound in bounds_of(chart[:, 0], chart[:, 1], widths).values())
+    return _refined(problem, jnp.asarray(dv, model.dtype), contacts, start, low, high)
+
+
+class _ForwardProblem(eqx.Module):
+    """Contacts to whitened readings, through the forward map."""
+
+    model: Model
+    sigma: Float[Array, " elements"]
+    background: Float[Array, ""]
+    untouched: Float[Array, " readings"]
+    whitening: Whitening
+    compress: Float[Array, "r k"]
+    points: Float[Array, "elements q 2"]
+    weights: Float[Array, " q"]
+
+    def white(self, dv: Float[Array, " readings"]) -> Float[Array, " r"]:
+        return self.compress @ self.whitening.sums(dv)
+
+    def response(self, flat: Float[Array, " m"]) -> Float[Array, " r"]:
+        """Whitened readings of contacts (x, y, log width, amplitude in S)."""
+        touched = sum(self._bump(one) for one in flat.reshape(-1, 4)) / self.background
+        return self.white(forward(self.model, self.sigma * (1 + touched)) - self.untouched)
+
+    def _bump(self, one: Float[Array, "4"]) -> Float[Array, " elements"]:
+        square = jnp.sum((self.points - one[:2]) ** 2, -1)
+        return one[3] * jnp.exp(-0.5 * square * jnp.exp(-2 * one[2])) @ self.weights
+
+
+@verb
+def _refined(
+    problem: _ForwardProblem,
+    dv: Float[Array, " readings"],
+    contacts: Contacts,
+    start: Float[Array, "n 4"],
+    low: Float[Array, "4"],
+    high: Float[Array, "4"],
+) -> Contacts:
+    count, y = len(start), problem.white(dv)
+    low, high = jnp.tile(low, count), jnp.tile(high, count)
+    found: optx.Solution[Array, Any] = optx.least_squares(
+        lambda flat, of: of[1] - of[0].response(flat),
+        SOLVER,
+        jnp.clip(start.ravel(), low, high),
+        (problem, y),
+        {"lower": low, "upper": high},
+        max_steps=MAX_STEPS + 1,
+        adjoint=ImplicitStep(),
+        throw=False,
+    )
+    misfit = found.state.square / max(len(y) - 4 * count, 1)
+    normal = found.state.quadratic.hessian.matrix
+    covariance = normal_inverse(normal, jnp.ones(4 * count, bool))(jnp.eye(4 * count, dtype=y.dtype))
+    own = covariance.reshape(count, 4, count, 4)[np.arange(count), :, np.arange(count)] * jnp.maximum(misfit, 1)
+    bound = ((found.value <= low) | (found.value >= high)).reshape(count, 4).any(1)
+    result = jnp.where(bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
+    theta = found.value.reshape(count, 4)
+    return Contacts(
+        present=contacts.present,
+        position=contacts.position.at[:count].set(theta[:, :2]),
+        width=contacts.width.at[:count].set(jnp.exp(theta[:, 2])),
+        amplitude=contacts.amplitude.at[:count].set(theta[:, 3]),
+        covariance=contacts.covariance.at[:count].set(own),
+        misfit=misfit,
+        result=contacts.result.at[:count].set(jnp.where(found.state.converged, result, ContactResult.NOT_CONVERGED)),
+    )

@@ -1,0 +1,336 @@
+"""The families of effects: one per physical stage, applied in the order of the stages.
+
+| stage      | family                    | acts on                                                           |
+|------------|---------------------------|-------------------------------------------------------------------|
+| mechanics  | `AbstractStageEffect`     | where and when the stage presses                                  |
+| mechanics  | `AbstractLoadEffect`      | how a unit load spreads over the sheet                            |
+| material   | `AbstractMemoryEffect`    | the load that the sheet feels, a history                          |
+| material   | `AbstractSheetEffect`     | pressure and manufacture to conductivity                          |
+| material   | `AbstractCoatEffect`      | the same, with a second sheet that `discretise` makes room for    |
+| electrical | `AbstractContactEffect`   | contact conductance of the electrodes                             |
+| electrical | `AbstractTerminalEffect`  | from the transfer matrix to the voltages between terminals        |
+| pneumatics | `AbstractPadEffect`       | how strongly a pad feels each place                               |
+| pneumatics | `AbstractPneumaticEffect` | the pressures in the pads, a history                              |
+| readout    | `AbstractScanEffect`      | when in a scan each reading is taken                              |
+| readout    | `AbstractReadoutEffect`   | a recorded stream, a history                                      |
+| readout    | `AbstractClockEffect`     | the time stamps of a stream, and what is lost on its way          |
+
+Histories are processed in blocks of samples: a history effect has a state that it passes from one block to the next.
+"""
+
+import enum
+import zlib
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+
+class StreamKind(enum.Enum):
+    """The recorded stream that a readout effect disturbs."""
+
+    EIT = "eit"
+    PRESSURE = "pressure"
+    FORCE = "force"
+
+
+class Path(NamedTuple):
+    """What the stage does, press by press.
+
+    | meaning                                    | shape         | unit |
+    |--------------------------------------------|---------------|------|
+    | places of the tip                          | (presses, 2)  | m    |
+    | delay of the press behind its plan         | (presses,)    | s    |
+    | pace: speed of its ramps over the planned  | (presses,)    | 1    |
+    """
+
+    places: Float[Array, "presses 2"]
+    delay: Float[Array, " presses"]
+    pace: Float[Array, " presses"]
+
+
+class Indenter(NamedTuple):
+    """An indenter on the skin: its centre, (2,) m, and the diameter of its flat tip, m."""
+
+    centre: Float[Array, "2"]
+    diameter: Float[Array, ""]
+
+
+class Sheet(NamedTuple):
+    """The state of the sheet and where its elements are.
+
+    | meaning                                              | shape         | unit |
+    |------------------------------------------------------|---------------|------|
+    | sigma: conductivity                                  | (elements,)   | S    |
+    | pressure on it                                       | (elements,)   | Pa   |
+    | centroids                                            | (elements, 2) | m    |
+    | size: side of a square of the element's area         | (elements,)   | m    |
+    | temperature above that at which sigma was given      | ()            | K    |
+    | share of it that bears the pressure; None: all of it | (elements,)   | 1    |
+    | metal: conductivity of a coat; None: no such sheet   | ()            | S    |
+    | coupling: contact conductance to that                | (elements,)   | S/m^2 |
+    """
+
+    sigma: Float[Array, " elements"]
+    pressure: Float[Array, " elements"]
+    centroids: Float[Array, "elements 2"]
+    size: Float[Array, " elements"]
+    temperature: Float[Array, ""]
+    share: Float[Array, " elements"] | None = None
+    metal: Float[Array, ""] | None = None
+    coupling: Float[Array, " elements"] | None = None
+
+
+class Circuit(NamedTuple):
+    """The sheet as its terminals see it.
+
+    | meaning                                                           | shape                    | unit |
+    |-------------------------------------------------------------------|--------------------------|------|
+    | z: potential of a per ampere into b, up to one potential per b    | (electrodes, electrodes) | ohm  |
+    | pattern: drive+, drive-, sense+, sense-                           | (readings, 4)            |      |
+    | current                                                           | ()                       | A    |
+    """
+
+    z: Float[Array, "electrodes electrodes"]
+    pattern: Int[Array, "readings 4"]
+    current: Float[Array, ""]
+
+
+class Line(NamedTuple):
+    """What a history effect is given besides its series.
+
+    | meaning                                                       | shape         | unit |
+    |---------------------------------------------------------------|---------------|------|
+    | key of all chance in this block                               | ()            |      |
+    | interval between samples                                      | ()            | s    |
+    | temperature of the air above that at the start                | (time,)       | K    |
+    | barometer: air pressure above that at the start               | (time,)       | Pa   |
+    | pattern of the EIT stream; no rows elsewhere                  | (channels, 4) |      |
+    """
+
+    key: Key[Array, ""]
+    interval: Float[Array, ""]
+    temperature: Float[Array, " time"]
+    barometer: Float[Array, " time"]
+    pattern: Int[Array, "channels 4"]
+
+
+class Packets(NamedTuple):
+    """The samples of a block on their way to the host.
+
+    | meaning                                        | shape   | unit |
+    |------------------------------------------------|---------|------|
+    | device: when taken, by the clock of the device | (time,) | s    |
+    | host: when received, by that of the host       | (time,) | s    |
+    | lost on the way                                | (time,) |      |
+    """
+
+    device: Float[Array, " time"]
+    host: Float[Array, " time"]
+    lost: Bool[Array, " time"]
+
+
+# A block of a series of samples, and what a history effect remembers between blocks.
+Series = Float[Array, "time channels"]
+State: TypeAlias = PyTree[Array]
+
+
+def parameter(default: float) -> Any:
+    """A numeric field that is a pytree leaf: a new value retraces nothing."""
+    return eqx.field(converter=jnp.asarray, default=default)
+
+
+class AbstractEffect(eqx.Module):
+    """One departure from the ideal sensor.
+
+    ``rank`` orders effects within their family; of effects that name the same ``alternative`` a scene has one.
+    """
+
+    stage: ClassVar[str]
+    rank: ClassVar[int] = 0
+    alternative: ClassVar[str] = ""
+
+    @abstractmethod
+    def __call__(self, state: Any, /, *context: Any) -> Any:
+        """What the family acts on, after this effect."""
+
+
+class AbstractStageEffect(AbstractEffect):
+    """Mechanics: where and when the stage presses."""
+
+    stage: ClassVar[str] = "mechanics"
+
+    @abstractmethod
+    def __call__(self, path: Path, key: Key[Array, ""]) -> Path:
+        """What the stage does when told to follow ``path``."""
+
+
+class AbstractLoadEffect(AbstractEffect):
+    """Mechanics: how a unit load spreads from the indenter to the sheet."""
+
+    stage: ClassVar[str] = "mechanics"
+
+    @abstractmethod
+    def __call__(
+        self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]
+    ) -> Float[Array, " elements"]:
+        """The pressure per unit load, 1/m^2, from that of the stage before."""
+
+
+class AbstractHistoryEffect(AbstractEffect):
+    """An effect on a series of samples, which it is given block by block."""
+
+    def start(self, first: Float[Array, " channels"]) -> State:
+        """The state before the first sample, given the series' value at rest; by default none."""
+        return ()
+
+    @abstractmethod
+    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+        """The block after this effect, and the state for the next."""
+
+
+class AbstractMemoryEffect(AbstractHistoryEffect):
+    """Material: the load of each contact as the sheet feels it, N; each contact is a channel."""
+
+    stage: ClassVar[str] = "material"
+
+
+class AbstractSheetEffect(AbstractEffect):
+    """Material: how pressure and manufacture change the sheet's conductivity."""
+
+    stage: ClassVar[str] = "material"
+
+    @abstractmethod
+    def __call__(self, sheet: Sheet) -> Sheet:
+        """The sheet after this effect."""
+
+    def laid(self, centroids: Float[Array, "elements 2"]) -> "AbstractSheetEffect":
+        """This effect for elements at these places, with everything that depends on places alone computed once; by
+        default the effect itself."""
+        return self
+
+
+class AbstractCoatEffect(AbstractSheetEffect):
+    """Material: a second conducting sheet, which touches the first where it is pressed."""
+
+
+class AbstractContactEffect(AbstractEffect):
+    """Electrical: the contact conductance of the electrodes, S/m^2 or S/m as the electrode has it."""
+
+    stage: ClassVar[str] = "electrical"
+
+    @abstractmethod
+    def __call__(self, contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
+        """The conductances after this effect; 0 stands for a perfect contact and stays."""
+
+
+class AbstractTerminalEffect(AbstractEffect):
+    """Electrical: how source and amplifier change the voltages at their terminals."""
+
+    stage: ClassVar[str] = "electrical"
+
+    @abstractmethod
+    def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:
+        """The voltages of a frame after this effect, V."""
+
+
+class AbstractPadEffect(AbstractEffect):
+    """Pneumatics: how strongly a pad feels the pressure at each place of its footprint."""
+
+    stage: ClassVar[str] = "pneumatics"
+
+    @abstractmethod
+    def __call__(
+        self, response: Float[Array, "pads elements"], distance: Float[Array, "pads elements"]
+    ) -> Float[Array, "pads elements"]:
+        """The response (1 for an ideal pad) given the distance in m to the pad's outline."""
+
+
+class AbstractPneumaticEffect(AbstractHistoryEffect):
+    """Pneumatics: the gage pressures in the pads, Pa; each pad is a channel."""
+
+    stage: ClassVar[str] = "pneumatics"
+
+
+class AbstractScanEffect(AbstractEffect):
+    """Readout: when each reading of a frame is taken, s after the frame's time."""
+
+    stage: ClassVar[str] = "readout"
+
+    @abstractmethod
+    def __call__(
+        self, when: Float[Array, " readings"], nominal: Float[Array, " readings"]
+    ) -> Float[Array, " readings"]:
+        """The times after this effect; ``nominal`` are those of the skin's protocol."""
+
+
+class AbstractReadoutEffect(AbstractHistoryEffect):
+    """Readout: how a recorded series departs from the quantity it records."""
+
+    stage: ClassVar[str] = "readout"
+    stream: eqx.AbstractVar[StreamKind]
+
+
+class AbstractClockEffect(AbstractEffect):
+    """Readout: what clocks and links do to the samples of a stream."""
+
+    stage: ClassVar[str] = "readout"
+    stream: eqx.AbstractVar[StreamKind]
+
+    @abstractmethod
+    def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:
+        """The packets after this effect."""
+
+
+def laid(effects: Iterable[AbstractEffect], centroids: Float[Array, "elements 2"]) -> tuple[AbstractEffect, ...]:
+    """The effects, with those of the sheet prepared by `AbstractSheetEffect.laid`, for many sheets on one mesh."""
+    return tuple(e.laid(centroids) if isinstance(e, AbstractSheetEffect) else e for e in effects)
+
+
+def chosen(effects: Iterable[AbstractEffect], family: type, stream: StreamKind | None = None) -> tuple[Any, ...]:
+    """The effects of one family (and stream) in the order in which they act."""
+    mine = (e for e in effects if isinstance(e, family) and (stream is None or getattr(e, "stream", None) is stream))
+    return tuple(sorted(mine, key=lambda e: e.rank))
+
+
+def fold(effects: Iterable[AbstractEffect], family: type, state: Any, *context: Any) -> Any:
+    """Apply the effects of one family in order of rank, each under its own name in the program."""
+    for effect in chosen(effects, family):
+        with jax.named_scope(type(effect).__name__):
+            state = effect(state, *context)
+    return state
+
+
+def keys(effects: Iterable[AbstractEffect], key: Key[Array, ""]) -> list[Key[Array, ""]]:
+    """A key for each effect, derived from its name and from the number of equal ones before it.
+
+    The key of one effect does not change when others are added or removed.
+    """
+    out, seen = [], dict[str, int]()
+    for effect in effects:
+        name = type(effect).__name__
+        seen[name] = seen.get(name, -1) + 1
+        out.append(jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), seen[name]))
+    return out
+
+
+def history_start(effects: Iterable[AbstractHistoryEffect], first: Float[Array, " channels"]) -> tuple[State, ...]:
+    """States of these history effects before the first sample, given the series' value at rest."""
+    return tuple(effect.start(first) for effect in effects)
+
+
+def history(
+    effects: Iterable[AbstractHistoryEffect], series: Series, states: tuple[State, ...], line: Line
+) -> tuple[Series, tuple[State, ...]]:
+    """A block of a series after these effects, in the order given, and their states for the next block."""
+    after = []
+    effects = tuple(effects)
+    for effect, state, key in zip(effects, states, keys(effects, line.key), strict=True):
+        with jax.named_scope(type(effect).__name__):
+            series, state = effect(series, state, line._replace(key=key))
+        after.append(state)
+    return series, tuple(after)

@@ -1,0 +1,15 @@
+"""Shapes of the sheet: flat outlines, and the surfaces in space that the sheet is laid on."""
+
+from .shapes import Disc, Domain, Polygon, Rectangle
+from .surfaces import AbstractSurface, Cylinder, Sphere, SurfaceError
+
+__all__ = [
+    "AbstractSurface",
+    "Cylinder",
+    "Disc",
+    "Domain",
+    "Polygon",
+    "Rectangle",
+    "Sphere",
+    "SurfaceError",
+]

@@ -1,0 +1,362 @@
+"""Shapes of the flat sheet, in metres: a rectangle, a disc, a simple polygon.
+
+A domain answers questions about points (inside? how far from the rim?) and about its rim, which is
+measured by the arc length s, counter-clockwise from an origin that each class states.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+TOLERANCE = 1e-9
+"""Points this close to the rim, relative to the domain's diagonal, count as being on it."""
+
+
+class Domain(ABC):
+    """A bounded, simply connected region of the plane, closed (its rim belongs to it)."""
+
+    @property
+    @abstractmethod
+    def area(self) -> float:
+        """Area in m^2."""
+
+    @property
+    @abstractmethod
+    def perimeter(self) -> float:
+        """Length of the rim in m."""
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether it is known to be convex."""
+        return False
+
+    @property
+    @abstractmethod
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Lower-left and upper-right corner of the bounding box, ((x0, y0), (x1, y1)) in m."""
+
+    @property
+    @abstractmethod
+    def corners(self) -> np.ndarray:
+        """Arc lengths of the corners, (corners,) m, ascending; empty for a smooth rim."""
+
+    @abstractmethod
+    def boundary_point(self, s: ArrayLike) -> np.ndarray:
+        """Points of the rim at arc lengths s (...) m, any turn of the rim; (..., 2) m."""
+
+    @abstractmethod
+    def boundary_coordinate(self, points: ArrayLike) -> np.ndarray:
+        """Arc length in [0, perimeter) of the rim point nearest to each of points (n, 2); (n,)."""
+
+    @abstractmethod
+    def clearance(self, s: ArrayLike) -> np.ndarray:
+        """Distance from rim points at arc lengths s (n,) across to any part of the rim that is not
+        on the same or an adjoining side; (n,) m, infinite where there is none."""
+
+    @abstractmethod
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        """Whether each of points is in the interior; either answer will do on the rim."""
+
+    @property
+    def tolerance(self) -> float:
+        """Distance in m below which a point counts as being on the rim."""
+        return TOLERANCE * float(np.hypot(*np.subtract(*self.bounds)))
+
+    def boundary_distance(self, points: ArrayLike) -> np.ndarray:
+        """Distance of points (n, 2) to the rim, whether inside or outside; (n,) m."""
+        points = as_points(points)
+        nearest = self.boundary_point(self.boundary_coordinate(points))
+        return np.asarray(np.linalg.norm(points - nearest, axis=1))
+
+    def contains(self, points: ArrayLike) -> np.ndarray:
+        """Whether each of points (n, 2) is inside or, within `tolerance`, on the rim; (n,) bool."""
+        points = as_points(points)
+        return self._inside(points) | (self.boundary_distance(points) <= self.tolerance)
+
+
+class _Polygonal(Domain):
+    """A rim of straight sides; subclasses give `corner_points`, counter-clockwise from s = 0."""
+
+    @property
+    @abstractmethod
+    def corner_points(self) -> np.ndarray:
+        """Corners in counter-clockwise order, the first at s = 0; (corners, 2) m."""
+
+    @cached_property
+    def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vectors, lengths and starting arc lengths (with the perimeter appended) of the sides."""
+        vectors = np.roll(self.corner_points, -1, axis=0) - self.corner_points
+        lengths = np.linalg.norm(vectors, axis=1)
+        return vectors, lengths, np.concatenate([[0.0], np.cumsum(lengths)])
+
+    @property
+    def perimeter(self) -> float:
+        return float(self._sides[2][-1])
+
+    @property
+    def corners(self) -> np.ndarray:
+        return self._sides[2][:-1].copy()
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        low, high = self.corner_points.min(0), self.corner_points.max(0)
+        return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
+
+    def boundary_point(self, s: ArrayLike) -> np.ndarray:
+        vectors, lengths, starts = self._sides
+        s = np.mod(np.asarray(s, float), self.perimeter)
+        side = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, len(lengths) - 1)
+        along = ((s - starts[side]) / lengths[side])[..., None]
+        return np.asarray(self.corner_points[side] + along * vectors[side])
+
+    def boundary_coordinate(self, points: ArrayLike) -> np.ndarray:
+        points = as_points(points)
+        along, squared = self._on_sides(points)
+        side = np.argmin(squared, axis=1)
+        _, lengths, starts = self._sides
+        s = starts[side] + along[np.arange(len(points)), side] * lengths[side]
+        return np.where(s >= self.perimeter, 0.0, s)
+
+    def clearance(self, s: ArrayLike) -> np.ndarray:
+        s, count = np.mod(np.asarray(s, float), self.perimeter), len(self.corner_points)
+        squared = self._on_sides(self.boundary_point(s))[1]
+        own = np.clip(np.searchsorted(self._sides[2], s, side="right") - 1, 0, count - 1)
+        apart = np.mod(np.arange(count) - own[:, None], count)
+        across = (apart > 1) & (apart < count - 1)
+        return np.asarray(np.sqrt(np.where(across, squared, np.inf).min(1)))
+
+    def _on_sides(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nearest place on each side, as a fraction of it, and squared distances; (n, sides)."""
+        vectors, lengths, _ = self._sides
+        offset = points[:, None] - self.corner_points
+        along = np.clip((offset * vectors).sum(-1) / lengths**2, 0.0, 1.0)
+        return along, ((offset - along[..., None] * vectors) ** 2).sum(-1)
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        """Even-odd rule: a point is inside if a ray to the right crosses the rim an odd number of
+        times."""
+        (vectors, _, _), start = self._sides, self.corner_points
+        stop = np.roll(start, -1, axis=0)
+        x, y = points[:, :1], points[:, 1:]
+        spans = (start[:, 1] > y) != (stop[:, 1] > y)
+        # Level sides span nothing, so that the slope put in for them is never used.
+        slope = vectors[:, 0] / np.where(vectors[:, 1] == 0.0, 1.0, vectors[:, 1])
+        crosses = x < start[:, 0] + (y - start[:, 1]) * slope
+        return np.asarray((spans & crosses).sum(1) % 2 == 1)
+
+
+@dataclass(frozen=True)
+class Rectangle(_Polygonal):
+    """A rectangle with its lower-left corner at the origin, where s = 0; s runs along the bottom.
+
+    | meaning       | shape | unit |
+    |---------------|-------|------|
+    | width, along x  | () | m    |
+    | height, along y | () | m    |
+
+    Raises ValueError unless both are positive and finite.
+    """
+
+    width: float
+    height: float
+
+    def __post_init__(self) -> None:
+        _require_positive("Rectangle", width=self.width, height=self.height)
+
+    @property
+    def is_convex(self) -> bool:
+        return True
+
+    @property
+    def area(self) -> float:
+        return float(self.width * self.height)
+
+    @cached_property
+    def corner_points(self) -> np.ndarray:
+        w, h = float(self.width), float(self.height)
+        return np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
+
+
+@dataclass(frozen=True)
+class Disc(Domain):
+    """A disc; s = 0 is its rightmost point (angle 0), so that s = radius * angle.
+
+    | meaning | shape | unit |
+    |---------|-------|------|
+    | radius  | ()    | m    |
+    | centre  | (2,)  | m    |
+
+    Raises ValueError unless the radius is positive and everything finite.
+    """
+
+    radius: float
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _require_positive("Disc", radius=self.radius)
+        if np.shape(self.centre) != (2,) or not np.all(np.isfinite(self.centre)):
+            raise ValueError(f"Disc: centre is {self.centre}; give two finite numbers in metres")
+        object.__setattr__(self, "centre", (float(self.centre[0]), float(self.centre[1])))
+
+    @property
+    def is_convex(self) -> bool:
+        return True
+
+    @property
+    def area(self) -> float:
+        return float(np.pi * self.radius**2)
+
+    @property
+    def perimeter(self) -> float:
+        return float(2 * np.pi * self.radius)
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        (x, y), a = self.centre, float(self.radius)
+        return (x - a, y - a), (x + a, y + a)
+
+    @property
+    def corners(self) -> np.ndarray:
+        return np.zeros(0)
+
+    def boundary_point(self, s: ArrayLike) -> np.ndarray:
+        angle = np.asarray(s, float) / self.radius
+        unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return np.asarray(self.centre) + self.radius * unit
+
+    def boundary_coordinate(self, points: ArrayLike) -> np.ndarray:
+        offset = as_points(points) - self.centre
+        s = self.radius * np.mod(np.arctan2(offset[:, 1], offset[:, 0]), 2 * np.pi)
+        return np.where(s >= self.perimeter, 0.0, s)
+
+    def boundary_distance(self, points: ArrayLike) -> np.ndarray:
+        return np.asarray(np.abs(np.linalg.norm(as_points(points) - self.centre, axis=1) - self.radius))
+
+    def clearance(self, s: ArrayLike) -> np.ndarray:
+        return np.full(np.shape(s), np.inf)
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(points - self.centre, axis=1) < self.radius)
+
+
+@dataclass(frozen=True)
+class Polygon(_Polygonal):
+    """A simple polygon; s = 0 is its first vertex.  Clockwise vertices are turned round.
+
+    | meaning  | shape       | unit |
+    |----------|-------------|------|
+    | vertices | (corners, 2) | m   |
+
+    Raises ValueError for fewer than three vertices, repeated ones, values that are not finite, and
+    sides that cross, touch or fold back on each other.
+    """
+
+    vertices: ArrayLike
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.vertices, float)
+        _require_polygon(points)
+        if _signed_area(points) < 0:
+            points = np.roll(points[::-1], 1, axis=0)
+        object.__setattr__(self, "vertices", tuple((float(x), float(y)) for x, y in points))
+
+    @property
+    def area(self) -> float:
+        return float(_signed_area(self.corner_points))
+
+    @cached_property
+    def corner_points(self) -> np.ndarray:
+        return np.array(self.vertices)
+
+
+def as_points(points: ArrayLike) -> np.ndarray:
+    """``points`` as a float64 array (n, 2); ValueError for any other shape."""
+    array = np.asarray(points, float)
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"points have shape {array.shape}; give an array of shape (n, 2)")
+    return array
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """z component of the cross product of plane vectors (..., 2); NumPy >= 2.5 has no such one."""
+    product: np.ndarray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return product
+
+
+def _require_positive(what: str, **sizes: float) -> None:
+    for name, value in sizes.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{what}: {name} is {value}; give a positive length in metres")
+
+
+def _signed_area(points: np.ndarray) -> float:
+    # Relative to the first vertex, so that a polygon far from the origin loses no digits.
+    points = points - points[0]
+    return 0.5 * float(np.sum(cross(points, np.roll(points, -1, axis=0))))
+
+
+def _require_polygon(points: np.ndarray) -> None:
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+        raise ValueError(f"Polygon: vertices have shape {points.shape}; give three or more (x, y) pairs")
+    if not np.all(np.isfinite(points)):
+        row = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
+        raise ValueError(f"Polygon: vertex {row} is {points[row]}; give finite metres")
+    _require_simple(points)
+
+
+def _require_simple(points: np.ndarray) -> None:
+    """Refuse a rim that meets itself: any two sides that share more than one corner."""
+    tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    if np.any(steps <= tolerance):
+        row = int(np.argmin(steps))
+        raise ValueError(
+            f"Polygon: vertices {row} and {(row + 1) % len(points)} coincide at {points[row]}; "
+            "remove one (the last vertex need not repeat the first)"
+        )
+    first, second = _meeting_sides(points, tolerance)
+    if len(first):
+        raise ValueError(
+            f"Polygon: the sides from vertices {first[0]} and {second[0]} meet; "
+            "give the corners in order along the rim, without crossing or touching"
+        )
+
+
+def _meeting_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    n = len(points)
+    first, second = np.triu_indices(n, 1)
+    distance = _segment_distance(points[first], points[(first + 1) % n], points[second], points[(second + 1) % n])
+    neighbours = (second == first + 1) | ((first == 0) & (second == n - 1))
+    meet = np.where(neighbours, _folds_back(points, first, second), distance <= tolerance)
+    return first[meet], second[meet]
+
+
+def _folds_back(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Whether two sides that share a corner run back over each other."""
+    sides = np.roll(points, -1, axis=0) - points
+    a, b = sides[first], sides[second]
+    scale = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    return np.asarray((np.abs(cross(a, b)) <= TOLERANCE * scale) & ((a * b).sum(1) < 0))
+
+
+def _segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Distance of the segments a-b and c-d, row by row; 0 where they cross."""
+    ends = np.stack(
+        [
+            _point_segment(a, c, d),
+            _point_segment(b, c, d),
+            _point_segment(c, a, b),
+            _point_segment(d, a, b),
+        ]
+    ).min(0)
+    crosses = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (cross(d - c, a - c) * cross(d - c, b - c) < 0)
+    return np.where(crosses, 0.0, ends)
+
+
+def _point_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    along = ((p - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)
+    distance: np.ndarray = np.linalg.norm(p - a - np.clip(along, 0.0, 1.0)[..., None] * (b - a), axis=-1)
+    return distance

@@ -1,0 +1,255 @@
+"""Images by the full forward map: the logarithm of the conductivity, in several steps.
+
+For absolute readings, or changes too large for one linear step: `gauss_newton` with any penalty, `least_squares_image`
+with a quadratic one and any least-squares solver of optimistix.  A difference of frames is imaged by adding it to the
+voltages that the model gives for the reference: ``readings = physics.voltages(0) + dv``.
+"""
+
+from abc import abstractmethod
+from typing import Any, cast
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from ..least_squares import Cholesky, ImplicitStep, LevenbergMarquardt, normal_equations, quadratic
+from ..least_squares.searches import Quadratic as HalfSquares
+from ..model.bases import BasisMap, Picture
+from ..model.discretisation import Model
+from ..model.forward_model import forward
+from ..model.sensitivity import scaled_jacobian
+from .priors import AbstractPrecision
+
+
+class LogConductivity(eqx.Module):
+    """Sheet conductivity as ``background * exp(image)``: positive, whatever the image.
+
+    | meaning                                        | unit |
+    |------------------------------------------------|------|
+    | model; image: a basis laid over it             |      |
+    | background: conductivity where the image is 0  | S    |
+    """
+
+    model: Model
+    image: BasisMap
+    background: Float[Array, ""]
+
+    def sigma(self, x: Float[Array, " basis"]) -> Float[Array, " elements"]:
+        """Conductivity of the elements, S."""
+        return self.background * jnp.exp(self.image.expand(x))
+
+    def voltages(self, x: Float[Array, " basis"]) -> Float[Array, " readings"]:
+        """Readings, V."""
+        return forward(self.model, self.sigma(x))
+
+    def slopes(self, x: Float[Array, " basis"]) -> Float[Array, "readings basis"]:
+        """Derivative of the readings with respect to the image, V: each element's share times its conductivity."""
+        sigma = self.sigma(x)
+        return scaled_jacobian(self.model, sigma, self.image, sigma)
+
+
+class AbstractPenalty(eqx.Module):
+    """What an image costs before the readings are seen."""
+
+    @abstractmethod
+    def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
+        """The penalty."""
+
+    @abstractmethod
+    def matrix(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, "basis basis"]:
+        """R with ``R x`` the gradient of the penalty at x."""
+
+
+class Quadratic(AbstractPenalty):
+    """``strength / 2 * x^T R x`` for the R of any prior, from `AbstractPrior.precision`."""
+
+    precision: AbstractPrecision
+    strength: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
+        return 0.5 * self.strength.astype(x.dtype) * x @ self.precision.times(x)
+
+    def matrix(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, "basis basis"]:
+        return self.strength.astype(x.dtype) * self.precision.matrix()
+
+
+class IsotropicVariation(AbstractPenalty):
+    """``weight * integral of sqrt(|grad x|^2 + (beta / h)^2)`` over pixels of side h: piecewise constant images whose
+    edges may lie in any direction (Rudin, Osher and Fatemi 1992), plus ``ridge / 2 * |x|^2`` that keeps it definite.
+
+    | meaning                                     | unit |
+    |---------------------------------------------|------|
+    | weight                                      | 1/m  |
+    | beta: jumps below it are smoothed over      |      |
+    | ridge                                       |      |
+    """
+
+    weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=350.0)
+    beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.05)
+    ridge: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1e-3)
+
+    def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
+        weight, size, _ = self._jumps(picture, x)
+        return weight * jnp.sum(size) + 0.5 * self.ridge.astype(x.dtype) * x @ x
+
+    def matrix(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, "basis basis"]:
+        """The quadratic that touches the penalty at x from above (Vogel and Oman 1996)."""
+        weight, size, (first, second) = self._jumps(picture, x)
+        w = weight / size[first]
+        r = self.ridge.astype(x.dtype) * jnp.eye(len(x), dtype=x.dtype)
+        r = r.at[first, first].add(w).at[second, second].add(w)
+        return r.at[first, second].add(-w).at[second, first].add(-w)
+
+    def _jumps(
+        self, picture: Picture, x: Float[Array, " basis"]
+    ) -> tuple[Float[Array, ""], Float[Array, " basis"], tuple[Int[Array, " edges"], Int[Array, " edges"]]]:
+        """Weight of a jump; size of each pixel's jump to its neighbours on one side, smoothed by beta; the pairs."""
+        first, second = jnp.sort(picture.edges, 1).T
+        square = jnp.zeros_like(x).at[first].add((x[second] - x[first]) ** 2)
+        side = jnp.sqrt(jnp.max(picture.areas))
+        size = jnp.sqrt(square + self.beta.astype(x.dtype) ** 2)
+        return self.weight.astype(x.dtype) * side, size, (first, second)
+
+
+def gauss_newton(
+    physics: LogConductivity,
+    penalty: AbstractPenalty,
+    readings: Float[Array, " readings"],
+    std: Float[Array, " readings"],
+    *,
+    steps: int = 12,
+    tolerance: float = 2e-3,
+) -> Float[Array, " basis"]:
+    """argmin over x of ``|(readings - voltages(x)) / std|^2 / 2 + penalty(x)``, from x = 0.
+
+    Each step takes the Jacobian and the penalty's matrix anew, and is halved until the sum falls. The last step is the
+    one that promises a fall by less than ``tolerance`` of the sum. Readings that are not finite are left out.
+
+    Works under `jax.jit`, `jax.vmap` and `jax.grad`. Derivatives are those of the exact minimum (`ImplicitStep`): for
+    precise ones ask for a small tolerance.
+
+    Args:
+        steps: at most.
+    """
+    weight, readings = _weights(jnp.asarray(readings), jnp.asarray(std))
+    return _most_probable(_Posterior(physics, penalty, readings, weight), steps, tolerance)
+
+
+class _Posterior(eqx.Module):
+    """Readings and penalty, for an image x: minus the logarithm of its probability, as half a sum of squares."""
+
+    physics: LogConductivity
+    penalty: AbstractPenalty
+    readings: Float[Array, " readings"]
+    weight: Float[Array, " readings"]
+
+    def residual(self, x: Float[Array, " basis"]) -> Float[Array, " readings_and_one"]:
+        """Half the square of the last number is the penalty, and a half that keeps its root smooth."""
+        missed = self.weight * (self.readings - self.physics.voltages(x))
+        return jnp.append(missed, jnp.sqrt(1 + 2 * self.penalty.value(self.physics.image.picture, x)))
+
+    def quadratic(self, x: Float[Array, " basis"]) -> HalfSquares:
+        """Gauss and Newton's, with the penalty's matrix."""
+        picture = self.physics.image.picture
+        missed = self.weight * (self.readings - self.physics.voltages(x))
+        data = normal_equations(missed, -self.weight[:, None] * self.physics.slopes(x))
+        matrix = self.penalty.matrix(picture, x)
+        value = data.f + self.penalty.value(picture, x)
+        return quadratic(value, data.grad + matrix @ x, data.hessian.matrix + matrix)
+
+
+@eqx.filter_jit
+def _most_probable(posterior: _Posterior, steps: int, tolerance: float) -> Float[Array, " basis"]:
+    newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
+    solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance, descent=newton, search=optx.BacktrackingArmijo())
+    found: optx.Solution[Array, Any] = optx.least_squares(
+        lambda x, posterior: posterior.residual(x),
+        solver,
+        jnp.zeros(posterior.physics.image.size, posterior.readings.dtype),
+        posterior,
+        {"quadratic": lambda x, posterior: posterior.quadratic(x)},
+        max_steps=steps + 1,  # the first evaluates the start
+        adjoint=ImplicitStep(),
+        throw=False,
+    )
+    return found.value
+
+
+def _weights(
+    readings: Float[Array, " readings"], std: Float[Array, " readings"]
+) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
+    """One over the noise, 0 where a reading or its noise is not finite, and readings that are."""
+    used = jnp.isfinite(readings) & jnp.isfinite(std)
+    return jnp.where(used, 1 / jnp.where(used, std, 1), 0), jnp.where(used, readings, 0)
+
+
+def least_squares_image(
+    physics: LogConductivity,
+    penalty: Quadratic,
+    readings: Float[Array, " readings"],
+    std: Float[Array, " readings"],
+    *,
+    solver: optx.AbstractLeastSquaresSolver[Any, Any, Any, Any] | None = None,
+    steps: int = 64,
+) -> Float[Array, " basis"]:
+    """argmin over x of ``|(readings - voltages(x)) / std|^2 / 2 + penalty(x)``, from x = 0, by `optimistix`.
+
+    For ``z = strength^1/2 Gamma x`` with ``R = Gamma^T Gamma`` this is a sum of squares. Readings that are not finite
+    are left out.
+
+    Args:
+        solver: of optimistix; default: `LevenbergMarquardt`, to a millionth (float32: a thousandth).
+        steps: at most.
+
+    Returns:
+        (basis,); NaN throughout if the solver did not converge.
+    """
+    weight, readings = _weights(jnp.asarray(readings), jnp.asarray(std))
+    tolerance = 1e-6 if readings.dtype == jnp.float64 else 1e-3
+    solver = LevenbergMarquardt(tolerance, tolerance) if solver is None else solver
+    return _solved(_Posterior(physics, penalty, readings, weight), solver, steps)
+
+
+@eqx.filter_jit
+def _solved(
+    posterior: _Posterior, solver: optx.AbstractLeastSquaresSolver[Any, Any, Any, Any], steps: int
+) -> Float[Array, " basis"]:
+    def image(z: Float[Array, " rows"], penalty: Quadratic) -> Float[Array, " basis"]:
+        return penalty.precision.image(z) / jnp.sqrt(penalty.strength.astype(z.dtype))
+
+    def residual(z: Float[Array, " rows"], posterior: _Posterior) -> Float[Array, " residuals"]:
+        x = image(z, cast(Quadratic, posterior.penalty))
+        missed = posterior.weight * (posterior.readings - _voltages(x, posterior.physics))
+        return jnp.concatenate([missed, z])
+
+    found: optx.Solution[Array, Any] = optx.least_squares(
+        residual,
+        solver,
+        jnp.zeros(posterior.physics.image.size, posterior.readings.dtype),
+        posterior,
+        max_steps=steps,
+        adjoint=ImplicitStep(),
+        throw=False,
+    )
+    converged = found.result == optx.RESULTS.successful
+    return jnp.where(converged, image(found.value, cast(Quadratic, posterior.penalty)), jnp.nan)
+
+
+@eqx.filter_custom_jvp
+def _voltages(x: Float[Array, " basis"], physics: LogConductivity) -> Float[Array, " readings"]:
+    return physics.voltages(x)
+
+
+def _voltages_jvp(
+    primals: tuple[Float[Array, " basis"], LogConductivity], tangents: tuple[Float[Array, " basis"] | None, Any]
+) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
+    """By the Jacobian: a solver that asks for all columns would otherwise make them one by one."""
+    x, physics = primals
+    value, of_physics = eqx.filter_jvp(lambda physics: physics.voltages(x), (physics,), (tangents[1],))
+    of_image = None if tangents[0] is None else physics.slopes(x) @ tangents[0]
+    changes = [change for change in (of_image, of_physics) if change is not None]
+    return value, sum(changes, start=jnp.zeros_like(value))
+
+
+_voltages.def_jvp(_voltages_jvp)

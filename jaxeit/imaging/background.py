@@ -1,0 +1,98 @@
+"""The conductivity of an untouched sheet, from a frame of it."""
+
+from typing import Any, cast
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from ..model.bases import BasisMap, Pixels
+from ..model.discretisation import Model
+from ..model.forward_model import forward
+from .absolute import LogConductivity, Quadratic, gauss_newton
+from .noise import InverseError
+from .priors import GaussianSmooth
+
+# Smallest error of a reading, of the root mean square of all: no reading is modelled better.
+ERROR_FLOOR = 1e-3
+# Part of the readings that may stay unexplained. More means another skin, order of readings or polarity.
+MAX_UNEXPLAINED = 0.1
+
+
+def fit_background(
+    model: Model,
+    v0: Float[ArrayLike, " readings"],
+    *,
+    std: Float[ArrayLike, ""] = 0.15,
+    length: Float[ArrayLike, ""] = 0.03,
+    model_error: Float[ArrayLike, ""] = 0.01,
+    columns: int = 20,
+    basis: BasisMap | None = None,
+    tolerance: float = 2e-3,
+) -> Float[Array, " elements"]:
+    """Estimate the conductivity, (elements,) S, of the untouched sheet from one frame; for ``sigma=`` of `prepare` and
+    `prepare_contacts`.
+
+    Real coatings are uneven, and assuming an even one is the largest source of localisation error. The estimate is the
+    most probable conductivity for ``log sigma ~ N(level, std^2 exp(-r^2 / (2 length^2)))`` and independent errors
+    ``model_error |v0|`` of the readings, at least a thousandth of their root mean square (`gauss_newton`). The level is
+    that of the even sheet nearest to v0, so that a gain common to all readings does no harm.
+
+    Works under `jax.jit` and `jax.grad`; values that are traced are not checked. Under jit give ``basis``.
+
+    Args:
+        v0: untouched frame, V, best a mean over many; readings that are not finite are left out.
+        std: standard deviation of the logarithm of the conductivity.
+        length: distance over which the coating varies, m.
+        model_error: relative error of a reading, from mesh, electrodes and current as they are modelled.
+        columns: number of pixels of the coating along x.
+        basis: pixels of the coating laid over the model, ``Pixels(columns).on(model)``; default: made here.
+        tolerance: as for `gauss_newton`.
+
+    Raises:
+        InverseError: if the shape or a value is wrong, or no coating explains the readings: then the order or the
+            polarity of the readings is not that of the skin's protocol.
+    """
+    v0, even = jnp.asarray(v0, model.dtype), forward(model, model.background)
+    _check(v0, even, std=std, length=length, model_error=model_error, columns=columns)
+    there = jnp.isfinite(v0)
+    known = jnp.where(there, v0, 0)
+    level = jnp.sum(jnp.where(there, even**2, 0)) / (even @ known)
+    if _is_known(level) and not level > 0:
+        raise InverseError("v0 has the opposite sign of what the skin's protocol gives: turn its polarity")
+    image = Pixels(columns).on(model) if basis is None else basis
+    physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
+    prior = GaussianSmooth(cast(float, jnp.asarray(length, model.dtype))).precision(
+        jnp.zeros((1, image.size), model.dtype), image.picture
+    )
+    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there))
+    error = jnp.hypot(model_error * known, floor)
+    penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)
+    x = gauss_newton(physics, penalty, v0, error, tolerance=tolerance)
+    _check_explained(physics.voltages(x), known, there)
+    return physics.sigma(x)
+
+
+def _is_known(value: Any) -> bool:
+    """Whether a value can be checked now: under a transformation of JAX it cannot."""
+    return not isinstance(value, Tracer)
+
+
+def _check(v0: Float[Array, "..."], even: Float[Array, " readings"], **positive: Any) -> None:
+    if v0.shape != even.shape:
+        raise InverseError(f"v0 has shape {v0.shape}; give the {len(even)} readings of one frame")
+    if _is_known(v0) and not np.any(np.nan_to_num(v0, posinf=0, neginf=0)):
+        raise InverseError("v0 has no reading that is finite and not zero")
+    for name, value in positive.items():
+        if _is_known(value) and not 0 < value < np.inf:
+            raise InverseError(f"{name} is {value}; give a number above zero")
+
+
+def _check_explained(
+    found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
+) -> None:
+    left = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
+    if _is_known(left) and not left < MAX_UNEXPLAINED:
+        raise InverseError(f"no coat explains v0: {left:.0%} of it is left; is this its skin, and the order its own?")

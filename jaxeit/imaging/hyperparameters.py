@@ -1,0 +1,216 @@
+"""Ways to choose the hyperparameter: how much noise there is, against how much image.
+
+Each looks at one-step images over a range of hyperparameters, through the eigenvectors U and eigenvalues w of
+``J R^-1 J^T`` (`methods` has the symbols): ``x = R^-1 J^T U (w + l^2)^-1 U^T y``.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..linalg.lapack import eigh
+from ..registry import Registry
+from .methods import Problem
+
+# Takes frames, (..., readings) V, to whitened ones, (..., k).
+Whiten = Callable[[Array], Array]
+
+_RANGE = np.logspace(-4, 2, 241)
+
+
+class HyperparameterError(ValueError):
+    """A hyperparameter that cannot be chosen so; the message says why."""
+
+
+class Spectrum(eqx.Module):
+    """A problem in its own coordinates.
+
+    | meaning                                             | shape      |
+    |-----------------------------------------------------|------------|
+    | squares: w over the scale of ``l^2``                | (k,)       |
+    | vectors: U                                          | (k, k)     |
+    | gained: ``R^-1 J^T U`` over that scale              | (basis, k) |
+    | problem                                             |            |
+    """
+
+    squares: Float[Array, " k"]
+    vectors: Float[Array, "k k"]
+    gained: Float[Array, "basis k"]
+    problem: Problem
+
+    def filters(self) -> tuple[np.ndarray, Float[Array, "h k"]]:
+        """The hyperparameters tried, and ``1 / (w + l^2)`` for each."""
+        return _RANGE, 1 / (self.squares + jnp.asarray(_RANGE, self.squares.dtype)[:, None] ** 2)
+
+
+@eqx.filter_jit
+def spectrum(problem: Problem) -> Spectrum:
+    """The eigenvectors that all choices share."""
+    gained = problem.precision().solve(problem.jacobian.T)
+    scale = jnp.sum(problem.jacobian.T * gained) / problem.readings
+    squares, vectors = eigh(problem.jacobian @ gained / scale)
+    return Spectrum(jnp.maximum(squares, 0), vectors, gained @ vectors / scale, problem)
+
+
+class AbstractHyperparameter(eqx.Module):
+    """A way to choose; given to `prepare` instead of a number."""
+
+    needs_noise: ClassVar[bool] = False
+
+    def on(self, frames: Float[ArrayLike, "... readings"]) -> "AbstractHyperparameter":
+        """The same choice, made on these frames, V; one that has frames of its own or needs none stays as it is."""
+        del frames
+        return self
+
+    @abstractmethod
+    def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
+        """The hyperparameter.
+
+        Args:
+            whiten: takes frames, (..., readings) V, to whitened ones, (..., k).
+
+        Raises:
+            HyperparameterError: if none in 1e-4 to 100 will do, or frames hold no change, or readings that are used and
+                not finite.
+        """
+
+
+class AbstractFrameChoice(AbstractHyperparameter):
+    """A way to choose that looks at frames: differences of readings, of which at least one shows a touch.
+
+    | meaning                                                                        | shape           | unit |
+    |--------------------------------------------------------------------------------|-----------------|------|
+    | frames; None: those of the recording that is imaged, see `Imaging.prepare`      | (..., readings) | V    |
+    """
+
+    frames: eqx.AbstractVar[Float[ArrayLike, "... readings"] | None]
+
+    def on(self, frames: Float[ArrayLike, "... readings"]) -> "AbstractFrameChoice":
+        return self if self.frames is not None else replace(self, frames=jnp.asarray(frames))
+
+    def whitened(self, whiten: Whiten) -> Float[Array, "... k"]:
+        """The frames, whitened.
+
+        Raises:
+            HyperparameterError: if there are no frames, they hold no change, or a reading that is not finite.
+        """
+        if self.frames is None:
+            name = type(self).__name__
+            raise HyperparameterError(f"{name} looks at frames of a touch and has none; give {name}(frames)")
+        return _changes(jnp.asarray(self.frames), whiten)
+
+
+class GeneralisedCrossValidation(AbstractFrameChoice):
+    """The least ``m |y - J x|^2 / tr(I - J Q)^2``: the readings are best told from each other (Golub et al. 1979).
+
+    m counts the independent numbers in a frame, here and below.
+    """
+
+    name: ClassVar[str] = "gcv"
+    frames: Float[ArrayLike, "... readings"] | None = None
+
+    def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
+        tried, filters = spectrum.filters()
+        residual = _residuals(spectrum, filters, self.whitened(whiten))
+        m = len(spectrum.squares)
+        freedom = m - jnp.sum(spectrum.squares * filters, 1)
+        return float(tried[int(jnp.argmin(m * residual / freedom**2))])
+
+
+class LCurve(AbstractFrameChoice):
+    """The corner of log |y - J x| against log x^T R x: where its curvature is largest (Hansen 1992)."""
+
+    frames: Float[ArrayLike, "... readings"] | None = None
+
+    def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
+        tried, filters = spectrum.filters()
+        y = self.whitened(whiten)
+        size = jnp.einsum("hk,...k->h", spectrum.squares * filters**2, (y @ spectrum.vectors) ** 2)
+        x, z = (np.log(np.asarray(v)) for v in (_residuals(spectrum, filters, y), size))
+        (x1, z1), (x2, z2) = _slopes(x, z), _slopes(*_slopes(x, z))
+        curvature = (x1 * z2 - x2 * z1) / np.maximum(x1**2 + z1**2, 1e-30) ** 1.5
+        inner = slice(4, -4)  # the ends of the range have one-sided slopes
+        return float(tried[inner][int(np.argmax(curvature[inner]))])
+
+
+def _slopes(*curves: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(np.gradient(curve, np.log(_RANGE)) for curve in curves)
+
+
+class Discrepancy(AbstractFrameChoice):
+    """The largest with ``|y - J x|^2 <= factor^2 m``: no closer to the readings than their noise (Morozov 1966).
+
+    Needs ``noise`` in `prepare`. ``factor`` multiplies the standard deviations; default 1.
+    """
+
+    needs_noise: ClassVar[bool] = True
+    frames: Float[ArrayLike, "... readings"] | None = None
+    factor: float = 1.0
+
+    def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
+        tried, filters = spectrum.filters()
+        y = self.whitened(whiten)
+        frames = y.size // y.shape[-1]
+        residual = _residuals(spectrum, filters, y) / (frames * len(spectrum.squares))
+        within = np.flatnonzero(np.asarray(residual) <= self.factor**2)
+        if not within.size:
+            raise HyperparameterError(
+                f"discrepancy: the readings stay {float(residual[0]) ** 0.5:.3g} standard deviations from any image; "
+                "the noise given is too small, or the model does not fit"
+            )
+        return float(tried[within[-1]])
+
+
+class NoiseFigure(AbstractHyperparameter):
+    """The smallest whose noise figure is at most ``target``, for a small contact in the middle of the sheet.
+
+    Signal to noise of the readings over that of the image, root mean squares over readings and area:
+    ``NF = (|y| / sqrt(m)) / (|x|_A / sqrt(E |Q e|_A^2))`` with e white.  (0.5 is EIDORS' usual target; there it is
+    defined by means of absolute values, Adler and Guardo 1996.)
+    """
+
+    target: float = 0.5
+
+    def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
+        tried, filters = spectrum.filters()
+        picture, areas = spectrum.problem.picture, spectrum.problem.picture.areas
+        middle = jnp.sum(picture.centres * areas[:, None], 0) / jnp.sum(areas)
+        square = jnp.sum((picture.centres - middle) ** 2, 1)
+        y = spectrum.problem.jacobian[:, jnp.argmin(jnp.where(areas > 0, square, jnp.inf))]
+        image = spectrum.gained @ (filters * (y @ spectrum.vectors)).T
+        noise = jnp.sqrt(filters**2 @ (areas @ spectrum.gained**2))
+        signal = jnp.sqrt(areas @ image**2)
+        figure = np.asarray(jnp.sqrt(jnp.sum(y**2) / spectrum.problem.readings) * noise / signal)
+        within = np.flatnonzero(figure <= self.target)
+        if not within.size:
+            raise HyperparameterError(f"noise figure: none as low as {self.target}; the least is {figure.min():.3g}")
+        return float(tried[within[0]])
+
+
+def _changes(frames: Float[Array, "... readings"], whiten: Whiten) -> Float[Array, "... k"]:
+    """Whitened frames, which must say something."""
+    y = whiten(frames)
+    bad = np.flatnonzero(~np.isfinite(y).all(-1))
+    if bad.size:
+        todo = "leave it out, or the channel by prepare(..., channels=...)"
+        raise HyperparameterError(f"frame {bad[0]} of those to choose by holds a reading that is not finite; {todo}")
+    if not np.any(y):
+        raise HyperparameterError("the frames to choose by hold no change; give differences, at least one of a touch")
+    return y
+
+
+def _residuals(spectrum: Spectrum, filters: Float[Array, "h k"], y: Float[Array, "... k"]) -> Float[Array, " h"]:
+    """``|y - J x|^2`` summed over the frames, for each hyperparameter tried."""
+    left = 1 - spectrum.squares * filters
+    return jnp.einsum("hk,...k->h", left**2, (y @ spectrum.vectors) ** 2)
+
+
+HYPERPARAMETERS = Registry(AbstractHyperparameter, "hyperparameter", "jaxeit.hyperparameters")
+"""Ways to choose the hyperparameter, by the names that the command line and recipes use."""

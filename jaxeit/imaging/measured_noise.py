@@ -1,0 +1,112 @@
+"""How readings are weighed against each other: alike, or by the noise of a recording without contact."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
+
+from ..registry import Registry
+from .noise import InverseError, noise_covariance
+
+LEAST_DEVIATION = 0.1  # of the median deviation: a reading that hardly changes is not trusted more than tenfold
+
+
+class AbstractNoise(eqx.Module):
+    """A choice of what the readings' noise is taken for; ``needs_frames``: whether it must be measured."""
+
+    needs_frames: ClassVar[bool] = True
+
+    @abstractmethod
+    def measured(
+        self, quiet: Float[ArrayLike, "frames readings"] | None, channels: Bool[ArrayLike, " readings"] | None = None
+    ) -> np.ndarray | None:
+        """The noise, as `prepare` takes it: (readings,) V, (readings, readings) V^2, or None: alike, of unknown size.
+
+        Args:
+            quiet: frames without contact less their mean, V.
+            channels: readings that are used; the others may hold anything. Default: all.
+
+        Raises:
+            InverseError: if the noise must be measured and there are too few frames.
+        """
+
+
+class EqualNoise(AbstractNoise):
+    """All readings alike, of unknown size. Images then have no standard deviations."""
+
+    name: ClassVar[str] = "equal"
+    needs_frames: ClassVar[bool] = False
+
+    def measured(
+        self, quiet: Float[ArrayLike, "frames readings"] | None, channels: Bool[ArrayLike, " readings"] | None = None
+    ) -> None:
+        return None
+
+
+class MeasuredNoise(AbstractNoise):
+    """Each reading by its standard deviation without contact. Readings are taken as independent."""
+
+    name: ClassVar[str] = "measured"
+
+    def measured(
+        self, quiet: Float[ArrayLike, "frames readings"] | None, channels: Bool[ArrayLike, " readings"] | None = None
+    ) -> np.ndarray:
+        used, frames = _used(self, quiet, channels)
+        out = np.ones(len(used))
+        out[used] = _deviations(frames)
+        return out
+
+
+class CorrelatedNoise(AbstractNoise):
+    """The readings by their covariance without contact, see `noise_covariance`: for an instrument with crosstalk."""
+
+    name: ClassVar[str] = "correlated"
+
+    def measured(
+        self, quiet: Float[ArrayLike, "frames readings"] | None, channels: Bool[ArrayLike, " readings"] | None = None
+    ) -> np.ndarray:
+        used, frames = _used(self, quiet, channels)
+        deviation, changing = np.ones(len(used)), np.zeros(len(used), bool)
+        deviation[used] = _deviations(frames)
+        moves = frames.std(0) > 0
+        changing[used] = moves
+        out = np.diag(deviation**2)  # a reading that does not change at all is taken as independent
+        out[np.ix_(changing, changing)] = noise_covariance(frames[:, moves])
+        return out
+
+
+NOISES = Registry(AbstractNoise, "noise", "jaxeit.noises")
+"""Choices of noise by the names that the command line and recipes use."""
+
+
+def _used(
+    noise: AbstractNoise,
+    quiet: Float[ArrayLike, "frames readings"] | None,
+    channels: Bool[ArrayLike, " readings"] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Readings that are used, (readings,), and the frames that have all of them."""
+    if quiet is None:
+        raise InverseError(f"{type(noise).__name__} is measured; give frames without contact (quiet=), or EqualNoise()")
+    frames = np.asarray(quiet, float)
+    used = np.ones(frames.shape[1], bool) if channels is None else np.asarray(channels, bool)
+    frames = frames[:, used]
+    frames = frames[np.isfinite(frames).all(1)]
+    if len(frames) < 4:
+        raise InverseError(
+            f"{type(noise).__name__} is measured from frames without contact, and {len(frames)} are complete; "
+            "record four or more before the first press, or choose EqualNoise"
+        )
+    return used, frames
+
+
+def _deviations(frames: np.ndarray) -> np.ndarray:
+    """Standard deviation of each reading about zero, not below `LEAST_DEVIATION` of the median."""
+    deviation = np.sqrt(np.mean(frames**2, axis=0))
+    least = LEAST_DEVIATION * np.median(deviation)
+    if not least > 0:
+        raise InverseError("most readings do not change at all without contact; choose EqualNoise")
+    floored: np.ndarray = np.maximum(deviation, least)
+    return floored

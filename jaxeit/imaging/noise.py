@@ -1,0 +1,336 @@
+"""From readings to independent numbers of unit noise.
+
+All readings are differences of the L(L-1)/2 *pair sums*, entries of the transfer matrix (see `jacobian`): ``v = P z``
+with four entries in each row of P.  So a frame of 1,372 readings of 25 electrodes holds at most 300 numbers, and a
+linear reconstruction need not know more of it than ``t = P^T W dv``, W the inverse covariance of the noise: from
+``J = P J_z``,
+
+    (J^T W J + l^2 R)^-1 J^T W dv  =  (J_z^T G J_z + l^2 R)^-1 J_z^T t,      G = P^T W P.
+
+With a factor ``G = C^T C`` of full rank and the least E for which ``E C^T = I``, the numbers ``y = E t`` have
+independent noise of unit variance and the Jacobian ``C J_z``: what is minimised over them is what would be over all
+readings.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpstrf
+
+from .._compile import is_traced, require_known
+from ..effects import AbstractTerminalEffect, chosen
+from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
+from ..model.discretisation import Model
+
+
+class InverseError(ValueError):
+    """Settings from which no reconstruction can be made."""
+
+
+class Whitening(eqx.Module):
+    """The pair sums that a protocol measures, and how well.
+
+    | meaning                                                              | shape              | unit  |
+    |----------------------------------------------------------------------|--------------------|-------|
+    | pairs: the four pair sums z0 - z1 - z2 + z3 of each reading          | (readings, 4)      |       |
+    | lines, sign: the readings that each pair sum occurs in; sign 0: none | (k, c)             |       |
+    | current                                                              | ()                 | A     |
+    | weight: inverse of the noise, as variances or as a covariance matrix | (readings,) or     | 1/V^2 |
+    |   (0 where a channel is not used)                                    | (readings, readings) |     |
+    | channels: readings that are used                                     | (readings,)        |       |
+    """
+
+    pairs: Int[Array, "readings 4"]
+    lines: Int[Array, "k c"]
+    sign: Float[Array, "k c"]
+    current: Float[Array, ""]
+    weight: Float[Array, "..."]
+    channels: Bool[Array, " readings"]
+
+    @property
+    def signs(self) -> Float[Array, "4"]:
+        """Current times the sign of each of the four pair sums of a reading, A."""
+        return self.current * jnp.asarray(SIGNS, self.sign.dtype)
+
+    def sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
+        """``t = P^T W dv``; channels that are not used may hold anything."""
+        dv = jnp.where(self.channels, dv, 0)
+        return self.pair_sums(dv * self.weight if self.weight.ndim == 1 else dv @ self.weight)
+
+    def pair_sums(self, values: Float[Array, "... readings"]) -> Float[Array, "... k"]:
+        """``P^T v``."""
+        if values.ndim == 1:
+            return self.current * jnp.sum(self.sign * values[self.lines], -1)
+        by_reading = values.reshape(-1, values.shape[-1]).T  # the frames of a batch lie side by side
+        sums = jnp.zeros((len(self.lines), by_reading.shape[1]), values.dtype)
+        columns = self.sign.T[..., None], self.lines.T
+        sums, _ = jax.lax.scan(lambda sums, column: (sums + column[0] * by_reading[column[1]], None), sums, columns)
+        return self.current * sums.T.reshape(*values.shape[:-1], -1)
+
+    def readings(self, z: Float[Array, "k ..."]) -> Float[Array, "readings ..."]:
+        """``P z``."""
+        first, second, third, fourth = (z[column] for column in self.pairs.T)
+        return self.current * (first - second - third + fourth)
+
+
+def pairs_of(pattern: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs of electrodes whose sums a pattern, (readings, 4), measures: (k, 2); the four of each reading."""
+    source, sink, plus, minus = pattern.T
+    ends = np.sort([[plus, source], [minus, source], [plus, sink], [minus, sink]], 1).astype(np.int64)
+    count = 1 + ends.max()
+    keys, number = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
+    return np.stack(np.divmod(keys, count), 1), number.reshape(4, -1).T
+
+
+def whitened(pattern: np.ndarray, current: Any, weight: Any, channels: np.ndarray, dtype: np.dtype) -> "Whitened":
+    """The pair sums of a protocol, from its pattern (readings, 4); in NumPy unless JAX traces current or weight."""
+    electrodes, pairs = pairs_of(pattern)
+    lines, sign = lines_of(pairs, len(electrodes))
+    arrays = {
+        "pairs": pairs.astype(np.int32),
+        "lines": lines.astype(np.int32),
+        "sign": sign.astype(dtype),
+        "current": jnp.asarray(current, dtype) if is_traced(current) else np.asarray(current, dtype),
+        "weight": weight.astype(dtype),
+        "channels": channels.copy(),  # JAX may keep the array that it is given, and the caller's is not ours to keep
+    }
+    factors = _factors(matrix_of(pairs, len(electrodes)), current, weight, channels)
+    return Whitened(Whitening(**_on_device(arrays)), electrodes, *factors)
+
+
+def _on_device(arrays: dict[str, Any]) -> dict[str, Array]:
+    """The arrays in JAX; those with known numbers stay known, inside a compiled function too."""
+    known = {name: array for name, array in arrays.items() if not is_traced(array)}
+    with jax.ensure_compile_time_eval():
+        moved: dict[str, Array] = arrays | jax.device_put(known)
+    return moved
+
+
+class Whitened(NamedTuple):
+    """What `whitened` finds; the matrices are in float64 whatever the model's precision.
+
+    The matrices are those of NumPy, or of JAX where it traces the noise or the current.
+
+    | meaning                                           | shape  | unit |
+    |---------------------------------------------------|--------|------|
+    | whitening                                         |        |      |
+    | electrodes: whose pair each sum is                | (k, 2) |      |
+    | factor C: from pair sums to whitened readings     | (r, k) | 1/ohm |
+    | compress E: from the sums ``t`` to whitened readings | (r, k) | ohm |
+    """
+
+    whitening: Whitening
+    electrodes: np.ndarray
+    factor: Any
+    compress: Any
+
+
+SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def lines_of(pairs: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each pair sum the readings it occurs in, and its sign there; padded with sign 0."""
+    order = np.argsort(pairs, axis=None, kind="stable")
+    pair, reading, sign = pairs.ravel()[order], order // 4, SIGNS[order % 4]
+    counts = np.bincount(pair, minlength=count)
+    rank = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
+    lines, signs = np.zeros((count, counts.max()), int), np.zeros((count, counts.max()))
+    lines[pair, rank], signs[pair, rank] = reading, sign
+    return lines, signs
+
+
+def matrix_of(pairs: np.ndarray, count: int) -> sp.csr_array:
+    """P for a unit current, (readings, k)."""
+    rows = np.repeat(np.arange(len(pairs)), 4)
+    return sp.csr_array((np.tile(SIGNS, len(pairs)), (rows, pairs.ravel())), (len(pairs), count))
+
+
+def gram_of(p: Any, weight: Any) -> Any:
+    """``P^T W P``, of a matrix P that is sparse or, for JAX, dense."""
+    weighted = p.T * weight if weight.ndim == 1 else p.T @ weight
+    gram = weighted @ p
+    return gram.toarray() if sp.issparse(gram) else gram
+
+
+class PairStructure(NamedTuple):
+    """Which pair sums are independent in the readings that are used: ``P = P_t M``.
+
+    | meaning                                                        | shape  |
+    |----------------------------------------------------------------|--------|
+    | taken t: independent pair sums                                 | (r,)   |
+    | mixing M                                                       | (r, k) |
+    | inverse K of M: ``K M^T = I``, and K is zero where M is        | (r, k) |
+    """
+
+    taken: np.ndarray
+    mixing: np.ndarray
+    inverse: np.ndarray
+
+
+def structure_of(gram: np.ndarray) -> PairStructure:
+    """The structure of G, from its Cholesky factor with pivots: as many pair sums as its rank."""
+    upper, pivots, rank, _ = dpstrf(gram, tol=1e-11 * gram.diagonal().max())
+    taken, left = np.split(pivots - 1, [rank])
+    mixing, null = np.empty((rank, len(gram))), np.zeros((len(gram), len(left)))
+    mixing[:, taken], mixing[:, left] = np.eye(rank), solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
+    null[taken], null[left] = -mixing[:, left], np.eye(len(left))
+    unit = np.zeros_like(mixing)
+    unit[:, taken] = np.eye(rank)
+    return PairStructure(taken, mixing, unit - unit @ null @ np.linalg.solve(null.T @ null, null.T))
+
+
+def _factors(p: sp.csr_array, current: Any, weight: Any, channels: np.ndarray) -> tuple[Any, Any]:
+    """C of ``G = C^T C``, as many rows as its rank, and the least E with ``E C^T = I``.
+
+    With ``G_tt = L L^T`` on the independent pair sums t, ``C = L^T M`` and ``E = L^-1 K`` (`PairStructure`). Where JAX
+    traces the weights, the structure is that of equal weights.
+    """
+    if is_traced(current, weight):
+        library, gram = JAX, current**2 * gram_of(p.toarray(), weight)
+        structure = structure_of(gram_of(p, channels.astype(float)))
+    else:
+        library, gram = NUMPY, current**2 * gram_of(p, weight)
+        structure = structure_of(gram)
+    lower = library.cholesky(gram[np.ix_(structure.taken, structure.taken)])
+    return lower.T @ structure.mixing, library.solve_lower(lower, structure.inverse)
+
+
+def whitened_readings(model: Model, noise: Any, channels: Any) -> Whitened:
+    """What of a frame is used, and how much it weighs; noise and channels as for `prepare`."""
+    between = chosen(model.effects, AbstractTerminalEffect)
+    if between:
+        raise InverseError(
+            f"{type(between[0]).__name__} acts between sheet and readings, which are then not the differences of "
+            "potentials that reconstruction takes them for; reconstruct with a scene without it"
+        )
+    if is_traced(model.pattern):
+        raise InverseError(
+            "jit, grad or vmap hides the protocol of the model, which decides the shapes of a reconstruction; use the "
+            "model from outside the transformed function, and pass only what changes as an argument"
+        )
+    readings = model.pattern.shape[0]
+    used = require_some(np.ones(readings, bool) if channels is None else known_flags(channels, readings))
+    weight = noise_weight(noise, readings, used)
+    if not is_traced(weight) and not np.abs(weight).max() < np.finfo(model.dtype).max:
+        raise InverseError(f"one over the noise squared is beyond {model.dtype}; is the noise in V?")
+    current = model.current if is_traced(model.current) else float(model.current)
+    return whitened(np.asarray(model.pattern), current, weight, used, model.dtype)
+
+
+def known_flags(channels: Any, readings: int) -> np.ndarray:
+    """One flag per reading, whose values decide shapes and so must be known."""
+    if is_traced(channels):
+        raise InverseError(
+            "jit, grad or vmap hides the values of channels, which decide the shapes of a reconstruction; give them as "
+            "a NumPy array from outside the transformed function, or use Reconstructor.without"
+        )
+    return np.asarray(as_flags(channels, readings))
+
+
+def as_flags(channels: Any, readings: int) -> Any:
+    """One flag per reading; of JAX where it traces them, else of NumPy."""
+    flags = channels.astype(bool) if is_traced(channels) else np.asarray(channels, bool)
+    if flags.shape != (readings,):
+        raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
+    return flags
+
+
+def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
+    """Refuse arrays that are not frames of so many readings."""
+    if np.shape(dv)[-1:] != (readings,):
+        raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {readings} readings")
+
+
+def require_some(used: Any) -> Any:
+    """Refuse flags none of which is set; flags whose values JAX hides pass."""
+    if not is_traced(used) and not np.any(used):
+        raise InverseError("every channel is left out: there is nothing to reconstruct from")
+    return used
+
+
+def noise_weight(noise: Any, readings: int, channels: np.ndarray) -> Any:
+    """Inverse of the noise on the channels that are used, zero elsewhere: variances or a covariance.
+
+    Traced noise gives an array of JAX and is not checked: where it is not positive, the result is not finite.
+    """
+    if noise is None:
+        return channels.astype(float)
+    library, known = (JAX, False) if is_traced(noise) else (NUMPY, True)
+    noise = jnp.asarray(noise) if not known else np.asarray(noise, float)
+    if noise.shape not in ((readings,), (readings, readings)):
+        raise InverseError(f"noise has shape {noise.shape}; this model has {readings} readings")
+    if noise.ndim == 2:
+        return _known_inverse(noise, channels) if known else _inverse_covariance(library, noise, channels)
+    bad = channels & ~(np.isfinite(noise) & (noise > 0)) if known else np.zeros(readings, bool)
+    if bad.any():
+        raise InverseError(
+            f"the noise of reading {int(np.argmax(bad))} is {noise[bad][0]} V; give a positive "
+            "number, or leave the channel out with channels=..."
+        )
+    where = library.namespace.where
+    return where(channels, where(channels, noise, 1.0) ** -2.0, 0.0)
+
+
+def _known_inverse(noise: np.ndarray, channels: np.ndarray) -> np.ndarray:
+    """The inverse of a covariance whose numbers are known, checked."""
+    used = np.ix_(*2 * [np.flatnonzero(channels)])
+    try:
+        weight: np.ndarray = _inverse_covariance(NUMPY, noise, channels)
+    except np.linalg.LinAlgError:
+        weight = np.full_like(noise, np.nan)
+    if not np.isfinite(weight).all() or not np.allclose(noise[used], noise[used].T, rtol=1e-6, atol=0):
+        raise InverseError(
+            "the covariance of the noise is not symmetric positive definite; a recording of fewer frames than readings "
+            "gives such a one: give standard deviations instead, or shrink it towards its diagonal "
+            "(jaxeit.noise_covariance does)"
+        )
+    return weight
+
+
+def _inverse_covariance(library: ArrayLibrary, noise: Any, channels: np.ndarray) -> Any:
+    """The inverse of the covariance of the channels that are used, zero elsewhere."""
+    used = np.flatnonzero(channels)
+    lower = library.cholesky(noise[np.ix_(used, used)])
+    half = library.solve_lower(lower, np.eye(len(used), dtype=lower.dtype))
+    place = np.full(len(channels), len(used))  # of each reading in the inverse; beyond its end, zeros
+    place[used] = np.arange(len(used))
+    return library.namespace.pad(half.T @ half, (0, 1))[np.ix_(place, place)]
+
+
+def noise_covariance(blank: Float[ArrayLike, "frames readings"]) -> np.ndarray:
+    """Covariance of the readings of a blank recording, shrunk towards its diagonal so that it can be inverted.
+
+    The weight of the diagonal is that of Schaefer and Strimmer (2005): the variance of the off-diagonal entries, as
+    the frames tell it, over their squares; 1 where the frames tell of no correlation.
+
+    Args:
+        blank: readings without contact, (frames, readings) V; at least four frames, finite.
+
+    Returns:
+        (readings, readings) V^2.
+
+    Raises:
+        InverseError: for fewer frames, or readings that are not finite or do not change at all.
+    """
+    require_known("noise_covariance", InverseError, blank)
+    blank = np.asarray(blank, float)
+    if blank.ndim != 2 or len(blank) < 4 or not np.isfinite(blank).all():
+        raise InverseError(f"the blank recording has shape {blank.shape}; give four or more frames of finite readings")
+    n, centred = len(blank), blank - blank.mean(0)
+    std = centred.std(0, ddof=1)
+    if (std == 0).any():
+        raise InverseError(f"reading {int(np.argmax(std == 0))} does not change at all; leave it out as a dead channel")
+    z = centred / std
+    mean = z.T @ z / n
+    spread = (z**2).T @ z**2 / n - mean**2
+    off = ~np.eye(len(std), dtype=bool)
+    correlation = mean * n / (n - 1)
+    shrink = np.clip(spread[off].sum() * n / (n - 1) ** 3 * n / max((correlation[off] ** 2).sum(), 1e-300), 0, 1)
+    return np.where(off, (1 - shrink) * correlation, 1.0) * np.outer(std, std)

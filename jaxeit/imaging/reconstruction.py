@@ -1,0 +1,226 @@
+"""Reconstructors: from a difference of frames to an image of the conductivity change."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from .._compile import compiler_options, require_known
+from ..linalg.array_libraries import JAX
+from ..model.bases import AbstractPictured, Picture
+from .methods import AbstractIterativeMethod, Problem
+from .missing import mended_sums, removed, without_readings
+from .noise import InverseError, Whitening, as_flags, require_frames, require_some
+from .numpy_images import NumpyImages
+
+
+class Provenance(dict[str, str]):
+    """What a reconstructor was made from.
+
+    Compares equal to any other provenance, so that a new date does not trigger recompilation. A reconstructor that a
+    compiled function returns therefore has the provenance of that function's first call; attach another one outside.
+    """
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Provenance)
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(Provenance)
+
+
+class AbstractReconstructor(AbstractPictured):
+    """Frames to images, without mesh or solver.
+
+    | meaning                                                                        | shape     | unit |
+    |--------------------------------------------------------------------------------|-----------|------|
+    | whitening: which readings are used, and how much they weigh                    |           |      |
+    | predict: pair sums of the one-step image, from the sums ``P^T W dv``           | (k, k)    | ohm2 |
+    | picture: where the image lies                                                  |           |      |
+    | provenance                                                                     |           |      |
+    """
+
+    whitening: eqx.AbstractVar[Whitening]
+    predict: eqx.AbstractVar[Float[Array, "k k"]]
+    provenance: eqx.AbstractVar[Provenance]
+
+    @abstractmethod
+    def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
+        """The image, from ``P^T W dv``."""
+
+    def __call__(self, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... basis"]:
+        """The image, S, of a difference of frames, V; any leading axes are batches.
+
+        Readings that ``channels`` of `prepare` leaves out may hold anything. Any other reading that is not finite is
+        replaced by the value that the one-step image of the other readings predicts, at the cost of one small solve:
+        the image of `OneStep` is exactly that of a reconstructor which never had the reading, with prior and strength
+        unchanged. The replacement loses digits as one over the square of the hyperparameter: three digits are left at
+        1e-5, in float32 at 1e-2. Leave out a channel that is dead for good by ``channels`` of `prepare`.
+
+        Raises:
+            InverseError: if the last axis does not hold the readings of a frame.
+        """
+        require_frames(dv, self.readings)
+        images: Array = _imaged(self, dv)
+        return images
+
+    def compiled(self) -> Callable[[Float[ArrayLike, "... readings"]], Float[Array, "... basis"]]:
+        """The reconstructor as a compiled function of the frame, its numbers as constants: less overhead per call."""
+        return jax.jit(lambda dv: self(dv), compiler_options=compiler_options())
+
+    def _sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
+        sums = self.whitening.sums(dv)
+
+        def each() -> Float[Array, "... k"]:
+            frames = dv.reshape(-1, self.readings)
+            completed: Array = jax.lax.map(self._complete, (frames, sums.reshape(len(frames), -1)))
+            return completed.reshape(sums.shape)
+
+        whole: Array = jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, each)
+        return whole
+
+    def _complete(self, of_a_frame: tuple[Float[Array, " readings"], Float[Array, " k"]]) -> Float[Array, " k"]:
+        dv, sums = of_a_frame
+        completed: Array = jax.lax.cond(
+            jnp.isfinite(jnp.sum(sums)), lambda: sums, lambda: mended_sums(self.whitening, self.predict, dv)
+        )
+        return completed
+
+    @abstractmethod
+    def on_host(
+        self, dtype: str | None = None
+    ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
+        """The same as a function of NumPy arrays."""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Precision in which images are made."""
+        return self.predict.dtype
+
+    @property
+    def readings(self) -> int:
+        """Number of readings of a frame."""
+        return self.whitening.channels.shape[0]
+
+    @property
+    def channels(self) -> Bool[Array, " readings"]:
+        """Readings that are used."""
+        return self.whitening.channels
+
+
+@jax.jit
+def _imaged(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
+    return recon._image(recon._sums(jnp.asarray(dv, recon.predict.dtype)))
+
+
+class Reconstructor(AbstractReconstructor):
+    """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `whitening`).
+
+    | meaning                                                                          | shape      | unit |
+    |----------------------------------------------------------------------------------|------------|------|
+    | factor: image per pair sum                                                       | (basis, k) | S V  |
+    | variance left to each coefficient by readings and prior; infinite where not known | (basis,)  | S^2  |
+    | the rest: `AbstractReconstructor`                                                |            |      |
+    """
+
+    factor: Float[Array, "basis k"]
+    variance: Float[Array, " basis"]
+    predict: Float[Array, "k k"]
+    whitening: Whitening
+    picture: Picture
+    provenance: Provenance = eqx.field(static=True)
+
+    def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
+        return sums @ self.factor.T
+
+    @property
+    def matrix(self) -> Float[Array, "basis readings"]:
+        """Q as one matrix, S/V; a reconstructor is applied without it."""
+        return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
+
+    def on_host(
+        self, dtype: str | None = None
+    ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
+        """The reconstructor in NumPy: for one frame at a time a call of JAX alone takes longer than the image.
+
+        It works in ``dtype``, except that missing readings are replaced in the reconstructor's own precision.
+
+        Raises:
+            InverseError: where jit, grad or vmap hides the numbers of the reconstructor.
+        """
+        require_known("on_host", InverseError, self)
+        return NumpyImages(self.factor, self.predict, self.whitening, dtype or str(self.factor.dtype))
+
+    def astype(self, dtype: str) -> "Reconstructor":
+        """The reconstructor in another precision: built in float64, a matrix may be applied in float32.
+
+        Missing readings are then replaced in float32 too, which loses digits (`__call__`); `on_host` keeps the digits.
+        """
+        other: Reconstructor = jax.tree.map(
+            lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self
+        )
+        return other
+
+    def without(self, channels: Bool[Array, " readings"]) -> "Reconstructor":
+        """The reconstructor that never had these readings, by an update of its rank; prior and strength stay the same.
+
+        Under jit and vmap the flags may be traced; that no reading is left is then not an error.
+
+        Args:
+            channels: flags, true for each reading to leave out.
+
+        Raises:
+            InverseError: if the shape does not fit, or no reading would be left.
+        """
+        used = require_some(self.channels & ~as_flags(channels, self.readings))
+        return replace(_without(self, used), provenance=self.provenance)
+
+
+@eqx.filter_jit
+def _without(recon: Reconstructor, used: Bool[Array, " readings"]) -> Reconstructor:
+    found, gram = without_readings(recon.whitening, used)
+    predict, factor = removed(JAX, gram, recon.predict, recon.factor)
+    return Reconstructor(
+        factor=factor,
+        variance=recon.variance + jnp.sum((factor @ gram) * recon.factor, 1),
+        predict=predict,
+        whitening=found,
+        picture=recon.picture,
+        provenance=Provenance(),
+    )
+
+
+class IterativeReconstructor(AbstractReconstructor):
+    """A reconstruction by a method that solves a problem for each frame.
+
+    | meaning                                     | shape  | unit |
+    |---------------------------------------------|--------|------|
+    | compress: whitened readings, from the sums  | (r, k) | ohm  |
+    | problem, method                             |        |      |
+    | the rest: `AbstractReconstructor`           |        |      |
+    """
+
+    compress: Float[Array, "r k"]
+    problem: Problem
+    method: AbstractIterativeMethod
+    predict: Float[Array, "k k"]
+    whitening: Whitening
+    picture: Picture
+    provenance: Provenance = eqx.field(static=True)
+
+    def on_host(
+        self, dtype: str | None = None
+    ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
+        """The same as a function of NumPy arrays, in the reconstructor's own precision whatever ``dtype``."""
+        del dtype
+        return lambda dv: np.asarray(self(dv))
+
+    def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
+        frames = sums.reshape(-1, sums.shape[-1]) @ self.compress.T
+        images: Array = jax.lax.map(lambda y: self.method.image(self.problem, y), frames)
+        return images.reshape(*sums.shape[:-1], images.shape[-1])

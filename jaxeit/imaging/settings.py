@@ -1,0 +1,86 @@
+"""The choices that make an image, as one object."""
+
+from dataclasses import dataclass, field
+
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from ..model.bases import BASES, AbstractBasis, Pixels
+from ..model.discretisation import Model
+from .hyperparameters import HYPERPARAMETERS, AbstractHyperparameter
+from .measured_noise import NOISES, AbstractNoise, EqualNoise
+from .methods import METHODS, AbstractIterativeMethod, AbstractLinearMethod, OneStep
+from .noise import InverseError
+from .preparation import Settings, prepare
+from .priors import PRIORS, AbstractPrior, Noser
+from .reconstruction import IterativeReconstructor, Reconstructor
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """How images are made: every choice of `prepare`, without the model and the recording that it is made for.
+
+    | meaning                                                       | default          |
+    |---------------------------------------------------------------|------------------|
+    | basis: what the coefficients of an image stand for             | `Pixels`         |
+    | method: how data and prior are weighed against each other      | `OneStep`        |
+    | prior: what is expected of an image                            | `Noser`          |
+    | hyperparameter: weight of the prior, or a way to choose it     | 0.1              |
+    | noise: how the readings are weighed                            | `EqualNoise`     |
+
+    Raises:
+        InverseError: for a hyperparameter that is not above zero, or a prior that changes with the image and a method
+            that never takes it anew.
+    """
+
+    basis: AbstractBasis = field(default_factory=Pixels)
+    method: AbstractLinearMethod | AbstractIterativeMethod = field(default_factory=OneStep)
+    prior: AbstractPrior = field(default_factory=Noser)
+    hyperparameter: float | AbstractHyperparameter = 0.1
+    noise: AbstractNoise = field(default_factory=EqualNoise)
+
+    def __post_init__(self) -> None:
+        weight = self.hyperparameter
+        if isinstance(weight, int | float) and not 0 < weight < float("inf"):
+            raise InverseError(f"the hyperparameter is {weight}; give a number above zero, such as 0.1")
+        if self.prior.follows_image and not self.method.follows_prior:
+            raise InverseError(
+                f"the prior {type(self.prior).__name__} changes with the image, and the method "
+                f"{type(self.method).__name__} takes it only once; choose the method Reweighted, or another prior"
+            )
+
+    def __str__(self) -> str:
+        """The choices by their names, such as "pixels, one-step, noser at 0.1"."""
+        weight = self.hyperparameter
+        chosen = HYPERPARAMETERS.text(weight) if isinstance(weight, AbstractHyperparameter) else f"{weight:g}"
+        noise = "" if isinstance(self.noise, EqualNoise) else f", {NOISES.text(self.noise)} noise"
+        return f"{BASES.text(self.basis)}, {METHODS.text(self.method)}, {PRIORS.text(self.prior)} at {chosen}{noise}"
+
+    def prepare(
+        self,
+        model: Model,
+        *,
+        quiet: Float[ArrayLike, "frames readings"] | None = None,
+        frames: Float[ArrayLike, "... readings"] | None = None,
+        channels: Bool[ArrayLike, " readings"] | None = None,
+        sigma: Float[Array, " elements"] | None = None,
+    ) -> Reconstructor | IterativeReconstructor:
+        """The reconstructor that these choices make of a model, by `prepare`.
+
+        Args:
+            quiet: frames without contact less their mean, V, from which the noise is measured; needed unless ``noise``
+                is `EqualNoise`.
+            frames: differences of readings, at least one of a touch, V; needed by a ``hyperparameter`` that looks at
+                frames and has none of its own.
+            channels, sigma: as for `prepare`.
+
+        Raises:
+            InverseError: as for `prepare`, or if the choices need frames that are not given.
+            HyperparameterError: if no hyperparameter can be chosen.
+        """
+        weight = self.hyperparameter
+        if isinstance(weight, AbstractHyperparameter) and frames is not None:
+            weight = weight.on(frames)
+        noise = self.noise.measured(quiet, channels)
+        settings: Settings = {"noise": noise, "hyperparameter": weight, "sigma": sigma, "channels": channels}
+        return prepare(model, self.prior, self.method, self.basis, **settings)

@@ -1,0 +1,285 @@
+"""A reconstructor as numbers, so that a robot applies it without mesh or solver.
+
+Numbers, not a compiled program: those fail, or worse load and differ, under another version of JAX.
+"""
+
+import io
+import json
+import math
+import os
+import struct
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, overload
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._compile import require_known
+from ..model.bases import Picture
+from .methods import AbstractIterativeMethod, Problem
+from .noise import Whitening, lines_of
+from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
+from .settings import Imaging
+
+FORMAT = "jaxeit reconstructor 1"
+
+# Name: dimensions, unit, meaning.
+_SHARED = {
+    "predict": ("k k", "ohm2", "pair sums of the one-step image, from weighted ones of the readings"),
+    "pairs": ("readings 4", "1", "the four pair sums of each reading"),
+    "current": ("", "A", "amplitude of the stimulation"),
+    "weight": ("readings *", "1/V2", "inverse of the noise: variances, or a covariance matrix"),
+    "channels": ("readings", "1", "readings that are used"),
+    "centres": ("basis 2", "m", "centres of the pixels"),
+    "areas": ("basis", "m2", "areas of the pixels on the sheet"),
+    "edges": ("edges 2", "1", "pairs of neighbouring pixels"),
+    "edge_length": ("edges", "m", "length of the border that neighbours share"),
+}
+LINEAR_NUMBERS = {
+    "factor": ("basis k", "S V", "image per pair sum"),
+    "variance": ("basis", "S2", "variance left to each coefficient"),
+    **_SHARED,
+}
+ITERATIVE_NUMBERS = {
+    "compress": ("r k", "ohm", "whitened readings, from weighted sums of the readings"),
+    "jacobian": ("r basis", "1/S", "of the whitened readings"),
+    "count": ("", "1", "readings that the whitened ones stand for"),
+    "hyperparameter": ("", "1", "weight of the prior"),
+    **_SHARED,
+}
+NUMBERS = LINEAR_NUMBERS | ITERATIVE_NUMBERS
+
+_KINDS = {"pairs": "iu", "edges": "iu", "channels": "b"}
+_WORDS = {"f": "floating point", "iu": "integers", "b": "boolean"}
+
+
+class StoreError(ValueError):
+    """A file or numbers that are no reconstructor; the message says what is wrong, and where."""
+
+
+def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.ndarray]:
+    """The arrays of a reconstructor under the names of `NUMBERS`; of an iterative one, all but its method and prior."""
+    require_known("to_numbers", StoreError, recon)
+    parts = (recon, recon.whitening, recon.picture)
+    if isinstance(recon, Reconstructor):
+        return {name: _part(parts, name) for name in LINEAR_NUMBERS}
+    problem = recon.problem
+    own = {
+        "jacobian": np.asarray(problem.jacobian),
+        "count": np.asarray(problem.readings),
+        "hyperparameter": np.asarray(problem.hyperparameter),
+    }
+    return {name: own[name] if name in own else _part(parts, name) for name in ITERATIVE_NUMBERS}
+
+
+def _part(parts: tuple[Any, ...], name: str) -> np.ndarray:
+    return np.asarray(next(vars(part)[name] for part in parts if name in vars(part)))
+
+
+@overload
+def from_numbers(
+    numbers: Mapping[str, np.ndarray],
+    shape: tuple[int, ...],
+    extent: tuple[float, ...],
+    provenance: Mapping[str, str] | None = None,
+) -> Reconstructor: ...
+
+
+@overload
+def from_numbers(
+    numbers: Mapping[str, np.ndarray],
+    shape: tuple[int, ...],
+    extent: tuple[float, ...],
+    provenance: Mapping[str, str] | None,
+    imaging: Imaging | None,
+) -> Reconstructor | IterativeReconstructor: ...
+
+
+def from_numbers(
+    numbers: Mapping[str, np.ndarray],
+    shape: tuple[int, ...],
+    extent: tuple[float, ...],
+    provenance: Mapping[str, str] | None = None,
+    imaging: Imaging | None = None,
+) -> Reconstructor | IterativeReconstructor:
+    """The reconstructor with these arrays; the reverse of `to_numbers`.
+
+    Args:
+        imaging: names the method and the prior of an iterative reconstructor; a linear one is in its arrays whole.
+
+    Raises:
+        StoreError: if an array is missing, they do not fit each other, or the method is needed and not iterative.
+    """
+    iterative = "jacobian" in numbers
+    names = ITERATIVE_NUMBERS if iterative else LINEAR_NUMBERS
+    missing = [name for name in names if name not in numbers]
+    if missing:
+        raise StoreError(f"{missing[0]}: missing")
+    sizes = _sizes({name: numbers[name] for name in names})
+    if len(extent) != 4 or not np.isfinite(extent).all() or math.prod(shape) != sizes["basis"]:
+        raise StoreError(f"a picture of shape {shape} and extent {extent} does not hold {sizes['basis']} coefficients")
+    for name, what, count in (("pairs", "pair sums", sizes["k"]), ("edges", "coefficients", sizes["basis"])):
+        array = np.asarray(numbers[name])
+        if ((array < 0) | (array >= count)).any():
+            raise StoreError(f"{name}: must count the {count} {what} from 0")
+    predict = jnp.asarray(numbers["predict"])
+    whitening, picture = _whitening(numbers, sizes["k"], predict.dtype), _picture(numbers, shape, extent)
+    about = Provenance(provenance or {})
+    if iterative:
+        return _iterative(numbers, imaging, predict, whitening, picture, about)
+    factor, variance = jnp.asarray(numbers["factor"]), jnp.asarray(numbers["variance"])
+    return Reconstructor(
+        factor=factor, variance=variance, predict=predict, whitening=whitening, picture=picture, provenance=about
+    )
+
+
+def _iterative(
+    numbers: Mapping[str, np.ndarray],
+    imaging: Imaging | None,
+    predict: Float[Array, "k k"],
+    whitening: Whitening,
+    picture: Picture,
+    provenance: Provenance,
+) -> IterativeReconstructor:
+    if imaging is None or not isinstance(imaging.method, AbstractIterativeMethod):
+        raise StoreError("the arrays are of an iterative method; give Imaging(method=..., prior=...) that they are for")
+    problem = Problem(
+        jacobian=jnp.asarray(numbers["jacobian"]),
+        readings=jnp.asarray(numbers["count"]),
+        hyperparameter=jnp.asarray(numbers["hyperparameter"]),
+        prior=imaging.prior,
+        picture=picture,
+    )
+    return IterativeReconstructor(
+        compress=jnp.asarray(numbers["compress"]),
+        problem=problem,
+        method=imaging.method,
+        predict=predict,
+        whitening=whitening,
+        picture=picture,
+        provenance=provenance,
+    )
+
+
+def _whitening(numbers: Mapping[str, np.ndarray], k: int, dtype: np.dtype) -> Whitening:
+    lines, sign = lines_of(np.asarray(numbers["pairs"]), k)
+    return Whitening(
+        pairs=jnp.asarray(numbers["pairs"], jnp.int32),
+        lines=jnp.asarray(lines, jnp.int32),
+        sign=jnp.asarray(sign, dtype),
+        current=jnp.asarray(numbers["current"]),
+        weight=jnp.asarray(numbers["weight"]),
+        channels=jnp.asarray(numbers["channels"], bool),
+    )
+
+
+def _picture(numbers: Mapping[str, np.ndarray], shape: tuple[int, ...], extent: tuple[float, ...]) -> Picture:
+    return Picture(
+        centres=jnp.asarray(numbers["centres"]),
+        areas=jnp.asarray(numbers["areas"]),
+        edges=jnp.asarray(numbers["edges"], jnp.int32),
+        edge_length=jnp.asarray(numbers["edge_length"]),
+        shape=tuple(shape),
+        extent=(extent[0], extent[1], extent[2], extent[3]),
+    )
+
+
+def _sizes(numbers: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """The size of each dimension in `NUMBERS`; they must agree, and the numbers be finite."""
+    sizes: dict[str, int] = {}
+    for name, given in numbers.items():
+        dimensions, array = NUMBERS[name][0], np.asarray(given)
+        if array.dtype.kind not in _KINDS.get(name, "f"):
+            raise StoreError(f"{name}: is of type {array.dtype}; it must be {_WORDS[_KINDS.get(name, 'f')]}")
+        words = dimensions.replace("*", "readings" if array.ndim == 2 else "").split()
+        if len(words) != array.ndim:
+            raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)})")
+        expected = tuple(
+            int(word) if word.isdigit() else sizes.setdefault(word, n)
+            for word, n in zip(words, array.shape, strict=True)
+        )
+        if array.shape != expected:
+            raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)}), here {expected}")
+        if not np.isfinite(array).all() and name != "variance":
+            raise StoreError(f"{name}: holds values that are not finite")
+    return sizes
+
+
+def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
+    """Write numbers and provenance to ``path`` (a NumPy .npz), whole or not at all.
+
+    Raises:
+        StoreError: for a reconstructor that is not linear, as the file holds a matrix.
+    """
+    if not isinstance(recon, Reconstructor):
+        raise StoreError(
+            f"{Path(path).name}: {type(recon).__name__} works on each frame anew and has no matrix to save; prepare "
+            "with a linear method, such as OneStep, or save the calibration that it belongs to"
+        )
+    about = {"format": FORMAT, "shape": recon.shape, "extent": recon.extent, "provenance": recon.provenance}
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **to_numbers(recon))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def load_reconstructor(path: str | Path) -> Reconstructor:
+    """Read what `save_reconstructor` wrote.
+
+    Raises:
+        StoreError: if the file cannot be read, is damaged or of another kind.
+    """
+    name = Path(path).name
+    try:
+        numbers = _read_numbers(path)
+        about = json.loads(str(numbers.pop("about")))
+        if about["format"] != FORMAT:
+            raise StoreError(f"is a {about['format']!r}; this version reads {FORMAT!r}")
+        return from_numbers(numbers, tuple(about["shape"]), tuple(about["extent"]), about["provenance"])
+    except StoreError as error:
+        raise StoreError(f"{name}: {error}") from None
+    except OSError as error:
+        raise StoreError(f"{name}: {error.strerror or 'is no reconstructor'}") from None
+    except _DAMAGE as error:
+        why = " ".join(str(error).split())[:120]
+        raise StoreError(f"{name}: is damaged or no reconstructor ({why}); prepare and save it again") from None
+
+
+_DAMAGE = (
+    *(ValueError, KeyError, TypeError, AttributeError, ArithmeticError),
+    *(EOFError, RuntimeError, MemoryError, struct.error, zipfile.BadZipFile),  # RuntimeError: a password, a recursion
+)
+
+
+def _read_numbers(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of a .npz; none is taken to be larger than the file that holds it."""
+    with zipfile.ZipFile(path) as file:
+        for member in file.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise StoreError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
+        return {m.filename.removesuffix(".npy"): _read_array(file, m) for m in file.infolist()}
+
+
+def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """One member, read whole before its own claims are looked at."""
+    stream = io.BytesIO(file.read(member))
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    if dtype.hasobject:
+        raise StoreError(f"{member.filename[:80]!r} holds Python objects, which could run any code; it is not read")
+    if math.prod(shape) * dtype.itemsize != len(stream.getbuffer()) - stream.tell():
+        raise StoreError(f"{member.filename[:80]!r} claims another size than it has")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)

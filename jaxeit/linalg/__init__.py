@@ -1,0 +1,33 @@
+"""Linear solvers as objects: symmetric positive definite, pattern fixed, values traced."""
+
+from ..registry import Registry
+from .base import AbstractLinearSolver, AbstractPlan, PatternError, SparsityPattern, inverse_columns, matvec, solve_spd
+from .conjugate_gradient import ConjugateGradient, Single
+from .dense import Dense
+from .nested_dissection import NestedDissection
+
+__all__ = [
+    "SOLVERS",
+    "AbstractLinearSolver",
+    "AbstractPlan",
+    "ConjugateGradient",
+    "Dense",
+    "NestedDissection",
+    "PatternError",
+    "Single",
+    "SparsityPattern",
+    "default_solver",
+    "inverse_columns",
+    "matvec",
+    "solve_spd",
+]
+
+
+SOLVERS: Registry[AbstractLinearSolver] = Registry(AbstractLinearSolver, "linear solver", "jaxeit.solvers")
+"""Linear solvers by the names that recipes use; a solver may hold another."""
+SOLVERS.parts = (SOLVERS,)
+
+
+def default_solver(n: int) -> AbstractLinearSolver:
+    """The quicker direct solver for n unknowns of a planar mesh."""
+    return Dense() if n < 300 else NestedDissection()

@@ -1,0 +1,62 @@
+"""The few functions that JAX and NumPy do not share, so that one formula serves both."""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array
+
+from . import lapack
+
+
+class ArrayLibrary(NamedTuple):
+    """JAX or NumPy; see `JAX` and `NUMPY`.
+
+    | meaning                                                                                |
+    |----------------------------------------------------------------------------------------|
+    | namespace: `jax.numpy` or `numpy`                                                      |
+    | solve(a, b): x with a x = b                                                            |
+    | cholesky(a): L with L L^T = a, not finite (JAX) or an error (NumPy) where there is none |
+    | solve_lower(a, b, trans=0): x with a x = b, or a^T x = b where ``trans`` is 1           |
+    | add_at(array, place, values): the array with values added at these places              |
+    """
+
+    namespace: ModuleType
+    solve: Callable[..., Any]
+    cholesky: Callable[..., Any]
+    solve_lower: Callable[..., Any]
+    add_at: Callable[..., Any]
+
+
+def _jax_solve_lower(lower: Array, b: Array, trans: int = 0) -> Array:
+    return lapack.solve_triangular(lower, b, trans=trans, lower=True)
+
+
+def _numpy_solve_lower(lower: np.ndarray, b: np.ndarray, trans: int = 0) -> np.ndarray:
+    found: np.ndarray = scipy.linalg.solve_triangular(lower, b, trans=trans, lower=True, check_finite=False)
+    return found
+
+
+def _numpy_add_at(array: np.ndarray, place: Any, values: np.ndarray) -> np.ndarray:
+    found = array.copy()
+    np.add.at(found, place, values)
+    return found
+
+
+JAX = ArrayLibrary(
+    namespace=jnp,
+    solve=lapack.solve,
+    cholesky=lambda a: lapack.cholesky(a, lower=True),
+    solve_lower=_jax_solve_lower,
+    add_at=lambda array, place, values: array.at[place].add(values),
+)
+NUMPY = ArrayLibrary(
+    namespace=np,
+    solve=np.linalg.solve,
+    cholesky=np.linalg.cholesky,
+    solve_lower=_numpy_solve_lower,
+    add_at=_numpy_add_at,
+)

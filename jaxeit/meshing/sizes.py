@@ -1,0 +1,181 @@
+"""How fine a graded mesh is where, and the nodes to start it from.
+
+The wanted edge length is ``h(x) = min(cap, min_i size_i + slope * distance(x, source_i))``, so that
+layers around a source grow by the factor ``1 + slope``.  Hexagonal lattices of stepped spacing fill
+the plane, and a greedy pass thins them where steps meet; `smoothing` does the rest.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..geometry.shapes import Domain
+
+STEPS_PER_OCTAVE = 3
+"""Lattice spacings between a length and its half."""
+
+_QUARTERS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
+
+
+@dataclass(frozen=True, eq=False)
+class SizeField:
+    """Wanted edge length as a function of position.
+
+    | meaning                                   | shape  | unit |
+    |-------------------------------------------|--------|------|
+    | centres, radii of the sources             | (k, 2), (k,) | m |
+    | sizes: edge length at each source's rim   | (k,)   | m    |
+    | slope: growth of the size per distance    | ()     |      |
+    | cap: largest edge length                  | ()     | m    |
+    """
+
+    centres: np.ndarray
+    radii: np.ndarray
+    sizes: np.ndarray
+    slope: float
+    cap: float
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Wanted edge length at points (n, 2); (n,) m."""
+        size = np.full(len(points), self.cap)
+        for centre, radius, at_rim in zip(self.centres, self.radii, self.sizes, strict=True):
+            away = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) - radius
+            np.minimum(size, at_rim + self.slope * np.maximum(away, 0.0), out=size)
+        return size
+
+    def level(self, size: np.ndarray) -> np.ndarray:
+        """Number of the lattice whose spacing is nearest to ``size``; 0 is the coarsest."""
+        return np.asarray(np.rint(np.log2(self.cap / size) * STEPS_PER_OCTAVE).astype(int))
+
+    def spacing(self, level: int) -> float:
+        """Spacing in m of the lattice of a level."""
+        return float(self.cap * 2.0 ** (-level / STEPS_PER_OCTAVE))
+
+
+def narrow_places(domain: Domain, cap: float, slope: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sources that keep edges shorter than the domain is wide: points (k, 2) and sizes (k,), m.
+
+    Sampled along the rim, at most 4000 places; those that another one already implies are left out.
+    """
+    coarse = domain.clearance(_along_rim(domain, domain.perimeter / 500))
+    if coarse.min() >= cap:
+        return np.zeros((0, 2)), np.zeros(0)
+    s = _along_rim(domain, max(0.5 * float(coarse.min()), domain.perimeter / 4000))
+    size, points = domain.clearance(s), domain.boundary_point(s)
+    kept = np.zeros(len(s), bool)
+    for i in np.argsort(size, kind="stable"):
+        away = np.linalg.norm(points[kept] - points[i], axis=1)
+        implied = np.min(size[kept] + slope * away, initial=cap)
+        kept[i] = size[i] < 0.9 * implied
+    return points[kept], size[kept]
+
+
+def _along_rim(domain: Domain, spacing: float) -> np.ndarray:
+    count = int(np.ceil(domain.perimeter / spacing))
+    return (np.arange(count) + 0.5) * (domain.perimeter / count)
+
+
+def divide_rim(domain: Domain, fixed: np.ndarray, size: SizeField) -> np.ndarray:
+    """Arc lengths (n,) of rim nodes: those ``fixed`` (k,), ascending, and graded ones between."""
+    ends = fixed if len(fixed) else np.zeros(1)
+    stops = np.append(ends[1:], ends[0] + domain.perimeter)
+    samples = _size_samples(domain, size)
+    pieces = [_divide(domain, a, b, size, samples) for a, b in zip(ends, stops, strict=True)]
+    return np.concatenate(pieces)
+
+
+def _size_samples(domain: Domain, size: SizeField) -> np.ndarray:
+    """Ascending arc lengths over two turns that resolve the size field, which varies fastest where
+    the rim passes a source: samples crowd there geometrically."""
+    nearest = domain.boundary_coordinate(size.centres)[:, None]
+    away = size.sizes[:, None] * np.geomspace(0.1, 1e4, 80)
+    close = np.concatenate([nearest - away, nearest, nearest + away], axis=1).ravel()
+    even = np.linspace(0, domain.perimeter, 2000)
+    once = np.unique(np.mod(np.concatenate([close, even]), domain.perimeter))
+    return np.concatenate([once, once + domain.perimeter])
+
+
+def _divide(domain: Domain, start: float, stop: float, size: SizeField, samples: np.ndarray) -> np.ndarray:
+    """``start`` and nodes up to, not including, ``stop``, evenly spread in the integral of 1/h."""
+    inside = samples[(samples > start) & (samples < stop)]
+    s = np.concatenate([[start], inside, np.linspace(start, stop, 33)[1:-1], [stop]])
+    s.sort()
+    per_length = 1.0 / size(domain.boundary_point(s))
+    steps = 0.5 * (per_length[1:] + per_length[:-1]) * np.diff(s)
+    edges_to = np.concatenate([[0.0], np.cumsum(steps)])
+    # A touch of slack: 1.3 edges' worth is one edge, not two.
+    count = max(1, int(np.ceil(edges_to[-1] - 0.3)))
+    return np.asarray(np.interp(np.arange(count) / count * edges_to[-1], edges_to, s))
+
+
+def fill(domain: Domain, size: SizeField) -> np.ndarray:
+    """Candidate nodes (n, 2) over the domain's bounding box, finest lattices first.
+
+    Lattices are laid from the middle of the box, and the order depends on nothing but positions, so
+    that equal input gives equal meshes.
+    """
+    low, high = np.asarray(domain.bounds)
+    middle = 0.5 * (low + high)
+    found = list(_lattice_points(high - low, middle, size))
+    points = np.concatenate([p for _, p in found])
+    level = np.concatenate([np.full(len(p), k) for k, p in found])
+    return points[np.lexsort((points[:, 0], points[:, 1], -level))]
+
+
+def _lattice_points(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[tuple[int, np.ndarray]]:
+    """Points of each lattice where its level is the wanted one: (level, points (n, 2))."""
+    for side, centres, wanted in _cells(extent, middle, size):
+        reach = size.slope * side / np.sqrt(2)
+        coarsest = size.level(np.minimum(wanted + reach, size.cap))
+        finest = size.level(np.maximum(wanted - reach, 0.1 * wanted))
+        for level in range(coarsest.min(), finest.max() + 1):
+            cells = centres[(coarsest <= level) & (level <= finest)]
+            points = middle + _hexagonal(cells - side / 2 - middle, side, size.spacing(level))
+            yield level, points[size.level(size(points)) == level]
+
+
+def _cells(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+    """Leaves of a quadtree no larger than about four wanted edges: (side, centres, sizes there)."""
+    side = 2.0 * size.cap
+    counts = np.ceil(extent / side + 1e-9).astype(int)
+    x, y = np.meshgrid(np.arange(counts[0]), np.arange(counts[1]))
+    centres = middle + (np.stack([x, y], -1).reshape(-1, 2) - (counts - 1) / 2) * side
+    while len(centres):
+        wanted = size(centres)
+        smallest = np.maximum(wanted - size.slope * side / np.sqrt(2), 0.1 * wanted)
+        split = side > 4 * smallest
+        if not split.all():
+            yield side, centres[~split], wanted[~split]
+        centres = (centres[split][:, None] + side * _QUARTERS).reshape(-1, 2)
+        side /= 2
+
+
+def _hexagonal(corners: np.ndarray, side: float, spacing: float) -> np.ndarray:
+    """Points of the hexagonal lattice through the origin that lie in square cells, each with its
+    lower-left corner in ``corners`` (k, 2) and half open, so that neighbours share no point."""
+    row, slack = spacing * np.sqrt(3) / 2, 1e-9
+    j = np.ceil(corners[:, 1] / row - slack)[:, None] + np.arange(int(np.ceil(side / row)) + 1)
+    shift = (j % 2) / 2
+    first = np.ceil(corners[:, :1] / spacing - shift - slack)
+    i = first[..., None] + np.arange(int(np.ceil(side / spacing)) + 1)
+    x, y = (i + shift[..., None]) * spacing, np.broadcast_to((j * row)[..., None], i.shape)
+    ends = corners[:, None, None] + side
+    inside = (x < ends[..., 0] - slack * spacing) & (y < ends[..., 1] - slack * row)
+    return np.asarray(np.stack([x, y], -1)[inside])
+
+
+def thin(candidates: np.ndarray, fixed: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """The candidates (n, 2), first come first served, that keep ``radii`` (n,) from every fixed
+    point and from those taken before them."""
+    near = cKDTree(fixed).query(candidates)[0] if len(fixed) else np.full(len(candidates), np.inf)
+    candidates, radii = candidates[near > radii], radii[near > radii]
+    if not len(candidates):
+        return candidates
+    free = np.ones(len(candidates), bool)
+    for i, around in enumerate(cKDTree(candidates).query_ball_point(candidates, radii)):
+        if free[i] and len(around) > 1:
+            free[around] = False
+            free[i] = True
+    return candidates[free]

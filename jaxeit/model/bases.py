@@ -1,0 +1,355 @@
+"""Image bases: what the coefficients of an image stand for."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
+
+from ..registry import Registry
+from .discretisation import Model
+from .stiffness import Stiffness, stiffness
+
+
+class BasisError(ValueError):
+    """A basis that cannot be laid over the model."""
+
+
+class Picture(eqx.Module):
+    """Where the coefficients of an image lie.
+
+    | meaning                                               | shape       | unit |
+    |-------------------------------------------------------|-------------|------|
+    | centres in the sheet's flat coordinates               | (basis, 2)  | m    |
+    | areas on the sheet; zero for a pixel that misses it   | (basis,)    | m^2  |
+    | edges: pairs of neighbours, each once                 | (edges, 2)  |      |
+    | edge_length: of the border that neighbours share      | (edges,)    | m    |
+    | shape: (rows, columns) of a picture, row 0 at low y   |             |      |
+    | extent: x0, x1, y0, y1 of that picture                |             | m    |
+    """
+
+    centres: Float[Array, "basis 2"]
+    areas: Float[Array, " basis"]
+    edges: Int[Array, "edges 2"]
+    edge_length: Float[Array, " edges"]
+    shape: tuple[int, ...] = eqx.field(static=True)
+    extent: tuple[float, float, float, float] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.areas.shape[0]
+
+
+class AbstractPictured(eqx.Module):
+    """Whatever has coefficients that lie on a `Picture`."""
+
+    picture: eqx.AbstractVar[Picture]
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.picture.size
+
+    @property
+    def centres(self) -> Float[Array, "basis 2"]:
+        """See `Picture`."""
+        return self.picture.centres
+
+    @property
+    def areas(self) -> Float[Array, " basis"]:
+        """See `Picture`."""
+        return self.picture.areas
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """See `Picture`."""
+        return self.picture.shape
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """See `Picture`."""
+        return self.picture.extent
+
+
+class BasisMap(AbstractPictured):
+    """A basis laid over one model: conductivity change = sparse matrix times coefficients.
+
+    The matrix is kept in lines of c entries; a coefficient has as many lines as it needs.
+
+    | meaning                                               | shape       | unit |
+    |-------------------------------------------------------|-------------|------|
+    | element, weight: entries of each line; weight 0: none | (lines, c)  |      |
+    | coefficient of each line                              | (lines,)    |      |
+    | stiffness of each line                                |             |      |
+    | picture: where the coefficients lie                   |             |      |
+    | single: whether each coefficient has one line         |             |      |
+    """
+
+    element: Int[Array, "lines c"]
+    weight: Float[Array, "lines c"]
+    coefficient: Int[Array, " lines"]
+    stiffness: Stiffness
+    picture: Picture
+    elements: int = eqx.field(static=True)
+    single: bool = eqx.field(static=True)
+
+    def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
+        """Values on the elements, from those of the coefficients."""
+        spread = self.weight * image[self.coefficient][:, None]
+        return jnp.zeros(self.elements, spread.dtype).at[self.element].add(spread)
+
+    def restrict(self, values: Float[Array, " elements"]) -> Float[Array, " basis"]:
+        """The transpose of `expand`: weighted sums over the elements of each coefficient."""
+        sums = jnp.sum(self.weight * values[self.element], 1)
+        return jnp.zeros(self.size, sums.dtype).at[self.coefficient].add(sums)
+
+
+class AbstractBasis(ABC):
+    """A choice of image; `on` lays it over a model, on the host."""
+
+    @abstractmethod
+    def on(self, model: Model) -> BasisMap:
+        """The basis for this model.
+
+        Raises:
+            BasisError: under jit, where the model's geometry is not known.
+        """
+
+
+@dataclass(frozen=True)
+class Elements(AbstractBasis):
+    """One coefficient per element: the finest image the mesh can carry, and not a picture."""
+
+    def on(self, model: Model) -> BasisMap:
+        areas = _host(model.areas)
+        every = np.arange(len(areas))
+        chart = _host(model.chart)
+        weight = np.ones(len(areas))
+        neighbours = _across_sides(_host(model.triangles), chart)
+        return _basis_map(
+            model, (every, every, weight), _host(model.centroids), areas, neighbours, (len(areas),), chart
+        )
+
+
+@dataclass(frozen=True)
+class Pixels(AbstractBasis):
+    """A regular grid over the sheet's bounding box, projected by exact areas of overlap.
+
+    The conductivity change of an element is the mean of the pixels over it, weighted by the areas
+    they share.
+
+    | meaning                                                      | default |
+    |--------------------------------------------------------------|---------|
+    | columns along x                                              | 40      |
+    | rows along y; None: square pixels                            | None    |
+    """
+
+    columns: int = 40
+    rows: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, count in (("columns", self.columns), ("rows", self.rows)):
+            if count is not None and not 1 <= count <= 2000:
+                raise BasisError(f"{name} is {count}; give 1 to 2000 pixels")
+
+    def on(self, model: Model) -> BasisMap:
+        chart = _host(model.chart)
+        low, high = chart.min(0), chart.max(0)
+        rows = self.rows or max(1, round(self.columns * (high[1] - low[1]) / (high[0] - low[0])))
+        counts = np.array([self.columns, rows])
+        pixel = (high - low) / counts
+        corners = (chart[_host(model.triangles)] - low) / pixel  # in units of pixels
+        element, place = _candidates(corners, counts)
+        shared = overlap_areas(corners[element], place, place + 1)
+        kept = shared > 1e-12
+        element, place, shared = element[kept], place[kept], shared[kept]
+        whole = np.bincount(element, shared, minlength=len(corners))
+        weight = shared / whole[element]
+        number = place[:, 1] * self.columns + place[:, 0]
+        areas = np.bincount(number, weight * _host(model.areas)[element], minlength=counts.prod())
+        x, y = np.meshgrid(np.arange(self.columns) + 0.5, np.arange(rows) + 0.5)
+        centres = low + np.stack([x.ravel(), y.ravel()], 1) * pixel
+        shape = (rows, self.columns)
+        neighbours = _grid_neighbours(areas.reshape(shape) > 0, pixel)
+        return _basis_map(model, (element, number, weight), centres, areas, neighbours, shape, chart)
+
+
+@dataclass(frozen=True)
+class Bumps(AbstractBasis):
+    """Overlapping Gaussian bumps on a regular grid: what a round contact does to the sheet (physics of a soft tip).
+
+    The paper samples 41 x 41 of them and calls the response J: its second reading.  A coefficient is the height of its
+    bump; a bump is cut at four widths.
+
+    | meaning                                                  | default | unit |
+    |----------------------------------------------------------|---------|------|
+    | columns, rows: centres from rim to rim; rows None: square | 41      |      |
+    | width: standard deviation of a bump                      | 0.012   | m    |
+    """
+
+    columns: int = 41
+    rows: int | None = None
+    width: float = 0.012
+
+    def __post_init__(self) -> None:
+        for name, count in (("columns", self.columns), ("rows", self.rows)):
+            if count is not None and not 2 <= count <= 500:
+                raise BasisError(f"{name} is {count}; give 2 to 500 bumps")
+        if not (np.isfinite(self.width) and self.width > 0):
+            raise BasisError(f"the width is {self.width} m; give a positive number")
+
+    def on(self, model: Model) -> BasisMap:
+        chart, places = _host(model.chart), _host(model.centroids)
+        low, high = chart.min(0), chart.max(0)
+        rows = self.rows or max(2, round((self.columns - 1) * (high[1] - low[1]) / (high[0] - low[0])) + 1)
+        counts = np.array([self.columns, rows])
+        pitch = (high - low) / (counts - 1)
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(rows))
+        centres = low + np.stack([x.ravel(), y.ravel()], 1) * pitch
+        near = cKDTree(places).query_ball_point(centres, 4 * self.width)
+        number = np.repeat(np.arange(len(centres)), [len(some) for some in near])
+        element = np.concatenate([np.asarray(some, int) for some in near])
+        square = np.sum((places[element] - centres[number]) ** 2, 1)
+        weight = np.exp(-0.5 * square / self.width**2)
+        areas = np.bincount(number, weight * _host(model.areas)[element], minlength=len(centres))
+        neighbours = _grid_neighbours(areas.reshape(rows, self.columns) > 0, pitch)
+        return _basis_map(
+            model, (element, number, weight), centres, areas, neighbours, (rows, self.columns), chart, pitch / 2
+        )
+
+
+BASES = Registry(AbstractBasis, "basis", "jaxeit.bases")
+"""Bases by the names that the command line and recipes use."""
+
+
+def _grid_neighbours(inside: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of pixels of the picture that share a side, both on the sheet, and the length of the side."""
+    number = np.arange(inside.size).reshape(inside.shape)
+    beside = (number[:, :-1], number[:, 1:]), (number[:-1], number[1:])
+    pairs = [np.stack([a.ravel(), b.ravel()], 1) for a, b in beside]
+    length = np.repeat(pixel[::-1], [len(some) for some in pairs])
+    edges = np.concatenate(pairs)
+    kept = inside.ravel()[edges].all(1)
+    return edges[kept], length[kept]
+
+
+def _across_sides(triangles: np.ndarray, chart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of triangles that share a side, and its length."""
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    order = np.lexsort(sides.T)
+    same = (np.diff(sides[order], axis=0) == 0).all(1)
+    first, second = order[:-1][same], order[1:][same]
+    ends = chart[sides[first]]
+    return np.stack([owner[first], owner[second]], 1), np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+
+
+def _basis_map(
+    model: Model,
+    entries: tuple[np.ndarray, np.ndarray, np.ndarray],
+    centres: np.ndarray,
+    areas: np.ndarray,
+    neighbours: tuple[np.ndarray, np.ndarray],
+    shape: tuple[int, ...],
+    chart: np.ndarray,
+    margin: np.ndarray | tuple[float, float] = (0.0, 0.0),
+) -> BasisMap:
+    (x0, y0), (x1, y1) = (chart.min(0) - margin).tolist(), (chart.max(0) + margin).tolist()
+    element, weight, coefficient = _lines(entries, len(areas), _host(model.centroids))
+    system = model.system
+    with jax.ensure_compile_time_eval():  # so that the basis is known inside a compiled function too
+        return BasisMap(
+            element=jnp.asarray(element, jnp.int32),
+            weight=jnp.asarray(weight, model.dtype),
+            coefficient=jnp.asarray(coefficient, jnp.int32),
+            stiffness=stiffness(
+                element, weight, _host(system.dofs), _host(system.slopes), system.unknowns, model.dtype
+            ),
+            picture=Picture(
+                centres=jnp.asarray(centres, model.dtype),
+                areas=jnp.asarray(areas, model.dtype),
+                edges=jnp.asarray(neighbours[0], jnp.int32),
+                edge_length=jnp.asarray(neighbours[1], model.dtype),
+                shape=shape,
+                extent=(x0, x1, y0, y1),
+            ),
+            elements=model.areas.shape[0],
+            single=np.array_equal(coefficient, np.arange(len(areas))),
+        )
+
+
+def _lines(
+    entries: tuple[np.ndarray, np.ndarray, np.ndarray], size: int, places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries in lines as long as half the coefficients need, so that little is padding; each of neighbours, which
+    share their nodes."""
+    element, coefficient, weight = entries
+    turn = np.empty(len(places), int)
+    turn[cKDTree(places).indices] = np.arange(len(places))
+    order = np.lexsort((turn[element], coefficient))
+    element, coefficient, weight = element[order], coefficient[order], weight[order]
+    counts = np.bincount(coefficient, minlength=size)
+    length = int(np.clip(np.median(counts[counts > 0]), 1, 128))
+    lines = -(-counts // length)
+    rank = np.arange(len(element)) - np.repeat(np.cumsum(counts) - counts, counts)
+    line = np.repeat(np.cumsum(lines) - lines, counts) + rank // length
+    table, weights = np.zeros((lines.sum(), length), int), np.zeros((lines.sum(), length))
+    table[line, rank % length], weights[line, rank % length] = element, weight
+    return table, weights, np.repeat(np.arange(size), lines)
+
+
+def _host(array: Array) -> np.ndarray:
+    try:
+        host = np.asarray(array)
+    except jax.errors.TracerArrayConversionError as error:
+        raise BasisError(
+            "a basis needs a model's geometry, which jit hides; make basis.on(model) outside and pass the result in"
+        ) from error
+    return host.astype(np.float64) if np.issubdtype(host.dtype, np.floating) else host
+
+
+def _candidates(corners: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a triangle and a pixel whose bounding boxes meet: (pairs,), (pairs, 2)."""
+    first = np.clip(np.floor(corners.min(1)).astype(int), 0, counts - 1)
+    last = np.clip(np.ceil(corners.max(1)).astype(int) - 1, first, counts - 1)
+    spans = last - first + 1
+    element = np.repeat(np.arange(len(corners)), spans.prod(1))
+    start = np.cumsum(spans.prod(1)) - spans.prod(1)
+    within = np.arange(len(element)) - start[element]
+    width = spans[element, 0]
+    return element, first[element] + np.stack([within % width, within // width], 1)
+
+
+def overlap_areas(polygons: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Areas that polygons share with axis-parallel boxes, exactly.
+
+    Each edge is split where it crosses the box's lines and what lies outside is pushed onto them;
+    the pushed parts enclose nothing, so the shoelace formula gives the area inside.
+
+    Args:
+        polygons: (pairs, corners, 2), counter-clockwise, convex or not.
+        low, high: corners of the boxes, (pairs, 2).
+    """
+    for axis in (0, 1):
+        polygons = _push(polygons, axis, low[:, axis], high[:, axis])
+    x, y = np.moveaxis(polygons, -1, 0)
+    areas: np.ndarray = 0.5 * np.sum(x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1), 1)
+    return areas
+
+
+def _push(polygons: np.ndarray, axis: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    start = polygons
+    step = np.roll(polygons, -1, 1) - start
+    lines = np.stack([low, high], -1)[:, None, :]
+    along = np.where(step[..., axis] == 0, 1.0, step[..., axis])[..., None]
+    crossing = np.clip((lines - start[..., axis][..., None]) / along, 0.0, 1.0)
+    t = np.concatenate([np.zeros_like(crossing[..., :1]), np.sort(crossing, -1)], -1)
+    points: np.ndarray = start[:, :, None] + t[..., None] * step[:, :, None]
+    points = points.reshape(len(points), -1, 2)
+    points[..., axis] = np.clip(points[..., axis], low[:, None], high[:, None])
+    return points

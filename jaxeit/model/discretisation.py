@@ -1,0 +1,165 @@
+"""From a scene and a fidelity to arrays: the only transfer from host to device, and the only place that
+refuses what cannot be computed."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._compile import is_traced
+from ..effects import AbstractCoatEffect, AbstractEffect, chosen
+from ..linalg import AbstractLinearSolver, default_solver
+from ..linalg.base import on_device
+from ..meshing.elements import Space, function_space
+from ..meshing.footprints import AbstractFootprint
+from ..meshing.generation import triangulate
+from ..meshing.triangles import Mesh
+from ..skin.description import Skin
+from ..skin.electrodes import touched
+from .fidelity import Fidelity, require_dtype
+from .metal_sheet import Coat, lay_coat
+from .scene import Scene
+from .system import System, system_arrays, system_of
+from .unknowns import number_unknowns
+
+COAT_EDGES = 2.0
+"""Edges of a coat's mesh over those of the sheet's.  The potential of the metal is a thousandth of what a touch does at
+0.1 ohm; that thousandth is then right to 3 %."""
+
+
+class Model(eqx.Module):
+    """A scene at a fidelity: arrays only, so that it can be an argument of any jitted function.
+
+    | meaning                                             | shape           | unit              |
+    |-----------------------------------------------------|-----------------|-------------------|
+    | nodes of the mesh                                   | (nodes, 2 or 3) | m                 |
+    | chart: nodes in the sheet's flat coordinates        | (nodes, 2)      | m                 |
+    | triangles                                           | (elements, 3)   |                   |
+    | centroids in the sheet's flat coordinates           | (elements, 2)   | m                 |
+    | areas                                               | (elements,)     | m^2               |
+    | background: sheet conductivity, before effects      | (elements,)     | S                 |
+    | contact: contact conductance of each electrode      | (electrodes,)   | S/m^2 or S/m      |
+    | pattern: drive+, drive-, sense+, sense-             | (readings, 4)   |                   |
+    | current                                             | ()              | A                 |
+    | effects of the scene                                |                 |                   |
+    | coat: the second sheet, if an effect asks for one   |                 |                   |
+    """
+
+    nodes: Float[Array, "nodes d"]
+    chart: Float[Array, "nodes 2"]
+    triangles: Int[Array, "elements 3"]
+    centroids: Float[Array, "elements 2"]
+    areas: Float[Array, " elements"]
+    background: Float[Array, " elements"]
+    contact: Float[Array, " electrodes"]
+    pattern: Int[Array, "readings 4"]
+    current: Float[Array, ""]
+    effects: tuple[AbstractEffect, ...]
+    system: System
+    solver: AbstractLinearSolver
+    coat: Coat | None
+
+    @property
+    def electrodes(self) -> int:
+        """Number of electrodes."""
+        return self.contact.shape[0]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of every floating-point array of the model."""
+        return self.background.dtype
+
+
+def discretise(
+    scene: Scene,
+    fidelity: Fidelity | None = None,
+    *,
+    mesh: Mesh | None = None,
+    ground: int | None = None,
+) -> Model:
+    """Build the model of ``scene`` at ``fidelity`` (default: `Fidelity.standard`).
+
+    Args:
+        mesh: use this mesh instead of making one, for a metal coat too; it must follow the electrodes.
+        ground: the mesh node held at zero volts; readings do not depend on it.
+
+    Raises:
+        FidelityError: float64 asked for while JAX is in 32-bit mode.
+        ElectrodeError, MeshError: the electrodes do not fit the sheet, each other or the mesh.
+    """
+    fidelity = Fidelity.standard() if fidelity is None else fidelity
+    require_dtype(fidelity.dtype)
+    skin = scene.skin
+    sheet, metal = _spaces(scene, fidelity, mesh)
+    values = _model_arrays(skin, sheet.mesh)
+    electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
+    unknowns = number_unknowns(sheet, electrodes, ground)
+    arrays, pattern = system_arrays(sheet, unknowns, electrodes)
+    solver = fidelity.solver or default_solver(unknowns.count)
+
+    def put(array: np.ndarray | Array) -> Array:
+        return _put(array, fidelity.dtype)
+
+    system = system_of(arrays, solver.analyse(pattern), put)
+    coat = None
+    if metal is not None:
+        index = unknowns.index[: len(sheet.points)]
+        coat = lay_coat(metal, sheet, pattern, index, arrays["under"][index], unknowns.electrode, solver, put)
+    effects = jax.tree.map(put, scene.effects)
+    return Model(**jax.tree.map(put, values), effects=effects, system=system, solver=solver, coat=coat)
+
+
+def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:
+    """The fields of a `Model` that are plain arrays."""
+    return {
+        "nodes": mesh.nodes,
+        "chart": mesh.chart,
+        "triangles": mesh.triangles,
+        "centroids": mesh.chart_centroids,
+        "areas": mesh.areas,
+        "background": np.full(len(mesh.triangles), 1 / skin.sheet_resistance),
+        "contact": np.array([1 / e.contact if e.contact > 0 else 0.0 for e in skin.electrodes]),
+        "pattern": skin.protocol.pattern,
+        "current": np.array(skin.protocol.current),
+    }
+
+
+def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
+    """The mesh that `discretise` makes: graded around the electrodes, checked."""
+    length = _edge_length(scene.skin, fidelity)
+    footprints = [electrode.footprint(fidelity.electrode_segments) for electrode in scene.skin.electrodes]
+    return _mesh(scene.skin, footprints, length, fidelity.growth)
+
+
+def _spaces(scene: Scene, fidelity: Fidelity, mesh: Mesh | None) -> tuple[Space, Space | None]:
+    """The function spaces of the sheet and of its metal coat, if an effect asks for one."""
+    coated = bool(chosen(scene.effects, AbstractCoatEffect))
+    coarse = COAT_EDGES * _edge_length(scene.skin, fidelity)
+    sheet = make_mesh(scene, fidelity) if mesh is None else mesh.check()
+    if not coated:
+        return function_space(sheet, fidelity.order), None
+    metal = _mesh(scene.skin, [], coarse, fidelity.growth) if mesh is None else sheet
+    return function_space(sheet, fidelity.order), function_space(metal, 1)
+
+
+def _edge_length(skin: Skin, fidelity: Fidelity) -> float:
+    """Edge length away from electrodes, m."""
+    return float(fidelity.edge_length * np.sqrt(skin.domain.area))
+
+
+def _mesh(skin: Skin, footprints: Sequence[AbstractFootprint], edge_length: float, growth: float) -> Mesh:
+    mesh = triangulate(skin.domain, footprints, edge_length, growth=growth)
+    return mesh if skin.surface is None else mesh.lift(skin.surface).check()
+
+
+def _put(values: np.ndarray | Array | float, dtype: np.dtype) -> Array:
+    """An array on the device: numbers in the model's precision, indices in 32 bits."""
+    if is_traced(values):  # a parameter of an effect
+        return jnp.asarray(values, dtype)
+    kind = np.asarray(values).dtype
+    if np.issubdtype(kind, np.floating):
+        return on_device(values, dtype)
+    return on_device(values, np.uint32 if np.issubdtype(kind, np.unsignedinteger) else np.int32)

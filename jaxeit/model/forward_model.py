@@ -1,0 +1,408 @@
+"""The forward model: from sheet conductivity to voltages.
+
+All readings are differences of the entries of one small symmetric matrix, the transfer matrix
+``Z[a, b]``: the potential of electrode a per ampere driven into electrode b (and out at a ground amid the
+sheet, which cancels).  With x_a the field of a unit current into electrode a, and
+``A(theta; x, y) = integral of sigma grad x . grad y + sum_l g_l integral over E_l of (x - X_l)(y - Y_l)``,
+
+    Z[a, b] = A(theta; x_a, x_b),          dZ[a, b] = -A(dtheta; x_a, x_b),
+
+since A is linear in theta = (sigma, g) and the fields are stationary.  The derivative needs no
+further solve (the adjoint identity; Geselowitz 1971, Lehr 1972).  Where a metal coat touches the sheet
+(`coat`), A has its two terms as well, and all else stays.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple, NoReturn, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import i0e, i1e
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._compile import verb
+from ..effects import (
+    AbstractContactEffect,
+    AbstractLoadEffect,
+    AbstractSheetEffect,
+    AbstractTerminalEffect,
+    Circuit,
+    Indenter,
+    Sheet,
+    fold,
+)
+from ..linalg import AbstractPlan, inverse_columns
+from .discretisation import Model
+from .metal_sheet import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
+from .system import System
+
+
+class CoatedSheet(NamedTuple):
+    """What current sees of a sheet pressed against a metal coat.
+
+    | meaning                                 | shape       | unit  |
+    |-----------------------------------------|-------------|-------|
+    | sigma: conductivity of the sheet itself | (elements,) | S     |
+    | metal: conductivity of the coat         | ()          | S     |
+    | coupling: conductance between the two   | (elements,) | S/m^2 |
+    """
+
+    sigma: Float[Array, " elements"]
+    metal: Float[Array, ""]
+    coupling: Float[Array, " elements"]
+
+
+class Coefficients(NamedTuple):
+    """What the physics is linear in: conductivity of the elements, S; contact conductances; those of a
+    coat, where it touches the sheet."""
+
+    sigma: Float[Array, " elements"]
+    contact: Float[Array, " electrodes"]
+    coat: CoatCoefficients | None = None
+
+
+class Fields(NamedTuple):
+    """Potentials per ampere driven into each electrode, in ohm.
+
+    | meaning                                        | shape                       |
+    |------------------------------------------------|-----------------------------|
+    | potential of the sheet at its unknowns         | (unknowns, electrodes)      |
+    | drop from sheet to electrode, where under one  | (unknowns, electrodes)      |
+    | terminal: potential of each electrode          | (electrodes, electrodes)    |
+    | coat: fields of the coat, if that touches      |                             |
+    """
+
+    potential: Float[Array, "unknowns electrodes"]
+    drop: Float[Array, "unknowns electrodes"]
+    terminal: Float[Array, "electrodes electrodes"]
+    coat: CoatFields | None
+
+
+def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None = None) -> Float[Array, " readings"]:
+    """Voltages of one frame.
+
+    Args:
+        model: from `discretise`.
+        sigma: sheet conductivity of each element, S, or what `conductivity` returns; default: that of
+            the untouched sheet.
+
+    Returns:
+        (readings,) V, in the order of the protocol; none of them finite if ``sigma`` is negative anywhere, or
+        zero all around a place.  Where parts of the sheet hardly touch, digits are lost: `rounding` says how many.
+
+    Raises:
+        ValueError: if ``sigma`` has another shape or precision than the model, or the model no coat.
+    """
+    return _forward(model, sigma if sigma is None or isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
+
+
+@verb
+def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Float[Array, " readings"]:
+    return voltages(model, transfer(model, coefficients(model, sigma)))
+
+
+@verb
+def rounding(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None = None) -> Float[Array, " readings"]:
+    """About what rounding has done to each reading of `forward`, (readings,) V.
+
+    A reading is a potential and, of the same fields, an energy.  With fields off by e the potential is off by
+    ``A(x, e)``, and the energy by twice that and a square: they differ by the error, and by what matters less.
+    The energy is that of differences of potentials, from which a part of the sheet that hardly touches the ground
+    may be lifted as a whole.  Takes a few times as long as `forward`, whose arguments these are.
+    """
+    theta = coefficients(model, sigma)
+    x = fields(model, theta)
+    return jnp.abs(readings(model, energy(model, theta, x)) - readings(model, x.terminal))
+
+
+def voltages(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
+    """Voltages of the protocol from the transfer matrix in ohm, as source and amplifiers of the scene make them."""
+    circuit = Circuit(z, model.pattern, model.current)
+    found: Array = fold(model.effects, AbstractTerminalEffect, readings(model, z), circuit)
+    return found
+
+
+@overload
+def conductivity(
+    model: Model, pressure: None = None, temperature: Float[ArrayLike, ""] = 0.0
+) -> Float[Array, " elements"]: ...
+
+
+@overload
+def conductivity(
+    model: Model, pressure: Float[Array, " elements"], temperature: Float[ArrayLike, ""] = 0.0
+) -> Float[Array, " elements"] | CoatedSheet: ...
+
+
+@verb
+def conductivity(
+    model: Model, pressure: Float[Array, " elements"] | None = None, temperature: Float[ArrayLike, ""] = 0.0
+) -> Float[Array, " elements"] | CoatedSheet:
+    """Sheet conductivity, (elements,) S, under the scene's material effects.
+
+    Where the scene has a metal coat and ``pressure`` is given, the two sheets and their contact: a
+    `CoatedSheet`.  Without pressure nothing touches the coat.
+
+    Args:
+        pressure: on the sheet, (elements,) Pa; default: none.
+        temperature: above that at which the skin's sheet resistance was measured, K.
+    """
+    touched = pressure is not None
+    if not any(isinstance(effect, AbstractSheetEffect) for effect in model.effects):
+        return model.background  # nothing to compute: the program is that of the ideal sensor
+    pressure = jnp.zeros_like(model.background) if pressure is None else pressure
+    warmer = jnp.asarray(temperature, model.dtype)
+    sheet = Sheet(model.background, pressure, model.centroids, jnp.sqrt(model.areas), warmer)
+    after = fold(model.effects, AbstractSheetEffect, sheet)
+    return CoatedSheet(after.sigma, after.metal, after.coupling) if touched and after.metal is not None else after.sigma
+
+
+@verb
+def load_spread(
+    model: Model, centre: Float[ArrayLike, "2"], diameter: Float[ArrayLike, ""]
+) -> Float[Array, " elements"]:
+    """Pressure on the sheet per unit load of a flat round tip, (elements,) 1/m^2.
+
+    The ideal tip presses evenly on its own area; effects of the scene may spread that.
+
+    Args:
+        centre: of the tip, (2,) m in the sheet's flat coordinates.
+        diameter: of the tip, m.
+    """
+    touch = Indenter(jnp.asarray(centre, model.dtype), jnp.asarray(diameter, model.dtype))
+    offset = jnp.linalg.norm(model.centroids - touch.centre, axis=-1)
+    even = jnp.where(offset < touch.diameter / 2, 4 / (jnp.pi * touch.diameter**2), 0.0)
+    spread: Array = fold(model.effects, AbstractLoadEffect, even, touch, model.centroids)
+    return spread
+
+
+def coefficients(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Coefficients:
+    """The conductivity given, or the scene's own, with the contact conductances."""
+    if sigma is None:
+        sigma = conductivity(model)
+    contact = fold(model.effects, AbstractContactEffect, model.contact)
+    if not isinstance(sigma, CoatedSheet):
+        return Coefficients(_fitting(model, "sigma", sigma), contact)
+    if model.coat is None:
+        raise ValueError("this model has no metal coat; discretise a scene whose effects have one")
+    sheet, coupling = _fitting(model, "sigma", sigma.sigma), _fitting(model, "coupling", sigma.coupling)
+    return Coefficients(sheet, contact, CoatCoefficients(jnp.asarray(sigma.metal, model.dtype), coupling))
+
+
+def _fitting(model: Model, name: str, values: Float[Array, " elements"]) -> Float[Array, " elements"]:
+    if values.shape != model.background.shape or values.dtype != model.dtype:
+        raise ValueError(
+            f"{name} is {values.dtype}{list(values.shape)}; this model needs "
+            f"{model.dtype}{list(model.background.shape)}, one value per element"
+        )
+    # A little below zero the matrix stays positive definite, and the voltages look like any others.
+    return jnp.where(values < 0, jnp.nan, values)
+
+
+def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
+    """Voltages of the protocol from the transfer matrix in ohm."""
+    source, sink, plus, minus = model.pattern.T
+    return model.current * (z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
+
+
+class DerivativeError(ValueError):
+    """A derivative with respect to an array that is not a parameter of the physics."""
+
+
+@jax.custom_jvp
+def _without_derivative(geometry: dict[str, Any]) -> dict[str, Any]:
+    """The same arrays. JAX asks for the rule below only if it differentiates with respect to one of them."""
+    return geometry
+
+
+@_without_derivative.defjvp
+def _(_: Any, __: Any) -> NoReturn:
+    raise DerivativeError(
+        "the model has no derivative with respect to its mesh and the matrices made of it (nodes, chart, centroids, "
+        "areas, system, coat); differentiate with respect to sigma, or to background, contact, current or the effects "
+        "of the model, one of which eqx.tree_at puts in place"
+    )
+
+
+@jax.custom_jvp
+def _perfect_contact(contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
+    """The same array, of a skin none of whose electrodes has a contact resistance."""
+    return contact
+
+
+@_perfect_contact.defjvp
+def _(_: Any, __: Any) -> NoReturn:
+    raise DerivativeError(
+        "no electrode of this model has a contact resistance, so that readings do not depend on its contacts; give the "
+        "electrodes a contact above zero to differentiate with respect to it"
+    )
+
+
+def _parameters_only(model: Model, theta: Coefficients) -> tuple[Model, Coefficients]:
+    """Model and coefficients that refuse derivatives which would be zero without a reason.
+
+    The derivative rule of the transfer matrix knows the coefficients alone, and nodes or areas do not occur in it.
+    """
+    names = ("nodes", "chart", "centroids", "areas", "system", "coat")
+    fixed = _without_derivative({name: getattr(model, name) for name in names})
+    system = model.system
+    if not system.contact_dofs.size and not system.near_element.size:
+        theta = theta._replace(contact=_perfect_contact(theta.contact))
+    return replace(model, **fixed), theta
+
+
+@verb
+def transfer(model: Model, theta: Coefficients) -> Float[Array, "electrodes electrodes"]:
+    """The transfer matrix Z in ohm; its derivatives of first order cost no further solve.
+
+    Raises:
+        DerivativeError: where JAX differentiates with respect to the mesh of the model or what is made of it.
+    """
+    model, theta = _parameters_only(model, theta)
+    z: Array = _transfer(theta, model) + jnp.diag(series_resistance(model.system, theta))
+    return z
+
+
+def series_resistance(system: System, theta: Coefficients) -> Float[Array, " electrodes"]:
+    """Contact resistance of discs taken in closed form (`electrodes.disc_resistance`), ohm; else 0.
+
+    With x = a sqrt(g / sigma), the radius over the transfer length:
+    ``R = I0(x) / I1(x) / (2 pi a sqrt(sigma g))``.
+    """
+    near = system.near_share * theta.sigma[system.near_element]
+    sigma = jnp.zeros_like(theta.contact).at[system.near_electrode].add(near)
+    lumped = system.lumped > 0
+    # Electrodes without a closed form take harmless numbers, so that no NaN enters a gradient.
+    radius, sigma, contact = (jnp.where(lumped, v, 1.0) for v in (system.lumped, sigma, theta.contact))
+    x = radius * jnp.sqrt(contact / sigma)
+    resistance = i0e(x) / i1e(x) / (2 * jnp.pi * radius * jnp.sqrt(sigma * contact))
+    return jnp.where(lumped, resistance, 0.0)
+
+
+@eqx.filter_custom_jvp
+def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes electrodes"]:
+    plan, matrix = _matrix(model, theta)
+    corner = model.solver.corner(plan, matrix.values) - matrix.lift
+    return corner[model.system.electrode_root][:, model.system.electrode_root]
+
+
+def _transfer_jvp(
+    primals: tuple[Coefficients, Model], tangents: tuple[Coefficients | None, Any]
+) -> tuple[Float[Array, "electrodes electrodes"], Float[Array, "electrodes electrodes"]]:
+    theta, model = primals
+    direction, _ = tangents
+    x = fields(model, theta)
+    slope = jnp.zeros_like(x.terminal)
+    if direction is not None:
+        slope = -energy(model, _filled(direction, theta), x)
+    return x.terminal, slope
+
+
+_transfer.def_jvp(_transfer_jvp)
+
+
+def _filled(direction: Coefficients, theta: Coefficients) -> Coefficients:
+    filled: Coefficients = jax.tree.map(lambda t, d: jnp.zeros_like(t) if d is None else d, theta, direction)
+    return filled
+
+
+@verb
+def fields(model: Model, theta: Coefficients) -> Fields:
+    """Fields of a unit current into each electrode; one factorisation, differentiable as `transfer` is."""
+    model, theta = _parameters_only(model, theta)
+    system = model.system
+    plan, matrix = _matrix(model, theta)
+    whole = inverse_columns(model.solver, plan, matrix.values)[:, system.electrode_root]
+    x = whole[: system.unknowns]
+    terminal = x[system.electrode_dof]
+    return Fields(
+        potential=x + _over(system, matrix.share[:, None] * terminal) - matrix.lift,
+        drop=x - _over(system, matrix.rest[:, None] * terminal),
+        terminal=terminal - matrix.lift,
+        coat=coat_fields(model.coat, theta.coat, whole, matrix.share) if model.coat and theta.coat else None,
+    )
+
+
+class Matrix(NamedTuple):
+    """The matrix for (w, U), as numbers.
+
+    | meaning                                                            | shape         | unit |
+    |--------------------------------------------------------------------|---------------|------|
+    | values of its lower triangle                                       | (nnz,)        | S    |
+    | share, rest: s and 1 - s of `discretise`                           | (electrodes,) | 1    |
+    | lift: potential of the grounded unknown per ampere into the sheet  | ()            | ohm  |
+    """
+
+    values: Float[Array, " nnz"]
+    share: Float[Array, " electrodes"]
+    rest: Float[Array, " electrodes"]
+    lift: Float[Array, ""]
+
+
+def _matrix(model: Model, theta: Coefficients) -> tuple[AbstractPlan, Matrix]:
+    """The matrix of the sheet, or of both where a coat touches it."""
+    matrix = assemble(model.system, theta)
+    if model.coat and theta.coat:
+        both = assemble_coat(model.coat, theta.coat, matrix.values, matrix.share)
+        return model.coat.plan, matrix._replace(values=both)
+    return model.system.plan, matrix
+
+
+def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, "n k"]:
+    """Each electrode's values at the unknowns under it, zero elsewhere."""
+    return jnp.concatenate([values, jnp.zeros_like(values[:1])])[system.under]
+
+
+def assemble(system: System, theta: Coefficients) -> Matrix:
+    """The matrix for (w, U).
+
+    The shares only choose the unknowns, and the ground the constant: no difference of potentials depends on
+    them, nor its derivatives.
+    """
+    sigma, contact = theta.sigma, theta.contact
+    chi, electrode = system.rim_chi, system.rim_electrode
+    around = sigma[system.rim_element, None] * system.rim_flux
+    sheet = jnp.zeros_like(contact).at[electrode].add(jnp.sum(chi * around, 1))
+    touch = contact * system.measure
+    total = jnp.where(touch > 0, touch + sheet, 1.0)
+    share, rest = jax.lax.stop_gradient((touch / total, sheet / total))
+
+    pieces = contact[system.contact_electrode]
+    load = pieces[:, None] * system.contact_mass.sum(2)
+    contributions = [
+        pieces[:, None, None] * system.contact_mass,
+        share[electrode, None] * around,
+        -rest[system.contact_electrode, None] * load,
+        share**2 * sheet + rest**2 * touch,
+        jnp.prod(share[system.bridge_electrodes], 1) * sigma[system.bridge_element] * system.bridge_flux,
+    ]
+    values = jnp.concatenate([jnp.sum(e.weight * sigma[e.element], 1) for e in system.sheet])
+    added = jnp.concatenate([c.ravel() for c in contributions])
+    values, lift = _grounded(system, values.at[system.slots].add(added, mode="drop"))
+    return Matrix(values, share, rest, lift)
+
+
+def _grounded(system: System, values: Float[Array, " nnz"]) -> tuple[Float[Array, " nnz"], Float[Array, ""]]:
+    """With the unknown that conducts best, of those fit, tied to zero by as much again; and what lifts it.
+
+    All current leaves there, so the unknown's potential is one over that conductance, whatever the rest.
+    """
+    own = jax.lax.stop_gradient(values[system.plan.diagonal[system.ground]])
+    best = jnp.argmax(own * system.ground_weight)
+    place = system.plan.diagonal[system.ground[best]]
+    return values.at[place].add(own[best]), 1 / own[best]
+
+
+def energy(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
+    """``A(theta; x_a, x_b)`` for all pairs of fields, in ohm."""
+    system = model.system
+    slopes = jnp.einsum("ekr,eka->era", system.slopes, x.potential[system.dofs])
+    sheet = jnp.einsum("era,erb->ab", theta.sigma[:, None, None] * slopes, slopes)
+    drop = x.drop[system.contact_dofs]
+    mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
+    own = sheet + jnp.einsum("pia,pij,pjb->ab", drop, mass, drop)
+    if model.coat and theta.coat and x.coat:
+        return own + coat_energy(model.coat, theta.coat, x.coat)
+    return own

@@ -1,0 +1,42 @@
+"""The pads: from the pressure on the sheet to the gage pressure in each pad."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import AbstractPadEffect, fold
+from ..geometry.shapes import Polygon
+from ..skin.description import Skin
+from .discretisation import Model
+
+CUTS_PER_SIDE = 8
+"""Each triangle is sampled at the square of this many places, so that the outline of a pad may cut through it."""
+
+
+def pad_response(skin: Skin, model: Model) -> Float[Array, "pads elements"]:
+    """Gage pressure in each pad per unit of pressure on each element, without unit.
+
+    An ideal pad feels the load on its footprint divided by its area; the scene's pad effects change
+    how strongly it feels each place.  ``pad_response(skin, model) @ pressure`` is (pads,) Pa.
+    """
+    corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
+    places = np.einsum("sc,ecd->esd", _barycentric(CUTS_PER_SIDE), corners)
+    coverage, distance = [], []
+    for pad in skin.pads:
+        outline = Polygon(pad.outline)
+        inside = outline.contains(places.reshape(-1, 2)).reshape(places.shape[:2])
+        coverage.append(inside.mean(1) / pad.area)
+        distance.append(outline.boundary_distance(corners.mean(1)))
+    shape = (len(skin.pads), len(corners))
+    felt = jnp.asarray(np.reshape(coverage, shape), model.dtype) * model.areas
+    places_in = jnp.asarray(np.reshape(distance, shape), model.dtype)
+    response: Array = felt * fold(model.effects, AbstractPadEffect, jnp.ones_like(felt), places_in)
+    return response
+
+
+def _barycentric(cuts: int) -> np.ndarray:
+    """Centroids of a triangle's cuts^2 congruent parts, (cuts^2, 3) barycentric."""
+    up = [(i + 1 / 3, j + 1 / 3) for i in range(cuts) for j in range(cuts - i)]
+    down = [(i + 2 / 3, j + 2 / 3) for i in range(cuts - 1) for j in range(cuts - 1 - i)]
+    xy = np.array(up + down) / cuts
+    return np.column_stack([1 - xy.sum(1), xy])

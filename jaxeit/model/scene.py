@@ -1,0 +1,66 @@
+"""A scene: a skin and the effects that act on it."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..effects import EFFECTS, AbstractEffect
+from ..skin.description import Skin
+from ..toml import TomlTable
+
+
+class SceneError(ValueError):
+    """A scene whose parts do not fit together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A skin and a tuple of effects; with none, the ideal sensor.
+
+    Effects that are not listed are neither computed nor compiled.
+
+    Raises:
+        SceneError: if ``effects`` is not a tuple of effects; if two of them are alternatives; if one names an electrode
+            that the skin does not have.
+    """
+
+    skin: Skin
+    effects: tuple[AbstractEffect, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.effects, tuple):
+            raise SceneError(f"effects must be a tuple, not {type(self.effects).__name__}")
+        for effect in self.effects:
+            if not isinstance(effect, AbstractEffect):
+                raise SceneError(f"{effect!r} is not an effect; make one, such as jaxeit.effects.LoadSpreading()")
+        _check_alternatives(self.effects)
+        _check_electrodes(self.effects, len(self.skin.electrodes))
+
+
+def _check_alternatives(effects: tuple[AbstractEffect, ...]) -> None:
+    names: dict[str, str] = {}
+    for effect in effects:
+        name = type(effect).__name__
+        if effect.alternative and effect.alternative in names:
+            raise SceneError(f"{names[effect.alternative]} and {name} both say {effect.alternative}; list one of them")
+        names[effect.alternative] = name
+
+
+def _check_electrodes(effects: tuple[AbstractEffect, ...], count: int) -> None:
+    for effect in effects:
+        for field in dataclasses.fields(effect):
+            numbers = np.asarray(getattr(effect, field.name)) if field.name == "electrode" else np.zeros(0)
+            if ((numbers < 0) | (numbers >= count)).any():
+                raise SceneError(
+                    f"{type(effect).__name__}: no electrode {numbers.max()}; the skin has 0 to {count - 1}"
+                )
+
+
+def read_effects(table: TomlTable) -> tuple[AbstractEffect, ...]:
+    """The effects of the tables [[effects]] of a scene file: ``type`` and its parameters.
+
+    Raises:
+        TomlError: for an effect or a parameter that does not exist, naming the nearest.
+    """
+    return tuple(map(EFFECTS.read, table.tables("effects")))

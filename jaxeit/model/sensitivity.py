@@ -1,0 +1,143 @@
+"""The Jacobian of the readings with respect to an image of the conductivity.
+
+`forward` gives the derivative rule of the transfer matrix, ``dZ[a, b] = -A(dtheta; x_a, x_b)``: no
+further solve.  As A is a sum over elements, the derivative for one coefficient of an image is that
+sum over its few elements, a product of the L fields at their nodes (`stiffness`).  All readings are
+differences of these L(L+1)/2 products, which are formed for a batch of coefficients at a time:
+nothing of the size elements times readings exists unless it is asked for.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Integer
+
+from .._compile import verb
+from ..effects import AbstractTerminalEffect, chosen
+from .bases import AbstractBasis, BasisMap, Elements
+from .discretisation import Model
+from .forward_model import CoatedSheet, Coefficients, coefficients, fields, series_resistance, transfer, voltages
+
+_BATCH = 512  # elements at once: their slopes and products stay in a core's cache
+
+
+def jacobian(
+    model: Model,
+    sigma: Float[Array, " elements"] | None = None,
+    basis: AbstractBasis | BasisMap | None = None,
+) -> Float[Array, "readings basis"]:
+    """Derivative of `forward` at ``sigma`` with respect to the coefficients of ``basis``, V/S.
+
+    One factorisation and one substitution for the L fields; the rest is products (see above).
+
+    Args:
+        sigma: (elements,) S; default: the untouched sheet.
+        basis: the image, such as `Pixels`; default: one coefficient per element.  Under jit pass a
+            `BasisMap` made outside with ``basis.on(model)``.
+
+    Raises:
+        ValueError: if ``sigma`` does not fit the model, or is that of two sheets.
+    """
+    if isinstance(sigma, CoatedSheet):
+        raise ValueError("sigma is that of a sheet and its coat; the Jacobian is for one sheet: give sigma.sigma")
+    basis = Elements() if basis is None else basis
+    image = basis if isinstance(basis, BasisMap) else basis.on(model)
+    return scaled_jacobian(model, None if sigma is None else jnp.asarray(sigma), image)
+
+
+@verb
+def scaled_jacobian(
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    scale: Float[Array, " elements"] | None = None,
+) -> Float[Array, "readings basis"]:
+    """`jacobian`, of coefficients that change each element's conductivity by ``scale`` times what the basis says."""
+    first, second = np.triu_indices(model.electrodes)
+    # dZ is symmetric: `pair` finds an unordered pair of electrodes among the columns.
+    number = np.zeros((model.electrodes, model.electrodes), np.int32)
+    number[first, second] = number[second, first] = np.arange(len(first))
+    pair = jnp.asarray(number)
+    slopes = _pair_slopes(model, sigma, image, np.stack([first, second], 1), scale)
+    by_pair: Array = jax.lax.optimization_barrier(slopes.T)
+    if chosen(model.effects, AbstractTerminalEffect):
+        z = transfer(model, coefficients(model, sigma))
+        at_terminals = partial(jax.jvp, partial(voltages, model), (z,))
+        felt: Array = jax.vmap(lambda column: at_terminals((column[pair],))[1], 1, 1)(by_pair)
+        return felt
+    source, sink, plus, minus = model.pattern.T
+    out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
+    found: Array = model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])
+    return found
+
+
+@verb
+def pair_jacobian(
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    electrodes: Integer[ArrayLike, "k 2"],
+    mixed: Float[Array, "r k"] | None = None,
+) -> Float[Array, "k basis"] | Float[Array, "r basis"]:
+    """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S, or of mixtures of them; see
+    `whitening`."""
+    slopes = _pair_slopes(model, sigma, image, electrodes).T
+    return slopes if mixed is None else mixed @ slopes
+
+
+def _pair_slopes(
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    pairs: Integer[ArrayLike, "k 2"],
+    scale: Float[Array, " elements"] | None = None,
+) -> Float[Array, "basis k"]:
+    """dZ for these pairs of electrodes."""
+    made_for, given = (image.elements, image.stiffness.unknowns), (len(model.areas), model.system.unknowns)
+    if made_for != given:
+        raise ValueError(
+            f"the basis lies on a model of {made_for[0]} elements and {made_for[1]} unknowns, this one has {given[0]} "
+            f"and {given[1]}; make basis.on(model) of this model"
+        )
+    theta, (first, second) = coefficients(model, sigma), jnp.asarray(pairs).T
+    potential = fields(model, theta).potential
+    if scale is None:
+        owner = None if image.single else image.coefficient
+        products = image.stiffness.products(potential, (first, second), owner, image.size)
+    else:
+        products = _by_elements(model, potential, image, (first, second), scale)
+    series = _series_slopes(model, theta, image, scale)
+    return jnp.where(first == second, series.T[:, first], 0) - products
+
+
+def _by_elements(
+    model: Model,
+    potential: Float[Array, "n electrodes"],
+    image: BasisMap,
+    pairs: tuple[Int[Array, " k"], Int[Array, " k"]],
+    scale: Float[Array, " elements"],
+) -> Float[Array, "basis k"]:
+    """What `Stiffness.products` returns, where each element counts ``scale`` times; batch after batch of lines."""
+    system, (first, second) = model.system, pairs
+    weights = image.weight * scale[image.element]
+    size = min(len(weights), max(1, _BATCH // image.element.shape[1]))
+
+    def line(element: Int[Array, " e"], weight: Float[Array, " e"]) -> Float[Array, " k"]:
+        slopes = jnp.einsum("ekr,eka->era", system.slopes[element], potential[system.dofs[element]])
+        return jnp.einsum("e,era,erb->ab", weight, slopes, slopes)[first, second]
+
+    found = jax.lax.map(lambda table: line(*table), (image.element, weights), batch_size=size)
+    return jnp.zeros((image.size, len(first)), potential.dtype).at[image.coefficient].add(found)
+
+
+def _series_slopes(
+    model: Model, theta: Coefficients, image: BasisMap, scale: Float[Array, " elements"] | None
+) -> Float[Array, "electrodes basis"]:
+    """Derivative of the contact resistances in closed form, each of which knows few elements."""
+    if not model.system.near_element.size:
+        return jnp.zeros((model.electrodes, image.size), model.dtype)
+    slopes = jax.jacrev(lambda sigma: series_resistance(model.system, theta._replace(sigma=sigma)))(theta.sigma)
+    return jax.vmap(image.restrict)(slopes if scale is None else scale * slopes)

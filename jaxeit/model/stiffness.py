@@ -1,0 +1,177 @@
+"""The sheet's stiffness, coefficient by coefficient of an image.
+
+What one coefficient contributes to the energy of two fields is ``A_p(x, y) = x^T K_p y`` with K_p the sum of its
+elements' stiffnesses at unit conductivity.  K_p only knows differences: with potentials taken from those of the first
+node, that node drops out.  Of the rest half is kept, ``K_p = H + H^T``, with few entries in each row of H, so that
+``x^T K_p y = x^T H y + (y^T H x)^T`` takes a row of products per node, where a sum over elements takes two per triangle
+(six on P2 elements), of which there are twice as many.
+"""
+
+from functools import partial
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Integer, Shaped
+from scipy import sparse
+
+from .._compile import stacked_product
+
+_ROWS = 4096  # of H at once: the potentials of their nodes stay in a core's cache
+_FEW = 40  # entries of H; of more, XLA's own loops make H x anew for each field and take twice as long as a library
+_ENTRIES = 1 << 18  # elements of lines that the host puts together at once
+
+
+class Stiffness(eqx.Module):
+    """H of each line of a `BasisMap`, whose elements have up to n + 1 nodes.
+
+    | meaning                                                       | shape          | unit |
+    |---------------------------------------------------------------|----------------|------|
+    | dofs: unknowns of the line; all potentials are from the first | (lines, n + 1) |      |
+    | column, entry of each row of H, the first node left out       | (lines, n, c)  | 1    |
+    """
+
+    dofs: Integer[Array, "lines n1"]
+    column: Integer[Array, "lines n c"]
+    entry: Float[Array, "lines n c"]
+    unknowns: int = eqx.field(static=True)
+
+    def products(
+        self,
+        potential: Float[Array, "unknowns k"],
+        pairs: tuple[Integer[Array, " r"], Integer[Array, " r"]],
+        coefficient: Integer[Array, " lines"] | None,
+        size: int,
+    ) -> Float[Array, "size r"]:
+        """``x_a^T K_p x_b`` for each coefficient p and these pairs (a, b) of fields, batch after batch of lines.
+
+        Args:
+            coefficient: of each line; None if line p is the one of p.
+        """
+        lines, rows, width = self.entry.shape
+        batch = max(1, min(-(-lines // 2), _ROWS // rows))  # a loop of one step XLA would make part of its surroundings
+        here = jnp.arange(batch)
+        product = stacked_product if rows * width <= _FEW else partial(jnp.einsum, "lna,lnb->lab")
+        first, second = pairs
+
+        def add(i: Int[Array, ""], sums: Float[Array, "size pairs"]) -> Float[Array, "size pairs"]:
+            start = jnp.minimum(i * batch, lines - batch)  # the last batch has lines of the one before
+
+            def cut(table: Shaped[Array, "lines ..."]) -> Shaped[Array, "batch ..."]:
+                return jax.lax.dynamic_slice_in_dim(table, start, batch)
+
+            dofs, column, entry = cut(self.dofs), cut(self.column), cut(self.entry)
+            x = potential.at[dofs].get(mode="promise_in_bounds")
+            x = x[:, 1:] - x[:, :1]
+            terms = (
+                entry[..., c, None] * x.at[here[:, None], column[..., c]].get(mode="promise_in_bounds")
+                for c in range(width)
+            )
+            half = product(x, cast(Array, sum(terms)))
+            found = half[:, first, second] + half[:, second, first]
+            if coefficient is None:
+                return jax.lax.dynamic_update_slice_in_dim(sums, found, start, 0)
+            fresh = start + here >= i * batch
+            return sums.at[cut(coefficient)].add(jnp.where(fresh[:, None], found, 0))
+
+        none = jnp.zeros((size, len(first)), potential.dtype)
+        found: Array = jax.lax.fori_loop(0, -(-lines // batch), add, none)
+        return found
+
+
+def stiffness(
+    element: Int[np.ndarray, "lines e"],
+    weight: Float[np.ndarray, "lines e"],
+    dofs: Int[np.ndarray, "elements k"],
+    slopes: Float[np.ndarray, "elements k r"],
+    unknowns: int,
+    dtype: np.dtype,
+) -> Stiffness:
+    """H of the elements of each line, times their weights; those of weight zero do not count.
+
+    Args:
+        dofs, slopes, unknowns: of a `System`.
+        dtype: of the entries; what rounding to it leaves of a right angle is no entry.
+    """
+    lines, step = len(element), max(1, _ENTRIES // element.shape[1])
+    cuts = [slice(start, start + step) for start in range(0, lines, step)]
+    rounding = 4 * float(np.finfo(dtype).eps)
+    parts = [_halves(element[cut], weight[cut], dofs, slopes, unknowns, rounding) for cut in cuts]
+    nodes = max(2, *(part.dofs.shape[1] for part in parts))
+    shape = lines, nodes - 1, max(1, *(part.slot.max(initial=-1) + 1 for part in parts))
+    table = np.empty((lines, nodes), np.uint32)
+    column, entry = np.zeros(shape, np.min_scalar_type(nodes)), np.zeros(shape, dtype)
+    for cut, part in zip(cuts, parts, strict=True):
+        table[cut] = np.pad(part.dofs, ((0, 0), (0, nodes - part.dofs.shape[1])), mode="edge")
+        at = cut.start + part.line, part.row, part.slot
+        column[at], entry[at] = part.column, part.entry
+    return Stiffness(jnp.asarray(table), jnp.asarray(column), jnp.asarray(entry), unknowns)
+
+
+class _Halves(NamedTuple):
+    """H of some lines: where its entries belong."""
+
+    dofs: np.ndarray  # (lines, nodes)
+    line: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    slot: np.ndarray
+    entry: np.ndarray
+
+
+def _halves(
+    element: np.ndarray, weight: np.ndarray, dofs: np.ndarray, slopes: np.ndarray, unknowns: int, rounding: float
+) -> _Halves:
+    lines = len(element)
+    line, place = np.nonzero(weight)
+    chosen, width = element[line, place], dofs.shape[1]
+    root = slopes[chosen]
+    own = weight[line, place, None, None] * (root @ root.swapaxes(1, 2))
+    # Every line has rows of its own, one for each unknown, in one sparse matrix of all.
+    known, row = np.unique(line[:, None] * unknowns + dofs[chosen], return_inverse=True)
+    row = row.reshape(-1, width)
+    owner, count = known // unknowns, len(known)
+    begin = np.searchsorted(owner, np.arange(lines))
+    local = np.arange(count) - begin[owner]
+    table = np.zeros((lines, local.max(initial=0) + 1), int)
+    table[:] = np.append(known % unknowns, 0)[begin, None]
+    table[owner, local] = known % unknowns
+
+    i, j = np.tril_indices(width)
+    places = np.maximum(row[:, i], row[:, j]), np.minimum(row[:, i], row[:, j])
+    # A corner that two nodes of an element share (an electrode) has the entry between them twice.
+    twice = (row[:, i] == row[:, j]) & (i != j)
+    values = np.where(twice, 2, 1) * own[:, i, j]
+    lower = sparse.coo_array((values.ravel(), tuple(place.ravel() for place in places)), (count, count))
+    lower = lower.tocsr().tocoo()  # sums what elements share
+    first, second = lower.row, lower.col
+    value = np.where(first == second, 0.5, 1) * lower.data
+    largest = np.zeros(lines)
+    np.maximum.at(largest, owner[first], np.abs(value))
+    kept = (local[first] > 0) & (local[second] > 0) & (np.abs(value) > rounding * largest[owner[first]])
+    first, second, value = first[kept], second[kept], value[kept]
+    first, second = _shared_out(first, second, count)
+    order = np.argsort(first, kind="stable")
+    first, second, value = first[order], second[order], value[order]
+    slot = np.arange(len(first)) - np.searchsorted(first, first)
+    return _Halves(table, owner[first], local[first] - 1, local[second] - 1, slot, value)
+
+
+def _shared_out(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs turned around until no row of so many has two entries more than one that it shares a pair with.
+
+    The longest row decides the width of the table: in meshes it goes down from 8 to 4, all but that of the mean.
+    """
+    while True:
+        entries = np.bincount(first, minlength=count)
+        excess = entries[first] - entries[second]
+        turned = np.flatnonzero(excess > 1)
+        if not len(turned):
+            return first, second
+        turned = turned[np.argsort(-excess[turned], kind="stable")]
+        for end in (first, second):  # one pair of a row at a time, so that none overshoots
+            turned = turned[np.sort(np.unique(end[turned], return_index=True)[1])]
+        first, second = first.copy(), second.copy()
+        first[turned], second[turned] = second[turned], first[turned]

@@ -1,0 +1,102 @@
+"""Which unknown is where: the numbering of the potentials of sheet and electrodes.
+
+The unknowns are the potentials ``u`` of the sheet and ``U`` of the complete electrodes.  Solving
+for them as they stand fails at both ends: at small contact resistance u and U differ by less than
+rounding, at large resistance the reverse substitution subtracts.  So under each electrode
+
+    u = w + s U chi,        s = G_c / (G_c + G_s)
+
+is solved for ``w`` and ``U`` instead, chi being one on the nodes under the electrode, G_c its contact
+conductance and G_s = chi^T K chi that of the sheet around it.  The diagonal entry of U becomes the
+conductance of the two in series, no entry is formed by subtraction, and after diagonal scaling the
+matrix is well conditioned from a perfect contact to none.  (Derived here; a congruence, so the
+matrix stays symmetric positive definite.)
+
+Potentials are known but for a constant, so one unknown is grounded: through a conductance as large as its
+own, which decides nothing but the constant.  The conductivities decide which one, as all potentials are
+then differences from that place (`forward_model.assemble`): one in a tear of the sheet would see the rest
+through what the tear still conducts, and readings would be the last digits of far larger numbers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..meshing.elements import Space
+from ..skin.electrodes import ElectrodeError, Touched
+
+RIM_PENALTY = 10.0
+"""How much less fit for the ground a place is at the sheet's size from its middle: it sees more resistance there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """The numbering of the unknowns.
+
+    | meaning                                                       | shape                  |
+    |---------------------------------------------------------------|------------------------|
+    | index: unknown of each dof of the space, then of each electrode | (dofs + electrodes,) |
+    | count of unknowns                                             | ()                     |
+    | coords: places of the unknowns, m; NaN for electrodes         | (unknowns, 2)          |
+    | electrode: unknown that is each electrode's potential         | (electrodes,)          |
+    | ground: unknowns that may be grounded                         | (g,)                   |
+    | ground_weight: how fit each is                                | (g,)                   |
+    | complete: electrodes with unknown contact, by their numbers   |                        |
+    """
+
+    index: np.ndarray
+    count: int
+    coords: np.ndarray
+    electrode: np.ndarray
+    ground: np.ndarray
+    ground_weight: np.ndarray
+    complete: list[int]
+
+
+def number_unknowns(space: Space, touched: Sequence[Touched], ground: int | None) -> Unknowns:
+    """The numbering for a space under these electrodes.
+
+    Args:
+        ground: the mesh node held at zero volts; None: chosen by the conductivities.
+
+    Raises:
+        ElectrodeError: for electrodes that share a node, or a ground that is under an electrode.
+    """
+    dofs = len(space.points)
+    alias, owner = np.arange(dofs + len(touched)), np.full(dofs, -1)
+    complete = []
+    for number, electrode in enumerate(touched):
+        patch = np.unique(electrode.pieces.dofs)
+        _claim(owner, patch, number)
+        if electrode.contact > 0 and not electrode.lumped:
+            complete.append(number)
+        else:  # a perfect contact, or one in series: one potential under the whole electrode
+            alias[patch] = alias[dofs + number] = patch[0]
+    names, index = np.unique(alias, return_inverse=True)
+    places = np.concatenate([space.chart, np.full((len(touched), 2), np.nan)])
+    grounded, weight = _grounds(space, np.isin(owner, complete), len(touched), ground)
+    return Unknowns(index, len(names), places[names], index[dofs:], index[grounded], weight, complete)
+
+
+def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
+    taken = owner[patch] >= 0
+    if taken.any():
+        other = int(owner[patch][taken][0])
+        raise ElectrodeError(
+            f"electrodes {other} and {number} touch the same mesh node; move them apart or make the mesh finer"
+        )
+    owner[patch] = number
+
+
+def _grounds(space: Space, covered: np.ndarray, electrodes: int, ground: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Which dofs may be grounded, and how fit each is: none that a complete electrode covers, and best those amid
+    the sheet; where electrodes cover all dofs, the electrodes themselves."""
+    if ground is None:
+        if covered.all():
+            return len(covered) + np.arange(electrodes), np.ones(electrodes)
+        away = np.linalg.norm(space.chart - space.chart.mean(0), axis=1) / np.ptp(space.chart)
+        return np.flatnonzero(~covered), 1 / (1 + RIM_PENALTY * away[~covered] ** 2)
+    if not (0 <= ground < len(covered)) or covered[ground]:
+        raise ElectrodeError(f"node {ground} cannot be the ground: it is under an electrode")
+    return np.array([ground]), np.ones(1)

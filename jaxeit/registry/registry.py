@@ -1,0 +1,242 @@
+"""Classes of one kind by the names that files and the command line use.
+
+A registry does not list its classes: it collects them from the room that defines them, so that a new class is known as
+soon as its module is imported.  Other packages add classes by entry points, and users name a class of their own by its
+import path, ``my_package.my_module:MyEffect``.  A TOML table (``type = "Creep"`` and its settings) and a word of the
+command line (``greit:width=0.01,radius=0.02``) go through the same reader.
+"""
+
+import difflib
+import functools
+import importlib
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields
+from importlib.metadata import EntryPoint, entry_points
+from inspect import isabstract, isclass
+from typing import Any, Generic, TypeVar, cast
+
+from ..toml import TomlTable
+from .settings import Part, settings_of, word
+
+T = TypeVar("T")
+
+
+class RegistryError(ValueError):
+    """A name that stands for no class of the kind that is asked for; the message says what to do."""
+
+
+class Registry(Mapping[str, type[T]], Generic[T]):
+    """Classes that can be chosen by name: a mapping from names to classes.
+
+    Shipped classes are the concrete classes derived from ``base`` in its room.  A class states its name as
+    ``name: ClassVar[str]``; without it, ``spell`` makes the name from the class's own.
+
+    Args:
+        base: from which all classes of this kind derive.
+        kind: what such a class is called in messages, such as "effect".
+        group: of entry points by which other packages add classes.
+        spell: makes the name of a class that states none; default: `TotalVariation` is "total-variation".
+        parts: registries of the choices that settings hold in turn.
+    """
+
+    def __init__(
+        self,
+        base: Callable[..., T],
+        kind: str,
+        group: str,
+        spell: Callable[[str], str] | None = None,
+        parts: tuple[Part, ...] = (),
+    ):
+        self.base = cast(type[T], base)  # declared as a function, since mypy refuses an abstract class as `type[T]`
+        self.kind, self.group, self.parts = kind, group, parts
+        self._spell = spell or kebab_case
+        self._room = base.__module__.rpartition(".")[0] + "."
+
+    def __repr__(self) -> str:
+        return f"Registry({self.base.__name__}: {', '.join(self.names)})"
+
+    # --- names and classes -------------------------------------------------------------------------------------------
+
+    @property
+    def shipped(self) -> dict[str, type[T]]:
+        """The classes of the room by name, in the order in which they are defined."""
+        modules = [module for name, module in list(sys.modules.items()) if name.startswith(self._room)]
+        classes = [(thing, module) for module in modules for thing in vars(module).values() if isclass(thing)]
+        own = [cast(type[T], kind) for kind, module in classes if kind.__module__ == module.__name__]
+        return {self._stated_name(kind): kind for kind in own if self._is_choice(kind)}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the shipped and of the installed classes."""
+        return tuple(dict.fromkeys((*self.shipped, *_entry_points(self.group))))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, name: str) -> type[T]:
+        if name not in self.names:
+            raise KeyError(name)
+        return self.find(name)
+
+    def find(self, name: str, allow_import: bool = False) -> type[T]:
+        """The class of a name: a shipped class, an installed class, or one named by its import path.
+
+        Args:
+            allow_import: whether the module of an import path may be imported, which runs its code.  Set it for what
+                the user wrote, not for what a session or calibration file holds.
+
+        Raises:
+            RegistryError: for an unknown name, naming the nearest; for an import path that gives no such class.
+        """
+        shipped, installed = self.shipped, _entry_points(self.group)
+        if name in shipped:
+            return shipped[name]
+        if name in installed:
+            return self._checked(_loaded(installed[name], self.kind), name)
+        if ":" in name:
+            return self._checked(self._by_path(name, allow_import), name)
+        near = difflib.get_close_matches(name, self.names, 1)
+        every = ", ".join(f'"{known}"' for known in self.names)
+        hint = f"did you mean {near[0]!r}?" if near else f"give one of {every}"
+        raise RegistryError(f"no {self.kind} {name!r}; {hint}")
+
+    def name_of(self, thing: T | type[T]) -> str:
+        """The name of a class or of an object's class; for a class that is neither shipped nor installed its path."""
+        kind: type = thing if isinstance(thing, type) else type(thing)
+        stated = self._stated_name(kind)
+        if self.shipped.get(stated) is kind:
+            return stated
+        path = f"{kind.__module__}:{kind.__qualname__}"
+        return next((point.name for point in _entry_points(self.group).values() if point.value == path), path)
+
+    def _is_choice(self, thing: Any) -> bool:
+        if not (isclass(thing) and issubclass(thing, self.base)):
+            return False
+        return not isabstract(thing) and not thing.__name__.startswith(("Abstract", "_"))
+
+    def _stated_name(self, kind: type) -> str:
+        stated = vars(kind).get("name")
+        return stated if isinstance(stated, str) else self._spell(kind.__name__)
+
+    def _by_path(self, path: str, allow_import: bool) -> Any:
+        module, _, attribute = path.partition(":")
+        if module not in sys.modules and not allow_import:
+            raise RegistryError(
+                f"{self.kind} {path!r} is code outside jaxeit, which a data file cannot import; import {module} first, "
+                f"or install it with an entry point of the group {self.group!r}"
+            )
+        try:
+            return functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+        except Exception as error:  # a user's module may raise anything
+            raise RegistryError(
+                f"{self.kind} {path!r} cannot be imported ({_one_line(error)}); check the path and PYTHONPATH"
+            ) from None
+
+    def _checked(self, thing: Any, name: str) -> type[T]:
+        if not self._is_choice(thing):
+            raise RegistryError(f"{self.kind} {name!r} is not a concrete class derived from {self.base.__name__}")
+        checked: type[T] = thing
+        return checked
+
+    # --- from text to objects and back -------------------------------------------------------------------------------
+
+    def make(self, text: str, allow_import: bool = False, **given: Any) -> T:
+        """The object that a word describes: a name, then settings as in ``sparse-bayes:steps=30``.
+
+        Args:
+            given: fields that do not come from the text.
+
+        Raises:
+            ValueError: for a name or a setting that does not exist, or a value of the wrong kind.
+        """
+        name, settings = split_word(text)
+        return _made(
+            self.find(name, allow_import), TomlTable(settings, f"{self.kind} {text!r}", allow_import), given, self.parts
+        )
+
+    def read(self, table: TomlTable, **given: Any) -> T:
+        """The object that a TOML table describes: ``type`` and its settings.
+
+        Raises:
+            TomlError: for a name or a setting that does not exist, or a value of the wrong kind.
+        """
+        name = table.get("type", lambda v: isinstance(v, str), f"the {self.kind}'s name")
+        try:
+            kind = self.find(name, table.allow_import)
+        except RegistryError as error:
+            raise table.error("type", str(error)) from None
+        return _made(kind, table, given, self.parts)
+
+    def settings(self, thing: T) -> dict[str, Any]:
+        """What `read` needs to make the object again: ``type``, and settings as numbers, texts, lists and tables."""
+        known = settings_of(type(thing), self.parts).values()
+        values = {setting.name: setting.plain(getattr(thing, setting.name)) for setting in known}
+        return {"type": self.name_of(thing)} | {name: value for name, value in values.items() if value is not None}
+
+    def text(self, thing: T) -> str:
+        """What `make` needs to make the object again: its name, and the settings that are not the default ones."""
+        known = settings_of(type(thing), self.parts).values()
+        values = {setting: getattr(thing, setting.name) for setting in known}
+        words = [f"{s.name}={word(s.plain(value))}" for s, value in values.items() if not s.is_default(value)]
+        return self.name_of(thing) + (":" + ",".join(words) if words else "")
+
+
+def kebab_case(name: str) -> str:
+    """``TotalVariation`` -> ``total-variation``, ``LCurve`` -> ``l-curve``."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "-", name).lower()
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _made(kind: type[T], table: TomlTable, given: Mapping[str, Any], parts: tuple[Part, ...]) -> T:
+    """An object of this class with the settings of the table; all other keys are refused."""
+    known = settings_of(kind, parts)
+    own = fields(cast(Any, kind))
+    required = {f.name for f in own if f.default is MISSING and f.default_factory is MISSING}
+    for missing in required - set(known) - set(given):
+        raise table.error(missing, f"text cannot give this field of {kind.__name__}; make the object in Python")
+    asked = [s for name, s in known.items() if name not in given and (name in required or table.has(name))]
+    values = {setting.name: setting.read(table) for setting in asked}
+    table.done()
+    try:
+        return kind(**values, **given)
+    except (ValueError, TypeError) as error:
+        raise table.error(kind.__name__, _one_line(error)) from None
+
+
+@functools.cache
+def _entry_points(group: str) -> Mapping[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def _loaded(point: EntryPoint, kind: str) -> Any:
+    try:
+        return point.load()
+    except Exception as error:  # another package may raise anything
+        raise RegistryError(f"{kind} {point.name!r}: {point.value} cannot be loaded ({_one_line(error)})") from None
+
+
+def split_word(text: str) -> tuple[str, dict[str, Any]]:
+    """The name, which may be an import path, and the settings of ``name:key=value,...``."""
+    name, _, rest = text.partition(":")
+    head, _, tail = rest.partition(":")
+    if head and "=" not in head:
+        name, rest = f"{name}:{head}", tail
+    pairs = [pair.partition("=") for pair in re.split(r",(?![^\[]*\])", rest) if pair.strip()]
+    return name, {key.strip(): _value(value.strip()) for key, _, value in pairs}
+
+
+def _value(text: str) -> Any:
+    """A value as TOML writes it; a text needs no quotes."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

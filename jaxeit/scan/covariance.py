@@ -1,0 +1,111 @@
+"""What the prior expects of a scan's readings, in units of their noise: the input of every choice of readings.
+
+How much a subset S of the readings tells of an image with prior covariance G is, in units of the readings' noise,
+
+    log det(1 + K_SS) = log det(G^-1 + J_S^T J_S) - log det(G^-1),        K = J G J^T,
+
+so that K, readings by readings, is all that a choice needs.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._compile import verb
+from ..imaging.methods import Problem
+from ..imaging.noise import InverseError, noise_weight
+from ..imaging.priors import AbstractPrior, Noser
+from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
+from ..model.discretisation import Model
+from ..model.sensitivity import jacobian
+
+
+def signal_covariance(
+    model: Model,
+    prior: AbstractPrior | None = None,
+    basis: AbstractBasis | BasisMap | None = None,
+    noise: Float[ArrayLike, " readings"] | None = None,
+    hyperparameter: Float[ArrayLike, ""] = 0.1,
+    *,
+    sigma: Float[Array, " elements"] | None = None,
+    region: Float[ArrayLike, "... basis"] | None = None,
+) -> Float[Array, "... readings readings"]:
+    """Covariance K of the readings that the prior expects, in units of their noise.
+
+    It works under jit, vmap and grad with respect to ``noise``, ``hyperparameter``, ``sigma`` and ``region``; traced
+    noise is not checked.
+
+    Args:
+        model: the scan's model.
+        prior, hyperparameter: as for `prepare`; default `Noser` and 0.1.
+        basis: default `Pixels`, 40 along x.  Under jit pass a `BasisMap`.
+        noise: standard deviation of each reading, (readings,) V; default: equal for all readings.
+        sigma: conductivity to linearise at, (elements,) S; default: the untouched sheet.
+        region: where changes are expected, (basis,) 0 to 1 (`around`, or the weights of `pad_masks`): the prior's
+            variances are multiplied by it.  The strength of the prior remains that of the whole sheet.  Leading axes
+            hold several regions.
+
+    Raises:
+        InverseError: if the noise is not one positive number per reading.
+    """
+    image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
+    flat = jnp.ones(image.size, model.dtype) if region is None else jnp.asarray(region, model.dtype)
+    return covariance_of_region(model, prior or Noser(), image, noise, hyperparameter, sigma)(flat)
+
+
+def covariance_of_region(
+    model: Model,
+    prior: AbstractPrior,
+    image: BasisMap,
+    noise: Float[ArrayLike, " readings"] | None,
+    hyperparameter: Float[ArrayLike, ""],
+    sigma: Float[Array, " elements"] | None,
+) -> Callable[[Float[Array, "... basis"]], Float[Array, "... readings readings"]]:
+    """`signal_covariance` as a function of the region, so that many regions share one Jacobian."""
+    readings = model.pattern.shape[0]
+    std = jnp.ones(readings) if noise is None else _standard_deviations(noise, readings)
+    strength = jnp.asarray(hyperparameter, model.dtype)
+    return partial(_signal, jacobian(model, sigma, image), std.astype(model.dtype), prior, strength, image)
+
+
+def _standard_deviations(noise: Float[ArrayLike, " readings"], readings: int) -> Float[Array, " readings"]:
+    if np.ndim(noise) != 1:
+        raise InverseError(
+            f"noise has shape {np.shape(noise)}; give one standard deviation per reading, ({readings},) V"
+        )
+    return jnp.asarray(noise_weight(noise, readings, np.ones(readings, bool)) ** -0.5)
+
+
+@verb
+def _signal(
+    j: Float[Array, "readings basis"],
+    std: Float[Array, " readings"],
+    prior: AbstractPrior,
+    hyperparameter: Float[Array, ""],
+    image: BasisMap,
+    region: Float[Array, "... basis"],
+) -> Float[Array, "... readings readings"]:
+    j = j / std[:, None]
+    problem = Problem(j, jnp.asarray(len(j), j.dtype), hyperparameter, prior, image.picture)
+    precision = problem.precision()
+    strength = problem.strength(precision.solve(j.T))
+
+    def within(region: Float[Array, " basis"]) -> Float[Array, "readings readings"]:
+        part = j * jnp.sqrt(region)
+        return part @ precision.solve(part.T) / strength
+
+    several: Array = jax.lax.map(within, region.reshape(-1, image.size))
+    return several.reshape(*region.shape[:-1], *several.shape[1:])
+
+
+def around(
+    picture: Picture | BasisMap, place: Float[ArrayLike, "2"] | Sequence[float], radius: float
+) -> Float[Array, " basis"]:
+    """A region for `signal_covariance`: ``exp(-d^2 / (2 radius^2))`` with the distance d from a place, m."""
+    square = jnp.sum((picture.centres - jnp.asarray(place, picture.centres.dtype)) ** 2, -1)
+    return jnp.exp(-0.5 * square / radius**2)

@@ -1,0 +1,220 @@
+"""Event-driven scans: pressure and the last contacts say which readings to take next."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from .._compile import require_known
+from ..fusion import pad_masks
+from ..geometry.shapes import Domain, Polygon
+from ..imaging.priors import Noser
+from ..model.bases import AbstractBasis, BasisMap, Pixels
+from ..model.discretisation import Model
+from ..skin.description import Skin
+from ..skin.protocol import ProtocolError
+from .covariance import around, covariance_of_region
+from .selection import AbstractSelection, choose_readings
+
+
+class ScanState(eqx.Module):
+    """State of an `EventScan` between two frames.
+
+    | meaning                                      | shape   |
+    |----------------------------------------------|---------|
+    | since: frames since the last whole scan      | ()      |
+    | pressed: pads that are in contact            | (pads,) |
+    """
+
+    since: Int[Array, ""]
+    pressed: Bool[Array, " pads"]
+
+
+class EventScan(eqx.Module):
+    """A scan that pressure directs: few readings at rest, and those around the contact while there is one.
+
+    `step` is pure and has fixed shapes, so that it runs under jit and `jax.lax.scan`.
+
+    | meaning                                                               | shape               | unit |
+    |-----------------------------------------------------------------------|---------------------|------|
+    | idle: readings of every frame                                         | (readings,)         |      |
+    | by_pad: readings while the pad is pressed at an unknown place         | (pads, readings)    |      |
+    | by_place: readings while this centre is the nearest one to a contact  | (regions, readings) |      |
+    | centres of the regions                                                | (regions, 2)        | m    |
+    | pad_of: whether the centre of the region lies on the pad              | (regions, pads)     |      |
+    | onset, release: change of pressure at which a contact begins and ends | (pads,)             | Pa   |
+    | every: frames from one whole scan to the next                         | ()                  |      |
+    """
+
+    idle: Bool[Array, " readings"]
+    by_pad: Bool[Array, "pads readings"]
+    by_place: Bool[Array, "regions readings"]
+    centres: Float[Array, "regions 2"]
+    pad_of: Bool[Array, "regions pads"]
+    onset: Float[Array, " pads"]
+    release: Float[Array, " pads"]
+    every: Int[Array, ""]
+
+    def start(self) -> ScanState:
+        """The state before the first frame, which is a whole scan."""
+        return ScanState(self.every - 1, jnp.zeros(len(self.by_pad), bool))
+
+    def step(
+        self,
+        state: ScanState,
+        pressure: Float[ArrayLike, " pads"],
+        places: Float[ArrayLike, "contacts 2"] | None = None,
+    ) -> tuple[ScanState, Bool[Array, " readings"]]:
+        """The next state, and the readings to take next.
+
+        Args:
+            state: from `start` or the step before.
+            pressure: change of each pad's pressure from rest, (pads,) Pa.  A pad whose pressure is not finite counts as
+                pressed.
+            places: contacts of the frame before, (contacts, 2) m, NaN for a contact that is not there; None: unknown.
+        """
+        pressure = jnp.asarray(pressure, self.onset.dtype)
+        limit = jnp.where(state.pressed, self.release, self.onset)
+        pressed = ~(pressure <= limit)
+        known, placed = self._around(places)
+        unknown = jnp.any(self.by_pad & (pressed & ~placed)[:, None], 0)
+        whole = state.since >= self.every - 1
+        readings = whole | self.idle | (jnp.any(pressed) & known) | unknown
+        return ScanState(jnp.where(whole, 0, state.since + 1), pressed), readings
+
+    def _around(
+        self, places: Float[ArrayLike, "contacts 2"] | None
+    ) -> tuple[Bool[Array, " readings"], Bool[Array, " pads"]]:
+        """Readings around the contacts, and the pads that the contacts lie on."""
+        if places is None:
+            return jnp.zeros_like(self.idle), jnp.zeros(len(self.by_pad), bool)
+        places = jnp.asarray(places, self.centres.dtype)
+        there = jnp.isfinite(places).all(-1)
+        square = jnp.sum((jnp.where(there[:, None], places, 0)[:, None] - self.centres) ** 2, -1)
+        nearest = jnp.argmin(square, 1)
+        known = jnp.any(self.by_place[nearest] & there[:, None], 0)
+        return known, jnp.any(self.pad_of[nearest] & there[:, None], 0)
+
+
+@dataclass(frozen=True, eq=False)
+class EventScanSettings:
+    """What an event-driven scan reads, and when.
+
+    | meaning                                                                          | default       | unit     |
+    |----------------------------------------------------------------------------------|---------------|----------|
+    | onset: change of pressure at which a contact begins, one for all pads or (pads,) |               | Pa       |
+    | release: change of pressure at which a contact ends, as onset                    | half of onset | Pa       |
+    | idle: readings of a frame at rest                                                | 24            |          |
+    | local: readings for a pad, or for the surroundings of a contact                  | 80            |          |
+    | every: frames from one whole scan to the next                                    | 50            |          |
+    | radius: of the surroundings of a contact (`around`)                              | 0.03          | m        |
+    | switch: cost of a change of the driven pair, as for `choose_readings`            | 0             | readings |
+    | selection: what makes a reading the next one                                     | `DOptimal`    |          |
+
+    The onset must be well above the noise of the pressure sensors. Centres of surroundings lie on a grid whose pitch is
+    the radius or less.
+
+    Raises:
+        ProtocolError: for a value out of range.
+    """
+
+    onset: Float[ArrayLike, "..."]
+    release: Float[ArrayLike, "..."] | None = None
+    idle: int = 24
+    local: int = 80
+    every: int = 50
+    radius: float = 0.03
+    switch: float = 0.0
+    selection: AbstractSelection | None = None
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or not self.radius > 0:
+            raise ProtocolError(
+                f"every is {self.every} and radius {self.radius}; give one frame or more, and a radius of "
+                "metres above 0"
+            )
+
+    def limits(self, pads: int) -> tuple[Float[np.ndarray, " pads"], Float[np.ndarray, " pads"]]:
+        """Onset and release of every pad, Pa.
+
+        Raises:
+            ProtocolError: if they are not finite and above zero, or a release is above its onset.
+        """
+        begins = np.broadcast_to(np.asarray(self.onset, float), pads)
+        ends = begins / 2 if self.release is None else np.broadcast_to(np.asarray(self.release, float), pads)
+        if not (np.isfinite(begins).all() and (ends > 0).all() and (begins >= ends).all()):
+            raise ProtocolError(
+                f"onset is {begins} and release {ends} Pa; give finite ones above 0, onset no less than release"
+            )
+        return begins, ends
+
+
+def prepare_event_scan(
+    model: Model,
+    skin: Skin,
+    settings: EventScanSettings,
+    *,
+    basis: AbstractBasis | BasisMap | None = None,
+    noise: Float[ArrayLike, " readings"] | None = None,
+    hyperparameter: float = 0.1,
+    sigma: Float[Array, " elements"] | None = None,
+) -> EventScan:
+    """Compute the tables of an `EventScan` for a skin with pads, on the host.
+
+    Args:
+        model: of the whole scan.
+        skin: with pads.
+        settings: what is read when.
+        basis: an image of pixels; default `Pixels`, 20 along x.
+        noise, hyperparameter, sigma: as for `signal_covariance`.
+
+    Raises:
+        ProtocolError: if the skin has no pads, or a setting is out of range.
+    """
+    require_known(
+        "prepare_event_scan", ProtocolError, model, settings.onset, settings.release, noise, hyperparameter, sigma
+    )
+    if not skin.pads:
+        raise ProtocolError(
+            f"the skin {skin.name!r} has no pads, and their pressure directs the scan; give a skin with pads"
+        )
+    begins, ends = settings.limits(len(skin.pads))
+    image = basis if isinstance(basis, BasisMap) else (basis or Pixels(20)).on(model)
+    centres = _grid(skin.domain, settings.radius)
+    kinds = {
+        "idle": (jnp.ones((1, image.size)), settings.idle),
+        "by_pad": (pad_masks(skin, image).weights, settings.local),
+        "by_place": (jnp.stack([around(image.picture, centre, settings.radius) for centre in centres]), settings.local),
+    }
+    expected, found = covariance_of_region(model, Noser(), image, noise, hyperparameter, sigma), {}
+    for name, (regions, count) in kinds.items():
+        covariances = (expected(region.astype(model.dtype)) for region in regions)
+        choices = [
+            choose_readings(k, count, settings.selection, pattern=model.pattern, switch=settings.switch)
+            for k in covariances
+        ]
+        rows = [choice.rows for choice in choices]
+        none = jnp.zeros((len(rows), model.pattern.shape[0]), bool)
+        found[name] = none.at[jnp.arange(len(rows))[:, None], jnp.stack(rows)].set(True)
+    return EventScan(
+        idle=found["idle"][0],
+        by_pad=found["by_pad"],
+        by_place=found["by_place"],
+        centres=jnp.asarray(centres, model.dtype),
+        pad_of=jnp.asarray(np.stack([Polygon(pad.outline).contains(centres) for pad in skin.pads], 1)),
+        onset=jnp.asarray(begins, model.dtype),
+        release=jnp.asarray(ends, model.dtype),
+        every=jnp.asarray(settings.every),
+    )
+
+
+def _grid(domain: Domain, pitch: float) -> Float[np.ndarray, "regions 2"]:
+    """Those centres of equal cells, with sides of at most ``pitch``, that lie on the sheet."""
+    low, high = np.asarray(domain.bounds)
+    cells = np.ceil((high - low) / pitch).astype(int)
+    axes = [lo + (hi - lo) * (np.arange(n) + 0.5) / n for lo, hi, n in zip(low, high, cells, strict=True)]
+    centres = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    return np.asarray(centres[domain.contains(centres)])

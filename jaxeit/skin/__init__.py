@@ -1,0 +1,42 @@
+"""The hardware of a skin: electrodes, protocol, pads and pressure sensors, read from one TOML file."""
+
+from .bolts import AreaPatch
+from .description import (
+    Pad,
+    PressureSensor,
+    Skin,
+    load_skin,
+    parse_skin,
+    shipped_skins,
+)
+from .edges import BoundaryPatch
+from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces, disc_resistance
+from .points import PointElectrode
+from .polygons import PolygonPatch, RectanglePatch
+from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
+from .rings import RingPatch
+
+__all__ = [
+    "ELECTRODES",
+    "AbstractAreaElectrode",
+    "AbstractElectrode",
+    "AreaPatch",
+    "BoundaryPatch",
+    "ElectrodeError",
+    "Pad",
+    "Pieces",
+    "PointElectrode",
+    "PolygonPatch",
+    "PressureSensor",
+    "Protocol",
+    "ProtocolError",
+    "RectanglePatch",
+    "RingPatch",
+    "Skin",
+    "adjacent",
+    "disc_resistance",
+    "load_skin",
+    "parse_skin",
+    "reciprocal_rows",
+    "shipped_skins",
+]

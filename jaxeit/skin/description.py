@@ -1,0 +1,195 @@
+"""The hardware as one TOML file: sheet, electrodes, protocol, pads and pressure sensors."""
+
+import math
+import os
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
+from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
+from ..registry import RegistryError
+from ..toml import TomlError, TomlTable, parse_toml, read_text
+from .electrodes import ELECTRODES, AbstractElectrode
+from .protocol import Protocol, adjacent
+
+
+@dataclass(frozen=True, eq=False)
+class Pad:
+    """One air-tight pad: its name and its outline, (corners, 2) m, counter-clockwise."""
+
+    name: str
+    outline: np.ndarray
+
+    @property
+    def area(self) -> float:
+        """In m^2."""
+        return Polygon(self.outline).area
+
+
+@dataclass(frozen=True)
+class PressureSensor:
+    """The span of a pad's gage pressure sensor and its stated accuracy, in Pa."""
+
+    minimum: float = 0.0
+    maximum: float = 34474.0
+    accuracy: float = 86.0
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A skin's hardware.  It knows nothing of physics or meshes.
+
+    | meaning                                   | unit           |
+    |-------------------------------------------|----------------|
+    | domain: the sheet's flat shape            | m              |
+    | sheet_resistance                          | ohm per square |
+    | electrodes, in the order of their numbers |                |
+    | protocol: one scan                        |                |
+    | pads, in the order of pressure channels   |                |
+    | surface: its shape in space; None: flat   |                |
+    | toml: the text that describes all this    |                |
+    """
+
+    name: str
+    domain: Domain
+    sheet_resistance: float
+    electrodes: tuple[AbstractElectrode, ...]
+    protocol: Protocol
+    pads: tuple[Pad, ...] = ()
+    pressure_sensor: PressureSensor = PressureSensor()
+    toml: str = ""
+    surface: AbstractSurface | None = None
+
+    def __post_init__(self) -> None:
+        self.protocol.check(len(self.electrodes))
+
+    @property
+    def electrode_positions(self) -> np.ndarray:
+        """Centres of the electrodes in the sheet's flat coordinates, (electrodes, 2) m."""
+        return np.array([e.centre(self.domain) for e in self.electrodes])
+
+
+def shipped_skins() -> tuple[str, ...]:
+    """Names that `load_skin` knows."""
+    files = resources.files(__package__).joinpath("skins").iterdir()
+    return tuple(sorted(f.name[:-5] for f in files if f.name.endswith(".toml")))
+
+
+def load_skin(name_or_path: str | Path) -> Skin:
+    """A shipped skin by name, or your own by the path of its TOML file.
+
+    Raises:
+        TomlError: naming the file, the key and the reason.
+    """
+    if str(name_or_path) in shipped_skins():
+        shipped = resources.files(__package__).joinpath("skins", f"{name_or_path}.toml")
+        return parse_skin(shipped.read_text(encoding="utf-8"), str(name_or_path))
+    path = Path(name_or_path)
+    if not os.path.isfile(path):  # False, too, for a name that no file can have
+        raise TomlError(
+            f"{name_or_path}: no such file, and not a shipped skin; shipped are {', '.join(shipped_skins())}"
+        )
+    return parse_skin(read_text(path), str(path), allow_import=True)
+
+
+def parse_skin(text: str, source: str = "skin", allow_import: bool = False) -> Skin:
+    """A skin from the text of its TOML file.
+
+    Args:
+        source: the name used in error messages.
+        allow_import: whether the text may name electrodes of your own by an import path, which runs their code; not
+            for text that a session or calibration file holds.
+
+    Raises:
+        TomlError: naming ``source``, the key and the reason.
+    """
+    return parse_toml(text, source, lambda table: _skin(table, text), allow_import)
+
+
+def _skin(top: TomlTable, text: str) -> Skin:
+    top.choice("format", "jaxeit-skin")
+    top.get("version", lambda v: v == 1, "1, the version this jaxeit reads")
+    name = top.get("name", lambda v: isinstance(v, str) and v != "", "the skin's name as text")
+    domain, sheet_resistance, surface = _sheet(top.table("sheet"))
+    electrodes = _electrodes(top.table("electrodes"), domain)
+    protocol = _protocol(top.table("protocol"), len(electrodes))
+    pads = tuple(_pad(table, domain) for table in top.tables("pads"))
+    sensor = PressureSensor()
+    if top.has("pressure_sensor"):
+        sensor = _sensor(top.table("pressure_sensor"))
+    top.done()
+    return Skin(name, domain, sheet_resistance, electrodes, protocol, pads, sensor, text, surface)
+
+
+def _sheet(table: TomlTable) -> tuple[Domain, float, AbstractSurface | None]:
+    shape = table.choice("shape", "rectangle", "disc", "polygon")
+    domain: Domain
+    if shape == "rectangle":
+        domain = Rectangle(*table.vector("size", 2, "[width, height] in m"))
+    elif shape == "disc":
+        domain = Disc(table.positive("radius", "a length in m"))
+    else:
+        domain = Polygon(table.array("vertices", 2, "corners [[x, y], ...] in m"))
+    resistance = table.positive("sheet_resistance", "ohm per square")
+    surface = _surface(table.table("surface"), domain) if table.has("surface") else None
+    table.done()
+    return domain, resistance, surface
+
+
+def _surface(table: TomlTable, domain: Domain) -> AbstractSurface:
+    kind = table.choice("kind", "cylinder", "sphere")
+    radius = table.positive("radius", "a length in m")
+    table.done()
+    (x0, y0), (x1, y1) = domain.bounds
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    return Cylinder(radius, x) if kind == "cylinder" else Sphere(radius, (x, y))
+
+
+def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ...]:
+    name = table.get("kind", lambda v: isinstance(v, str), "one of " + ", ".join(f'"{n}"' for n in ELECTRODES))
+    try:
+        kind = ELECTRODES.find(name, table.allow_import)
+    except RegistryError as error:
+        raise table.error("kind", str(error)) from None
+    electrodes = kind.read(table, domain)
+    table.done()
+    return electrodes
+
+
+def _protocol(table: TomlTable, electrodes: int) -> Protocol:
+    if table.has("rows"):
+        rows = table.array("rows", 4, "[[drive+, drive-, sense+, sense-], ...]")
+    else:
+        table.choice("pattern", "adjacent")
+        rows = adjacent(electrodes)
+    current = table.positive("current", "the amplitude in A")
+    frequency = table.number("frequency", "Hz, zero or more", 0.0)
+    reading_time = table.number("reading_time", "s, zero or more", 1e-5)
+    table.done()
+    return Protocol(rows, current, frequency, reading_time)
+
+
+def _pad(table: TomlTable, domain: Domain) -> Pad:
+    name = table.get("name", lambda v: isinstance(v, str), "the pad's name as text")
+    if table.has("rectangle"):
+        x0, y0, x1, y1 = table.vector("rectangle", 4, "[x0, y0, x1, y1] in m")
+        if not (x0 < x1 and y0 < y1):
+            raise table.error("rectangle", "the second corner must lie right of and above the first")
+        outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    else:
+        outline = Polygon(table.array("polygon", 2, "corners [[x, y], ...] in m")).corner_points
+    table.done()
+    return Pad(name, np.asarray(outline, float))
+
+
+def _sensor(table: TomlTable) -> PressureSensor:
+    low = table.number("minimum", "Pa", 0.0, least=-math.inf)
+    high = table.number("maximum", "Pa", least=-math.inf)
+    accuracy = table.number("accuracy", "Pa, zero or more", 0.0)
+    if not high > low:
+        raise table.error("maximum", f"is {high} Pa, not above the minimum, {low} Pa")
+    table.done()
+    return PressureSensor(low, high, accuracy)

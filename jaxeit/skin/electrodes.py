@@ -1,0 +1,174 @@
+"""Electrode models: how a terminal of the instrument meets the sheet.
+
+Every model states what the mesh must follow (`footprint`), which pieces of the mesh it touches
+(`pieces`), and how a skin file describes it (`read`).  A complete electrode has a contact conductance
+``g`` per unit of its measure (area for a bolt, length for an edge electrode) and obeys, with u the
+sheet potential and U its own,
+
+    -div(sigma grad u) + sum_l chi_l g_l (u - U_l) = 0,      integral over E_l of g_l (U_l - u) = I_l
+
+(area patch: current enters through the film from above; boundary patch: through its edge, which is
+the complete electrode model of Somersalo, Cheney and Isaacson 1992).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from scipy.special import ive
+
+from ..geometry.shapes import Domain
+from ..meshing.elements import Space
+from ..meshing.footprints import AbstractFootprint
+from ..registry import Registry
+from ..toml import TomlTable
+
+
+class ElectrodeError(ValueError):
+    """An electrode that cannot be built on this sheet or mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Where one electrode touches a function space.
+
+    | meaning                                         | shape  | unit   |
+    |-------------------------------------------------|--------|--------|
+    | dofs of each triangle or boundary edge touched  | (p, k) |        |
+    | mass: integrals of phi_i phi_j over each        | (p, k, k) | m^2 or m |
+    """
+
+    dofs: np.ndarray
+    mass: np.ndarray
+
+
+class AbstractElectrode(ABC):
+    """One terminal.  ``contact`` is its specific contact resistance; 0 means a perfect contact.
+
+    ``name`` is the ``kind`` of such electrodes in a skin file.
+    """
+
+    name: ClassVar[str]
+    contact: float
+
+    @abstractmethod
+    def footprint(self, segments: int) -> AbstractFootprint:
+        """What the mesh must follow, discs as polygons of ``segments`` sides."""
+
+    @abstractmethod
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        """The parts of the space that it touches.
+
+        Raises:
+            ElectrodeError: where the mesh does not follow it.
+        """
+
+    def elements(self, space: Space) -> np.ndarray:
+        """Numbers of the triangles under it; none for an electrode without area."""
+        return np.zeros(0, int)
+
+    def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
+        """Radius in m of the disc whose contact is taken in closed form because the mesh does not
+        resolve it; 0 where the mesh does, or where there is no closed form."""
+        return 0.0
+
+    @abstractmethod
+    def centre(self, domain: Domain) -> np.ndarray:
+        """Its middle in the sheet's flat coordinates, (2,) m."""
+
+    @classmethod
+    @abstractmethod
+    def read(cls, table: TomlTable, domain: Domain) -> tuple["AbstractElectrode", ...]:
+        """The electrodes that the table ``[electrodes]`` of a skin file describes.
+
+        Raises:
+            TomlError: naming the key and the reason.
+        """
+
+
+class AbstractAreaElectrode(AbstractElectrode):
+    """An electrode whose current enters the sheet under its whole area."""
+
+    @abstractmethod
+    def elements(self, space: Space) -> np.ndarray:
+        """Numbers of the triangles under it."""
+
+    def pieces(self, space: Space, domain: Domain) -> Pieces:
+        inside = self.elements(space)
+        return Pieces(space.dofs[inside], space.element_mass(inside))
+
+
+ELECTRODES = Registry(AbstractElectrode, "electrode", "jaxeit.electrodes")
+"""Electrodes by the names that skin files use as ``kind``."""
+
+
+class Touched(NamedTuple):
+    """What one electrode is on a function space.
+
+    | meaning                                                      | shape | unit |
+    |--------------------------------------------------------------|-------|------|
+    | pieces that it touches                                       |       |      |
+    | lumped: radius of the disc whose contact is in closed form, or 0 | () | m   |
+    | elements: triangles under that disc                          | (n,)  |      |
+    | contact: specific contact resistance                         | ()    | ohm m^2 or ohm m |
+    """
+
+    pieces: Pieces
+    lumped: float
+    elements: np.ndarray
+    contact: float
+
+
+def touched(
+    electrodes: Sequence[AbstractElectrode], space: Space, domain: Domain, sheet_resistance: float
+) -> list[Touched]:
+    """What each of these electrodes is on a function space.
+
+    Raises:
+        ElectrodeError: where the mesh does not follow an electrode.
+    """
+    out = []
+    for electrode in electrodes:
+        pieces, lumped = electrode.pieces(space, domain), electrode.lumped_radius(space, sheet_resistance)
+        under = electrode.elements(space) if lumped else np.zeros(0, int)
+        out.append(Touched(pieces, lumped, under, electrode.contact))
+    return out
+
+
+def require_positive(**values: float) -> None:
+    """Raise ElectrodeError, naming it, for a value that is not a positive number."""
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ElectrodeError(f"an electrode's {name} is {value}; give a positive number")
+
+
+def require_contact(value: float, unit: str) -> None:
+    """Raise ElectrodeError for a contact resistance that is neither zero nor a positive number."""
+    if not (np.isfinite(value) and value >= 0):
+        raise ElectrodeError(f"an electrode's contact is {value} {unit}; give zero (perfect) or a positive number")
+
+
+def require_covered(space: Space, elements: np.ndarray, area: float, what: str) -> None:
+    """Raise ElectrodeError unless these triangles cover at least half of ``area``, m^2."""
+    if not len(elements):
+        raise ElectrodeError(f"the mesh has no triangle under {what}")
+    covered = space.mesh.areas[elements].sum() / area
+    if covered < 0.5:
+        raise ElectrodeError(
+            f"the mesh covers {100 * covered:.0f} % of {what}; move it inside the sheet, or make the mesh finer there"
+        )
+
+
+def disc_resistance(radius: float, contact: float, sheet_resistance: float) -> float:
+    """Resistance in ohm from a disc electrode into the sheet around it, in closed form.
+
+    ``R_s L_T / (2 pi a) * I0(a / L_T) / I1(a / L_T)`` with the transfer length
+    ``L_T = sqrt(contact / R_s)``: the modified Bessel solution of ``laplace(u) = (u - U) / L_T^2``
+    under the disc.  Radius in m, contact in ohm m^2, sheet resistance in ohm per square.
+    """
+    require_positive(radius=radius, contact=contact, sheet_resistance=sheet_resistance)
+    transfer = np.sqrt(contact / sheet_resistance)
+    ratio = radius / transfer
+    return float(sheet_resistance * transfer / (2 * np.pi * radius) * ive(0, ratio) / ive(1, ratio))

@@ -1,0 +1,40 @@
+"""Keys that several kinds of electrodes share in a skin file: where they are, and their contact."""
+
+import numpy as np
+
+from ..geometry.shapes import Domain
+from ..toml import TomlTable
+
+
+def read_positions(table: TomlTable) -> list[tuple[float, float]]:
+    """The places of ``positions`` or of the table ``grid``, m."""
+    given = table.has("positions")
+    rows = table.array("positions", 2, "[[x, y], ...] in m") if given else _grid(table.table("grid"))
+    return [(float(x), float(y)) for x, y in rows]
+
+
+def read_positions_inside(table: TomlTable, domain: Domain) -> list[tuple[float, float]]:
+    """The places of ``positions`` or ``grid``, all of them on the sheet, m."""
+    positions = read_positions(table)
+    outside = ~domain.contains(np.array(positions))
+    if outside.any():
+        number = int(np.argmax(outside))
+        raise table.error("positions", f"electrode {number} at {positions[number]} m lies outside the sheet")
+    return positions
+
+
+def read_area_contact(table: TomlTable) -> float:
+    """The specific contact resistance ``contact``, ohm m^2."""
+    return table.number("contact", "ohm m^2, zero or more")
+
+
+def _grid(table: TomlTable) -> np.ndarray:
+    columns, rows = table.count("columns"), table.count("rows")
+    pitch = table.positive("pitch", "a length in m")
+    origin = table.vector("origin", 2, "[x, y] of the first electrode in m")
+    order = table.choice("order", "snake", "rows", default="rows")
+    table.done()
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    if order == "snake":
+        x[1::2] = x[1::2, ::-1]
+    return np.stack([x.ravel(), y.ravel()], 1) * pitch + origin

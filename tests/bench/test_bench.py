@@ -1,0 +1,344 @@
+"""The simulated bench: its motion, its frames from few solves, its blocks, its presets."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.bench import (
+    Bench,
+    BenchError,
+    Companion,
+    Timing,
+    grid,
+    load_bench,
+    measure_costs,
+    presets,
+    render_costs,
+    simulate,
+    simulate_contacts,
+    streams,
+)
+from calib.bench.interpolation import FrameInterpolant, ParameterBox, enclosing_boxes
+from calib.bench.motion import loads_at, planned_motion
+from calib.bench.streams import simulated_streams
+
+DRAFT = je.Fidelity.draft()
+QUICK = Timing(rest=0.1, ramp=0.3, hold=0.3, release=0.2, recovery=0.1)
+SHEET = (je.effects.LoadSpreading(), je.effects.ContactPiezoresistance())
+
+
+def _bench(skin, *effects, sites=((0.06, 0.07), (0.13, 0.1)), **changes):
+    given = {"timing": QUICK, "blank": 0.2, "eit_rate": 50.0, "pad_rate": 100.0, "toml": "x"} | changes
+    return Bench(je.Scene(skin, effects), np.array(sites), np.array([10.0, 20.0]), **given)
+
+
+def _all(recording, blocks=None):
+    """A stream from its first block to the last."""
+    state, out = recording.start(), []
+    for number in range(recording.blocks if blocks is None else blocks):
+        samples, state = recording.block(number, state)
+        out.append(samples)
+    return streams.SampleBlock(*(np.concatenate(parts) for parts in zip(*out, strict=True)))
+
+
+def test_a_tip_goes_down_slides_and_comes_up(skin):
+    bench = _bench(skin, slide=(0.05, 0.0), companions=(Companion((0.0, 0.03), 5.0, delay=0.1),))
+    assert bench.period == pytest.approx(1.1)
+    start = 0.2 + 1.1
+    now = loads_at(planned_motion(bench), start + np.array([0.0, 0.1, 0.25, 0.4, 0.55, 0.7, 0.8, 0.9, 1.0]))
+    np.testing.assert_allclose(now.load[:, 0], [0, 0, 10, 20, 20, 20, 10, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(now.load[:, 1], [0, 0, 2.5 - 2.5 * np.cos(np.pi / 6), 3.75, 5, 5, 5, 2.5, 0], atol=1e-9)
+    np.testing.assert_allclose(now.progress[[3, 4, 5], 0], [0, 0.5, 1], atol=1e-12)
+    assert (np.diff(now.phase) >= 0).all()
+
+
+def test_rest_loading_hold_and_unloading_share_a_box():
+    low = np.array([[0, 0], [0.1, 0], [20, 0], [0.2, 0], [0, 0], [np.inf] * 2], float)
+    high = np.array([[0, 0], [19, 0], [20, 0], [20, 0], [0, 0], [-np.inf] * 2], float)
+    found, owner = enclosing_boxes(low, high, np.array([20.0, 1.0]))
+    assert len(found) == 1
+    np.testing.assert_array_equal(owner[:5], 0)
+    np.testing.assert_array_equal([found[0].low, found[0].high], [[0, 0], [20, 0]])
+
+
+def test_a_slide_has_a_box_of_its_own():
+    low = np.array([[0, 0], [0, 0], [20, 0], [0, 1]], float)
+    high = np.array([[0, 0], [20, 0], [20, 1], [20, 1]], float)
+    found, owner = enclosing_boxes(low, high, np.array([20.0, 1.0]))
+    assert len(found) == 3
+    assert owner[0] == owner[1] != owner[2] != owner[3]
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+def test_interpolants_keep_their_tolerance(tolerance):
+    """Against the function itself, smooth in two numbers with one at rest."""
+
+    def exact(q):
+        return np.stack([1 / (1 + q[:, 0] / 7), np.exp(-q[:, 2]) * np.sqrt(3 + q[:, 0]), 0 * q[:, 0] + 2], 1)
+
+    box = ParameterBox(np.array([0.0, 5.0, -0.5]), np.array([20.0, 5.0, 1.0]))
+    rest = exact(np.zeros((1, 3)))[0]
+    made = FrameInterpolant(box, exact, rest, tolerance)
+    q = box.low + np.random.default_rng(0).random((200, 3)) * (box.high - box.low)
+    change = np.abs(exact(q) - rest).max()
+    assert np.abs(made(q[:, None]) - exact(q)).max() < 2 * tolerance * change
+    each = made(np.stack([q, q[::-1], q], 1))  # readings at times of their own
+    np.testing.assert_allclose(each[:, 0], made(q[:, None])[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(each[:, 1], made(q[::-1, None])[:, 1], rtol=1e-12)
+    assert made.solves < 600
+
+
+def test_frames_from_few_solves_are_those_of_a_solve_each(skin):
+    """With a tip that slides, a second one, hysteresis, and readings taken one after the other."""
+    few = dataclasses.replace(skin.protocol, pattern=skin.protocol.pattern[::100], reading_time=1e-3)
+    second = Companion((0.05, 0.0), 8.0, delay=0.3)
+    bench = _bench(
+        dataclasses.replace(skin, protocol=few), *SHEET, je.effects.Hysteresis(), je.effects.ScanSkew(),
+        slide=(0.02, 0.01), companions=(second,), sites=((0.06, 0.07),), eit_rate=25.0,
+    )  # fmt: skip
+    joined = simulated_streams(bench, DRAFT).eit
+    each = simulated_streams(bench, dataclasses.replace(DRAFT, interpolation=0)).eit
+    got, exact = _all(joined).values, _all(each).values
+    assert np.abs(got - exact).max() < 1e-4 * np.abs(exact - exact[0]).max()
+
+
+def test_a_press_takes_few_solves(skin):
+    made = simulated_streams(_bench(skin, *SHEET, je.effects.Hysteresis(), eit_rate=500.0), DRAFT).eit
+    _all(made)
+    assert made.samples > 1000
+    assert made.solves == 2 * 9
+
+
+@pytest.mark.slow
+def test_a_scan_takes_its_readings_one_after_the_other(skin):
+    """Reading m of a skewed frame is reading m of a frame taken at its own time."""
+    skewed = simulated_streams(_bench(skin, *SHEET, je.effects.ScanSkew()), DRAFT).eit
+    plain = simulated_streams(_bench(skin, *SHEET), DRAFT).eit
+    at = np.array([0.45])
+    some = [0, 200, 549]
+    late = [plain.quantity(0, at + m * skin.protocol.reading_time, ())[0][0, m] for m in some]
+    got, frame = skewed.quantity(0, at, ())[0][0], plain.quantity(0, at, ())[0][0]
+    size = np.abs(frame - plain.resting).max()
+    np.testing.assert_allclose(got[some], late, rtol=0, atol=1e-9 * size)
+    assert np.abs(got - frame).max() > 2e-2 * size
+
+
+def test_pads_and_load_cell_feel_all_tips(skin):
+    bench = _bench(skin, je.effects.LoadSpreading(width=0.02), companions=(Companion((0.0, 0.08), 5.0),))
+    made = simulated_streams(bench, DRAFT)
+    force, pads = _all(made.force).values, _all(made.pressure).values
+    assert force.max() == pytest.approx(25.0)
+    # An ideal pad holds the load on it over its area; the tips stand whole on pads of 0.01 m2.
+    np.testing.assert_allclose(pads.sum(1), force[:, 0] / skin.pads[0].area, rtol=0.03, atol=1.0)
+
+
+def test_effects_of_the_stage_and_the_clock_reach_the_file(skin, tmp_path):
+    unsteady = je.effects.StageError(position=1e-3, jitter=0.0, ripple=0.0)
+    bench = _bench(skin, unsteady, je.effects.DropOut(probability=0.2), je.effects.ClockError(jitter=0.01))
+    with calib.open_session(simulate(bench, tmp_path / "s.h5", fidelity=DRAFT)) as session:
+        eit = session.stream("eit")
+        moved = session.truth["contact_position"] - bench.sites
+        assert 1e-5 < np.abs(moved).max() < 5e-3
+        assert len(eit) < bench.duration * 50
+        gaps = (eit.status() & int(calib.session.Status.gap_before)) > 0
+        device = eit.time_device.astype(float) * 1e-6
+        assert gaps[1:].sum() > 2
+        np.testing.assert_array_equal(gaps[1:], np.diff(device) > 1.5 / 50)
+        late = eit.time * 1e-9 - device / (1 + 50e-6)
+        assert late.min() >= 0.0009
+        assert len(session.stream("force")) == int(bench.duration * 100)
+
+
+class _Killed(Exception):
+    pass
+
+
+def _stop_after(count):
+    def progress(work):
+        for number, item in enumerate(work):
+            if number == count:
+                raise _Killed
+            yield item
+
+    return progress
+
+
+def test_a_run_that_was_killed_goes_on_and_gives_the_same_file(skin, tmp_path, monkeypatch):
+    monkeypatch.setattr(streams, "BLOCK_ROWS", 16)
+    effects = (
+        *SHEET,
+        je.effects.Hysteresis(),
+        je.effects.PadLeak(time=1.0),
+        je.effects.BaselineDrift(rate=0.01),
+        je.effects.Noise(std=1e-5),
+    )
+    bench = _bench(skin, *effects, sites=((0.06, 0.07),))
+    whole = simulate(bench, tmp_path / "whole.h5", fidelity=DRAFT).read_bytes()
+    made = []
+    for count in (3, 5, 9):
+        with pytest.raises(_Killed):
+            simulate(bench, tmp_path / "cut.h5", fidelity=DRAFT, progress=_stop_after(count))
+        assert not (tmp_path / "cut.h5").exists()
+        made.append({p.name: p.stat().st_mtime_ns for p in (tmp_path / "cut.h5.part").iterdir()})
+    assert made[0].items() <= made[1].items() <= made[2].items()  # nothing was made twice
+    assert simulate(bench, tmp_path / "cut.h5", fidelity=DRAFT).read_bytes() == whole
+    assert {p.name for p in tmp_path.iterdir()} == {"whole.h5", "cut.h5"}
+
+
+@pytest.mark.slow
+def test_the_remains_of_another_scene_are_not_used(skin, tmp_path):
+    first, second = (_bench(skin, *SHEET, sites=((x, 0.07),)) for x in (0.06, 0.1))
+    with pytest.raises(_Killed):
+        simulate(first, tmp_path / "s.h5", fidelity=DRAFT, progress=_stop_after(2))
+    path = simulate(second, tmp_path / "s.h5", fidelity=DRAFT)
+    assert path.read_bytes() == simulate(second, tmp_path / "t.h5", fidelity=DRAFT).read_bytes()
+
+
+def test_a_folder_in_the_way_is_left_alone(skin, tmp_path):
+    (tmp_path / "s.h5.part").mkdir()
+    (tmp_path / "s.h5.part" / "thesis.txt").write_text("dear reader")
+    with pytest.raises(BenchError, match="exists and was not made by this program"):
+        simulate(_bench(skin), tmp_path / "s.h5", fidelity=DRAFT)
+    assert (tmp_path / "s.h5.part" / "thesis.txt").exists()
+
+
+@pytest.mark.slow
+def test_blocks_do_not_show(skin, monkeypatch):
+    """Histories handed from block to block are those of one run; only the draws of chance differ."""
+    bench = _bench(
+        skin,
+        *SHEET,
+        je.effects.Hysteresis(),
+        je.effects.Creep(),
+        je.effects.PadLeak(time=1.0),
+        je.effects.GasRelaxation(),
+    )
+    whole = simulated_streams(bench, DRAFT)
+    expected = [_all(recording).values for _, recording in whole]
+    monkeypatch.setattr(streams, "BLOCK_ROWS", 16)
+    for (_, recording), values in zip(simulated_streams(bench, DRAFT), expected, strict=True):
+        scale = np.abs(values).max()
+        np.testing.assert_allclose(_all(recording).values, values, rtol=0, atol=1e-9 * scale)
+
+
+@pytest.mark.slow
+def test_warmth_is_simulated_where_it_is_felt(skin):
+    bench = _bench(
+        skin, *SHEET, je.effects.SheetTemperature(coefficient=0.01), sites=((0.06, 0.07),), temperature_rate=5.0
+    )
+    warm = simulated_streams(bench, DRAFT).eit
+    assert warm._feels_warmth
+    frames = _all(warm).values
+    last = 5.0 * (warm.samples - 1) / 50
+    expected = je.forward(warm.model, je.conductivity(warm.model, None, last))
+    np.testing.assert_allclose(frames[-1], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    unmoved = simulated_streams(_bench(skin, *SHEET, temperature_rate=5.0), DRAFT).eit
+    assert not unmoved._feels_warmth
+
+
+@pytest.mark.parametrize("name", presets())
+def test_presets_are_benches(name):
+    bench = load_bench(name)
+    assert bench.scene.skin.name == "testbed"
+    assert bench.duration < 3600
+    assert (name == "ideal") == (not bench.scene.effects)
+
+
+def test_every_preset_asked_for_is_there():
+    assert {"ideal", "paper_bench", "sliding", "two_contacts", "hot_day", "broken_electrode"} <= set(presets())
+
+
+def test_an_unknown_preset_is_named():
+    with pytest.raises(ValueError, match=r"papr_bench: no such scene file or preset; presets: .*paper_bench"):
+        load_bench("papr_bench")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"slide": (0.3, 0.0)}, "after its slide"),
+        ({"companions": (Companion((0.0, 0.2), 1.0),)}, "of a companion"),
+        ({"sites": ((0.3, 0.1),)}, "site 0 at"),
+    ],
+)
+def test_tips_stay_on_the_sheet(skin, change, message):
+    with pytest.raises(BenchError, match=message):
+        _bench(skin, **change)
+
+
+@pytest.mark.slow
+def test_explain_names_each_effect_in_its_stage(skin):
+    whole = (
+        je.effects.StageError(),
+        je.effects.PadEdgeDip(),
+        je.effects.ScanSkew(),
+        je.effects.DropOut(),
+        je.effects.IntermittentElectrode(),
+    )
+    effects = (*SHEET, *whole, je.effects.ContactScatter(), je.effects.PadLeak(), je.effects.Noise(std=1e-5))
+    bench = _bench(skin, *effects, sites=((0.06, 0.07),))
+    parts = measure_costs(bench, DRAFT)
+    by_name = {part.name: part for part in parts}
+    for effect in effects:
+        (part,) = (p for name, p in by_name.items() if name.split(" ")[0] == type(effect).__name__)
+        assert part.stage == effect.stage
+        assert part.seconds > 0
+    assert by_name["the sheet itself"].runs == 9
+    text = render_costs(bench, parts)
+    assert "LoadSpreading" in text
+    assert "Quantisation" not in text
+    shares = [float(line.split("%")[0].split()[-1]) for line in text.splitlines() if "%" in line]
+    assert sum(shares) == pytest.approx(100, abs=0.1 * len(shares))
+
+
+@pytest.mark.slow
+def test_chance_is_of_the_seed_and_of_nothing_else(skin):
+    noise, sites = je.effects.Noise(std=1e-5), ((0.06, 0.07),)
+    first, again = (_all(simulated_streams(_bench(skin, noise, sites=sites), DRAFT).eit).values for _ in range(2))
+    other = _all(simulated_streams(_bench(skin, noise, sites=sites, seed=1), DRAFT).eit).values
+    more = _all(simulated_streams(_bench(skin, noise, je.effects.PadLeak(), sites=sites), DRAFT).eit).values
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, more)
+    assert np.abs(first - other).std() > 1e-6
+
+
+@pytest.mark.slow
+def test_the_data_set_is_one_solve_each(skin):
+    model = je.discretise(je.Scene(skin), DRAFT)
+    places, amplitudes = grid(skin, 3, 2), np.array([0.0, 0.5, 1.0])
+    voltages = simulate_contacts(model, places, amplitudes)
+    assert voltages.shape == (6, 3, 550)
+    square = ((np.asarray(model.centroids) - places[4]) ** 2).sum(1)
+    sigma = model.background * (1 + 0.5 * np.exp(-0.5 * square / 0.012**2))
+    np.testing.assert_allclose(voltages[4, 1], je.forward(model, sigma), rtol=0, atol=1e-12 * np.abs(voltages).max())
+    np.testing.assert_allclose(voltages[:, 0], np.tile(je.forward(model), (6, 1)), rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_data_set_is_shared_out_over_devices(tmp_path):
+    """Two devices give what one gives."""
+    code = (
+        "import sys, jax; jax.config.update('jax_enable_x64', True)\n"
+        "import numpy as np, jaxeit as je\n"
+        "from calib.bench import grid, simulate_contacts\n"
+        "skin = je.load_skin('testbed')\n"
+        "model = je.discretise(je.Scene(skin), je.Fidelity.draft())\n"
+        "np.save(sys.argv[1], simulate_contacts(model, grid(skin, 2, 2), np.array([0.0, 1.0])))\n"
+        "print(jax.device_count())"
+    )
+    found = []
+    for count in (1, 2):
+        path = tmp_path / f"{count}.npy"
+        flags = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={count}"}
+        done = subprocess.run(
+            [sys.executable, "-c", code, path], env=flags, capture_output=True, text=True, check=False
+        )
+        assert done.stdout.strip() == str(count), done.stderr
+        found.append(np.load(path))
+    np.testing.assert_array_equal(*found)

@@ -1,0 +1,460 @@
+"""From a simulated bench to newtons and back, and what is said when something is wrong."""
+
+import multiprocessing
+import sys
+import time
+from dataclasses import replace
+from datetime import datetime
+
+import equinox as eqx
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.bench import Bench, Timing, simulate
+from calib.calibration.evaluation import render_table
+from calib.calibration.force_maps import fused, law_of, remembered
+from calib.calibration.localisation import locator_from_numbers, locator_numbers
+from calib.calibration.press_images import fit_untouched_sheet
+from calib.calibration.storage import to_archive
+from calib.fitting.curves import CURVES, play
+from calib.fitting.fields import Places, geometry_of
+from calib.fitting.pads import LocatedPresses, fit_hybrid
+from calib.presses.pooled import pool_presses
+from calib.presses.table import measure
+from calib.report import document as report
+from calib.session import StreamFacts
+
+from ..kill_worker import write_all, write_for_ever
+
+SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
+QUICK = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft())
+EFFECTS = (
+    je.effects.LoadSpreading(width=0.008),
+    je.effects.ContactPiezoresistance(),
+    je.effects.Noise(std=1e-6, stream=je.effects.StreamKind.EIT),
+    je.effects.Noise(std=2.0, stream=je.effects.StreamKind.PRESSURE),
+    je.effects.Noise(std=0.01, stream=je.effects.StreamKind.FORCE),
+)
+
+
+def bench(skin, sites, seed=0, **changes):
+    timing = Timing(rest=0.6, ramp=0.6, hold=1.2, release=0.6, recovery=0.6)
+    settings = {"timing": timing, "blank": 1.0, "eit_rate": 10.0, "pad_rate": 50.0, "eit_step": 1e-6, "seed": seed}
+    return Bench(je.Scene(skin, EFFECTS), sites, np.array([20.0]), **(settings | changes), toml="simulated in a test")
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("sessions")
+
+
+@pytest.fixture(scope="session")
+def grid(skin, folder):
+    """16 presses, four on each pad."""
+    return simulate(bench(skin, SITES), folder / "grid.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+
+
+@pytest.fixture(scope="session")
+def two(skin, folder):
+    """Two presses, both on the lower left pad."""
+    return simulate(bench(skin, SITES[:2]), folder / "two.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+
+
+@pytest.fixture(scope="session")
+def calibration(grid):
+    with calib.open_session(grid) as session:
+        return calib.calibrate([session], recipe=QUICK)
+
+
+@pytest.fixture(scope="session")
+def pressed(skin, grid):
+    """What curves are fitted to."""
+    with calib.open_session(grid) as session:
+        return pool_presses([session], skin).data
+
+
+def test_recovers_the_pads(calibration):
+    """Without effects in the pads, force = pressure x area wherever the whole load is on one pad."""
+    slope = np.asarray(calibration.curves.parameters)[:, 0]
+    np.testing.assert_allclose(slope, 0.01, rtol=0.02)
+
+
+def test_results_are_sane(calibration):
+    s = calibration.evaluation.summary()
+    assert s["presses"] == 16
+    assert s["localisation_half_mean"] < 0.01  # of the size of a pixel
+    assert s["force_rmse"] < 0.5
+    assert s["cv_hybrid_ddof1"] < 0.03 < s["cv_eit_ddof1"]
+    assert calibration.simulated
+
+
+def test_saved_and_loaded_it_is_the_same(calibration, folder):
+    path = folder / "calibration.h5"
+    calibration.save(path)
+    loaded = calib.load_calibration(path)
+    assert loaded.evaluation.summary() == calibration.evaluation.summary()
+    assert loaded.provenance == calibration.provenance
+    dv = np.random.default_rng(0).normal(size=(3, 550)) * 1e-4
+    pressures = np.array([[500.0, 0, 0, 100.0], [0, 0, 0, 0], [2000.0, 1, 2, 3]])
+    first, second = (calib.force_map(c, dv, pressures) for c in (calibration, loaded))
+    np.testing.assert_array_equal(first.map.force, second.map.force)
+    np.testing.assert_array_equal(first.standard_error, second.standard_error)
+
+
+@pytest.mark.parametrize("curve", [calib.PowerLaw(), calib.Affine()], ids=lambda c: type(c).__name__)
+def test_every_curve_survives_the_file(calibration, pressed, folder, curve):
+    curves = fit_hybrid(
+        curve, None, LocatedPresses(pressed, geometry_of(calibration.skin)), calib.fitting.SoftL1()
+    ).curves
+    assert (np.asarray(curves.result) == 0).all()
+    found = replace(calibration, curves=curves, provenance=calibration.provenance | {"curve": CURVES.name_of(curve)})
+    found.save(folder / "one.h5")
+    pressures = np.linspace(0, 2000, 7)[:, None] * np.ones(4)
+    again = calib.load_calibration(folder / "one.h5").pad_forces(pressures)
+    for mine, theirs in zip(found.pad_forces(pressures), again, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.fixture(scope="session")
+def located(grid):
+    """With a correction by location, the place from the image."""
+    with calib.open_session(grid) as session:
+        return calib.calibrate(
+            [session],
+            recipe=replace(QUICK, location=calib.Bilinear(nodes=2, shared=True), locator=calib.ImageCentroid("half")),
+        )
+
+
+def test_a_correction_by_location_is_kept_in_the_file_beside_the_papers_recipe(located, calibration, folder):
+    located.save(folder / "located.h5")
+    loaded = calib.load_calibration(folder / "located.h5")
+    assert loaded.provenance["location"] == "bilinear"
+    summary = loaded.evaluation.summary()
+    assert summary == located.evaluation.summary()
+    for method in ("eit", "hybrid", "calibrated", "true_place"):
+        assert f"cv_{method}_ddof1" in summary
+    plain = calibration.evaluation.summary()
+    assert summary["cv_hybrid_ddof1"] == pytest.approx(plain["cv_hybrid_ddof1"], rel=1e-6)
+    assert summary["force_eit_rmse"] > summary["force_rmse"]
+    text = render_table(loaded.evaluation, "t")
+    assert all(word in text for word in ("EIT only", "calibrated (linear, bilinear)", "true place", "fitted"))
+    dv = np.random.default_rng(0).normal(size=(3, 550)) * 1e-4
+    pressures = np.array([[500.0, 0, 0, 100.0], [0, 0, 0, 0], [2000.0, 1, 2, 3]])
+    first, second = (calib.force_map(c, dv, pressures) for c in (located, loaded))
+    np.testing.assert_array_equal(first.map.force, second.map.force)
+    np.testing.assert_array_equal(first.standard_error, second.standard_error)
+    np.testing.assert_allclose(np.asarray(first.map.force).sum(1), first.force.sum(1), rtol=1e-12)
+
+
+def test_a_calibration_of_before_is_still_read(calibration, folder):
+    """Written without the arrays that came later."""
+    attrs, arrays = to_archive(calibration)
+    old = {k: v for k, v in arrays.items() if not k.startswith(("baseline/", "presses/force_"))}
+    attrs = {k: v for k, v in attrs.items() if k not in ("image_gain", "provenance_location", "evaluation_recipe")}
+    calib.session.write_archive(folder / "old.h5", "skin-calibration", attrs, old)
+    loaded = calib.load_calibration(folder / "old.h5")
+    assert loaded.field is None
+    assert loaded.evaluation.summary()["force_rmse"] == calibration.evaluation.summary()["force_rmse"]
+    del arrays["pads/parameters"]
+    calib.session.write_archive(folder / "old.h5", "skin-calibration", attrs, arrays)
+    with pytest.raises(calib.SessionError, match="pads/parameters: missing"):
+        calib.load_calibration(folder / "old.h5")
+
+
+@pytest.mark.slow
+def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, calibration, grid):
+    locator = calib.FittedContact(columns=21, widths=(0.008, 0.03))
+    made = locator.prepare(model, np.full(550, 1e-5), np.ones(550, bool))
+    again = locator_from_numbers(locator_numbers(made), model.dtype)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (made, again)), strict=True))
+    with calib.open_session(grid) as session:
+        found = measure(session, calibration.skin)
+    places = calib.locate(again.single(), found.dv, calibration.recon, calibration.masks)
+    error = np.linalg.norm(np.asarray(places.position)[:, 0] - found.position, axis=1)
+    assert error.mean() < 0.006  # a draft mesh, and a table to match
+
+
+@pytest.mark.slow
+def test_what_a_curve_remembers_of_the_past_is_enough():
+    rng = np.random.default_rng(0)
+    past = np.cumsum(rng.normal(0, 1, (500, 2)), 0)
+    now = past[-1] + np.cumsum(rng.normal(0, 1, (40, 2)), 0)
+    few = remembered(past)
+    assert len(few) < 60
+    widths = jnp.array([0.5, 2.0, 8.0, 20.0])
+    for pad in range(2):
+        whole = play(jnp.asarray(np.r_[past[:, pad], now[:, pad]]), widths)[500:]
+        short = play(jnp.asarray(np.r_[few[:, pad], now[:, pad]]), widths)[len(few) :]
+        np.testing.assert_allclose(short, whole, atol=1e-12)
+
+
+def test_force_maps_sum_to_the_pads_and_know_their_limits(calibration):
+    pressures = np.array([[1000.0, 0.0, 0.0, 500.0], [9000.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    found = calib.force_map(calibration, np.zeros((3, 550)), pressures)
+    np.testing.assert_allclose(np.asarray(found.map.force).sum(1), found.force.sum(1), rtol=1e-12)
+    assert found.valid[0].all()
+    assert not found.valid[1, 0]  # beyond what was calibrated
+    assert (found.standard_error > 0).all()
+    with pytest.raises(ValueError, match=r"give \(n, 550\) V and \(n, 4\) Pa"):
+        calib.force_map(calibration, np.zeros((3, 3)), pressures)
+
+
+def test_contacts_share_what_their_pad_carries(located):
+    """By the integrals of their bumps; one across the border of two pads has its part of both."""
+    law, recon = law_of(located), located.recon
+    position = jnp.array([[[0.03, 0.05], [0.075, 0.05]], [[0.1, 0.05], [jnp.nan, jnp.nan]]])
+    width, amplitude = jnp.array([[0.01, 0.01], [0.01, jnp.nan]]), jnp.array([[3.0, 1.0], [1.0, 0.0]])
+    share = je.fusion.contact_shares(position, width, amplitude, recon.centres, located.masks).share
+    image = jnp.exp(-0.5 * jnp.sum((position[:, :1] - recon.centres) ** 2, -1) / 0.03**2)
+    pressures = jnp.array([[1600.0, 0.0, 20.0, 20.0], [500.0, 500.0, 20.0, 20.0]])  # the others': crosstalk
+    found = eqx.filter_jit(fused)(law, image, pressures, Places(position, share, width, amplitude), None, 0.6)
+    np.testing.assert_allclose(found.map.force.sum(1), found.force.sum(1), rtol=1e-12)
+    touched = jnp.array([[True, False, False, False], [True, True, False, False]])
+    np.testing.assert_allclose(found.contact_force.sum(1), jnp.where(touched, found.force, 0).sum(1), rtol=1e-12)
+    ratio = np.asarray(found.contact_force)[0] / np.asarray(found.force)[0, 0]
+    np.testing.assert_allclose(ratio, [0.75, 0.25], atol=0.01)
+    assert found.contact_force[1, 1] == 0
+    assert found.map.standard_error.shape == (2, 400)
+    found = calib.force_map(located, np.zeros((3, 550)), np.concatenate([pressures, pressures[:1]]))
+    assert found.contact_force.shape == (3, 1)
+
+
+def test_evaluate_on_another_session(calibration, skin, folder):
+    sites = np.array([[0.05, 0.05], [0.15, 0.14]])
+    path = simulate(bench(skin, sites, seed=7), folder / "other.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    with calib.open_session(path) as session:
+        found = calib.evaluate(calibration, session)
+        assert found.held_out_by == "session"
+        assert found.summary()["force_rmse"] < 0.5
+        np.testing.assert_allclose(found.position, sites)
+
+
+def test_apply_writes_the_force_of_every_frame(calibration, grid, folder):
+    out = folder / "forcemap.h5"
+    with calib.open_session(grid) as session:
+        calib.apply(calibration, session, out)
+        frames = len(session.stream("eit"))
+    archive = calib.session.read_archive(out, "skin-forcemap")
+    force, pads = archive.arrays["force"], archive.arrays["pad_force"]
+    assert force.shape == (frames, 400)
+    np.testing.assert_allclose(force.sum(1), pads.sum(1), atol=1e-4)
+    with calib.open_session(grid) as session:
+        middle = (session.presses.t_hold0[3] + session.presses.t_hold1[3]) // 2
+    held = np.argmin(np.abs(archive.arrays["time"] - middle))
+    assert pads[held].sum() == pytest.approx(20.0, rel=0.1)
+    assert archive.arrays["shape_valid"][held].any()
+    assert np.abs(pads[:8].sum(1)).max() < 0.5  # the blank
+    np.testing.assert_allclose(archive.arrays["force_se"].sum(1), archive.arrays["pad_force_se"].sum(1), rtol=1e-5)
+    assert "contact_force" not in archive.arrays  # without a correction by location no contact is looked for
+
+
+def test_a_failed_apply_leaves_no_file(calibration, grid, folder):
+    out = folder / "never.h5"
+
+    def break_off(blocks):
+        yield from list(blocks)[:1]
+        raise KeyboardInterrupt
+
+    with calib.open_session(grid) as session, pytest.raises(KeyboardInterrupt):
+        calib.apply(calibration, session, out, progress=break_off)
+    assert not out.exists()
+    assert not list(folder.glob("*never*"))
+
+
+KILLS = 100
+
+
+@pytest.mark.slow
+def test_100_kills_leave_the_old_result_or_a_complete_new_one(calibration, tmp_path, monkeypatch):
+    """Of the calibration and of each file of its report; what a kill leaves beside them is hidden."""
+    known, ready, drawn = {}, [], {}
+    draw = report._figures
+    monkeypatch.setattr(report, "_figures", lambda calibration, evaluations: drawn[calibration.notes])
+    for mark in ("old", "new"):
+        (tmp_path / mark).mkdir()
+        ready.append(tmp_path / f"{mark}.h5")
+        replace(calibration, notes=(mark,)).save(ready[-1])
+        version = calib.load_calibration(ready[-1])
+        drawn[version.notes] = draw(version, {})
+        write_all(version, tmp_path / mark)
+        for path in (tmp_path / mark).iterdir():
+            known.setdefault(path.name, []).append(path.read_bytes())
+    out, rng, halves, cycle = tmp_path / "out", np.random.default_rng(0), 0, 0.0
+    out.mkdir()
+    context = multiprocessing.get_context("forkserver")  # a fork before JAX has threads: 100 starts in a minute
+    context.set_forkserver_preload(["tests.kill_worker"])
+    for kill in range(KILLS + 1):
+        begun = context.Event()
+        worker = context.Process(target=write_for_ever, args=(ready, drawn, out, begun))
+        worker.start()
+        assert begun.wait(120)
+        if kill:
+            time.sleep(rng.uniform(0, 1.5 * cycle))
+        else:  # how long a fresh process takes to write them all
+            start = time.monotonic()
+            while not {*known} <= {p.name for p in out.iterdir()}:
+                assert time.monotonic() < start + 120
+                time.sleep(0.01)
+            cycle = time.monotonic() - start
+        worker.kill()
+        worker.join()
+        for path in out.iterdir():
+            if path.name.startswith("."):
+                halves += 1
+                path.unlink()
+            else:
+                assert path.read_bytes() in known[path.name], path.name
+                if not kill:
+                    path.unlink()
+    assert sorted(p.name for p in out.iterdir()) == sorted(known)
+    assert halves > 0  # some of the kills did come in the middle of a file
+
+
+def test_the_same_bench_makes_the_same_file(skin, two, folder):
+    again = simulate(bench(skin, SITES[:2]), folder / "same.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    assert again.read_bytes() == two.read_bytes()
+
+
+# --- what is said when something is wrong --------------------------------------------------------
+
+
+def _rewritten(grid, path, change):
+    """A copy of the session with its streams changed by ``change(name, values)``."""
+    with calib.open_session(grid) as s:
+        writer = calib.SessionWriter(
+            path,
+            calib.session.SessionFacts(
+                title="t",
+                skin_name=s.skin_name,
+                skin_toml=s.skin_toml,
+                pattern=s.pattern,
+                current=s.current,
+                frequency=s.frequency,
+                epoch=datetime.fromisoformat(s.epoch),
+            ),
+        )
+        with writer:
+            for name, stream in s.streams.items():
+                values = change(name, stream.read())
+                writer.add_stream(
+                    name,
+                    StreamFacts(
+                        stream.variable, units=stream.unit, channels=values.shape[1], rate_hz=stream.nominal_rate
+                    ),
+                )
+                writer.append(name, stream.time, values)
+            writer.set_presses(s.presses)
+    return path
+
+
+def test_a_dead_eit_channel_is_left_out_and_named(grid, folder):
+    def kill(name, values):
+        return np.where(np.arange(values.shape[1]) == 12, np.nan, values) if name == "eit" else values
+
+    path = _rewritten(grid, folder / "dead.h5", kill)
+    with calib.open_session(path) as session:
+        found = calib.calibrate([session], recipe=QUICK)
+    assert any("left out: 12" in note for note in found.notes)
+    assert found.evaluation.summary()["localisation_half_mean"] < 0.01
+    assert not found.simulated
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda n, v: v[:, :3] if n == "pressure" else v, "has 3 columns, the skin 'testbed' has 4 pads"),
+        (
+            lambda n, v: np.where(np.arange(v.shape[1]) == 2, np.nan, v) if n == "pressure" else v,
+            "column 2, pad 'upper left', holds no finite sample",
+        ),
+        (lambda n, v: np.nan * v if n == "force" else v, "none of 16 presses can be used"),
+    ],
+)
+def test_a_missing_pad_or_load_cell_is_one_clear_line(grid, folder, change, message):
+    path = _rewritten(grid, folder / "broken.h5", change)
+    with calib.open_session(path) as session, pytest.raises(calib.SessionError, match=message) as caught:
+        calib.calibrate([session])
+    assert str(caught.value).startswith("broken.h5: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_another_skin_is_refused(grid, skin):
+    other = replace(skin, protocol=je.Protocol(skin.protocol.pattern[::-1]))
+    with calib.open_session(grid) as session, pytest.raises(calib.SessionError, match="is not that of the skin"):
+        calib.calibrate([session], other)
+
+
+def test_a_low_pass_the_stream_cannot_carry_is_refused(grid):
+    asked = calib.presses.Processing(corrections=(calib.presses.LowPass(50.0),))
+    with calib.open_session(grid) as session, pytest.raises(ValueError, match=r"eit.*10"):
+        calib.calibrate([session], recipe=calib.Recipe(processing=asked))
+
+
+def test_a_pad_that_was_never_pressed(two):
+    with calib.open_session(two) as session, pytest.raises(ValueError, match=r"pad 1 .*lower right"):
+        calib.calibrate([session], recipe=QUICK)
+
+
+def test_no_session_at_all():
+    with pytest.raises(calib.SessionError, match="no session"):
+        calib.calibrate([])
+
+
+def test_sites_outside_the_sheet(skin):
+    with pytest.raises(ValueError, match="site 0"):
+        bench(skin, np.array([[0.3, 0.1]]))
+
+
+def test_bundled_sessions_say_that_they_are_simulated(bundled):
+    for path in bundled:
+        with calib.open_session(path) as session:
+            assert session.simulated
+            assert session.scene == path.with_suffix(".toml").read_text()
+            assert session.seed == calib.load_bench(path.with_suffix(".toml")).seed
+        with h5py.File(path) as file:
+            assert file.attrs["simulated"] == 1
+
+
+def test_an_untouched_frame_that_fits_no_sheet_is_said(model):
+    """Contacts are then placed on an even sheet."""
+    v0 = np.asarray(je.forward(model))
+    sigma, note = fit_untouched_sheet(model, -v0, np.ones(len(v0), bool))
+    assert sigma is None
+    assert "even sheet" in note
+    assert "polarity" in note
+
+
+OWN_CURVE = """
+from calib.fitting import Linear
+
+
+class Straight(Linear):
+    pass
+"""
+
+
+def test_a_calibration_with_a_curve_of_ones_own(grid, tmp_path, monkeypatch):
+    """Whoever has imported the curve opens it; for others the file imports nothing, and the error says what to do."""
+    (tmp_path / "curve_of_ones_own.py").write_text(OWN_CURVE)
+    monkeypatch.syspath_prepend(tmp_path)
+    recipe = replace(QUICK, curve=CURVES.make("curve_of_ones_own:Straight", allow_import=True))
+    with calib.open_session(grid) as session:
+        made = calib.calibrate([session], recipe=recipe)
+    assert made.provenance["curve"] == "curve_of_ones_own:Straight"
+    made.save(tmp_path / "c.h5")
+    again = calib.load_calibration(tmp_path / "c.h5")
+    assert type(again.curves.curve) is type(recipe.curve)
+    np.testing.assert_array_equal(again.curves.parameters, made.curves.parameters)
+    monkeypatch.delitem(sys.modules, "curve_of_ones_own")
+    with pytest.raises(
+        calib.SessionError,
+        match=r"^c\.h5: .*curve 'curve_of_ones_own:Straight' is code outside jaxeit, which a data file cannot import; "
+        "import curve_of_ones_own first, or install it with an entry point of the group 'calib.curves'$",
+    ):
+        calib.load_calibration(tmp_path / "c.h5")
+    assert "curve_of_ones_own" not in sys.modules

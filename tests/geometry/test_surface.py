@@ -1,0 +1,92 @@
+"""Sheets bent in space."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import jaxeit as je
+
+from ..helpers import skin_of
+
+POINTS = [(-0.04, -0.02), (0.05, 0.01), (0.0, 0.05), (-0.03, 0.03)]
+PATTERN = [[0, 1, 2, 3], [0, 2, 1, 3]]
+
+
+@pytest.fixture(scope="module")
+def chest():
+    return je.load_skin("chest")
+
+
+def test_the_chest(chest):
+    assert len(chest.electrodes) == 32
+    assert chest.protocol.readings == 32 * 29
+    assert chest.protocol.frame_time == pytest.approx(9.28e-3)
+    steps = np.linalg.norm(np.diff(chest.electrode_positions, axis=0), axis=1)
+    assert steps.max() < 0.07
+
+
+@pytest.mark.slow
+def test_a_rolled_sheet_reads_as_the_flat_one(chest):
+    """A cylinder is developable; the mesh's chords are shorter than the arcs by (h / r)^2 / 24."""
+    fidelity = je.Fidelity.draft(solver=je.linalg.Dense())
+    rolled = je.discretise(je.Scene(chest), fidelity)
+    flat = je.discretise(je.Scene(replace(chest, surface=None)), fidelity)
+    assert rolled.nodes.shape[1] == 3
+    bent, straight = np.asarray(je.forward(rolled)), np.asarray(je.forward(flat))
+    assert np.abs(bent - straight).max() < 1e-3 * np.abs(straight).max()
+    assert np.abs(bent - straight).max() > 0
+    assert float(rolled.areas.sum()) == pytest.approx(0.28**2, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_images_and_forces_on_the_chest(chest):
+    model = je.discretise(je.Scene(chest), je.Fidelity.draft(solver=je.linalg.Dense()))
+    recon = je.prepare(model, basis=je.Pixels(20))
+    near = np.linalg.norm(np.asarray(model.centroids) - [0.08, 0.20], axis=1) < 0.015
+    dv = je.forward(model, model.background * (1 + 0.5 * near)) - je.forward(model)
+    image = recon(dv)
+    found = np.asarray(je.LevelCentroid(0.5)(image, recon))
+    assert np.linalg.norm(found - [0.08, 0.20]) < 0.01
+    fmap = je.fuse(image, je.pad_masks(chest, recon), np.array([0.0, 0.0, 9.0, 0.0]))
+    assert bool(fmap.valid[2])
+    assert float(fmap.force.sum()) == pytest.approx(9.0, rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("edge_length", [0.08, 0.04])
+def test_a_spherical_cap_is_the_flat_disc_of_its_stereographic_projection(edge_length):
+    """Conduction in a sheet is invariant under conformal maps, and this projection is conformal."""
+    disc = je.Disc(0.1)
+    skin = skin_of(disc, [je.PointElectrode(p) for p in POINTS], PATTERN)
+    fidelity = je.Fidelity(edge_length=edge_length, solver=je.linalg.Dense())
+    mesh = je.model.make_mesh(je.Scene(skin), fidelity)
+
+    def onto_the_sphere(chart, radius=0.08):
+        square = np.sum(chart**2, 1, keepdims=True) / (4 * radius**2)
+        return np.concatenate([chart, radius * (1 - square)], 1) / (1 + square)
+
+    cap = mesh.lift(onto_the_sphere)
+    assert cap.areas.max() < 0.999 * mesh.areas.max()  # far from an isometry
+    flat, bent = (np.asarray(je.forward(je.discretise(je.Scene(skin), fidelity, mesh=m))) for m in (mesh, cap))
+    np.testing.assert_allclose(bent, flat, rtol=1.5 * edge_length**2)
+
+
+@pytest.mark.slow
+def test_a_sphere_of_large_radius_is_flat():
+    disc = je.Disc(0.1)
+    skin = skin_of(disc, [je.PointElectrode(p) for p in POINTS], PATTERN)
+    fidelity = je.Fidelity(edge_length=0.1, solver=je.linalg.Dense())
+    flat, far, near = (
+        np.asarray(je.forward(je.discretise(je.Scene(replace(skin, surface=s)), fidelity)))
+        for s in (None, je.Sphere(100.0), je.Sphere(0.1))
+    )
+    np.testing.assert_allclose(far, flat, rtol=1e-5)
+    assert np.abs(near / flat - 1).max() > 0.01
+
+
+def test_surfaces_that_cannot_be():
+    with pytest.raises(ValueError, match="above zero"):
+        je.Cylinder(0.0)
+    with pytest.raises(ValueError, match="larger radius"):
+        je.Sphere(0.01)(np.array([[0.1, 0.0]]))

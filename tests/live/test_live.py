@@ -1,0 +1,760 @@
+"""Live: frames to results as they arrive, and who is shown them."""
+
+import base64
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from benchmarks import bench_live
+from calib.bench import Bench, Timing, simulate
+from calib.calibration.force_maps import ForceLaw, fused
+from calib.cli import main
+from calib.live import loop as live_module
+from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestLevels
+from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
+from calib.live.page import Page
+from calib.live.presentation import Presentation, present
+from calib.live.results import TouchEstimates
+from calib.live.scan_control import ScanDirector, prepare_director
+from calib.record import encoding
+from calib.record.device import SimulatedDevice, frame_packets, recording_packets
+from calib.record.plan import StreamPlan
+from calib.record.planning import plan_recording
+from calib.record.priority import PriorityError, real_time
+from calib.record.recorder import StopRequest, record_session
+from calib.record.wire import Frame
+from jaxeit import effects as fx
+
+S = 1_000_000_000
+READINGS, PADS = 6, 2
+CENTRES = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1], [0.1, 0.1]])
+
+
+class FakePrograms:
+    """The change of pressure in newtons; on each pad spread over its two pixels as 1 to 3."""
+
+    nowhere, searches = "nowhere", False
+
+    def __init__(self, law):
+        self.searched, self.places = [], []
+
+    def warm_up(self):
+        pass
+
+    def map(self, frame, pressure, places, before):
+        self.places.append(places)
+        share = np.array([0.25, 0.75])
+        image = np.concatenate([pressure[0] * share, pressure[1] * share])
+        return FrameForces(image, pressure, np.full(PADS, 0.1), pressure < 50, pressure > 1, 1e-3 * image)
+
+    def search(self, frame):
+        self.searched.append(frame)
+        return "somewhere", TouchEstimates(np.full((1, 2), 0.05), 1e-6 * np.eye(2)[None], np.array([True]), 0)
+
+
+class SearchingPrograms(FakePrograms):
+    """With contacts that are fitted."""
+
+    searches = True
+
+
+@pytest.fixture
+def calibration(monkeypatch, skin):
+    """What live needs of one, of two pads and four pixels, without a computation."""
+    monkeypatch.setattr(Engine.__init__, "__defaults__", (2.0, FakePrograms))
+    channels = np.arange(READINGS) > 0
+    recon = SimpleNamespace(
+        centres=CENTRES, areas=np.ones(4), readings=READINGS, channels=channels, shape=(2, 2), factor=None
+    )
+    pads = [SimpleNamespace(name="left"), SimpleNamespace(name='<b>"right"')]
+    positions = np.array([[0.0, 0.0], [0.1, 0.1]])
+    protocol = SimpleNamespace(
+        readings=READINGS, pattern=np.tile([0, 1, 2, 3], (READINGS, 1)), current=1.0, frequency=0.0, reading_time=1e-5
+    )
+    hardware = SimpleNamespace(name="small", toml="", pads=pads, electrode_positions=positions, protocol=protocol)
+    weights = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
+    curves = SimpleNamespace(curve=SimpleNamespace(path=False))
+    return SimpleNamespace(
+        skin=hardware,
+        recon=recon,
+        masks=SimpleNamespace(weights=weights),
+        simulated=True,
+        curves=curves,
+        field=None,
+        locator=None,
+        evaluation=None,
+    )
+
+
+def arrival(pressure, host=0, voltage=0.0):
+    return ReceivedFrame(np.full(READINGS, float(voltage)), np.asarray(pressure, float), host)
+
+
+def rested(calibration, programs=FakePrograms):
+    engine = Engine(calibration, 0.5, programs)
+    assert engine.step(arrival([10.0, 20.0], 0)) is None
+    assert engine.step(arrival([12.0, 20.0], S)) is None
+    assert not engine.resting
+    return engine
+
+
+# --- from frames to results ----------------------------------------------------------------------
+
+
+def test_forces_are_those_above_the_resting_level(calibration):
+    result = rested(calibration).step(arrival([11.0, 24.0], time.monotonic_ns()), dropped=7)
+    np.testing.assert_allclose(result.force, [0.0, 4.0])
+    np.testing.assert_allclose(result.map.sum(), 4.0)
+    np.testing.assert_allclose(result.centre[1], [0.075, 0.1])
+    assert np.isnan(result.centre[0]).all()
+    assert (result.number, result.dropped, result.valid.tolist()) == (1, 7, [True, True])
+    assert 0 <= result.latency < 1
+
+
+def test_what_is_missing_stays_where_it_is(calibration):
+    """A dead reading is taken as unchanged; a pad without pressure has no force, the other one keeps its own."""
+    engine = rested(calibration)
+    voltage = np.full(READINGS, np.nan)
+    result = engine.step(ReceivedFrame(voltage, np.array([np.nan, 24.0]), 0))
+    np.testing.assert_array_equal(result.force, [np.nan, 4.0])
+    assert (result.missing, result.valid.tolist()) == (READINGS - 1, [False, True])
+    assert np.isfinite(result.map).all()
+    line = json.loads(result.to_json(image=True))
+    assert line["force"] == [None, 4.0]
+    for name in ("map", "image"):
+        np.testing.assert_allclose(np.frombuffer(base64.b64decode(line[name]), "<f4"), getattr(result, name))
+
+
+def test_levels_do_not_count_what_is_missing():
+    resting = RestLevels(1.0)
+    for n, value in enumerate([1.0, np.nan, 3.0]):
+        resting.add(arrival([value, np.nan], n * S))
+        if n:
+            break
+    np.testing.assert_array_equal(resting.levels[1], [1.0, np.nan])
+
+
+def test_zero_may_be_set_again(calibration):
+    engine = rested(calibration)
+    engine.tare()
+    assert engine.step(arrival([50.0, 50.0], 2 * S)) is None
+    assert engine.step(arrival([50.0, 50.0], 3 * S)) is None
+    np.testing.assert_allclose(engine.step(arrival([51.0, 50.0])).force, [1.0, 0.0])
+
+
+def test_frames_that_come_together_are_all_taken():
+    inbox = FrameQueue(StreamPlan("eit", 1), StreamPlan("pressure", 1))
+    inbox.put(1, Frame(2, 0, 0, 32, np.array([1.0])), 0)
+    now = time.monotonic_ns()
+    for number in range(3):
+        inbox.put(0, Frame(1, 0, 0, 32, np.array([float(number)])), now)
+    assert [inbox.take(0.0).voltage[0] for _ in range(3)] == [0.0, 1.0, 2.0]
+    for number in range(50):
+        inbox.put(0, Frame(1, 0, 0, 32, np.array([float(number)])), time.monotonic_ns())
+    assert inbox.dropped >= 50 - 16
+
+
+def test_the_newest_frame_is_taken_and_the_others_are_counted():
+    inbox = FrameQueue(StreamPlan("eit", 2, scale=0.5), StreamPlan("pressure", 1))
+    assert inbox.take(0.0) is None
+    inbox.put(0, Frame(1, 0, 0, 32, np.array([2, 4], "<i2")), 5)
+    assert inbox.take(0.0) is None  # no pressure yet
+    for value in (1.0, 2.0, 6.0):
+        inbox.put(1, Frame(2, 0, 0, 32, np.array([value])), 0)
+    for number in range(3):
+        inbox.put(0, Frame(1, 0, 0, 32, np.array([number, 4], "<i2")), number)
+    found = inbox.take(0.0)
+    assert (found.voltage.tolist(), found.pressure.tolist(), found.host) == ([1.0, 2.0], [3.0], 2)
+    assert inbox.dropped == 3
+    assert inbox.take(0.0) is None
+    inbox.put(0, Frame(1, 0, 0, 32, np.array([1, 4], "<i2")), 9)
+    assert inbox.take(0.0).pressure.tolist() == [3.0]  # held
+
+
+# --- contacts, and readings that are missing -----
+
+
+def test_contacts_are_fitted_when_there_is_time_and_serve_the_next_frames(calibration):
+    engine = rested(calibration, SearchingPrograms)
+    programs = engine._programs
+    engine.step(arrival([11.0, 20.0]))
+    engine.use_spare_time(1.0)
+    assert programs.searched == []  # nothing is touched
+    result = engine.step(arrival([31.0, 20.0], voltage=3.0))
+    assert len(result.touches.position) == 0
+    engine.use_spare_time(1.0)
+    result = engine.step(arrival([31.0, 20.0], voltage=4.0))
+    assert (result.touches.age, result.touches.sure.tolist()) == (1, [True])
+    assert programs.places == ["nowhere", "nowhere", "somewhere"]
+    np.testing.assert_array_equal(programs.searched[0], np.full(READINGS, 3.0))
+    line = json.loads(result.to_json())
+    assert line["contacts_age"] == 1
+    contact = {"position": [0.05, 0.05], "standard_error": [0.001, 0.001], "sure": True}
+    assert contact.items() <= line["contacts"][0].items()
+    result = engine.step(arrival([11.0, 20.0]))  # let go
+    assert (len(result.touches.position), result.touches.age) == (0, 0)
+    assert programs.places[-1] == "somewhere"  # it may not be known yet that it was let go
+
+
+def test_frames_without_time_for_their_contacts_are_counted(calibration, monkeypatch):
+    engine = rested(calibration, SearchingPrograms)
+    engine._search_time = 0.01
+    engine._search_end = time.monotonic() + 1000  # as if some had just been fitted
+    for _ in range(4):
+        result = engine.step(arrival([31.0, 20.0]))
+        engine.use_spare_time(0.005)
+    assert result.unsearched == 3
+    assert engine._programs.searched == []
+    engine._search_end = 0.0  # long ago: now it is done at the cost of a frame
+    engine.use_spare_time(0.005)
+    assert len(engine._programs.searched) == 1
+
+
+def test_missing_readings_are_counted_of_those_that_are_used(calibration):
+    engine = rested(calibration)
+    broken = ReceivedFrame(np.where(np.isin(np.arange(READINGS), [0, 2]), np.nan, 1.0), np.array([11.0, 20.0]), 0)
+    assert engine.step(broken).missing == 1  # the first is not used
+    assert engine.step(arrival([11.0, 20.0])).missing == 0
+
+
+@pytest.mark.slow
+def test_programs_for_one_frame_are_those_of_the_force_map(model, skin, pixels):
+    """To rounding; also for frames that lack some readings, or most."""
+    recon, rng = je.prepare(model, basis=pixels), np.random.default_rng(0)
+    pressure = np.tile(np.linspace(0, 4000, 40), (len(skin.pads), 1))
+    curves = calib.fit_curves(calib.Linear(), pressure, 5e-3 * pressure[0] + rng.normal(0, 0.1, 40))
+    law = ForceLaw(recon, je.pad_masks(skin, recon), curves, None, None)
+    frame, pressed = rng.normal(0, 1e-3, recon.readings), np.array([3000.0, 0.0, 1000.0, 0.0])
+    holes, few = (np.where(rng.random(recon.readings) < share, np.nan, frame) for share in (0.3, 0.9))
+    programs = FramePrograms(law)
+    programs.warm_up()
+    for lacking in (frame, holes, few):
+        found = programs.map(lacking, pressed, programs.nowhere, np.zeros((1, 4)))
+        other = fused(law, recon(lacking[None]), pressed[None], None, None, 0.6)
+        np.testing.assert_allclose(found.map, other.map.force[0], rtol=1e-9, atol=1e-9 * abs(found.map).max())
+        for mine, theirs in zip(found[1:4], other[1:4], strict=True):
+            np.testing.assert_allclose(mine, theirs[0], rtol=1e-12)
+        assert found.loaded.tolist() == [True, False, True, False]
+
+
+# --- the whole -----------------------------------------------------------------------------------
+
+
+def small_device(rate=100):
+    """Pressure on the second pad rises by 5 N after a second."""
+    times = [n * S // rate for n in range(10**5)]
+    eit = frame_packets(1, iter(times), (np.zeros(READINGS, "f4") for _ in times))
+    pressure = frame_packets(2, iter(times), (np.array([0.0, 5.0 * (t > S)], "f4") for t in times))
+    return SimulatedDevice([eit, pressure], wait_for=1)
+
+
+def sources_of(device, calibration):
+    return plan_recording({"eit": device.urls[0], "pressure": device.urls[1]}, calibration.skin)
+
+
+def test_results_come_as_frames_arrive(calibration):
+    show, results = LiveControl(), []
+    with small_device() as device:
+
+        def publish(result):
+            results.append(result)
+            if result.force[1] > 4.5:
+                show.stop.set()
+
+        count = run_live(calibration, *sources_of(device, calibration), [publish], show, LiveSettings(rest=0.3))
+    assert count == len(results) > 10
+    assert [r.number for r in results] == list(range(1, count + 1))
+    np.testing.assert_allclose(results[-1].force, [0.0, 5.0])
+    assert show.state == "running"
+
+
+def policies():
+    return [os.sched_getscheduler(int(task)) for task in os.listdir("/proc/self/task")]
+
+
+def test_a_live_show_may_go_before_all_ordinary_processes(calibration):
+    """Its threads, old and new, while it lasts; none afterwards."""
+    try:
+        with real_time():
+            pass
+    except PriorityError as error:
+        pytest.skip(str(error))
+    show, seen = LiveControl(), []
+    with small_device() as device:
+
+        def publish(result):
+            seen.extend(policies())
+            show.stop.set()
+
+        plan, sources = sources_of(device, calibration)
+        run_live(calibration, plan, sources, [publish], show, LiveSettings(rest=0.1, realtime=True))
+    assert len(seen) > 2
+    assert set(seen) == {os.SCHED_FIFO}
+    assert os.SCHED_FIFO not in policies()
+
+
+def refuse(task, policy, parameters):
+    raise PermissionError
+
+
+@pytest.mark.parametrize(("system", "said"), [(refuse, "rtprio 1"), (None, "on Linux only")])
+def test_a_priority_that_is_refused_is_said(monkeypatch, system, said):
+    if system is None:
+        monkeypatch.delattr(os, "sched_setscheduler", raising=False)
+    else:
+        monkeypatch.setattr(os, "sched_setscheduler", system, raising=False)
+    with pytest.raises(PriorityError, match=said), real_time():
+        pytest.fail("must not go on")
+    with real_time(False):
+        pass
+
+
+def test_a_priority_that_is_refused_is_said_before_anything_else(monkeypatch, capsys):
+    monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
+    streams = ["--eit", "tcp://127.0.0.1:1", "--pressure", "tcp://127.0.0.1:1"]
+    assert main(["live", "--calibration", "nowhere.h5", *streams, "--realtime"]) == 2
+    assert "leave out --realtime" in capsys.readouterr().err
+
+
+def test_a_live_show_is_recorded(calibration, tmp_path):
+    """Everything that came is in the session, also what came before the first result, and frames that were dropped."""
+    show, output, told = LiveControl(), tmp_path / "s.h5", []
+    with small_device() as device:
+        present(
+            calibration,
+            *sources_of(device, calibration),
+            show,
+            Presentation(port=0, output=output),
+            LiveSettings(rest=0.1),
+            tell=told.append,
+            also=[lambda result: show.stop.set() if result.number == 20 else None],
+        )
+    assert "complete" in told[-1]
+    assert [path.name for path in tmp_path.iterdir()] == ["s.h5"]
+    with calib.open_session(output) as session:
+        assert session.complete
+        assert len(session.stream("eit")) >= 30
+        assert not session.stream("eit").status().any()
+
+
+def test_a_live_show_that_sees_nothing_leaves_nothing(calibration, tmp_path):
+    plan, sources = plan_recording({"eit": "tcp://127.0.0.1:1", "pressure": "tcp://127.0.0.1:1"}, calibration.skin)
+    with pytest.raises(LiveError, match="nothing answers"):
+        present(
+            calibration,
+            plan,
+            sources,
+            LiveControl(),
+            Presentation(port=0, output=tmp_path / "s.h5"),
+            LiveSettings(wait=0.2),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def small_scan():
+    """Two readings at rest, two more for the pad that is pressed, every reading each 40 frames."""
+    flags = np.eye(READINGS, dtype=bool)
+    scan = je.scan.EventScan(
+        idle=flags[0] | flags[1],
+        by_pad=np.stack([flags[0] | flags[2], flags[4] | flags[5]]),
+        by_place=(flags[0] | flags[4] | flags[5])[None],
+        centres=np.zeros((1, 2)),
+        pad_of=np.array([[False, True]]),
+        onset=np.full(PADS, 2.0),
+        release=np.full(PADS, 1.0),
+        every=np.asarray(40),
+    )
+    return jax.tree.map(jnp.asarray, scan)
+
+
+def test_pressure_says_what_the_device_reads_next(calibration, monkeypatch):
+    """Over loopback: what is not asked for is missing, and the pads' forces are as ever."""
+
+    monkeypatch.setattr(live_module, "prepare_director", lambda _, *told: ScanDirector(small_scan(), *told))
+    show, results = LiveControl(), []
+    with small_device() as device:
+
+        def publish(result):
+            results.append(result)
+            if result.force[1] > 4.5 and result.number > results[0].number + 150:
+                show.stop.set()
+
+        run_live(
+            calibration, *sources_of(device, calibration), [publish], show, LiveSettings(rest=0.3, event_driven=True)
+        )
+    idle = np.array([r.missing for r in results if r.force[1] < 0.5])
+    pressed = np.array([r.missing for r in results if r.force[1] > 4.5])
+    asked_of = READINGS - 1  # the first reading is not used by the reconstruction
+    assert np.bincount(idle).argmax() == asked_of - 1
+    assert np.bincount(pressed[5:]).argmax() == asked_of - 3
+    assert (pressed == 0).any()  # a whole scan now and then
+    np.testing.assert_allclose(results[-1].force, [0.0, 5.0])
+
+
+def test_a_device_is_told_again_and_after_a_new_zero_reads_everything():
+    said = []
+    director = ScanDirector(small_scan(), 1, said.append)
+    for _ in range(3):
+        director.update(np.zeros(PADS), np.full((PADS, 2), np.nan))
+    assert director.requested.sum() == 2
+    before = len(said)
+    time.sleep(0.35)
+    director.update(np.zeros(PADS), np.full((PADS, 2), np.nan))
+    assert len(said) == before + 1
+    director.request_all()
+    assert director.requested.all()
+    _, found, _ = encoding.parse_requests(b"", said[-1])
+    assert found[1][:READINGS].all()
+
+
+class Accounts:
+    """What became of every frame: a log that counts what arrived, and the inbox, engine and publisher behind it."""
+
+    size = 0
+
+    def __init__(self, monkeypatch):
+        self.received, self.worked, self.results = 0, 0, []
+        step = Engine.step
+
+        def counted(engine, *arrival):
+            self.worked += 1
+            return step(engine, *arrival)
+
+        def made(*plans):
+            self.inbox = FrameQueue(*plans)
+            return self.inbox
+
+        monkeypatch.setattr(Engine, "step", counted)
+        monkeypatch.setattr(live_module, "FrameQueue", made)
+
+    def append(self, stream, flags, host, payload):
+        self.received += stream == 0
+
+
+def test_a_slow_listener_to_results_makes_nothing_late(calibration, monkeypatch):
+    """Frames are worked on in order or dropped, and every one is accounted for."""
+    show, accounts = LiveControl(), Accounts(monkeypatch)
+    results = accounts.results
+    with small_device(200) as device:
+
+        def publish(result):
+            results.append(result)
+            time.sleep(0.05)
+            if len(results) == 20:
+                show.stop.set()
+
+        found = sources_of(device, calibration)
+        assert (
+            run_live(calibration, *found, [publish], show, LiveSettings(rest=0.1), log=accounts) == len(results) == 20
+        )
+    assert results[-1].dropped > 50
+    assert (np.diff([r.host for r in results]) >= 0).all()
+    assert (np.diff([r.dropped for r in results]) >= 0).all()
+    inbox = accounts.inbox
+    assert accounts.received == accounts.worked + inbox.dropped + len(inbox._frames)
+    assert accounts.worked > len(results)  # those from which the levels were taken
+
+
+def test_streams_that_do_not_fit_or_do_not_come_are_said(calibration):
+    plan, sources = plan_recording({"eit": "tcp://127.0.0.1:1", "pressure": "tcp://127.0.0.1:1"}, calibration.skin)
+    with pytest.raises(LiveError, match="nothing answers"):
+        run_live(calibration, plan, sources, [], LiveControl(), LiveSettings(wait=0.2))
+    plan, sources = plan_recording({"eit": "tcp://h:1", "pressure": "tcp://h:1?channels=7"}, calibration.skin)
+    with pytest.raises(LiveError, match="7 pressures"):
+        run_live(calibration, plan, sources, [], LiveControl())
+
+
+# --- the page and the lines ----------------------------------------------------------------------
+
+
+def fetch(page, path, *, method="GET", headers=None):
+    host, port = page.server_address[:2]
+    link = http.client.HTTPConnection(host, port, timeout=5)
+    link.request(method, path, headers=headers or {})
+    reply = link.getresponse()
+    body = reply.read() if path != "/results" else b""
+    return link, reply, body
+
+
+def events(reply, count):
+    """Events of the page, as they are pushed."""
+    out = []
+    while len(out) < count:
+        line = reply.readline()
+        if line.startswith(b"data: "):
+            out.append(json.loads(line[6:]))
+    return out
+
+
+@pytest.fixture
+def page(calibration):
+    with Page(calibration, LiveControl()) as found:
+        yield found
+
+
+def test_the_page_is_whole_and_asks_nothing_of_others(page):
+    link, reply, body = fetch(page, "/")
+    assert reply.status == 200
+    assert b"http://" not in body.replace(b"http://www.w3.org", b"")
+    assert b"https://" not in body
+    assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
+    link.close()
+    link, reply, body = fetch(page, "/scene")
+    scene = json.loads(body)
+    assert (scene["rows"], scene["pads"], scene["simulated"]) == (2, ["left", '<b>"right"'], True)
+    link.close()
+    link, reply, _ = fetch(page, "/../etc/passwd")
+    assert reply.status == 404
+    link.close()
+
+
+def test_a_viewer_is_given_the_newest_result_only(page, calibration):
+    engine = rested(calibration)
+    page.control.state = "running"
+    link, reply, _ = fetch(page, "/results")
+    for force in range(200):
+        page.show_result(engine.step(arrival([11.0 + force, 20.0])))
+    found = events(reply, 2)
+    assert found[-1]["about"] == {"state": "running", "simulated": False, "lost": 0}
+    last = [event["result"] for event in found if event["result"]][-1]
+    assert last["number"] > 100
+    assert len(base64.b64decode(last["map"])) == 16
+    link.close()
+
+
+def test_a_viewer_who_never_reads_delays_no_one(page, calibration):
+    engine = rested(calibration)
+    deaf = socket.create_connection(page.server_address[:2])
+    deaf.sendall(f"GET /results HTTP/1.1\r\nHost: 127.0.0.1:{page.server_address[1]}\r\n\r\n".encode())
+    begin = time.monotonic()
+    for force in range(2000):
+        page.show_result(engine.step(arrival([11.0 + force % 7, 20.0])))
+    assert time.monotonic() - begin < 3
+    deaf.close()
+
+
+def test_only_our_own_page_may_ask(page):
+    port = page.server_address[1]
+    others = {"Host": f"evil.example:{port}"}
+    assert fetch(page, "/", headers=others)[1].status == 403
+    assert fetch(page, "/tare", method="POST", headers={"Origin": "http://evil.example"})[1].status == 403
+    assert fetch(page, "/else", method="POST")[1].status == 403
+    assert not page.control.tare.is_set()
+    own = {"Origin": f"http://127.0.0.1:{port}"}
+    assert fetch(page, "/tare", method="POST", headers=own)[1].status == 200
+    assert page.control.tare.is_set()
+
+
+def listening(process="self"):
+    """Addresses that a process listens at, as the system tells them: hexadecimal, with the port."""
+    links = [os.readlink(link) for link in Path(f"/proc/{process}/fd").iterdir() if link.is_symlink()]
+    tables = [Path(f"/proc/{process}/net/{name}").read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
+    frame_packets = [line.split() for table in tables for line in table]
+    return [row[1] for row in frame_packets if row[3] == "0A" and f"socket:[{row[9]}]" in links]
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs Linux")
+def test_everything_listens_on_this_machine_only(calibration, hard):
+    """What a live show opens, and the simulated device."""
+    before, show, found = listening(), LiveControl(), []
+
+    def publish(result):
+        found.extend(set(listening()) - set(before))
+        show.stop.set()
+
+    with small_device() as device:
+        present(
+            calibration,
+            *sources_of(device, calibration),
+            show,
+            Presentation(port=0, publish=0),
+            LiveSettings(rest=0.1),
+            also=[publish],
+        )
+    assert len(set(found)) == 4  # page, lines, two streams of the device
+    assert all(address.startswith("0100007F:") for address in found)
+    told = "127.0.0.1 only; with --host another address, and a line that says who can look"
+    hard("fault 14: what listens", "page, JSON lines, simulated device", beyond=told)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs Linux")
+def test_a_served_skin_listens_on_this_machine_only(bundled):
+    session = next(path for path in bundled if "presses" in path.name)
+    command = [sys.executable, "-m", "calib.cli", "simulate", "ideal", "-o", str(session), "--serve"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
+        try:
+            assert "serving" in serving.stdout.readline()
+            found = listening(serving.pid)
+            serving.send_signal(signal.SIGINT)
+            assert serving.wait(20) == 0
+        finally:
+            serving.kill()
+    assert len(found) == 3
+    assert all(address.startswith("0100007F:") for address in found)
+
+
+def test_results_are_published_as_lines_and_a_warning_precedes_an_open_door(calibration):
+    show, told, lines = LiveControl(), [], []
+
+    def tell(line):
+        told.append(line)
+        if line.startswith("lines"):
+            port = line.rpartition(":")[2]
+            threading.Thread(target=listen, args=("127.0.0.1", int(port)), daemon=True).start()
+
+    def listen(host, port):
+        with socket.create_connection((host, port), timeout=10) as link, link.makefile("rb") as file:
+            lines.extend(json.loads(file.readline()) for _ in range(5))
+        show.stop.set()
+
+    with small_device() as device:
+        present(
+            calibration,
+            *sources_of(device, calibration),
+            show,
+            Presentation(host="0.0.0.0", port=0, publish=0),
+            LiveSettings(rest=0.1),
+            tell=tell,
+        )
+    assert len(lines) == 5
+    assert "anyone who can reach this machine" in told[-1]
+    assert set(lines[0]) >= {"force", "standard_error", "valid", "centre", "latency_ms", "dropped"}
+
+
+@pytest.mark.slow
+def test_an_event_driven_scan_of_the_testbed_finds_the_contact_with_a_fraction_of_the_readings(model, skin, pixels):
+    """A press appears where the whole scan sees it, from the readings of the director's own choice."""
+    recon = je.prepare(model, basis=pixels)
+    masks, owner = je.pad_masks(skin, recon), np.asarray(je.pad_masks(skin, recon).weights)
+    curves = SimpleNamespace(pressure_range=np.tile([0.0, 4000.0], (len(skin.pads), 1)))
+    director = prepare_director(SimpleNamespace(skin=skin, curves=curves), 1, lambda data: None)
+    place = np.array([0.06, 0.15])
+    centres, v0 = np.asarray(model.centroids), np.asarray(je.forward(model))
+    bump = 0.3 * np.exp(-0.5 * ((centres - place) ** 2).sum(1) / 0.012**2)
+    dv = np.asarray(je.forward(model, model.background * (1 + bump))) - v0
+    pad = int(np.argmax(owner @ np.exp(-((np.asarray(recon.centres) - place) ** 2).sum(1) / 1e-4)))
+    pressure, centre = np.zeros(len(skin.pads)), np.full((len(skin.pads), 2), np.nan)
+    director.update(pressure, centre)  # the first is a whole scan
+    director.update(pressure, centre)
+    assert director.requested.sum() < 0.1 * recon.readings
+    pressure[pad] = 2000.0
+    for _ in range(4):
+        director.update(pressure, centre)
+        image = recon(jnp.where(director.requested, dv, jnp.nan))
+        force = np.asarray(je.fuse(image, masks, jnp.asarray(pressure)).force)
+        centre[pad] = force @ np.asarray(recon.centres) / force.sum()
+        assert director.requested.sum() < 0.3 * recon.readings
+        assert np.linalg.norm(centre[pad] - place) < 0.015
+
+
+@pytest.mark.slow
+def test_live_at_the_rate_of_the_paper_accounts_for_every_frame():
+    """928 readings at 100 Hz, 1,000 pressures a second, recorded as well; how fast, is for bench_live to say."""
+    found = bench_live.soaked(bench_live.made_up(), 20.0)
+    assert found["lost"] == 0
+    assert found["received"] == found["recorded"]
+    assert found["recorded_gaps"] == [0, 0]
+    assert found["complete"]
+    assert found["received"][0] > found["shown"] + found["dropped"] > 0  # the others gave the levels
+
+
+@pytest.mark.parametrize("limit", [0, 100, 150, 399, 1000, 10**6])
+def test_the_highest_rate_is_found_by_doubling_and_bisection(limit):
+    tried = []
+
+    def sustains(rate):
+        tried.append(rate)
+        return rate <= limit
+
+    found = bench_live.highest(sustains, 100, 6400)
+    assert found <= limit
+    assert len(tried) <= 12
+    if limit == 10**6:
+        assert found == 6400
+    elif limit:
+        refused = min(rate for rate in tried if rate > limit)
+        assert found == max(rate for rate in tried if rate <= limit)
+        assert refused <= bench_live.CLOSE * found
+
+
+# --- end to end ----------------------------------------------------------------------------------
+
+SITES = np.stack(np.meshgrid([0.035, 0.065, 0.135, 0.165], [0.035, 0.065, 0.135, 0.165]), -1).reshape(-1, 2)
+TIMING = Timing(rest=0.6, ramp=0.6, hold=1.2, release=0.6, recovery=0.6)
+
+
+def stage(bench):
+    """Where the indenter stands, at 20 Hz: over the site of the press of the time."""
+    times = np.arange(0, bench.duration, 0.05)
+    press = np.clip((times - bench.blank) // bench.timing.period, 0, len(bench.sites) - 1).astype(int)
+    return frame_packets(4, (times * S).astype(int), bench.sites[press].astype("f4"))
+
+
+@pytest.mark.slow
+def test_from_a_simulated_skin_to_a_recording_a_calibration_and_live_forces(skin, tmp_path):
+    """Everything over loopback, in real time: forces stay within the calibration's own error bars."""
+    deviations = {fx.StreamKind.EIT: 1e-6, fx.StreamKind.PRESSURE: 2.0, fx.StreamKind.FORCE: 0.01}
+    noise = [fx.Noise(std=std, stream=stream) for stream, std in deviations.items()]
+    effects = (fx.ContactPiezoresistance(), *noise)
+    bench = Bench(
+        je.Scene(skin, effects),
+        SITES,
+        np.array([20.0]),
+        timing=TIMING,
+        blank=2.0,
+        eit_rate=100.0,
+        pad_rate=200.0,
+        toml="simulated in a test",
+    )
+    simulate(bench, tmp_path / "skin.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    names = ["eit", "pressure", "force"]
+    streams = [recording_packets(tmp_path / "skin.h5", [name]) for name in names]
+    with SimulatedDevice([*streams, stage(bench)], wait_for=1) as device:
+        urls = dict(zip([*names, "stage"], device.urls, strict=True))
+        plan, sources = plan_recording({**urls, "stage": urls["stage"] + "?channels=2"}, skin, "end to end")
+        summary = record_session(
+            plan, sources, tmp_path / "recorded.h5", seconds=bench.duration - 0.5, stop_request=StopRequest()
+        )
+    assert summary.complete
+    assert all(stream.lost == 0 for stream in summary.streams)
+    with calib.open_session(tmp_path / "recorded.h5") as session:
+        calibration = calib.calibrate(
+            [session], recipe=calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft())
+        )
+        force = session.stream("force")
+        assert calibration.evaluation.summary()["force_rmse"] < 4.0
+    show, results = LiveControl(), []
+    with SimulatedDevice(
+        [recording_packets(tmp_path / "skin.h5", [name]) for name in ("eit", "pressure")], wait_for=1
+    ) as device:
+        threading.Timer(20.0, show.stop.set).start()
+        found = plan_recording({"eit": device.urls[0], "pressure": device.urls[1]}, skin)
+        run_live(calibration, *found, [results.append], show, LiveSettings(rest=1.5))
+    assert len(results) > 200
+    _, each = np.unique([result.host for result in results], return_index=True)  # of frames read together one
+    results = [results[n] for n in each]
+    total = np.array([result.force.sum() for result in results])
+    error = np.array([np.linalg.norm(result.standard_error) for result in results])
+    since = np.array([result.host - results[0].host for result in results]) / S + 1.5
+    with calib.open_session(tmp_path / "recorded.h5") as session:
+        force = session.stream("force")
+        true = np.interp(since, (force.time - force.time[0]) / S, force.read()[:, 0])
+    still = np.abs(np.gradient(true, since)) < 5
+    assert np.mean(np.abs(total - true)[still] < 2 * error[still] + 0.1) > 0.9
+    assert np.ptp(true) > 15

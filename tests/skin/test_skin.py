@@ -1,0 +1,158 @@
+"""Skin files: what is read, and what is said about a wrong one."""
+
+import importlib.resources
+
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit.toml import read_text
+
+TEXT = importlib.resources.files("jaxeit").joinpath("skin/skins/testbed.toml").read_text()
+
+
+def test_the_testbed(skin):
+    assert skin.name == "testbed"
+    assert skin.domain.area == pytest.approx(0.04)
+    assert len(skin.electrodes) == 25
+    assert len(skin.pads) == 4
+    assert skin.protocol.readings == 550
+    assert skin.protocol.frame_time == pytest.approx(5.5e-3)
+    steps = np.linalg.norm(np.diff(skin.electrode_positions, axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.04)  # a snake: every number next to its neighbour
+
+
+def test_a_copied_and_edited_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(TEXT.replace('name = "testbed"', 'name = "mine"').replace("radius = 0.003", "radius = 0.004"))
+    skin = je.load_skin(path)
+    assert (skin.name, skin.electrodes[0].radius) == ("mine", 0.004)
+    assert skin.toml == path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("radius = 0.003", "raduis = 0.003", r"\[electrodes\]: radius: missing"),
+        ("radius = 0.003", "radius = 0.003\nfoo = 1", r"foo: unknown key"),
+        ("radius = 0.003", "radius = -1.0", r"radius: is -1.0; give the contact radius"),
+        ("radius = 0.003", 'radius = "3 mm"', r"radius: is '3 mm'"),
+        ("radius = 0.003", "radius = nan", "radius: is nan"),
+        ("size = [0.2, 0.2]", "size = [0.2]", r"\[sheet\]: size: has 1 numbers"),
+        ('kind = "bolt"', 'kind = "screw"', 'give one of "bolt"'),
+        ('pattern = "adjacent"', "rows = [[0, 1, 2, 99]]", "names an electrode outside 0 to 24"),
+        ('pattern = "adjacent"', "rows = [[0, 0, 2, 3]]", "uses one electrode twice"),
+        ("pitch = 0.04", "pitch = 0.06", "electrode 4 at .* lies outside the sheet"),
+        ("current = 1e-3", "current = 0", "current"),
+        ("version = 1", "version = 2", "version: is 2"),
+        ('format = "jaxeit-skin"', 'format = "other"', "format"),
+        ("rectangle = [0.0, 0.0, 0.1, 0.1]", "rectangle = [0.1, 0.0, 0.0, 0.1]", r"\[\[pads\]\] number 1"),
+        ("[sheet]", "[sheet", "not valid TOML"),
+        ("maximum = 34474.0", "maximum = -1.0", r"\[pressure_sensor\]: maximum"),
+    ],
+)
+def test_a_wrong_file_names_key_and_reason(old, new, message):
+    assert old in TEXT
+    with pytest.raises(je.toml.TomlError, match=message) as caught:
+        je.skin.parse_skin(TEXT.replace(old, new, 1), "mine.toml")
+    assert str(caught.value).startswith("mine.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_says_what_is_shipped():
+    with pytest.raises(je.toml.TomlError, match="shipped are chest, testbed"):
+        je.load_skin("tesbed")
+
+
+def test_edge_electrodes_and_points():
+    text = TEXT[: TEXT.index("[electrodes]")] + TEXT[TEXT.index("[protocol]") :]
+    edge = text + '[electrodes]\nkind = "edge"\ncount = 16\nwidth = 0.01\ncontact = 1e-3\n'
+    skin = je.skin.parse_skin(edge)
+    assert len(skin.electrodes) == 16
+    np.testing.assert_allclose(skin.electrode_positions[0], [0, 0], atol=1e-12)
+    places = [[0.05, 0.05], [0.15, 0.05], [0.15, 0.15], [0.05, 0.15]]
+    points = f'{text}[electrodes]\nkind = "point"\npositions = {places}\n'
+    assert je.skin.parse_skin(points).protocol.readings == 4
+
+
+def _with_electrodes(lines):
+    return TEXT[: TEXT.index("[electrodes]")] + TEXT[TEXT.index("[protocol]") :] + f"[electrodes]\n{lines}\n"
+
+
+RECTANGLES = """kind = "rectangle"
+size = [0.02, 0.01]
+angle = 0.3
+contact = 1e-5
+positions = [[0.05, 0.05], [0.15, 0.05], [0.15, 0.15], [0.05, 0.15]]"""
+
+POLYGONS = """kind = "polygon"
+contact = 0.0
+outlines = [[[0.01, 0.01], [0.01, 0.03], [0.03, 0.01]], [[0.1, 0.1], [0.12, 0.1], [0.12, 0.12], [0.1, 0.12]],
+            [[0.15, 0.1], [0.17, 0.1], [0.17, 0.12]], [[0.15, 0.15], [0.17, 0.15], [0.17, 0.17]]]"""
+
+
+def test_rectangles_are_turned_about_their_centres():
+    skin = je.skin.parse_skin(_with_electrodes(RECTANGLES))
+    np.testing.assert_allclose(skin.electrode_positions[3], [0.05, 0.15], rtol=1e-14)
+    first = skin.electrodes[0]
+    assert (first.outline.area, first.contact) == (pytest.approx(2e-4), 1e-5)
+    bottom = first.outline.corner_points[1] - first.outline.corner_points[0]  # counter-clockwise from the x axis
+    np.testing.assert_allclose(bottom, 0.02 * np.array([np.cos(0.3), np.sin(0.3)]), rtol=1e-12)
+    row = 'kind = "rectangle"\nsize = [0.02, 0.01]\ncontact = 0.0\n'
+    grid = je.skin.parse_skin(
+        _with_electrodes(row + "grid = {columns = 4, rows = 1, pitch = 0.04, origin = [0.04, 0.1]}")
+    )
+    assert grid.electrodes[1].outline.bounds == (pytest.approx((0.07, 0.095)), pytest.approx((0.09, 0.105)))
+
+
+def test_polygons():
+    skin = je.skin.parse_skin(_with_electrodes(POLYGONS))
+    assert [len(e.outline.corner_points) for e in skin.electrodes] == [3, 4, 3, 3]
+    np.testing.assert_allclose(skin.electrode_positions[0], [0.05 / 3, 0.05 / 3], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lines", "old", "new", "message"),
+    [
+        (
+            RECTANGLES,
+            "size = [0.02, 0.01]",
+            "size = [0.02, 0.0]",
+            r"\[electrodes\]: size: is \[0.02, 0.0\]; give a width",
+        ),
+        (RECTANGLES, "size = [0.02, 0.01]", "radius = 0.01", r"size: missing; give \[width, height\] in m"),
+        (RECTANGLES, "[0.15, 0.05]", "[0.195, 0.05]", r"positions: electrode 1 has a corner at \[0.2.* m, outside"),
+        (RECTANGLES, "angle = 0.3", "angle = '17 deg'", "angle: is '17 deg'; give the turn counter-clockwise in rad"),
+        (RECTANGLES, "contact = 1e-5", "contact = -1.0", "contact: is -1.0; give ohm m.2"),
+        (RECTANGLES, "angle = 0.3", "angel = 0.3", "angel: unknown key; did you mean 'angle'"),
+        (
+            POLYGONS,
+            "[0.01, 0.01]",
+            "[-0.01, 0.01]",
+            r"outlines: electrode 0 has a corner at \[-0.01, 0.01\] m, outside",
+        ),
+        (POLYGONS, "[0.1, 0.12]", "[0.11, 0.09]", "outlines: electrode 1: Polygon: the sides .* meet"),
+        (POLYGONS, "[0.1, 0.12]", "[nan, 0.09]", "outlines: electrode 1: Polygon: vertex 3 .* give finite metres"),
+        (POLYGONS, "[0.1, 0.12]", "[0.1, '0.12']", r"outlines: is .*; give \[\[\[x, y\], ...\], ...\]"),
+        (POLYGONS, "outlines = [[[0.01, 0.01]", "outlines = [[0.01, [0.01, 0.01]", "outlines: is .*; give"),
+    ],
+)
+def test_wrong_patches_are_refused(lines, old, new, message):
+    assert old in lines
+    with pytest.raises(je.toml.TomlError, match=message):
+        je.skin.parse_skin(_with_electrodes(lines.replace(old, new, 1)))
+
+
+def test_adjacent_never_senses_what_it_drives():
+    pattern = je.skin.adjacent(32)
+    assert pattern.shape == (32 * 29, 4)
+    assert (pattern[:, :2, None] != pattern[:, None, 2:]).all()
+    assert (je.skin.reciprocal_rows(pattern) >= 0).all()
+
+
+def test_what_is_not_text_or_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(je.toml.TomlError, match=r"cannot be read \(.*\); check the name and the folder"):
+        read_text(tmp_path)
+    (tmp_path / "skin.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(je.toml.TomlError, match=r"skin\.toml: is not text; give a TOML file"):
+        read_text(tmp_path / "skin.toml")
