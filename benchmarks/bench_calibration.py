@@ -11,29 +11,27 @@ as a bench that stops at these forces would record them.  Places are found with 
 through the sheet that the mean of its untouched frames shows.
 """
 
-import argparse
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import calib
 import jaxeit as je
-from calib.calibration import press_data
-from calib.figures import plain_numbers, write_figure
-from calib.fit import FitResult
-from calib.hybrid import Hybrid, PressData, fit_hybrid, folds_by_place
-from calib.location import Geometry, Places, geometry_of
+from calib.fitting.fields import Geometry, Places, geometry_of
+from calib.fitting.held_out import folds_by_place
+from calib.fitting.pads import Hybrid, LocatedPresses, fit_hybrid
+from calib.fitting.results import FitResult
+from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
 
-from . import _common as c
+from .figures import logarithmic, panels
+from .harness import ROOT, Question, Row, Run
 
-PICTURE = c.ROOT / "docs" / "calibration-cost.png"
-SESSIONS = c.ROOT / "data" / "sessions"
+SESSIONS = ROOT / "data" / "sessions"
 SIDES = (3, 4, 5, 6, 8, 10, 15)  # of the grid of presses
 LEVELS = (1, 2, 3, 5, None)  # None: the whole press
 DRAWS, FOLDS = 3, 5
@@ -41,16 +39,13 @@ SIDE = 15  # of the pool's grid
 CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib.PowerLaw()}
 FIELDS = {"none": None, "pad edge": calib.PadEdge()}
 RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))
-SMOKE = {
-    "location": calib.Bilinear(nodes=2, shared=True),
-    "locator": calib.ImageCentroid("half"),
-    "fidelity": je.Fidelity.draft(),
-    "folds": 2,
-}
-
+SMOKE = calib.Recipe(
+    location=calib.Bilinear(nodes=2, shared=True),
+    locator=calib.ImageCentroid("half"),
+    fidelity=je.Fidelity.draft(),
+    folds=2,
+)
 LINES = {"scattered": "-", "grid": "--", "random": ":"}
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +69,18 @@ class Pool:
     elsewhere: Places
 
 
-def pool(**settings: Any) -> Pool:
-    """Places as `calibrate` with these settings tells them."""
+@cache
+def pool(smoke: bool) -> Pool:
+    """Places as `calibrate` tells them."""
     with calib.open_session(SESSIONS / "testbed_grid.h5") as session:
-        calibration = calib.calibrate([session], **{"location": calib.PadEdge()} | settings)
-        found = calib.measure(session, calibration.skin)
-        data, dv, position = press_data([found])
-        seconds = float(np.median(np.diff(found.presses.t_press))) * 1e-9
+        calibration = calib.calibrate([session], recipe=SMOKE if smoke else calib.Recipe(location=calib.PadEdge()))
+        found = pool_presses([session], calibration.skin)
+        seconds = float(np.median(np.diff(found.recordings[0].presses.t_press))) * 1e-9
     with calib.open_session(SESSIONS / "testbed_presses.h5") as session:
-        other, other_dv, _ = press_data([calib.measure(session, calibration.skin)])
-    places, elsewhere = (_places(calibration, frames) for frames in (dv, other_dv))
+        other = pool_presses([session], calibration.skin)
+    places, elsewhere = (_places(calibration, frames) for frames in (found.dv, other.dv))
     geometry = geometry_of(calibration.skin, places.position.dtype)
-    return Pool(data, geometry, places, position, seconds, other, elsewhere)
+    return Pool(found.data, geometry, places, found.position, seconds, other.data, elsewhere)
 
 
 def _places(calibration: calib.Calibration, frames: np.ndarray) -> Places:
@@ -149,7 +144,8 @@ def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | N
     places = None if field is None else pool.places
     pressed = pool.position[use]
     data = replace(at_levels(pool.data, levels), reach=np.stack([pressed.min(0), pressed.max(0)]))
-    hybrid = fit_hybrid(curve, field, data, pool.geometry, places, calib.SoftL1(), use=use)
+    presses = LocatedPresses(data, pool.geometry, places)
+    hybrid = fit_hybrid(curve, field, presses, calib.fitting.SoftL1(), use=use)
     results = [np.asarray(hybrid.curves.result), *([] if hybrid.field is None else [np.asarray(hybrid.field.result)])]
     return hybrid if all((found == FitResult.SUCCESS).all() for found in results) else None
 
@@ -171,18 +167,17 @@ def judged(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | N
     hybrids = [fitted(pool, recipe, part, levels) for part in (*parts, use)]
     if not all(hybrids):
         return None
-    whole, held, along = hybrids[-1], [], []
+    held, along = [], []
     for part, hybrid in zip(parts, hybrids, strict=False):
         over_holds, over_samples = errors(hybrid, pool.data, pool.places)
         held.append(over_holds[~part])
         along.append(over_samples[~part[pool.data.sample_press]])
-    other = errors(whole, pool.other, pool.elsewhere)[0]
-    return {"hold_n": rms(held), "press_n": rms(along), "other_session_n": rms([other])}
+    other = errors(hybrids[-1], pool.other, pool.elsewhere)[0]
+    return {"hold_n": _rms(held), "press_n": _rms(along), "other_session_n": _rms([other])}
 
 
-def rms(parts: Sequence[np.ndarray]) -> float:
-    values = np.concatenate(parts)
-    return float(np.sqrt(np.nanmean(values**2)))
+def _rms(parts: Sequence[np.ndarray]) -> float:
+    return float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2)))
 
 
 def row(pool: Pool, recipe: tuple[str, str], spread: str, uses: Sequence[np.ndarray], levels: int | None) -> Row:
@@ -200,46 +195,29 @@ def row(pool: Pool, recipe: tuple[str, str], spread: str, uses: Sequence[np.ndar
     return out
 
 
-def by_presses(pool: Pool, sides: Sequence[int], draws: int, recipes: Sequence[tuple[str, str]]) -> Iterator[Row]:
-    presses = len(pool.data.force)
+def by_presses(run: Run) -> Iterator[Row]:
+    found, recipes = pool(run.smoke), RECIPES[1:2] if run.smoke else RECIPES
+    presses = len(found.data.force)
     for recipe in recipes:
-        for count in (side**2 for side in sides):
-            uses = {"grid": [on_grid(pool.position, round(count**0.5))]}
+        for count in (side**2 for side in ((5, 15) if run.smoke else SIDES)):
+            uses = {"grid": [on_grid(found.position, round(count**0.5))]}
             if count < presses:
-                uses["scattered"] = [scattered(pool.position, count)]
-                uses["random"] = [drawn(presses, count, seed) for seed in range(draws)]
-            for spread, some in uses.items():
-                yield row(pool, recipe, spread, some, None)
+                uses["scattered"] = [scattered(found.position, count)]
+                uses["random"] = [drawn(presses, count, seed) for seed in range(1 if run.smoke else DRAWS)]
+            yield {"presses": [row(found, recipe, spread, some, None) for spread, some in uses.items()]}
+    yield {"verdict": verdict(run.data["presses"])}
 
 
-def by_levels(pool: Pool, levels: Sequence[int | None], counts: Sequence[int]) -> Iterator[Row]:
-    for curve in CURVES:
-        for presses in counts:
-            for count in levels:
-                yield row(pool, (curve, "pad edge"), "scattered", [scattered(pool.position, presses)], count)
+def by_levels(run: Run) -> Iterator[Row]:
+    yield {"levels": []}
+    for curve in () if run.smoke else CURVES:
+        for count in (36, 100):
+            uses = [scattered(pool(False).position, count)]
+            rows = [row(pool(False), (curve, "pad edge"), "scattered", uses, levels) for levels in LEVELS]
+            yield {"levels": rows}
 
 
 # --- what is said of it
-
-
-def table(rows: Sequence[Row]) -> str:
-    lines = [
-        "| curve | location | presses | minutes | levels | spread | held out, N | all along, N | other session, N |",
-        "|---" * 9 + "|",
-    ]
-    for r in rows:
-        levels = "whole press" if r["levels"] is None else r["levels"]
-        failed = f", {r['failed']} of {r['draws']} undetermined" if r["failed"] else ""
-        cells = [_cell(r, name) for name in ("hold_n", "press_n", "other_session_n")]
-        heads = [r["curve"], r["location"], r["presses"], f"{r['minutes']:.1f}", levels, r["spread"] + failed]
-        lines.append("| " + " | ".join(map(str, [*heads, *cells])) + " |")
-    return "\n".join(lines)
-
-
-def _cell(r: Row, name: str) -> str:
-    if name not in r:
-        return ""
-    return f"{r[name]:.2f}" + (f" ± {r[f'{name}_sd']:.2f}" if f"{name}_sd" in r else "")
 
 
 def verdict(rows: Sequence[Row]) -> str:
@@ -248,9 +226,8 @@ def verdict(rows: Sequence[Row]) -> str:
     for recipe in RECIPES:
         mine = [r for r in rows if (r["curve"], r["location"]) == recipe and "hold_n" in r]
         most = max((r["presses"] for r in mine), default=0)
-        mine = sorted(
-            (r for r in mine if r["spread"] == "scattered" or r["presses"] == most), key=lambda r: r["presses"]
-        )
+        mine = [r for r in mine if r["spread"] == "scattered" or r["presses"] == most]
+        mine.sort(key=lambda r: r["presses"])
         if len(mine) > 1:
             best = mine[-1]["hold_n"]
             few = next(r for r in mine if r["hold_n"] <= 1.25 * best)
@@ -261,68 +238,39 @@ def verdict(rows: Sequence[Row]) -> str:
     return "\n".join(said)
 
 
-def picture(data: Mapping[str, Any]) -> Figure:
+def picture(data: Row) -> Figure:
     """Error against presses, and against force levels."""
-    figure = Figure(figsize=(10.8, 4.6), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, sharey=True)
-    for number, recipe in enumerate(RECIPES):
+    figure, (left, right) = panels(10.8, 4.6, 1, 2, sharey=True)
+    for colour, recipe in zip(("C0", "C1", "C2"), RECIPES, strict=True):
+        rows = [r for r in data["presses"] if (r["curve"], r["location"]) == recipe and "hold_n" in r]
         for spread, line in LINES.items():
-            mine = [r for r in data["presses"] if (r["curve"], r["location"]) == recipe and "hold_n" in r]
-            mine = [r for r in mine if r["spread"] == spread]
             label = f"{recipe[0]}, place: {recipe[1]}" if spread == "scattered" else None
-            left.errorbar(
-                [r["presses"] for r in mine],
-                [r["hold_n"] for r in mine],
-                [r.get("hold_n_sd", 0) for r in mine],
-                color=f"C{number}",
-                linestyle=line,
-                marker="o" if spread == "scattered" else ".",
-                label=label,
-            )
-    for number, curve in enumerate(CURVES):
-        mine = [r for r in data["levels"] if r["curve"] == curve and "press_n" in r]
-        most = max((r["presses"] for r in mine), default=0)
-        for count, line in {r["presses"]: "-" if r["presses"] == most else "--" for r in mine}.items():
-            some = [r for r in mine if r["presses"] == count]
-            places = [LEVELS.index(r["levels"]) for r in some]
-            values = [r["press_n"] for r in some]
-            right.plot(places, values, line, color=f"C{number}", marker="o", label=f"{curve}, {count} presses")
-    left.set(xscale="log", yscale="log", xlabel="presses fitted", ylabel="RMS error of held-out forces, N")
-    left.set_title("over the holds; scattered (lines), grid (dashed), random (dotted, ± sd)", fontsize=10)
-    plain_numbers(left)
+            look: Row = {"color": colour, "linestyle": line, "marker": "o" if label else ".", "label": label}
+            points = [(r["presses"], r["hold_n"], r.get("hold_n_sd", 0)) for r in rows if r["spread"] == spread]
+            left.errorbar(*zip(*points, strict=True), **look)
+    for colour, curve in zip(("C0", "C1", "C2"), CURVES, strict=True):
+        curves: dict[int, list[tuple[int, float]]] = {}
+        for r in data["levels"]:
+            if r["curve"] == curve and "press_n" in r:
+                curves.setdefault(r["presses"], []).append((LEVELS.index(r["levels"]), r["press_n"]))
+        for count, points in curves.items():
+            look = {"color": colour, "linestyle": "-" if count == max(curves) else "--", "marker": "o"}
+            right.plot(*zip(*points, strict=True), **look, label=f"{curve}, {count} presses")
+    labels: Any = {"xlabel": "presses fitted", "ylabel": "RMS error of held-out forces, N"}
+    logarithmic(left, "over the holds; scattered (lines), grid (dashed), random (dotted, ± sd)", **labels)
     left.set_xticks([s**2 for s in SIDES], labels=[str(s**2) for s in SIDES])
     left.set_xticks([], minor=True)
     right.set_xticks(range(len(LEVELS)), labels=["whole press" if n is None else str(n) for n in LEVELS])
     right.set(xlabel="force levels")
     right.set_title("all along the press; place: pad edge", fontsize=10)
+    right.grid(True, which="both", color="#e4e4e4", linewidth=0.7)
     for axes in (left, right):
-        axes.grid(True, which="both", color="#e4e4e4", linewidth=0.7)
         axes.legend(fontsize=8, frameon=False)
     return figure
 
 
-def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="few fits, nothing written")
-    parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
-    args = parser.parse_args(argv)
-    set_up()
-    if args.draw_only:
-        write_figure(picture(c.stored("calibration_cost")), PICTURE)
-        return {}
-    data: dict[str, Any] = {"circumstances": c.circumstances()}
-    found = pool(**SMOKE) if args.smoke else pool()
-    sides, draws, recipes = ((5, 15), 1, RECIPES[1:2]) if args.smoke else (SIDES, DRAWS, RECIPES)
-    data["presses"] = list(by_presses(found, sides, draws, recipes))
-    data["levels"] = [] if args.smoke else list(by_levels(found, LEVELS, (36, 100)))
-    data["verdict"] = verdict(data["presses"])
-    print(table([*data["presses"], *data["levels"]]), data["verdict"], sep="\n\n", flush=True)
-    if not args.smoke:
-        c.write("calibration_cost", c.closed(data))
-        write_figure(picture(data), PICTURE)
-    return data
-
+PARTS = {"presses": by_presses, "levels": by_levels}
+main = Question("calibration_cost", __doc__, PARTS, picture=picture, file="calibration-cost.png", prepare=set_up)
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -7,18 +7,14 @@ challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, w
 evaluation frames are not used here; the levels are made by leaving those readings of the training frames out.
 """
 
-import argparse
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -28,11 +24,14 @@ from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from scipy.optimize import minimize_scalar
 
 import jaxeit as je
-from calib.figures import write_figure
+from calib.report.figures import write_figure
 
-from . import _common as c
+from .clock import seconds
+from .figures import panels
+from .harness import ROOT, Question, Row, Run
+from .tables import crossed
 
-PICTURE = c.ROOT / "docs" / "ktc.png"
+PICTURE = ROOT / "docs" / "ktc.png"
 RADIUS, ELECTRODES, GRID = 0.115, 32, 256
 LEVELS, SMOKE_LEVELS = tuple(range(1, 8)), (1, 7)
 OTHER_SECTORS, OTHER_LEVELS = (8, 16, 24), (4, 7)  # where else electrodes are taken away; not looked at while tuning
@@ -58,7 +57,7 @@ def half_height(image: np.ndarray, floor: float, least: int) -> np.ndarray:
 def otsu_labels(image: np.ndarray) -> np.ndarray:
     """The challenge's own segmentation: three classes by Otsu's thresholds, the largest taken for water; what lies
     below it is resistive, what lies above conductive."""
-    classes = np.digitize(image, np.asarray(je.otsu_thresholds(image)))
+    classes = np.digitize(image, np.asarray(je.metrics.otsu_thresholds(image)))
     water = np.bincount(classes.ravel()).argmax()
     return np.where(classes < water, RESISTIVE, np.where(classes > water, CONDUCTIVE, WATER))
 
@@ -207,7 +206,7 @@ class Linear:
     """The recipe of old: one step from even water with `Noser`, then Otsu."""
 
     model: je.Model
-    image: je.BasisMap
+    image: je.model.BasisMap
     water: Water
     hyperparameter: float = 0.1
 
@@ -231,9 +230,9 @@ class Variation:
     """
 
     model: je.Model
-    image: je.BasisMap
+    image: je.model.BasisMap
     water: Water
-    prior: je.IsotropicVariation = field(default_factory=je.IsotropicVariation)
+    prior: je.imaging.IsotropicVariation = field(default_factory=je.imaging.IsotropicVariation)
     relative: float = 0.05
     absolute: float = 0.01
     floor: float = 0.5
@@ -242,7 +241,7 @@ class Variation:
     def __call__(self, data: Data) -> list[tuple[np.ndarray, np.ndarray]]:
         contact = jnp.full_like(self.model.contact, 1 / self.water.contact)
         model = eqx.tree_at(lambda m: m.contact, self.model, contact)
-        physics = je.LogConductivity(model, self.image, jnp.asarray(self.water.sigma))
+        physics = je.imaging.LogConductivity(model, self.image, jnp.asarray(self.water.sigma))
         rest = np.asarray(_rest(physics))
         pictures = [self._picture(physics, rest, frame, data.reference) for frame in data.frames]
         return [(picture, half_height(picture, self.floor, self.least)) for picture in pictures]
@@ -266,9 +265,7 @@ def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method
     return {"linear": Linear(model, image, water), "variation": Variation(model, image, water)}
 
 
-# --- results ---------------------------------------------------------------------------------------------------------
-
-Row = dict[str, Any]
+# --- results
 
 
 def measure(
@@ -278,9 +275,9 @@ def measure(
     rows, found = [], {}
     for level in levels:
         for name, way in ways.items():
-            spent, out = c.seconds(way, with_level(data, level, first))
+            spent, out = seconds(way, with_level(data, level, first))
             found[level, name] = [labels for _, labels in out]
-            scores = [float(je.ktc_score(a, b)) for a, b in zip(found[level, name], data.truth, strict=True)]
+            scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(found[level, name], data.truth, strict=True)]
             row = {"level": level, "first": first, "method": name, "seconds": round(spent, 2)}
             rows.append(row | {"scores": [round(s, 3) for s in scores], "mean": round(float(np.mean(scores)), 3)})
             print(rows[-1], flush=True)
@@ -295,21 +292,20 @@ def totals(rows: list[Row]) -> dict[str, float]:
 
 def means(rows: list[Row]) -> dict[str, dict[str, float]]:
     """Mean score by level and method."""
-    keys = dict.fromkeys((row["level"], row["method"]) for row in rows)
-    found: dict[str, dict[str, float]] = {}
-    for level, name in keys:
-        scores = [row["mean"] for row in rows if (row["level"], row["method"]) == (level, name)]
-        found.setdefault(name, {})[f"level {level}"] = round(float(np.mean(scores)), 3)
-    return found
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        found.setdefault(row["method"], {}).setdefault(f"level {row['level']}", []).append(row["mean"])
+    return {
+        name: {level: round(float(np.mean(scores)), 3) for level, scores in by_level.items()}
+        for name, by_level in found.items()
+    }
 
 
 def table(rows: list[Row]) -> str:
-    levels = sorted({row["level"] for row in rows})
-    lines = ["| method | " + " | ".join(f"level {n}" for n in levels) + " | of 21 |", "|---" * (2 + len(levels)) + "|"]
-    for name, total in totals(rows).items():
-        means = {row["level"]: row["mean"] for row in rows if row["method"] == name}
-        lines.append(f"| {name} | " + " | ".join(f"{means[n]:.3f}" for n in levels) + f" | {total:.2f} |")
-    return "\n".join(lines)
+    """Scores by level, and the total."""
+    of_21 = [{"method": name, "head": "of 21", "score": f"{total:.2f}"} for name, total in totals(rows).items()]
+    by_level = [row | {"head": f"level {row['level']}", "score": f"{row['mean']:.3f}"} for row in rows]
+    return crossed("method", "{method}", "{head}", "{score}", by_level + of_21)
 
 
 RIM = "#333333"
@@ -319,22 +315,20 @@ SHOWN = {"linear": "linear", "variation": "total variation"}
 
 def picture(data: Data, found: dict[tuple[int, str], list[np.ndarray]]) -> Figure:
     """Truth beside what each method makes of it, at the first and the last level found."""
-    ends = sorted({level for level, _ in found})
-    ends = [ends[0], ends[-1]]
-    columns = [(level, name) for level in ends for name in SHOWN]
-    figure = Figure(figsize=(2.1 * (1 + len(columns)), 2.3 * len(data.truth)), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(data.truth), 1 + len(columns), squeeze=False)
-    for number, (line, truth) in enumerate(zip(grid, data.truth, strict=True)):
-        _panel(line[0], truth, 1)
-        line[0].set_ylabel(f"frame {number + 1}", fontsize=10)
-        for axes, key in zip(line[1:], columns, strict=True):
-            labels = found[key][number]
-            _panel(axes, labels, key[0])
-            axes.set_xlabel(f"score {float(je.ktc_score(labels, truth)):.2f}", fontsize=9)
-    grid[0, 0].set_title("truth", fontsize=10)
-    for axes, (level, name) in zip(grid[0, 1:], columns, strict=True):
-        axes.set_title(f"{SHOWN[name]}\nlevel {level}", fontsize=10)
+    levels = sorted({level for level, _ in found})
+    columns = [(level, name) for level in (levels[0], levels[-1]) for name in SHOWN]
+    rows, width = len(data.truth), 1 + len(columns)
+    figure, axes = panels(2.1 * width, 2.3 * rows, rows, width, squeeze=False)
+    for number, truth in enumerate(data.truth):
+        first, *others = axes[number * width : (number + 1) * width]
+        _panel(first, truth, 1)
+        first.set_ylabel(f"frame {number + 1}", fontsize=10)
+        for panel, key in zip(others, columns, strict=True):
+            _panel(panel, found[key][number], key[0])
+            panel.set_xlabel(f"score {float(je.metrics.ktc_score(found[key][number], truth)):.2f}", fontsize=9)
+    axes[0].set_title("truth", fontsize=10)
+    for panel, (level, name) in zip(axes[1:width], columns, strict=True):
+        panel.set_title(f"{SHOWN[name]}\nlevel {level}", fontsize=10)
     kinds = [Patch(color=COLOURS(kind), label=name) for kind, name in enumerate(("water", "resistive", "conductive"))]
     rim = Line2D([], [], color=RIM, linewidth=2, label="electrodes in use")
     figure.legend(handles=[*kinds, rim], loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
@@ -355,38 +349,26 @@ def _panel(axes: Any, labels: np.ndarray, level: int) -> None:
     axes.set_frame_on(False)
 
 
-def main(argv: list[str] | None = None) -> Row:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder with training/ and groundtruth_training/")
-    parser.add_argument("--smoke", action="store_true", help="one frame at two levels, nothing written")
-    args = parser.parse_args(argv)
-    c.set_up()
-    data = load(args.data)
+def challenge(run: Run) -> Iterator[Row]:
+    """All levels, and some levels with electrodes taken away elsewhere."""
+    data = load(run.args.data)
     model = tank(data)
     water = fits(model, data)
-    residuals = {name: round(fit.residual, 4) for name, fit in water.items()}
-    print("relative residual of even water:", residuals, flush=True)
-    run = partial(measure, ways=methods(model, water["equal currents, offsets"]))
-    if args.smoke:
-        rows, _ = run(replace(data, frames=data.frames[:1], truth=data.truth[:1]), levels=SMOKE_LEVELS)
-        return {"residuals": residuals, "rows": rows}
-    circumstances = c.circumstances()
-    rows, found = run(data, levels=LEVELS)
+    yield {"residuals": {name: round(fit.residual, 4) for name, fit in water.items()}}
+    ways = methods(model, water["equal currents, offsets"])
+    if run.smoke:
+        data = replace(data, frames=data.frames[:1], truth=data.truth[:1])
+    rows, found = measure(data, ways, SMOKE_LEVELS if run.smoke else LEVELS)
     print(table(rows), flush=True)
-    others = [row for first in OTHER_SECTORS for row in run(data, levels=OTHER_LEVELS, first=first)[0]]
-    results: Row = {
-        "circumstances": circumstances,
-        "residuals": residuals,
-        "published_of_21": PUBLISHED,
-        "of_21": totals(rows),
-        "means_other_sectors": means(others),
-        "rows": rows,
-        "other_sectors": others,
-    }
-    c.write("ktc", c.closed(results))
-    write_figure(picture(data, found), PICTURE)
-    return results
+    yield {"published_of_21": PUBLISHED, "of_21": totals(rows), "rows": rows}
+    if not run.smoke:
+        write_figure(picture(data, found), PICTURE)
+        others = [row for first in OTHER_SECTORS for row in measure(data, ways, OTHER_LEVELS, first)[0]]
+        yield {"means_other_sectors": means(others), "other_sectors": others}
 
+
+DATA: Row = {"type": Path, "required": True, "help": "folder with training/ and groundtruth_training/"}
+main = Question("ktc", __doc__, {"rows": challenge}, {"--data": DATA})
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -1,11 +1,11 @@
-"""Live over loopback: loss, latency from a frame's last byte to its force map, growth of memory, and the highest rate.
+"""Live over loopback: loss, latency from the last byte of a frame to its force map, memory growth, highest rate.
 
 The skin is a process of its own that sends frames of 928 readings and 1,000 samples of the pads' pressures a second.
 First a soak, which is recorded as well, and another at real-time priority where that is allowed; then a recording of as
 many frames in a tenth of the time; then the highest rate of frames that is sustained, by doubling and bisection. A rate
 at which frames are dropped is tried once more: a machine that stands still for a moment drops them at any rate.
 
-python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5] [--no-rates | --rates-only]
+python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5 --section NAME] [--only rates]
 
 Latency counts from when the bytes that end a frame were read; `since_due` from when the simulated device should have
 sent it: the device's own lateness, and what the bytes waited to be read, are in it. `woken` is how late a process wakes
@@ -13,8 +13,6 @@ that does nothing but sleep from one hundredth of a second to the next, at the s
 promise less, at the same priority.
 """
 
-import argparse
-import multiprocessing
 import os
 import sys
 import tempfile
@@ -24,6 +22,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count
+from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
@@ -32,16 +31,17 @@ import numpy as np
 
 import calib
 import jaxeit as je
-from calib.acquisition.device import Device, Packets, rows
-from calib.acquisition.entries import unpack_frames
-from calib.acquisition.live import Show, live
-from calib.acquisition.priority import real_time
-from calib.acquisition.recorder import Log, Nowhere, kept, record
-from calib.acquisition.results import Result
-from calib.acquisition.setup import prepare
+from calib.live.loop import LiveControl, LiveSettings, run_live
+from calib.live.results import FrameResult
+from calib.record.device import Packets, SimulatedDevice, frame_packets
+from calib.record.intake import NullSink, RecordSink
+from calib.record.planning import plan_recording
+from calib.record.priority import real_time, refusal
+from calib.record.recorder import record_session, session_journal
+from calib.record.records import unpack_frames
 from calib.runtime import set_up_live
 
-from ._common import circumstances, may_run_in_real_time, stored, write
+from .harness import Question, Row, Run
 from .memory import growth, resident
 
 RATE, PRESSURE_RATE = 100, 1000
@@ -51,47 +51,35 @@ FASTEST = 6400  # Hz
 CLOSE = 1.1  # the rate that is sustained and the one that is not are not farther apart
 
 
-def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="five seconds, two rates, nothing written")
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--calibration", help="default: one made up for the chest skin, without correction by place")
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument("--no-rates", action="store_true", help="leave out the search for the highest rate")
-    which.add_argument("--rates-only", action="store_true", help="leave the long runs of the last time as they are")
-    args = parser.parse_args(argv)
-    section = "live_located" if args.calibration else "live"
-    set_up_live()
-    calibration = calib.load_calibration(args.calibration) if args.calibration else made_up()
-    data = stored(section) if args.rates_only else long_runs(calibration, 5.0 if args.smoke else 60 * args.minutes)
-    data["rates"] = []
-    if not args.no_rates:
-
-        def sustains(rate: int) -> bool:
-            row = watched(calibration, rate, 3.0 if args.smoke else 15.0)
-            data["rates"].append(row)
-            print(row, flush=True)
-            return row["sustained"]
-
-        most = 2 * RATE if args.smoke else FASTEST
-        data["highest_hz"] = highest(lambda rate: sustains(rate) or sustains(rate), RATE, most)
-        print("highest rate sustained:", data["highest_hz"], "Hz", flush=True)
-    if not args.smoke:
-        write(section, data)
-    return data
+def calibration_of(run: Run) -> calib.Calibration:
+    return calib.load_calibration(run.args.calibration) if run.args.calibration else made_up()
 
 
-def long_runs(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
+def long_runs(run: Run) -> Iterator[Row]:
     """The soaks, and the recording of as many frames in a tenth of the time."""
-    data: dict[str, Any] = {"circumstances": circumstances(), "readings": calibration.recon.readings}
-    data["soak"] = soaked(calibration, seconds)
-    print(data["soak"], flush=True)
-    if may_run_in_real_time():
-        data["soak_realtime"] = soaked(calibration, seconds, realtime=True)
-        print(data["soak_realtime"], flush=True)
-    data["tenfold"] = tenfold(calibration, max(seconds / 10, 3.0))
-    print(data["tenfold"], flush=True)
-    return data
+    calibration, seconds = calibration_of(run), 5.0 if run.smoke else 60 * run.args.minutes
+    yield {"readings": calibration.recon.readings, "soak": soaked(calibration, seconds)}
+    if refused := refusal():
+        print(f"at ordinary priority, where others may come between: {refused}")
+    else:
+        yield {"soak_realtime": soaked(calibration, seconds, realtime=True)}
+    yield {"tenfold": tenfold(calibration, max(seconds / 10, 3.0))}
+
+
+def rates(run: Run) -> Iterator[Row]:
+    """The highest rate that is sustained; a rate that fails is tried once more."""
+    calibration, tried = calibration_of(run), []
+
+    def sustains(rate: int) -> bool:
+        for _ in range(2):
+            tried.append(watched(calibration, rate, 3.0 if run.smoke else 15.0))
+            print(tried[-1], flush=True)
+            if tried[-1]["sustained"]:
+                return True
+        return False
+
+    most = 2 * RATE if run.smoke else FASTEST
+    yield {"highest_hz": highest(sustains, RATE, most), "rates": tried}
 
 
 def highest(sustains: Callable[[int], bool], low: int, most: int) -> int:
@@ -122,7 +110,9 @@ def made_up() -> calib.Calibration:
 
 def skin_process(rates: tuple[int, int], channels: tuple[int, int], told: Any, stop: Event) -> None:
     """The device, until told to stop."""
-    with Device([frames(number + 1, *what) for number, what in enumerate(zip(rates, channels, strict=True))]) as device:
+    with SimulatedDevice(
+        [frames(number + 1, *what) for number, what in enumerate(zip(rates, channels, strict=True))]
+    ) as device:
         told.put((device.begin, device.urls))
         stop.wait()
 
@@ -134,13 +124,13 @@ def frames(number: int, rate: int, channels: int) -> Packets:
     pressed = pool + np.float32(2e-4 * rng.normal() if number == 1 else 2000.0)
     times = (n * 1_000_000_000 // rate for n in count())
     choice = ((pressed if n > 2 * rate and n // rate % 2 else pool)[n % 64] for n in count())
-    return rows(number, times, choice)
+    return frame_packets(number, times, choice)
 
 
 class Received:
     """What arrives, on its way to a log: how many frames of each stream, and when the latest were due."""
 
-    def __init__(self, log: Log):
+    def __init__(self, log: RecordSink):
         self._log = log
         self.counts = [0, 0]
         self._due: OrderedDict[int, int] = OrderedDict()
@@ -175,9 +165,9 @@ class Watch:
         self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
         self._memory, self._used = np.full((int(seconds) + 60, 2), np.nan), 0
         self._rate, self._begin, self._received = rate, begin, received
-        self.last: Result | None = None
+        self.last: FrameResult | None = None
 
-    def __call__(self, result: Result) -> None:
+    def __call__(self, result: FrameResult) -> None:
         now, row = time.monotonic_ns(), result.number - 1
         self.last = result
         self._latency[row] = result.latency
@@ -188,7 +178,7 @@ class Watch:
             self._memory[self._used] = now / 1e9, resident()
             self._used += 1
 
-    def found(self) -> dict[str, Any]:
+    def found(self) -> Row:
         """In ms, and MB."""
         out = spread("latency", self._latency) | spread("since_due", self._since_due)
         memory = self._memory[: self._used]
@@ -218,7 +208,7 @@ def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
 @contextmanager
 def beside(target: Callable[..., None], *args: Any) -> Iterator[tuple[Any, Event]]:
     """A process of its own that runs ``target(*args, told, stop)``: its queue, and the event that ends it."""
-    context = multiprocessing.get_context("spawn")
+    context = get_context("spawn")
     told, stop = context.Queue(), context.Event()
     process = context.Process(target=target, args=(*args, told, stop), daemon=True)
     process.start()
@@ -262,7 +252,7 @@ def sleeping(realtime: bool, told: Any, stop: Event) -> None:
     told.put(np.array(late))
 
 
-def tenfold(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
+def tenfold(calibration: calib.Calibration, seconds: float) -> Row:
     """A recording at ten times the rate of the paper: frames, those lost, and what memory did."""
     rates, memory = (10 * RATE, 10 * PRESSURE_RATE), np.full((int(10 * seconds) + 1000, 2), np.nan)
     used = count()
@@ -272,8 +262,8 @@ def tenfold(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
         memory[row] = time.monotonic(), resident()
 
     with device(calibration, rates) as (_, (eit, pressure)), tempfile.TemporaryDirectory() as folder:
-        plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
-        summary = record(plan, sources, Path(folder) / "session.h5", seconds=seconds, progress=note)
+        plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
+        summary = record_session(plan, sources, Path(folder) / "session.h5", seconds=seconds, progress=note)
     recorded = memory[: next(used) - 1]  # the last is told when the session is written
     return {
         "rate_hz": rates[0],
@@ -285,7 +275,7 @@ def tenfold(calibration: calib.Calibration, seconds: float) -> dict[str, Any]:
     }
 
 
-def soaked(calibration: calib.Calibration, seconds: float, realtime: bool = False) -> dict[str, Any]:
+def soaked(calibration: calib.Calibration, seconds: float, realtime: bool = False) -> Row:
     """One run at the rate of the paper, recorded as well: all that arrived is in the session, in order."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.h5"
@@ -300,25 +290,19 @@ def soaked(calibration: calib.Calibration, seconds: float, realtime: bool = Fals
 
 def watched(
     calibration: calib.Calibration, rate: int, seconds: float, output: Path | None = None, realtime: bool = False
-) -> dict[str, Any]:
+) -> Row:
     """One run: frames and what became of them, the latencies in ms, and what memory did."""
     with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
         with ExitStack() as stack:
-            show, received = Show(), Received(stack.enter_context(kept(output)) if output is not None else Nowhere())
+            show, received = (
+                LiveControl(),
+                Received(stack.enter_context(session_journal(output)) if output is not None else NullSink()),
+            )
             watch, woken = Watch(rate, seconds, begin, received), stack.enter_context(metronome(realtime))
             timer = threading.Timer(seconds, show.stop.set)
-            plan, sources = prepare({"eit": eit, "pressure": pressure}, calibration.skin)
-            live(
-                calibration,
-                plan,
-                sources,
-                watch,
-                show,
-                log=received,
-                realtime=realtime,
-                rest=REST,
-                begun=timer.start,
-            )
+            plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
+            how: Any = {"log": received, "begun": timer.start}
+            run_live(calibration, plan, sources, [watch], show, LiveSettings(REST, realtime=realtime), **how)
             timer.cancel()
             ended = time.monotonic()
         finishing = time.monotonic() - ended
@@ -340,6 +324,12 @@ def watched(
         **({} if output is None else {"finishing_s": round(finishing, 1)}),
     }
 
+
+OPTIONS: Row = {
+    "--minutes": {"type": float, "default": 10.0},
+    "--calibration": {"help": "default: one made up for the chest skin, without correction by place"},
+}
+main = Question("live", __doc__, {"runs": long_runs, "rates": rates}, OPTIONS, prepare=set_up_live)
 
 if __name__ == "__main__":
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read when NumPy is imported; jaxeit live sets it too

@@ -10,9 +10,9 @@ them.  To save time ten frames a second are simulated, each a mean of eighteen s
 so.  Further rows spread the load otherwise at the same force, one seed each.
 """
 
-import argparse
 import dataclasses
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,44 +24,26 @@ import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.runtime import set_up
 
-from . import _common as c
+from .harness import Question, Row, Run
+from .tables import PAPER_BENCH
 
 SCENE = 0.01  # m, the spreading of the shipped scene
 WIDTHS = (0.006, 0.008, SCENE, 0.012, 0.016, 0.020)
 EIT_RATE, SCANS = 10.0, 18
-COLUMNS = {
-    "localisation_quarter_mean": ("localisation, quarter, mm", 1e3),
-    "localisation_half_mean": ("half, mm", 1e3),
-    "localisation_peak_mean": ("peak, mm", 1e3),
-    "localisation_quarter_inward_bias": ("inward, mm", 1e3),
-    "cv_eit_ddof1": ("CV, EIT only", 1),
-    "cv_hybrid_ddof1": ("CV, hybrid", 1),
-    "localisation_fitted_mean": ("contacts fitted, mm", 1e3),
-    "cv_calibrated_ddof1": ("CV, hybrid corrected for the place", 1),
-}
 PAPER = {"localisation_quarter_mean": "6.9", "cv_eit_ddof1": "0.31", "cv_hybrid_ddof1": "0.14"}
 
 
-def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--smoke", action="store_true", help="few presses, coarse; writes nothing")
-    args = parser.parse_args(argv)
-    set_up()
-    before, seeds = c.circumstances(), range(1 if args.smoke else args.seeds)
-    widths = (SCENE,) if args.smoke else WIDTHS
-    several = {width: seeds if width == SCENE else seeds[:1] for width in widths}
-    results = {width: [figures(seed, width, args.smoke) for seed in mine] for width, mine in several.items()}
-    data = {
-        "seeds": len(seeds),
-        "paper": PAPER,
-        "rows": [{"spreading_mm": 1e3 * width, "seeds": len(rows)} | summary(rows) for width, rows in results.items()],
-        "circumstances": before,
-    }
-    print(table(data["rows"]))
-    if not args.smoke:
-        print(c.write("paper", c.closed(data)))
-    return data
+def measure(run: Run) -> Iterator[Row]:
+    """A row for each load spreading: mean and standard deviation over the seeds."""
+    seeds = 1 if run.smoke else run.args.seeds
+    yield {"seeds": seeds, "paper": PAPER}
+    for width in (SCENE,) if run.smoke else WIDTHS:
+        found = [figures(seed, width, run.smoke) for seed in range(seeds if width == SCENE else 1)]
+        row: Row = {"spreading_mm": 1e3 * width, "seeds": len(found)}
+        for name in PAPER_BENCH:
+            values = np.array([one[name] for one in found])
+            row[name] = [float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else 0.0]
+        yield {"rows": [row]}
 
 
 def seeded(seed: int, width: float, smoke: bool) -> Bench:
@@ -75,11 +57,11 @@ def seeded(seed: int, width: float, smoke: bool) -> Bench:
 
 def _reseeded(effect: Any, seed: int, width: float) -> Any:
     match effect:
-        case je.CoatingNonUniformity() | je.ContactGain():
+        case je.effects.CoatingNonUniformity() | je.effects.ContactGain():
             return eqx.tree_at(lambda e: e.seed, effect, np.asarray(1000 + seed))
-        case je.LoadSpreading():
-            return je.LoadSpreading(width=width)
-        case je.Noise(stream=je.Stream.EIT):
+        case je.effects.LoadSpreading():
+            return je.effects.LoadSpreading(width=width)
+        case je.effects.Noise(stream=je.effects.StreamKind.EIT):
             return eqx.tree_at(lambda e: e.std, effect, effect.std / SCANS**0.5)
     return effect
 
@@ -90,35 +72,12 @@ def figures(seed: int, width: float, smoke: bool) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = simulate(seeded(seed, width, smoke), Path(folder) / "session.h5", fidelity=fidelity)
         with calib.open_session(path) as session:
-            found = calib.calibrate([session], location=calib.PadEdge()).evaluation.summary()
-    print(f"seed {seed}, spreading {1e3 * width:g} mm: " + ", ".join(f"{k} {found[k]:.3g}" for k in COLUMNS))
-    return {name: float(found[name]) for name in COLUMNS}
+            found = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge())).evaluation.summary()
+    print(f"seed {seed}, spreading {1e3 * width:g} mm: " + ", ".join(f"{k} {found[k]:.3g}" for k in PAPER_BENCH))
+    return {name: float(found[name]) for name in PAPER_BENCH}
 
 
-def summary(rows: list[dict[str, float]]) -> dict[str, list[float]]:
-    """Mean and standard deviation over the seeds."""
-    out = {}
-    for name in COLUMNS:
-        values = np.array([row[name] for row in rows])
-        out[name] = [float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else 0.0]
-    return out
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown: a line per spreading, mean ± standard deviation over the seeds."""
-    lines = ["| load spreading (seeds) | " + " | ".join(label for label, _ in COLUMNS.values()) + " |"]
-    lines.append("|---" * (1 + len(COLUMNS)) + "|")
-    for row in rows:
-        cells = [_cell(*row[name], scale, row["seeds"]) for name, (_, scale) in COLUMNS.items()]
-        lines.append(f"| {row['spreading_mm']:g} mm ({row['seeds']}) | " + " | ".join(cells) + " |")
-    lines.append("| the paper, on hardware | " + " | ".join(PAPER.get(name, "") for name in COLUMNS) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _cell(mean: float, std: float, scale: float, seeds: int) -> str:
-    digits = 1 if scale > 1 else 3
-    return f"{scale * mean:.{digits}f}" + (f" ± {scale * std:.{digits}f}" if seeds > 1 else "")
-
+main = Question("paper", __doc__, {"rows": measure}, {"--seeds": {"type": int, "default": 6}}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

@@ -17,81 +17,61 @@ follows the one branch where the other was held out; stretches a tenth as long a
 1 %.
 """
 
-import argparse
-import json
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from scipy import io, ndimage
 
 import calib
-from calib.curves import AbstractCurve, curve_name
-from calib.fit import FitResult, fit_curves, predict_pads
-from calib.response import fit_log, rmse
+from calib.fitting.channel_faults import faults
+from calib.fitting.curve_fit import fit_curves
+from calib.fitting.curves import CURVES, AbstractCurve
+from calib.fitting.fitted_curve import predict_pads
+from calib.fitting.gaussian_process import SmoothChannels
+from calib.fitting.results import FitResult
+from calib.fitting.validation import fit_log, rmse
 from calib.runtime import set_up
-from calib.smooth import SmoothChannels
-from calib.taxels import faults
 
-from . import _common as c
+from .harness import Question, Row, Run
 
 GRAM = 9.80665e-3  # N
 EFLESH = "eflesh/20250401_014340_probe"
 ACTUATORS = ("Circle_1bar", "Circle_5bar", "O-ring257_3bar", "Stadium_1bar")
-LAWS = (calib.Linear(), calib.Affine(), calib.Hysteresis())
-STRETCHES, PARTS, THIN = 20, 5, 10
+LAWS = (calib.Linear(), calib.Affine(), calib.fitting.AffinePlay())
+TAXEL_LAWS = (
+    calib.MonotonePolynomial(),
+    calib.MonotoneSpline(),
+    calib.fitting.AffinePlay(),
+    calib.fitting.PlaySpline(),
+)
+STRETCHES, FOLDS, THIN = 20, 5, 10
 REST = 200  # samples at first, before the chamber is filled: the zero of counts and pressure alike
 
 
-def main(argv: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="with eflesh, pneumatic_actuator and insole_plenum")
-    parser.add_argument("--only", choices=RECORDINGS, help="one of them; its rows alone are replaced in the results")
-    parser.add_argument("--smoke", action="store_true", help="few samples; writes nothing")
-    args = parser.parse_args(argv)
-    wanted = [args.only] if args.only else list(RECORDINGS)
-    absent = [name for name in wanted if not (args.folder / name).is_dir()]
-    if absent:
-        parser.error(f"{args.folder} has no folder {', '.join(absent)}: give the one that holds the recordings")
-    set_up()
-    data: dict[str, Any] = (_stored() if args.only else {}) | {"circumstances": c.circumstances()}
-    for name in wanted:
-        data[name] = []
-        for row in RECORDINGS[name](args.folder, args.smoke):
-            data[name].append(row)
-            print(" | ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-        if not args.smoke:  # at once: the insole takes minutes, and what is done is not lost if it is stopped
-            c.write("real", c.closed(data))
-    return data
-
-
-def _stored() -> dict[str, Any]:
-    path = c.RESULTS / f"{c.machine()}.json"
-    return json.loads(path.read_text(encoding="utf-8")).get("real", {}) if path.exists() else {}
-
-
-def _row(of: str, law: str, train: float, test: float, unit: str, **more: Any) -> dict[str, Any]:
+def _row(of: str, law: str, train: float, test: float, unit: str, **more: object) -> Row:
     return {"recording": of, "law": law, "fitted": round(train, 4), "predicted": round(test, 4), "unit": unit} | more
 
 
 # --- pressure against force -----------------------------------------------------------------------
 
 
-def _actuators(folder: Path, smoke: bool) -> Iterator[dict[str, Any]]:
+def _actuators(folder: Path, smoke: bool) -> Iterator[Row]:
     for name in ACTUATORS[: 1 if smoke else None]:
         table = np.loadtxt(folder / "pneumatic_actuator" / f"{name}.csv.gz", delimiter=None)
         time, pressure, force = table[:, 0] * 1e6, table[:, 5] * 1e5, table[:, 6]
         for law in LAWS:
             fit = fit_log(law, time, pressure, force)
-            yield _row(name, curve_name(law), fit.train.rmse, fit.held_out.rmse, "N")
+            yield _row(name, CURVES.name_of(law), fit.train.rmse, fit.held_out.rmse, "N")
 
 
 # --- channels against a scale -----------------------------------------------------------------------
 
 
-def _eflesh(folder: Path, smoke: bool) -> Iterator[dict[str, Any]]:
+def _eflesh(folder: Path, smoke: bool) -> Iterator[Row]:
     states = np.loadtxt(folder / EFLESH / "states.csv", delimiter=",")
     sensor = np.loadtxt(folder / EFLESH / "sensor_post_baselines.csv", delimiter=",")
     time = (states[:, 0] - states[0, 0]) * 1e9
@@ -111,7 +91,7 @@ def _eflesh(folder: Path, smoke: bool) -> Iterator[dict[str, Any]]:
 # --- taxels against a chamber's pressure --------------------------------------------------------------
 
 
-def _insole(folder: Path, smoke: bool) -> Iterator[dict[str, Any]]:
+def _insole(folder: Path, smoke: bool) -> Iterator[Row]:
     found = io.loadmat(folder / "insole_plenum" / "calibration_dataset.mat", squeeze_me=True, struct_as_record=False)[
         "experiment"
     ]
@@ -153,28 +133,23 @@ def aligned(counts: np.ndarray, pressure: np.ndarray) -> tuple[np.ndarray, float
     return np.interp(index * rate + lag, np.arange(len(pressure)), pressure), rate, lag
 
 
-def _taxel_fits(signal: np.ndarray, pressure: np.ndarray) -> Iterator[dict[str, Any]]:
-    part = (np.arange(len(pressure)) * STRETCHES // len(pressure)) % PARTS
+def _taxel_fits(signal: np.ndarray, pressure: np.ndarray) -> Iterator[Row]:
+    part = (np.arange(len(pressure)) * STRETCHES // len(pressure)) % FOLDS
     cubic = np.array([_cubic(one, pressure, part) for one in signal])
-    yield _row("insole", "static cubic, by hand", *np.median(cubic, 0), "bar", taxels=len(signal))
-    for law in (calib.MonotonePolynomial(), calib.MonotoneSpline(), calib.Hysteresis(), calib.HysteresisSpline()):
+    train, test = np.median(cubic, 0)
+    yield _row("insole", "static cubic, by hand", train, test, "bar", taxels=len(signal))
+    for law in TAXEL_LAWS:
         each = _law_errors(law, signal, pressure, part)
-        better = float(np.mean(each[:, 1] < cubic[:, 1]))
-        yield _row(
-            "insole",
-            curve_name(law),
-            *np.nanmedian(each, 0),
-            "bar",
-            failed=int(np.isnan(each[:, 0]).sum()),
-            better_than_cubic=round(better, 3),
-        )
+        (train, test), failed = np.nanmedian(each, 0), int(np.isnan(each[:, 0]).sum())
+        better = round(float(np.mean(each[:, 1] < cubic[:, 1])), 3)
+        yield _row("insole", CURVES.name_of(law), train, test, "bar", failed=failed, better_than_cubic=better)
 
 
 def _cubic(signal: np.ndarray, pressure: np.ndarray, part: np.ndarray) -> tuple[float, float]:
     z = signal / np.abs(signal).max()
     x = np.stack([z**k for k in range(4)], 1)
     held = np.empty_like(pressure)
-    for k in range(PARTS):
+    for k in range(FOLDS):
         out = part == k
         held[out] = x[out] @ np.linalg.lstsq(x[~out], pressure[~out], rcond=None)[0]
     return rmse(x @ np.linalg.lstsq(x, pressure, rcond=None)[0], pressure), rmse(held, pressure)
@@ -183,7 +158,7 @@ def _cubic(signal: np.ndarray, pressure: np.ndarray, part: np.ndarray) -> tuple[
 def _law_errors(law: AbstractCurve, signal: np.ndarray, pressure: np.ndarray, part: np.ndarray) -> np.ndarray:
     """(taxels, 2) errors of a fit of all samples, and of those predicted; NaN where a fit failed."""
     held = np.empty_like(signal)
-    for k in range(PARTS):
+    for k in range(FOLDS):
         held[:, part == k] = _predicted(law, signal, pressure, part != k)[:, part == k]
     whole = _predicted(law, signal, pressure, part >= 0)
     return np.sqrt(np.stack([np.mean((e - pressure) ** 2, 1) for e in (whole, held)], 1))
@@ -195,7 +170,29 @@ def _predicted(law: AbstractCurve, signal: np.ndarray, pressure: np.ndarray, use
     return np.where((np.asarray(fitted.result) == FitResult.SUCCESS)[:, None], force, np.nan)
 
 
-RECORDINGS = {"pneumatic_actuator": _actuators, "eflesh": _eflesh, "insole_plenum": _insole}
+RECORDINGS: dict[str, Callable[[Path, bool], Iterator[Row]]] = {
+    "pneumatic_actuator": _actuators,
+    "eflesh": _eflesh,
+    "insole_plenum": _insole,
+}
+
+
+def recording(name: str, run: Run) -> Iterator[Row]:
+    """The rows of one recording; stops where a recording that is wanted is not there."""
+    wanted = [run.args.only] if run.args.only else list(RECORDINGS)
+    absent = [one for one in wanted if not (run.args.folder / one).is_dir()]
+    if absent:
+        folder = run.args.folder
+        print(f"{folder} has no folder {', '.join(absent)}: give the one that holds the recordings", file=sys.stderr)
+        raise SystemExit(2)
+    for row in RECORDINGS[name](run.args.folder, run.smoke):
+        print(" | ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+        yield {name: [row]}
+
+
+FOLDER: Row = {"type": Path, "metavar": "FOLDER", "help": "with eflesh, pneumatic_actuator and insole_plenum"}
+PARTS = {name: partial(recording, name) for name in RECORDINGS}
+main = Question("real", __doc__, PARTS, {"folder": FOLDER}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

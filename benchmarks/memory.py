@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 _MB, _HOUR = 1e6, 3600.0
-_LEAST = 10  # samples that tell a slope and its error
+MIN_SAMPLES = 10  # samples that tell a slope and its error
 
 
 class Growth(NamedTuple):
@@ -34,7 +34,7 @@ def growth(samples: np.ndarray) -> Growth:
     """
     time, used = np.asarray(samples, float)[len(samples) // 2 :].T
     count = len(time)
-    if count < _LEAST:
+    if count < MIN_SAMPLES:
         return Growth(0.0, np.inf)
     time = time - time.mean()
     spread = float(time @ time)

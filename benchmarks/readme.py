@@ -1,5 +1,4 @@
-"""Write the tables of the README, docs/costs.md and docs/live.md: accuracy and its picture from the bundled session,
-others from results/.
+"""Write the tables of the README and of docs/: the accuracy from the bundled session, the others from results/.
 
 python -m benchmarks.readme
 """
@@ -8,21 +7,21 @@ import json
 from pathlib import Path
 
 import calib
-from calib.figures import sensitivity_figure, write_figure
+from calib.report.figures import sensitivity_figure, write_figure
 from calib.runtime import set_up
 from calib.session import replacing
 
 from .tables import evaluation, filled, replaced
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "costs.md", ROOT / "docs" / "live.md")
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MEASURED = ROOT / "benchmarks" / "results" / "2-core-x86.json"
 
 
 def main() -> None:
     set_up()
     with calib.open_session(ROOT / "data" / "sessions" / "testbed_grid.h5") as session:
-        calibration = calib.calibrate([session], location=calib.PadEdge())
+        calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge()))
     results = evaluation(calibration.evaluation.summary())
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     for page in PAGES:

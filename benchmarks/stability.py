@@ -1,52 +1,39 @@
-"""Where the numbers end: error against severity on each hard axis, in both precisions and by the textbook.
+"""Numerical limits: error against severity on nine hard axes, in both precisions and in a textbook form.
 
 python -m benchmarks.stability [--smoke | --draw-only]
 """
 
-import argparse
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 import jaxeit as je
-from calib.figures import write_figure
 from tests import hard_sheet as sheet
 from tests import hard_strip as strip
 from tests.oracles.rational import inverse_corner
 
-from . import _common as c
+from .figures import BLUE, GREY, ORANGE, legend, panels
+from .harness import Question, Row, Run
+from .problems import square
 
-PICTURE = c.ROOT / "docs" / "stability.png"
 FORMS = ("float64", "float32", "naive")
-SOLVER = je.NestedDissection()
+SOLVER = je.linalg.NestedDissection()
 X, Y = sheet.MESH.centroids.T
 FLAT = np.random.default_rng(0).integers(1, 33, len(X)) / 16.0
 ONE = (1.0,) * 4
 SIDE, DRAWS = 12, 100  # pixels along the image, and noises that a touch is drawn with
 
-Row = dict[str, Any]
-Errors = tuple[float, float, float]
+Errors = tuple[float, float, float]  # of float64, float32 and the naive form
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """One way for things to get hard.
-
-    | meaning                                                                                |
-    |----------------------------------------------------------------------------------------|
-    | title; what its severity is, with the unit; what the naive form is; what the error is   |
-    | errors: of float64, float32 and the naive form at a severity; not finite where they are |
-    | severities, the mildest first                                                          |
-    """
+class Axis(NamedTuple):
+    """One way for things to get hard: its title, what its severity is, what the naive form is, what the error is, the
+    errors at a severity, and the severities, the mildest first."""
 
     title: str
     severity: str
@@ -55,12 +42,12 @@ class Axis:
     errors: Callable[[float], Errors]
     severities: Sequence[float]
 
-    def rows(self, severities: Sequence[float]) -> Iterator[Row]:
-        for severity in severities:
-            with np.errstate(all="ignore"):
-                found = self.errors(severity)
-            kept = {form: float(e) if np.isfinite(e) else None for form, e in zip(FORMS, found, strict=True)}
-            yield {"axis": self.title, "severity": severity} | kept
+    def row(self, severity: float) -> Row:
+        """The errors that are finite, None for the others."""
+        with np.errstate(all="ignore"):
+            found = self.errors(severity)
+        kept = {form: float(e) if np.isfinite(e) else None for form, e in zip(FORMS, found, strict=True)}
+        return {"axis": self.title, "severity": severity} | kept
 
 
 # The sheet of exact readings.
@@ -118,7 +105,7 @@ def sliver(angle: float) -> Errors:
     return _on_the_strip(strip.capped(np.tan(np.radians(angle)) / 2**0.5))
 
 
-def _on_the_strip(mesh: je.Mesh) -> Errors:
+def _on_the_strip(mesh: je.meshing.Mesh) -> Errors:
     double, single = (strip.strip_error(mesh, dtype) for dtype in ("float64", "float32"))
     return double, single, strip.strip_error(strip.in_single_precision(mesh))
 
@@ -132,19 +119,18 @@ def _image_skin() -> je.Skin:
     places = [(0.05 * i, 0.05 * j) for j in (1, 2, 3) for i in (1, 2, 3)]
     pairs = np.array([[a, a + 1, b, b + 1] for a in range(8) for b in range(a + 2, 8)])
     pad = je.Pad("whole", np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]]))
-    electrodes = tuple(je.PointElectrode(place) for place in places)
-    return je.Skin("bench", je.Rectangle(0.2, 0.2), 1.0, electrodes, je.Protocol(pairs, 1.0), (pad,))
+    return square(np.array(places), pairs, (pad,))
 
 
 @cache
 def _image_model(dtype: str) -> je.Model:
     skin = _image_skin()
-    mesh = je.structured(skin.domain, SIDE, SIDE)  # type: ignore[arg-type]  # the rectangle above
-    return je.discretise(je.Scene(skin), je.Fidelity(dtype=dtype, solver=je.Dense()), mesh=mesh)
+    mesh = je.meshing.structured(skin.domain, SIDE, SIDE)  # type: ignore[arg-type]  # the rectangle above
+    return je.discretise(je.Scene(skin), je.Fidelity(dtype=dtype, solver=je.linalg.Dense()), mesh=mesh)
 
 
 @cache
-def _basis(dtype: str) -> je.BasisMap:
+def _basis(dtype: str) -> je.model.BasisMap:
     return je.Pixels(SIDE).on(_image_model(dtype))
 
 
@@ -180,7 +166,7 @@ def _minimiser(matrix: np.ndarray) -> np.ndarray:
 def _ours(dtype: str, weight: float, dv: np.ndarray) -> np.ndarray:
     try:
         recon = je.prepare(_image_model(dtype), je.Tikhonov(), basis=_basis(dtype), hyperparameter=weight)
-    except je.InverseError:
+    except je.imaging.InverseError:
         return np.full(SIDE**2, np.nan)  # refused
     return np.asarray(recon(np.asarray(dv, dtype)), float)
 
@@ -212,6 +198,7 @@ def _decades(first: float, last: float, step: float) -> list[float]:
 READING = "error of the worst reading"
 SCHUR = "pseudo-inverse of Y"
 GEOMETRY = "nodes in float32"
+TOO_MUCH = "force too much"
 AXES = [
     Axis("Contact resistance", "specific resistance, Ω m² or Ω m", SCHUR, READING, contact, _decades(-12, 8, 1)),
     Axis("Contrast, each element its own", "largest over smallest", SCHUR, READING, contrast, _decades(0, 12, 1)),
@@ -221,9 +208,7 @@ AXES = [
     Axis("Graded mesh", "longest over shortest edge", GEOMETRY, READING, grading, _decades(1, 6, 1)),
     Axis("Slivers, unchecked", "smallest angle, degrees", GEOMETRY, READING, sliver, _decades(1, -7, 1)),
     Axis("Regularisation", "λ", "inverse of JᵀJ + λ²R", "error of the image", regularisation, _decades(2, -10, 1)),
-    Axis(
-        "Light touch", "peak over noise", "equation 4 as printed", "force too much", light_touch, _decades(2, -2, 0.25)
-    ),
+    Axis("Light touch", "peak over noise", "equation 4 as printed", TOO_MUCH, light_touch, _decades(2, -2, 0.25)),
 ]
 
 
@@ -233,23 +218,28 @@ def measure(axes: Sequence[Axis], per_axis: int | None = None) -> list[Row]:
     for axis in axes:
         count = len(axis.severities)
         picked = range(count) if per_axis is None else np.linspace(0, count - 1, per_axis).astype(int)
-        rows += axis.rows([axis.severities[k] for k in picked])
+        rows += [axis.row(axis.severities[k]) for k in picked]
         print(f"{axis.title}: {rows[-1]}", flush=True)
     return rows
 
 
-COLOURS = {"float64": "#1f5fa8", "float32": "#d9730d", "naive": "#9a9a9a"}
+COLOURS = {"float64": BLUE, "float32": ORANGE, "naive": "#9a9a9a"}
 MARKERS = {"float64": "o", "float32": "s", "naive": "D"}
+NAMES = ("jaxeit, float64", "jaxeit, float32", "naive, float64 (as each panel says)")
 LOWEST, HIGHEST = 1e-17, 1e3
 
 
-def picture(rows: list[Row], axes: Sequence[Axis] = AXES) -> Figure:
+def picture(data: Row) -> Figure:
     """A panel per axis; what is not finite at the upper edge."""
-    figure = Figure(figsize=(11.0, 9.6), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    for panel, axis in zip(figure.subplots(3, 3, sharey=True).flat, axes, strict=True):
-        _panel(panel, axis, [row for row in rows if row["axis"] == axis.title])
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    figure, axes = panels(11.0, 9.6, 3, 3, sharey=True)
+    for panel, axis in zip(axes, AXES, strict=True):
+        _panel(panel, axis, [row for row in data["rows"] if row["axis"] == axis.title])
+    looks = zip(FORMS, NAMES, strict=True)
+    entries: list[Row] = [
+        {"color": COLOURS[form], "marker": MARKERS[form], "markersize": 4, "label": name} for form, name in looks
+    ]
+    lost = {"color": GREY, "marker": "x", "linestyle": "none", "label": "not finite, or refused"}
+    legend(figure, [*entries, lost], 4, size=9)
     return figure
 
 
@@ -261,43 +251,22 @@ def _panel(panel: Any, axis: Axis, rows: list[Row]) -> None:
     panel.grid(True, which="major", color="#e8e8e8", linewidth=0.8)
     panel.axhspan(1, 10 * HIGHEST, color="#f6eded", zorder=0)
     for form in FORMS[::-1]:
-        _curve(panel, form, [(row["severity"], row[form]) for row in rows])
+        look: Row = {"color": COLOURS[form], "marker": MARKERS[form], "markersize": 3.6, "linewidth": 1.3}
+        finite = (np.nan if row[form] is None else np.clip(row[form], LOWEST * 1.6, HIGHEST) for row in rows)
+        panel.plot([row["severity"] for row in rows], list(finite), **look)
+        lost = [row["severity"] for row in rows if row[form] is None]
+        panel.plot(lost, [3 * HIGHEST] * len(lost), color=COLOURS[form], marker="x", linestyle="none", markersize=5)
     if axis.severities[0] > axis.severities[-1]:
         panel.invert_xaxis()
     if panel.get_subplotspec().is_first_col() or axis.error != READING:
         panel.set_ylabel(axis.error, fontsize=9)
 
 
-def _curve(panel: Any, form: str, points: list[tuple[float, float | None]]) -> None:
-    shown = [(x, np.clip(e, LOWEST * 1.6, HIGHEST)) if e is not None else (x, np.nan) for x, e in points]
-    look: Row = {"color": COLOURS[form], "marker": MARKERS[form], "markersize": 3.6, "linewidth": 1.3}
-    panel.plot(*zip(*shown, strict=True), **look)
-    lost = [x for x, e in points if e is None]
-    panel.plot(lost, [3 * HIGHEST] * len(lost), color=COLOURS[form], marker="x", linestyle="none", markersize=5)
+def every(run: Run) -> Iterator[Row]:
+    yield {"rows": measure(AXES, 2 if run.smoke else None)}
 
 
-def _legend() -> list[Line2D]:
-    names = {"float64": "jaxeit, float64", "float32": "jaxeit, float32", "naive": "naive, float64 (as each panel says)"}
-    entries = [Line2D([], [], color=COLOURS[f], marker=MARKERS[f], markersize=4, label=names[f]) for f in FORMS]
-    return [*entries, Line2D([], [], color="#555555", marker="x", linestyle="none", label="not finite, or refused")]
-
-
-def main(argv: list[str] | None = None) -> Row:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--smoke", action="store_true", help="two severities of each axis, nothing written")
-    parser.add_argument("--draw-only", action="store_true", help="draw the stored results again")
-    args = parser.parse_args(argv)
-    c.set_up()
-    if args.draw_only:
-        write_figure(picture(c.stored("stability")["rows"]), PICTURE)
-        return {}
-    data: Row = {"circumstances": c.circumstances()}
-    data["rows"] = rows = measure(AXES, 2 if args.smoke else None)
-    if not args.smoke:
-        c.write("stability", c.closed(data))
-        write_figure(picture(rows), PICTURE)
-    return data
-
+main = Question("stability", __doc__, {"rows": every}, picture=picture, file="stability.png")
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

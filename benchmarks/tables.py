@@ -1,28 +1,116 @@
-"""Tables in Markdown of what was measured, each for its mark in a page; see `readme`."""
+"""Tables in Markdown of what was measured, declared as data: those of the pages by their marks, and what a run prints.
+
+A cell is a format string over a row of the results, as ``"{frames:,}"``. Two kinds of numbers are added to Python's:
+``{x:ms}``, three figures or whole numbers from 100 on, and ``{x:.1f %}``, a fraction in percent. A cell is empty where
+the row lacks the number.
+"""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+import string
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import jaxeit as je
 
-from . import bench_inverse, bench_paper, bench_protocol
 from .repeat import compared
 
-SHOWN = {
-    ("forward", "jaxeit float64"): "forward, jaxeit",
-    ("forward", "CHOLMOD by hand"): "forward, CHOLMOD driven by hand",
-    ("forward", "SuperLU by hand"): "forward, SuperLU driven by hand",
-    ("forward", "EIDORS"): "forward, EIDORS",
-    ("forward", "pyEIT"): "forward, pyEIT",
-    ("jacobian", "jaxeit float64, pixels"): "Jacobian onto 900 pixels, jaxeit",
-    ("jacobian", "adjoint by hand, pixels"): "Jacobian onto 900 pixels, adjoint formula by hand",
-    ("jacobian", "EIDORS, pixels"): "Jacobian onto 900 pixels, EIDORS",
-}
-PAPER = {"localisation": "6.9 mm (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
+Row = dict[str, Any]
 
 
-def filled(page: str, measured: dict) -> str:
+class _Format(string.Formatter):
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if format_spec == "ms":
+            return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+        if format_spec.endswith(" %"):
+            return format(100 * value, format_spec[:-2]) + " %"
+        return format(value, format_spec)
+
+
+def cell(template: str, row: Row, missing: str = "") -> str:
+    """A format string filled from a row; ``missing`` where the row has not all that the string names."""
+    try:
+        return _Format().vformat(template, (row,), row)
+    except (KeyError, TypeError):
+        return missing
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
+
+
+# --- what a run prints
+
+
+def report(section: str, data: Row) -> str:
+    """All rows of a section, then the tables that are made of it alone and whose parts are measured."""
+    parts = list(_every(data))
+    for sections, table in TABLES.values():
+        with suppress(LookupError):
+            parts += [table(data)] if sections == (section,) else []
+    return "\n".join(parts)
+
+
+def _every(data: Row, path: str = "") -> Iterator[str]:
+    for name, value in data.items():
+        if isinstance(value, list) and value and isinstance(value[0], Mapping):
+            yield f"{path}{name}\n\n{_all_columns(value)}"
+        elif isinstance(value, Mapping) and all(isinstance(one, list) for one in value.values()):
+            yield from _every(value, f"{path}{name}, ")
+        elif name != "circumstances":
+            yield f"{path}{name}: {_plain(value)}\n"
+
+
+def _all_columns(rows: Sequence[Row]) -> str:
+    """Every number of the rows; least and most stand beside the median, and a standard deviation after its mean."""
+    names = dict.fromkeys(name for row in rows for name, value in row.items() if not isinstance(value, Mapping))
+    shown = [n for n in names if not (n.endswith("_sd") or re.sub("^(min|max)_", "median_", n) in {*names} - {n})]
+    return markdown([name.replace("_", " ") for name in shown], [[_with_spread(row, n) for n in shown] for row in rows])
+
+
+def _with_spread(row: Row, name: str) -> str:
+    value, least, most = (row.get(name.replace("median_", kind)) for kind in ("median_", "min_", "max_"))
+    if name.startswith("median_") and least is not None:
+        return f"{value:.3g} ({least:.3g} to {most:.3g})"
+    sd = row.get(f"{name}_sd")
+    return _plain(row.get(name)) + ("" if sd is None else f" ± {sd:.2g}")
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "" if value is None else str(value)
+
+
+# --- the pages
+
+
+class Columns(NamedTuple):
+    """Heads of a table and the line of a row, both with their cells between bars."""
+
+    heads: str
+    line: str
+
+    def __call__(self, rows: Iterable[Row]) -> str:
+        lines = ([cell(template, row) for template in self.line.split(" | ")] for row in rows)
+        return markdown(self.heads.split(" | "), lines)
+
+    def of(self, key: str) -> Callable[[Row], str]:
+        """The table of the rows that a section holds under a key."""
+        return lambda results: self(results[key])
+
+
+def crossed(head: str, line: str, column: str, content: str, rows: Sequence[Row], missing: str = "") -> str:
+    """A line and a column for each value of two format strings, in order of appearance; of equals the last counts."""
+    heads = dict.fromkeys(cell(column, row) for row in rows)
+    found: dict[str, dict[str, str]] = {}
+    for row in rows:
+        found.setdefault(cell(line, row), {})[cell(column, row)] = cell(content, row, missing)
+    return markdown([head, *heads], [[label, *(cells.get(h, "") for h in heads)] for label, cells in found.items()])
+
+
+def filled(page: str, measured: Row) -> str:
     """A page with the tables between its marks written anew; those whose benchmark has not run stay as they are."""
     for mark, (sections, table) in TABLES.items():
         if f"<!-- {mark}:" in page and all(name in measured for name in sections):
@@ -36,48 +124,67 @@ def replaced(page: str, mark: str, table: str) -> str:
     return re.sub(pattern, lambda m: m[1] + table + m[2], page, flags=re.DOTALL)
 
 
-def evaluation(s: dict[str, float]) -> str:
-    """What a calibration of the bundled session says of itself, beside the paper."""
-    rows = [
-        f"| localisation error, {label}, mean | {1e3 * s[f'localisation_{name}_mean']:.1f} ± "
-        f"{1e3 * s[f'localisation_{name}_mean_se']:.1f} mm | {PAPER['localisation'] if name == 'quarter' else ''} |"
-        for name, label in {**{n: f"{n} estimator" for n in je.ESTIMATORS}, "fitted": "contacts fitted"}.items()
-    ]
-    rows += [
-        f"| coefficient of variation of sensitivity, {label} | {s[f'cv_{name}_ddof1']:.3f} ± {s[f'cv_{name}_se']:.3f} "
-        f"| {PAPER.get(name, '')} |"
-        for name, label in (
-            ("eit", "EIT only"),
-            ("hybrid", "hybrid, the paper's recipe"),
-            ("calibrated", "hybrid, corrected for the contact's place"),
-        )
-    ]
-    rows += [
-        f"| force error on presses held out by place, RMSE, {label} | {s[f'force_{mark}rmse']:.2f} N, "
-        f"{s[f'force_{mark}rmse_percent_full_scale']:.1f} % of 20 N | |"
-        for mark, label in (("hybrid_", "the paper's recipe"), ("", "corrected for the place"))
-    ]
-    head = "| simulated, 225 presses | this run, ± SE over places | the paper, on hardware |\n|---|---|---|\n"
-    return head + "\n".join(rows) + "\n"
+PAPER = {"quarter": "6.9 mm (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
+SENSITIVITY = {
+    "eit": "EIT only",
+    "hybrid": "hybrid, the paper's recipe",
+    "calibrated": "hybrid, corrected for the contact's place",
+}
+FORCE = {"hybrid_": "the paper's recipe", "": "corrected for the place"}
+EVALUATION = Columns(
+    "simulated, 225 presses | this run, ± SE over places | the paper, on hardware", "{what} | {found} | {paper}"
+)
 
 
-def _speed(forward: dict, jacobian: dict) -> str:
-    """Medians in ms by tool and mesh, forward solves and Jacobians onto pixels."""
-    runs = [(name, row) for name, part in (("forward", forward), ("jacobian", jacobian)) for row in part["rows"]]
-    nodes = sorted({row["nodes"] for _, row in runs})
-    rows = []
-    for (section, tool), label in SHOWN.items():
-        found = {row["nodes"]: row["median_ms"] for kind, row in runs if (kind, row["tool"]) == (section, tool)}
-        if found:
-            rows.append([label, *(_figures(found[n]) if n in found else "" for n in nodes)])
-    return _markdown(["ms, median", *(f"{n:,} nodes" for n in nodes)], rows)
+def evaluation(s: Mapping[str, float]) -> str:
+    """The evaluation of a calibration on the bundled session, beside the paper."""
+    rows: list[tuple[str, str, str]] = []
+    for name, label in {**{n: f"{n} estimator" for n in je.metrics.ESTIMATORS}, "fitted": "contacts fitted"}.items():
+        mean, error = (1e3 * s[f"localisation_{name}_mean{end}"] for end in ("", "_se"))
+        rows.append((f"localisation error, {label}, mean", f"{mean:.1f} ± {error:.1f} mm", PAPER.get(name, "")))
+    for name, label in SENSITIVITY.items():
+        found = f"{s[f'cv_{name}_ddof1']:.3f} ± {s[f'cv_{name}_se']:.3f}"
+        rows.append((f"coefficient of variation of sensitivity, {label}", found, PAPER.get(name, "")))
+    for name, label in FORCE.items():
+        found = f"{s[f'force_{name}rmse']:.2f} N, {s[f'force_{name}rmse_percent_full_scale']:.1f} % of 20 N"
+        rows.append((f"force error on presses held out by place, RMSE, {label}", found, ""))
+    return EVALUATION(dict(zip(("what", "found", "paper"), row, strict=True)) for row in rows)
 
 
-def _repeat(*runs: dict) -> str:
-    """Whether the ratios between the times of `_speed` came out alike in two runs; in words."""
+SPEED = {
+    ("forward", "jaxeit float64"): "forward, jaxeit",
+    ("forward", "CHOLMOD by hand"): "forward, CHOLMOD driven by hand",
+    ("forward", "SuperLU by hand"): "forward, SuperLU driven by hand",
+    ("forward", "EIDORS"): "forward, EIDORS",
+    ("forward", "pyEIT"): "forward, pyEIT",
+    ("jacobian", "jaxeit float64, pixels"): "Jacobian onto 900 pixels, jaxeit",
+    ("jacobian", "adjoint by hand, pixels"): "Jacobian onto 900 pixels, adjoint formula by hand",
+    ("jacobian", "EIDORS, pixels"): "Jacobian onto 900 pixels, EIDORS",
+}
+
+
+def _speed(forward: Row, jacobian: Row) -> str:
+    """Medians of forward solves and of Jacobians onto pixels, by tool and mesh."""
+    runs = {"forward": forward["rows"], "jacobian": jacobian["rows"]}
+    rows = [row | {"tool": label} for (kind, tool), label in SPEED.items() for row in runs[kind] if row["tool"] == tool]
+    return _by_size("ms, median", rows)
+
+
+def _by_size(head: str, rows: Sequence[Row]) -> str:
+    return crossed(head, "{tool}", "{nodes:,} nodes", "{median_ms:ms}", rows)
+
+
+def _by_tool(head: str) -> Callable[[Row], str]:
+    return lambda results: _by_size(
+        head, [row | {"tool": re.sub(", (?=pixels|elements)", ", onto ", row["tool"])} for row in results["rows"]]
+    )
+
+
+def _repeat(*runs: Row) -> str:
+    """Whether the ratios between the times of `_speed` came out alike in two runs; a sentence."""
     kinds = ("forward", "jacobian", "forward", "jacobian")
     quoted = [
-        [row for row in run["rows"] if (kind, row["tool"]) in SHOWN] for kind, run in zip(kinds, runs, strict=True)
+        [row for row in run["rows"] if (kind, row["tool"]) in SPEED] for kind, run in zip(kinds, runs, strict=True)
     ]
     found = [one for first, second in zip(quoted[:2], quoted[2:], strict=True) for one in compared(first, second)]
     change = max(abs(one.second.value / one.first.value - 1) for one in found)
@@ -88,237 +195,189 @@ def _repeat(*runs: dict) -> str:
     )
 
 
-def _images(results: dict) -> str:
-    """Methods side by side; the image's own best estimator, or the fit."""
-    heads = [
-        "method (seeds)",
-        "error, mm",
-        "inward, mm",
-        "false second",
-        "both, 30 mm",
-        "40 mm",
-        "40 mm, 1:3",
-        "ms a frame",
-    ]
-    rows = []
+IMAGES = Columns(
+    "method (seeds) | error, mm | inward, mm | false second | both, 30 mm | 40 mm | 40 mm, 1:3 | ms a frame",
+    "{method} ({seeds}) | {error:.1f} | {inward_mm:.1f} | {false_seconds:.0f %} | {0[pairs_30mm_1:1]:.0f %} | "
+    "{0[pairs_40mm_1:1]:.0f %} | {0[pairs_40mm_1:3]:.0f %} | {frame_ms:ms}",
+)
+
+
+def _images(results: Row) -> str:
+    """Methods side by side; the error is that of the image's own best estimator, or of the fit."""
+    names = [f"{name}_mm" for name in (*je.metrics.ESTIMATORS, "parametric")]
+    best = ({"error": min(row[name] for name in names if name in row)} for row in results["rows"])
+    return IMAGES({"seeds": results["seeds"]} | row | error for row, error in zip(results["rows"], best, strict=True))
+
+
+PAPER_BENCH = {  # head, factor from SI to its unit
+    "localisation_quarter_mean": ("localisation, quarter, mm", 1e3),
+    "localisation_half_mean": ("half, mm", 1e3),
+    "localisation_peak_mean": ("peak, mm", 1e3),
+    "localisation_quarter_inward_bias": ("inward, mm", 1e3),
+    "cv_eit_ddof1": ("CV, EIT only", 1),
+    "cv_hybrid_ddof1": ("CV, hybrid", 1),
+    "localisation_fitted_mean": ("contacts fitted, mm", 1e3),
+    "cv_calibrated_ddof1": ("CV, hybrid corrected for the place", 1),
+}
+
+
+def _paper(results: Row) -> str:
+    """Mean ± standard deviation over the seeds, a line for each load spreading."""
+    lines = []
     for row in results["rows"]:
-        error = min(row[f"{name}_mm"] for name in (*je.ESTIMATORS, "parametric") if f"{name}_mm" in row)
-        cells = [f"{error:.1f}", f"{row['inward_mm']:.1f}", f"{100 * row['false_seconds']:.0f} %"]
-        cells += [f"{100 * row[f'pairs_{pair}']:.0f} %" for pair in ("30mm_1:1", "40mm_1:1", "40mm_1:3")]
-        head = f"{row['method']} ({row.get('seeds', results['seeds'])})"
-        rows.append([head, *cells, _figures(row["frame_ms"])])
-    return _markdown(heads, rows)
+        lines.append([f"{row['spreading_mm']:g} mm ({row['seeds']})"])
+        for name, (_, factor) in PAPER_BENCH.items():
+            mean, sd = (f"{factor * value:.{1 if factor > 1 else 3}f}" for value in row[name])
+            lines[-1].append(f"{mean} ± {sd}" if row["seeds"] > 1 else mean)
+    lines.append(["the paper, on hardware", *(results["paper"].get(name, "") for name in PAPER_BENCH)])
+    return markdown(["load spreading (seeds)", *(head for head, _ in PAPER_BENCH.values())], lines)
 
 
-def _scenes(results: dict) -> str:
-    """What the shipped scenes cost."""
-    rows = []
-    for row in results["sessions"]:
-        cells = [f"{row['recording_s']:,.0f} s", f"{row['frames']:,}", f"{row['second_s']:.1f} s"]
-        rows.append([f"`{row['scene']}`", *cells, f"{row['times_real_time']:.0f}"])
-    return _markdown(["scene", "recording", "frames", "simulated in", "times real time"], rows)
+LADDER = Columns(
+    "fidelity | nodes | voltages, error | a touch, error | forward, ms | Jacobian, ms | localised, mm | frame, ms",
+    "{name} | {nodes:,} | {voltage_error:.2g %} | {difference_error:.2g %} | {forward_ms:ms} | {jacobian_ms:ms} | "
+    "{localised_mm:.2f} | {frame_ms:ms}",
+)
 
 
-def _pipeline(results: dict) -> str:
-    """Mesh to images of 100 frames, by tool and mesh."""
-    return _by_tool("mesh to images of 100 frames, ms", results["rows"])
-
-
-def _preparation(results: dict) -> str:
-    """Conductivity to reconstructor, by tool and mesh."""
-    return _by_tool("a reconstruction prepared, ms", results["rows"])
-
-
-def _by_tool(head: str, measured: Sequence[dict]) -> str:
-    nodes = sorted({row["nodes"] for row in measured})
-    rows = []
-    for tool in dict.fromkeys(row["tool"] for row in measured):
-        found = {row["nodes"]: _figures(row["median_ms"]) for row in measured if row["tool"] == tool}
-        rows.append([tool.replace(", ", ", onto "), *(found.get(n, "") for n in nodes)])
-    return _markdown([head, *(f"{n:,} nodes" for n in nodes)], rows)
-
-
-def _frame(results: dict) -> str:
-    """One frame to its image: in a stream of frames, after other work, and in a batch."""
-    stream, after, batch = (
-        {row["way"]: row for row in results["application"][kind]}
-        for kind in (bench_inverse.SINGLE, bench_inverse.AFTER_WORK, bench_inverse.BATCH)
-    )
-    heads = ["ms a frame", *(f"{p}{when}" for when in ("", ", after other work") for p in ("p50", "p99", "most"))]
-    rows = []
-    for way, row in stream.items():
-        times = [f"{one[f'{p}_ms']:.3f}" if one else "" for one in (row, after.get(way)) for p in ("p50", "p99", "max")]
-        together = f"{batch[way]['p50_ms']:.4f}" if way in batch else ""
-        rows.append([way, *times, together, f"{row['least_ms']:.3f}"])
-    return _markdown([*heads, "1,000 together", "as many bytes copied"], rows)
-
-
-def _stream(results: dict) -> str:
-    """Frames one after the other, so many that those which take long can be counted."""
-    rows = results["application"][bench_inverse.STREAM]
-    heads = ["ms a frame", "frames", *PERCENTILES, f"above {bench_inverse.GOAL_MS} ms"]
-    cells = ([f"{row[f'{p}_ms']:.3f}" for p in PERCENTILES] for row in rows)
-    return _markdown(
-        heads, [[r["way"], f"{r['calls']:,}", *c, f"{r['above']:,}"] for r, c in zip(rows, cells, strict=True)]
-    )
-
-
-PERCENTILES = ("p50", "p99", "p99.9")
-
-
-def _to_accuracy(results: dict) -> str:
-    """The quickest mesh of each tool that reaches an accuracy."""
-    targets = list(dict.fromkeys(row["target"] for row in results["to_accuracy"]))
-    heads = [f"voltages to {100 * target:g} %" for target in targets]
-    rows = []
-    for kind in dict.fromkeys(row["kind"] for row in results["to_accuracy"]):
-        best = [row["best"] for row in results["to_accuracy"] if row["kind"] == kind]
-        cells = (f"{_figures(b['median_ms'])} ({b['unknowns']:,})" if b else "not reached" for b in best)
-        rows.append([kind, *cells])
-    return _markdown(["forward, ms (unknowns)", *heads], rows)
-
-
-def _calibration(results: dict) -> str:
-    """Error of held-out forces by presses scattered over the skin, and by recipe."""
-    fits = [row for row in results["presses"] if row["spread"] == "scattered" or row["presses"] == 225]
-    sizes = {row["presses"]: row["minutes"] for row in fits}
-    heads = [f"{n} presses, {minutes:.0f} min" for n, minutes in sorted(sizes.items())]
-    rows = []
-    for curve, location in dict.fromkeys((row["curve"], row["location"]) for row in fits):
-        found = {r["presses"]: r for r in fits if (r["curve"], r["location"]) == (curve, location)}
-        cells = (f"{found[n]['hold_n']:.2f}" if "hold_n" in found[n] else "not determined" for n in sorted(sizes))
-        rows.append([f"{curve}, location {location}", *cells])
-    return _markdown(["error of held-out forces, N", *heads], rows)
-
-
-def _protocol(results: dict) -> str:
-    """Error of place by readings of a frame, and by the way they are chosen."""
-    tried = results["rows"]
-    counts = sorted({row["readings"]: row["frames_per_s"] for row in tried}.items())
-    heads = [f"{n} readings, {rate:,.0f} frames/s" for n, rate in counts]
-    rows = []
-    for way in dict.fromkeys(row["way"] for row in tried):
-        found = {row["readings"]: row["fit_mm"] for row in tried if row["way"] == way and row["fit_mm"] is not None}
-        rows.append([way, *(f"{found[n]:.2g}" if n in found else "" for n, _ in counts)])
-    return _markdown(["mean error of place, contacts fitted, mm", *heads], rows)
-
-
-def _growth(results: dict) -> str:
-    """Fitted exponents beside the theory's."""
-    rows = []
-    for fit in results["fits"]:
-        cells = [str(fit[n][what]) for n in ("time", "memory") for what in ("exponent", "theory")]
-        ends = f"{fit['sizes'][0]:,} to {fit['sizes'][-1]:,}"
-        rows.append([f"{fit['series']} by {fit['of']}", ends, *cells])
-    return _markdown(["work", "sizes", "time grows as size to the", "theory", "memory", "theory"], rows)
-
-
-def _start(results: dict) -> str:
-    """Seconds of fresh processes."""
-    rows = [[row["start"], f"{row['median_ms'] / 1e3:.2f}"] for row in results["rows"]]
-    return _markdown(["fresh process", "s"], rows)
-
-
-def _ladder(results: dict, skin: int) -> str:
+def _ladder(skin: int) -> Callable[[Row], str]:
     """The rungs of a skin that name a fidelity or lie on the front of error against time of a forward solve."""
-    heads = [
-        "rung",
-        "nodes",
-        "voltages, error",
-        "a touch, error",
-        "forward, ms",
-        "Jacobian, ms",
-        "localised, mm",
-        "frame, ms",
-    ]
-    rows = []
-    for row in results["ladders"][skin]["rungs"]:
-        if not (row["front"] or row["label"] in ("draft", "standard", "reference")):
-            continue
-        image = row["image"]
-        cells = [f"{row['nodes']:,}", f"{100 * row['voltage_error']:.2g} %", f"{100 * row['difference_error']:.2g} %"]
-        cells += [_figures(1e3 * row[name]["median"]) for name in ("forward", "jacobian")]
-        cells += [f"{1e3 * image['localisation']:.2f}", _figures(1e3 * image["frame"]["median"])] if image else ["", ""]
-        name = f"**{row['label']}**" if row["front"] else row["label"]
-        rows.append([name, *cells])
-    return _markdown(heads, rows)
+
+    def shown(row: Row) -> Row:
+        new = {"name": f"**{row['label']}**" if row["front"] else row["label"]}
+        new |= {f"{name}_ms": 1e3 * row[name]["median"] for name in ("forward", "jacobian")}
+        if image := row["image"]:
+            new |= {"localised_mm": 1e3 * image["localisation"], "frame_ms": 1e3 * image["frame"]["median"]}
+        return row | new
+
+    named = ("draft", "standard", "reference")
+    return lambda results: LADDER(
+        shown(row) for row in results["ladders"][skin]["rungs"] if row["front"] or row["label"] in named
+    )
 
 
-def _paper(results: dict) -> str:
-    return bench_paper.table(results["rows"])
+FRAME = Columns(
+    "ms a frame | p50 | p99 | max | p50, after other work | p99, after other work | max, after other work | "
+    "batch of 1,000 | memory-copy bound",
+    "{way} | {p50_ms:.3f} | {p99_ms:.3f} | {max_ms:.3f} | {after[p50_ms]:.3f} | {after[p99_ms]:.3f} | "
+    "{after[max_ms]:.3f} | {batch[p50_ms]:.4f} | {least_ms:.3f}",
+)
+STREAM = Columns(
+    "ms a frame | frames | p50 | p99 | p99.9 | above 0.1 ms",
+    "{way} | {calls:,} | {p50_ms:.3f} | {p99_ms:.3f} | {0[p99.9_ms]:.3f} | {above:,}",
+)
 
 
-def _event_scan(results: dict) -> str:
-    return bench_protocol.event_table(results["events"]) + "\n"
+def _frame(results: Row) -> str:
+    """One frame to its image: in a stream of frames, after other work, and in a batch."""
+    kinds = ("single", "single, after other work", "batch")
+    single, after, batch = ({row["way"]: row for row in results["application"][kind]} for kind in kinds)
+    return FRAME(row | {"after": after.get(way, {}), "batch": batch.get(way, {})} for way, row in single.items())
 
 
-def _effects(results: dict) -> str:
-    """What a program holds and takes as effects are added one by one."""
-    columns = {"frame_ms": "a frame, ms", "frame_mflop": "Mflop", "frame_operations": "operations"}
-    columns |= {"block_ms": "1,024 frames' histories, ms", "block_mflop": "Mflop", "block_operations": "operations"}
-    rows = [[row["effects"], *(_figures(row[name]) for name in columns)] for row in results["rows"]]
-    return _markdown(["effects", *columns.values()], rows)
+def _to_accuracy(results: Row) -> str:
+    """The quickest mesh of each tool that reaches an accuracy."""
+    column, content = "voltages to {target:g %}", "{best[median_ms]:ms} ({best[unknowns]:,})"
+    return crossed("forward, ms (unknowns)", "{kind}", column, content, results["to_accuracy"], "not reached")
 
 
-def _live(results: dict) -> str:
+def _calibration(results: Row) -> str:
+    """Error of held-out forces by presses scattered over the skin, and by recipe."""
+    fits = sorted((r for r in results["presses"] if r["spread"] == "scattered"), key=lambda r: r["presses"])
+    line, column = "{curve}, location {location}", "{presses} presses, {minutes:.0f} min"
+    every = [r for r in results["presses"] if r["presses"] == 225]
+    return crossed("error of held-out forces, N", line, column, "{hold_n:.2f}", fits + every, "not determined")
+
+
+def _readings(results: Row) -> str:
+    """Error of place by readings of a frame, and by the way they are chosen."""
+    head, column = "mean error of place, contacts fitted, mm", "{readings} readings, {frames_per_s:,.0f} frames/s"
+    return crossed(head, "{way}", column, "{fit_mm:.2g}", results["rows"])
+
+
+EVENT_SCAN = Columns(
+    "event-driven scan | readings | fit, mm | lost | frames/s | frames/s with switching",
+    "{label} | {readings:.0f} | {fit_mm:.2f} | {lost:.0f %} | {frames_per_s:,.0f} | {frames_per_s_with_switching:,.0f}",
+)
+EVENTS = {"rest": "at rest", "first": "first frame of a contact", "next": "the frames after"}
+
+
+def _event_scan(results: Row) -> str:
+    return EVENT_SCAN(results["events"][name] | {"label": label} for name, label in EVENTS.items())
+
+
+LIVE = Columns(
+    "run | frames | lost | dropped | latency p50, ms | latency p99, ms | latency max, ms | after due time, p99, ms | "
+    "wake-up delay of a sleeper, p99, ms | memory, MB an hour",
+    "{label} | {received[0]:,} | {lost:,} | {dropped:,} | {latency_ms_p50:ms} | {latency_ms_p99:ms} | "
+    "{latency_ms_max:ms} | {since_due_ms_p99:ms} | {woken_ms_p99:ms} | "
+    "{memory_mb_per_hour:.2f} ± {memory_mb_per_hour_error:.2f}",
+)
+
+
+def _live(results: Row) -> str:
     """What came over loopback, and when it was shown."""
-    soak, tenfold = results["soak"], results["tenfold"]
-    best = [row for row in results["rates"] if row["rate_hz"] == results["highest_hz"] and row["sustained"]]
-    heads = ["run", "frames", "lost", "dropped", *(f"latency {p}, ms" for p in ("p50", "p99", "max"))]
-    heads += ["beyond the scan, p99, ms", "a sleeper wakes late, p99, ms", "memory, MB an hour"]
-    long = f"live and recorded, {soak['rate_hz']} Hz, {soak['seconds'] / 60:.0f} min"
-    rows = [
-        _live_row(long, soak),
-        *([_live_row(long + ", `--realtime`", results["soak_realtime"])] if "soak_realtime" in results else []),
-        *(_live_row(f"live, highest rate sustained: {row['rate_hz']} Hz", row) for row in best),
-        [
-            f"recorded, {tenfold['rate_hz']} Hz, {tenfold['seconds'] / 60:.0f} min",
-            f"{tenfold['recorded'][0]:,}",
-            f"{tenfold['lost'][0]:,}",
-            *[""] * 6,
-            _grown(tenfold),
-        ],
-    ]
-    return _markdown(heads, rows)
+    soak, recorded = results["soak"], results["tenfold"]
+    labels = [f"{one['rate_hz']} Hz, {one['seconds'] / 60:.0f} min" for one in (soak, recorded)]
+    rows = [soak | {"label": f"live and recorded, {labels[0]}"}]
+    if "soak_realtime" in results:
+        rows.append(results["soak_realtime"] | {"label": f"live and recorded, {labels[0]}, `--realtime`"})
+    for row in results["rates"]:
+        if row["rate_hz"] == results["highest_hz"] and row["sustained"]:
+            rows.append(row | {"label": f"live, highest rate sustained: {row['rate_hz']} Hz"})
+    shown = {"label": f"recorded, {labels[1]}", "received": recorded["recorded"], "lost": recorded["lost"][0]}
+    return LIVE([*rows, recorded | shown])
 
 
-def _live_row(label: str, row: dict) -> list[str]:
-    cells = [f"{row['received'][0]:,}", f"{row['lost']:,}", f"{row['dropped']:,}"]
-    cells += [_figures(row[f"latency_ms_{p}"]) for p in ("p50", "p99", "max")]
-    return [label, *cells, _figures(row["since_due_ms_p99"]), _figures(row["woken_ms_p99"]), _grown(row)]
+SCENES = Columns(
+    "scene | recording | frames | simulated in | times real time",
+    "`{scene}` | {recording_s:,.0f} s | {frames:,} | {second_s:.1f} s | {times_real_time:.0f}",
+)
+EFFECTS = Columns(
+    "effects | a frame, ms | Mflop | operations | 1,024 frames' histories, ms | Mflop | operations",
+    "{effects} | {frame_ms:ms} | {frame_mflop:ms} | {frame_operations:ms} | {block_ms:ms} | {block_mflop:ms} | "
+    "{block_operations:ms}",
+)
+GROWTH = Columns(
+    "work | sizes | time grows as size to the | theory | memory | theory",
+    "{series} by {of} | {sizes[0]:,} to {last:,} | {time[exponent]} | {time[theory]} | {memory[exponent]} | "
+    "{memory[theory]}",
+)
+START = Columns("fresh process | s", "{start} | {seconds:.2f}")
 
 
-def _grown(row: dict) -> str:
-    name = "memory_mb_per_hour"
-    return f"{row[name]:.2f} ± {row[f'{name}_error']:.2f}" if name in row else ""
+def _growth(results: Row) -> str:
+    return GROWTH(fit | {"last": fit["sizes"][-1]} for fit in results["fits"])
 
 
-def _markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
+def _start(results: Row) -> str:
+    return START(row | {"seconds": row["median_ms"] / 1e3} for row in results["rows"])
 
 
-def _figures(ms: float) -> str:
-    return f"{ms:,.0f}" if ms >= 100 else f"{ms:.3g}"
+def _stream(results: Row) -> str:
+    return STREAM(results["application"]["stream"])
 
 
+# By the mark in a page (`forward` and `jacobian` are only printed): the sections that a table is made of, and how.
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
+    "forward": (("forward",), _by_tool("forward solve, ms")),
+    "jacobian": (("jacobian",), _by_tool("Jacobian, ms")),
     "speed": (("forward", "jacobian"), _speed),
     "repeat": (("forward", "jacobian", "forward-again", "jacobian-again"), _repeat),
     "images": (("images",), _images),
-    "scenes": (("scene",), _scenes),
+    "scenes": (("scene",), SCENES.of("sessions")),
     "paper": (("paper",), _paper),
-    "ladder": (("ladder",), partial(_ladder, skin=0)),
-    "ladder-chest": (("ladder",), partial(_ladder, skin=1)),
-    "preparation": (("inverse",), _preparation),
+    "ladder": (("ladder",), _ladder(0)),
+    "ladder-chest": (("ladder",), _ladder(1)),
+    "preparation": (("inverse",), _by_tool("a reconstruction prepared, ms")),
     "frame": (("inverse",), _frame),
     "stream": (("inverse",), _stream),
-    "pipeline": (("pipeline",), _pipeline),
+    "pipeline": (("pipeline",), _by_tool("mesh to images of 100 frames, ms")),
     "to-accuracy": (("pipeline",), _to_accuracy),
     "calibration-cost": (("calibration_cost",), _calibration),
-    "measurement-cost": (("protocol_cost",), _protocol),
+    "measurement-cost": (("protocol_cost",), _readings),
     "event-scan": (("protocol_cost",), _event_scan),
-    "effects": (("scene",), _effects),
+    "effects": (("scene",), EFFECTS.of("rows")),
     "growth": (("growth",), _growth),
     "start": (("start",), _start),
     "live": (("live",), _live),

@@ -35,9 +35,15 @@ def missing() -> str | None:
 
 
 class Eidors:
-    """A tool that has Octave at work; `last_seconds` is what Octave measured around its last call."""
+    """A tool that has Octave at work; `last_seconds` is what Octave measured around its last call.
 
-    def __init__(self, problem, verb: str, order: int = 1, pixels=None, **extra: Any) -> None:
+    ``verb``: "forward", whose ``order`` 2 has six-node triangles (`fwd_solve_higher_order`); "jacobian"; "inverse", the
+    matrix of `inv_solve_diff_GN_one_step` with `prior_noser`, (basis, readings), for a ``hyperparameter``; "pipeline",
+    images of ``frames`` (readings, frames) by it, the model made anew in each call.  Onto elements, or onto ``pixels``
+    (elements, basis): the quicker of EIDORS's `coarse2fine` and a product.
+    """
+
+    def __init__(self, problem, verb: str = "forward", order: int = 1, pixels=None, **extra: Any) -> None:
         folder = tempfile.TemporaryDirectory(prefix="eidors-")
         self.folder, self.last_seconds = Path(folder.name), float("nan")
         image = problem.mesh.triangles if pixels is None else pixels.T
@@ -114,27 +120,3 @@ def versions() -> dict[str, str]:
     command = ["octave-cli", "--norc", "--quiet", "--eval", ask]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return dict(zip(("octave", "eidors"), done.stdout.split(), strict=True))
-
-
-def prepare(problem) -> Eidors:
-    return Eidors(problem, "forward")
-
-
-def prepare_quadratic(problem) -> Eidors:
-    """Six-node triangles (`fwd_solve_higher_order`)."""
-    return Eidors(problem, "forward", order=2)
-
-
-def prepare_jacobian(problem, pixels=None) -> Eidors:
-    """Onto elements, or onto ``pixels`` (elements, basis): the quicker of EIDORS's `coarse2fine` and a product."""
-    return Eidors(problem, "jacobian", pixels=pixels)
-
-
-def prepare_inverse(problem, hyperparameter: float, pixels=None) -> Eidors:
-    """The matrix of `inv_solve_diff_GN_one_step` with `prior_noser`, (basis, readings), its Jacobian included."""
-    return Eidors(problem, "inverse", pixels=pixels, hyperparameter=hyperparameter)
-
-
-def prepare_pipeline(problem, hyperparameter: float, frames: np.ndarray, pixels=None) -> Eidors:
-    """From the mesh to images of frames, (readings, frames): each call makes the model anew."""
-    return Eidors(problem, "pipeline", pixels=pixels, hyperparameter=hyperparameter, frames=frames)

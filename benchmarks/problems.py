@@ -1,0 +1,160 @@
+"""The problems that are measured on: sheets whose readings are known, skins of any size, presses simulated on one."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from jaxeit.linalg import NestedDissection
+from tests.oracles.disc import disc_potentials
+from tests.oracles.rectangle import green
+
+SIZES = (30, 60, 120, 240)  # cells a side, multiples of 10: the electrodes are nodes
+SMOKE = 10
+SIDE, PITCH, MARGIN = 0.2, 0.04, 0.02  # m
+CONTACT, ELECTRODES = 0.1, 16  # of the disc
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The testbed sheet with 25 point electrodes on a regular mesh; SI units, P1, sheet resistance 1.
+
+    | meaning                                                          | shape         |
+    |------------------------------------------------------------------|---------------|
+    | pairs: the neighbours of the 5x5 grid, both drives and senses    | (40, 2)       |
+    | drive, sense: pair of each reading; the two share no electrode   | (1372,)       |
+    | pattern: drive+, drive-, sense+, sense-                          | (1372, 4)     |
+    | electrode_nodes                                                  | (25,)         |
+    | sigma: conductivity, varied so that no tool can profit from one  | (elements,)   |
+    """
+
+    cells: int
+
+    @cached_property
+    def mesh(self) -> je.meshing.Mesh:
+        return je.meshing.structured(je.Rectangle(SIDE, SIDE), self.cells, self.cells)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        line = MARGIN + PITCH * np.arange(5)
+        return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+
+    @cached_property
+    def electrode_nodes(self) -> np.ndarray:
+        column, row = np.rint(self.points / SIDE * self.cells).astype(int).T
+        nodes = row * (self.cells + 1) + column
+        if not np.allclose(self.mesh.nodes[nodes], self.points, atol=1e-12):
+            raise ValueError(f"{self.cells} cells a side put no nodes at the electrodes; give a multiple of 10")
+        return nodes
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        grid = np.arange(25).reshape(5, 5)
+        along = np.stack([grid[:, :-1].ravel(), grid[:, 1:].ravel()], 1)
+        return np.concatenate([along, np.stack([grid[:-1].ravel(), grid[1:].ravel()], 1)])
+
+    @cached_property
+    def kept(self) -> np.ndarray:
+        """(40, 40) whether drive and sense share no electrode."""
+        shared = self.pairs[:, None, :, None] == self.pairs[None, :, None, :]
+        return ~shared.any((2, 3))
+
+    @cached_property
+    def pattern(self) -> np.ndarray:
+        drive, sense = np.nonzero(self.kept)
+        return np.concatenate([self.pairs[drive], self.pairs[sense]], 1)
+
+    @cached_property
+    def sigma(self) -> np.ndarray:
+        x, y = (self.mesh.chart_centroids / SIDE).T
+        return 1 + 0.3 * np.sin(5 * x) * np.cos(4 * y)
+
+    @property
+    def skin(self) -> je.Skin:
+        return square(self.points, self.pattern)
+
+    def model(self, dtype: str = "float64", order: int = 1) -> je.Model:
+        fidelity = je.Fidelity(order=order, dtype=dtype, solver=NestedDissection())
+        return je.discretise(je.Scene(self.skin), fidelity, mesh=self.mesh)
+
+
+def square(points: np.ndarray, pattern: np.ndarray, pads: tuple[je.Pad, ...] = ()) -> je.Skin:
+    """The square sheet of unit conductivity with point electrodes at (electrodes, 2) places, 1 A."""
+    electrodes = tuple(je.PointElectrode(tuple(point)) for point in points.tolist())
+    return je.Skin("bench", je.Rectangle(SIDE, SIDE), 1.0, electrodes, je.Protocol(pattern, 1.0), pads)
+
+
+# --- skins whose readings are known
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A skin of unit conductivity whose readings (readings,) in V are known."""
+
+    name: str
+    skin: je.Skin
+    exact: np.ndarray
+
+
+def rectangle() -> Case:
+    problem = Problem(SMOKE)
+    return Case("rectangle", problem.skin, exact_rectangle(problem))
+
+
+def disc() -> Case:
+    """The unit disc, half its rim covered by complete electrodes, adjacent drives and senses."""
+    width = np.pi / ELECTRODES
+    starts = (2 * width * np.arange(ELECTRODES) - width / 2) % (2 * np.pi)
+    electrodes = tuple(je.BoundaryPatch(float(s), float(s + width), CONTACT) for s in starts)
+    pattern = je.skin.adjacent(ELECTRODES)
+    skin = je.Skin("bench", je.Disc(1.0), 1.0, electrodes, je.Protocol(pattern, 1.0), ())
+    return Case("disc", skin, exact_disc(pattern))
+
+
+def exact_rectangle(problem: Problem) -> np.ndarray:
+    """Voltages of the homogeneous square. The series is along the axis on which two points lie farther apart."""
+    source, sink, plus, minus = problem.pattern.T
+    z = np.zeros((25, 25))
+    for i, j in zip(*np.triu_indices(25, 1), strict=True):
+        a, b = problem.points[i], problem.points[j]
+        flip = slice(None, None, -1 if abs(a - b)[0] > abs(a - b)[1] else 1)
+        z[i, j] = z[j, i] = green(SIDE, SIDE, a[flip], b[flip])
+    return z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink]
+
+
+def exact_disc(pattern: np.ndarray) -> np.ndarray:
+    """Voltages of the homogeneous disc for adjacent drives, which are rotations of one; good to 1e-7."""
+    first = disc_potentials(CONTACT, ELECTRODES)
+    by_drive = np.stack([np.roll(first, turn) for turn in range(ELECTRODES)])
+    source, _, plus, minus = pattern.T
+    return by_drive[source, plus] - by_drive[source, minus]
+
+
+# --- presses
+
+
+def readings_of_presses(model: je.Model, places: np.ndarray, loads: np.ndarray) -> np.ndarray:
+    """(n, readings) V of presses at (n, k, 2) places at once with (n, k) N, by tips of 20 mm."""
+    return np.asarray(_pressed(model, jnp.asarray(places), jnp.asarray(loads)))
+
+
+def _forwards(model: je.Model, places: jax.Array, loads: jax.Array) -> jax.Array:
+    def frame(press):
+        loads_there = jax.vmap(lambda place: je.model.load_spread(model, place, 0.02))(press[0])
+        return je.forward(model, je.conductivity(model, press[1] @ loads_there))
+
+    return jax.lax.map(frame, (places, loads))
+
+
+_jit: Any = eqx.filter_jit  # its type leaves out what it hands on to jax.jit
+_pressed = _jit(_forwards, compiler_options=je.compiler_options())  # compiled once for all seeds
+
+
+def noise_of(v0: np.ndarray) -> float:
+    """Noise of a reading, V: 60 dB below the readings' rms."""
+    return 1e-3 * float(np.sqrt(np.mean(v0**2)))

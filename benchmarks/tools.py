@@ -1,0 +1,279 @@
+"""The tools that are compared, as data: for each kind of work those that do it, their preparation and their limits.
+
+All get the same mesh, conductivity and pairs, and are called with NumPy arrays that give NumPy arrays.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import cho_factor, cho_solve
+
+import jaxeit as je
+
+from .clock import MAX_DIFFERENCE, Tool, peak_megabytes, peaks, seconds
+from .peers import adjoint, cholmod, eidors, pyeit, superlu
+from .problems import Problem
+
+PIXELS = 30
+HYPERPARAMETER = 0.1
+PRIOR = je.Noser(floor=1e-12)  # the others know no floor; ours would lift the pixels in the corners
+FRAMES = 100  # of the pipeline
+MAX_FLOAT32_DIFFERENCE = 1e-2  # single precision: how far it is off is reported, not required to be nothing
+MAX_IMAGE_DIFFERENCE = 1e-7
+IN_DATA, IN_IMAGE = "by hand in data space", "by hand in image space"
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A tool at some work: its name in the results, how it is prepared for a problem, and its limits.
+
+    ``largest``: cells a side beyond which it takes minutes or gigabytes. ``loose``: how far its results may be off.
+    """
+
+    name: str
+    prepare: Callable[[Problem], Tool]
+    peer: ModuleType | None = None
+    largest: int = 240
+    loose: float = MAX_DIFFERENCE
+
+    def absent(self, cells: int) -> str | None:
+        """Why the tool does not run at this size."""
+        if self.peer is not None and self.peer.missing():
+            return self.peer.missing()
+        return f"beyond {self.largest} cells a side it takes too long" if cells > self.largest else None
+
+
+def present(entries: Sequence[Entry], cells: int) -> list[Entry]:
+    """Those that run at this size; says which do not, and why."""
+    for entry in entries:
+        if reason := entry.absent(cells):
+            print(f"{entry.name} left out: {reason}")
+    return [entry for entry in entries if not entry.absent(cells)]
+
+
+def compiled(function: Callable, model: je.Model, *extra: Any, options: Mapping[str, Any] | None = None) -> Callable:
+    """``function(model, sigma, *extra)`` under one jit, with no compiler options but these; a function of sigma."""
+    run = je.bind(lambda model, extra, sigma: function(model, sigma, *extra), model, extra, options=options or {})
+    return lambda sigma: jax.block_until_ready(run(sigma))
+
+
+def as_tool(run: Callable, dtype: str = "float64") -> Tool:
+    """A jitted function as the other tools are: NumPy in, NumPy out, transfers included."""
+    return lambda sigma: np.asarray(run(np.asarray(sigma, dtype)))
+
+
+# --- forward solves
+
+
+def forward(problem: Problem, dtype: str = "float64", order: int = 1) -> Tool:
+    return forward_of(problem.model(dtype, order), dtype)
+
+
+def forward_of(model: je.Model, dtype: str) -> Tool:
+    return as_tool(compiled(je.forward, model, options=je.compiler_options()), dtype)
+
+
+def forward_inside(problem: Problem) -> Tool:
+    """As part of a program that was not given `je.compiler_options`."""
+    return as_tool(compiled(je.forward, problem.model()))
+
+
+def forward_called(problem: Problem) -> Tool:
+    """As users call it: `je.forward(model, sigma)`."""
+    model = problem.model()
+    return lambda sigma: np.asarray(je.forward(model, sigma))
+
+
+FORWARD = (
+    Entry("jaxeit float64", forward),
+    Entry("jaxeit float32", partial(forward, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
+    Entry("jaxeit float64, called from Python", forward_called),
+    Entry("jaxeit float64, without compiler options", forward_inside),
+    Entry(superlu.NAME, superlu.prepare, superlu),
+    Entry(cholmod.NAME, cholmod.prepare, cholmod),
+    Entry(pyeit.NAME, pyeit.prepare, pyeit, largest=120),
+    Entry(eidors.NAME, eidors.Eidors, eidors),
+)
+
+
+# --- Jacobians
+
+
+def basis_of(model: je.Model, pixels: bool) -> je.model.BasisMap:
+    return (je.Pixels(PIXELS) if pixels else je.Elements()).on(model)
+
+
+def jacobian(problem: Problem, pixels: bool, dtype: str = "float64") -> Tool:
+    model = problem.model(dtype)
+    return as_tool(compiled(je.jacobian, model, basis_of(model, pixels), options=je.compiler_options()), dtype)
+
+
+def projection(problem: Problem, pixels: bool = True) -> sp.csr_array | None:
+    """(elements, 900): pixels as a matrix, for the tools that are given it; None onto elements."""
+    if not pixels:
+        return None
+    image = basis_of(problem.model(), True)
+    weight, element = np.asarray(image.weight), np.asarray(image.element)
+    coefficient = np.broadcast_to(np.asarray(image.coefficient)[:, None], element.shape)
+    entries = weight.ravel(), (element.ravel(), coefficient.ravel())
+    return sp.csr_array(entries, shape=(len(problem.sigma), image.size))
+
+
+def jacobian_by_hand(problem: Problem, pixels: bool) -> Tool:
+    return adjoint.prepare(problem, projection(problem, pixels))
+
+
+def by_eidors(problem: Problem, pixels: bool, verb: str) -> eidors.Eidors:
+    """EIDORS at a verb of `peers.eidors`, onto pixels or elements."""
+    extra: dict[str, Any] = {} if verb == "jacobian" else {"hyperparameter": strength(problem, pixels) ** 0.5}
+    if verb == "pipeline":
+        extra["frames"] = frames(len(problem.pattern))
+    return eidors.Eidors(problem, verb, pixels=projection(problem, pixels), **extra)
+
+
+def onto(image: str, name: str, prepare: Callable[..., Tool], *rest: Any, **more: Any) -> Entry:
+    """A tool onto "pixels" or "elements", which its name says."""
+    return Entry(f"{name}, {image}", partial(prepare, pixels=image == "pixels"), *rest, **more)
+
+
+JACOBIAN = (
+    onto("pixels", "jaxeit float64", jacobian),
+    onto("pixels", "jaxeit float32", partial(jacobian, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
+    onto("pixels", adjoint.NAME, jacobian_by_hand),
+    onto("elements", "jaxeit float64", jacobian, largest=120),  # beyond, the matrix alone takes 1.3 GB
+    onto("elements", adjoint.NAME, jacobian_by_hand, largest=120),
+    Entry(f"{pyeit.NAME}, elements", pyeit.prepare_jacobian, pyeit, 30),  # it inverts a dense matrix
+    onto("pixels", eidors.NAME, partial(by_eidors, verb="jacobian"), eidors),
+    onto("elements", eidors.NAME, partial(by_eidors, verb="jacobian"), eidors, 120),
+)
+
+
+# --- reconstructions: from conductivity to what turns frames into images
+
+
+def reconstructor(model: je.Model, basis: je.model.BasisMap, sigma: jax.Array) -> je.Reconstructor:
+    return je.prepare(model, PRIOR, basis=basis, hyperparameter=HYPERPARAMETER, sigma=sigma)
+
+
+class Reconstruction:
+    """`prepare`, whose clock stops when the reconstructor is there; Q is written out for comparison only."""
+
+    def __init__(self, problem: Problem, pixels: bool, dtype: str = "float64") -> None:
+        self.before, self.dtype = peak_megabytes(), dtype
+        self.model = problem.model(dtype)
+        self.basis = basis_of(self.model, pixels)
+
+    def __call__(self, sigma: np.ndarray) -> np.ndarray:
+        self.last_seconds, recon = seconds(self.reconstructor, sigma)
+        self.peak = peak_megabytes()
+        return np.asarray(recon.matrix)
+
+    def reconstructor(self, sigma: np.ndarray) -> je.Reconstructor:
+        return jax.block_until_ready(reconstructor(self.model, self.basis, jnp.asarray(sigma, self.dtype)))
+
+    def peaks(self) -> dict[str, int]:
+        return peaks(self.before, self.peak)
+
+
+def noser(j: np.ndarray) -> tuple[np.ndarray, float]:
+    """R = diag(J^T J)^0.5, and l^2 = hyperparameter^2 tr(J R^-1 J^T) / readings, of which the trace is that of R."""
+    prior = np.sqrt(np.einsum("ij,ij->j", j, j))
+    return prior, HYPERPARAMETER**2 * prior.sum() / len(j)
+
+
+def in_data_space(j: np.ndarray) -> np.ndarray:
+    """``R^-1 J^T (J R^-1 J^T + l^2 I)^-1``."""
+    prior, square = noser(j)
+    gained = j / prior
+    small = gained @ j.T
+    np.einsum("ii->i", small)[:] += square
+    return cho_solve(cho_factor(small, overwrite_a=True), gained).T
+
+
+def in_image_space(j: np.ndarray) -> np.ndarray:
+    """``(J^T J + l^2 R)^-1 J^T``."""
+    prior, square = noser(j)
+    small = j.T @ j
+    np.einsum("ii->i", small)[:] += square * prior
+    return cho_solve(cho_factor(small, overwrite_a=True), j.T)
+
+
+def inverse_by_hand(problem: Problem, pixels: bool, solve: Callable = in_data_space) -> Tool:
+    matrix = jacobian_by_hand(problem, pixels)
+    return lambda sigma: solve(matrix(sigma))
+
+
+def strength(problem: Problem, pixels: bool = False) -> float:
+    """l^2, which the others are given as a number."""
+    return noser(jacobian_by_hand(problem, pixels)(problem.sigma))[1]
+
+
+def inverse_by_pyeit(problem: Problem) -> Tool:
+    return pyeit.prepare_inverse(problem, strength(problem))
+
+
+DENSE: dict[str, Any] = {
+    "largest": 60,
+    "loose": MAX_IMAGE_DIFFERENCE,
+}  # a dense system elements x elements takes minutes
+INVERSE = (
+    onto("pixels", "jaxeit float64", Reconstruction, loose=MAX_IMAGE_DIFFERENCE),
+    onto("pixels", IN_DATA, inverse_by_hand, loose=MAX_IMAGE_DIFFERENCE),
+    onto("pixels", IN_IMAGE, partial(inverse_by_hand, solve=in_image_space), loose=MAX_IMAGE_DIFFERENCE),
+    onto("pixels", eidors.NAME, partial(by_eidors, verb="inverse"), eidors, loose=MAX_IMAGE_DIFFERENCE),
+    onto("elements", "jaxeit float64", Reconstruction, **DENSE),
+    onto("elements", IN_DATA, inverse_by_hand, **DENSE),
+    onto("elements", eidors.NAME, partial(by_eidors, verb="inverse"), eidors, **DENSE),
+    Entry(f"{pyeit.NAME}, elements", inverse_by_pyeit, pyeit, **DENSE),
+)
+
+
+# --- the whole way: from the mesh to images of frames
+
+
+@cache
+def frames(readings: int) -> np.ndarray:
+    """(readings, 100)."""
+    return np.random.default_rng(0).normal(size=(readings, FRAMES))
+
+
+def pipeline(problem: Problem, pixels: bool) -> Tool:
+    """`discretise`, `prepare` and images, from arrays to arrays."""
+    seen, _ = frames(len(problem.pattern)).T, problem.mesh  # at hand before the clock starts
+
+    def images(sigma: np.ndarray) -> np.ndarray:
+        model = problem.model()
+        return np.asarray(reconstructor(model, basis_of(model, pixels), jnp.asarray(sigma))(seen)).T
+
+    return images
+
+
+def pipeline_by_hand(problem: Problem, pixels: bool) -> Tool:
+    """The adjoint formula and SciPy's Cholesky, prepared for the mesh in each call."""
+    project, seen = projection(problem, pixels), frames(len(problem.pattern))
+    return lambda sigma: in_image_space(adjoint.prepare(problem, project)(sigma)) @ seen
+
+
+def pipeline_by_pyeit(problem: Problem) -> Tool:
+    return pyeit.prepare_pipeline(problem, strength(problem), frames(len(problem.pattern)))
+
+
+SLOW = DENSE | {"largest": 30}
+PIPELINE = (
+    onto("pixels", "jaxeit float64", pipeline, loose=MAX_IMAGE_DIFFERENCE),
+    onto("pixels", IN_IMAGE, pipeline_by_hand, loose=MAX_IMAGE_DIFFERENCE),
+    onto("pixels", eidors.NAME, partial(by_eidors, verb="pipeline"), eidors, loose=MAX_IMAGE_DIFFERENCE),
+    onto("elements", "jaxeit float64", pipeline, **SLOW),
+    onto("elements", IN_IMAGE, pipeline_by_hand, **SLOW),
+    onto("elements", eidors.NAME, partial(by_eidors, verb="pipeline"), eidors, **SLOW),
+    Entry(f"{pyeit.NAME}, elements", pipeline_by_pyeit, pyeit, **SLOW),
+)
+
+TOOLS = {"forward": FORWARD, "jacobian": JACOBIAN, "inverse": INVERSE, "pipeline": PIPELINE}
