@@ -31,13 +31,13 @@ from calib.live.page import Page
 from calib.live.presentation import Presentation, present
 from calib.live.results import TouchEstimates
 from calib.live.scan_control import ScanDirector, prepare_director
-from calib.record import encoding
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
 from calib.record.plan import StreamPlan
 from calib.record.planning import plan_recording
 from calib.record.priority import PriorityError, real_time
 from calib.record.recorder import StopRequest, record_session
-from calib.record.wire import Frame
+from calib.record.wire import encoding
+from calib.record.wire.messages import Frame
 from jaxeit import effects as fx
 
 S = 1_000_000_000
