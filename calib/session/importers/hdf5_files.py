@@ -185,7 +185,7 @@ def _shape(source: h5py.Dataset) -> tuple[int, ...]:
     return (source.size,) if vector and source.ndim == 2 and 1 in source.shape else source.shape
 
 
-def _kind(source: h5py.Dataset) -> np.dtype[Any]:
+def _kind(source: h5py.Dataset) -> np.dtype:
     return np.dtype("u1") if source.dtype.kind == "b" else source.dtype
 
 

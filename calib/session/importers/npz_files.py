@@ -5,7 +5,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import IO, ClassVar
 
 import numpy as np
 from numpy.lib import format as npy
@@ -85,7 +85,7 @@ def _zipped(path: Path, wanted: set[str] | None) -> Iterator[tuple[str, IO[bytes
                     yield name, stream
 
 
-def _header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     version = npy.read_magic(stream)
     if version not in HEADERS:
         raise problem(path, name, f"is of the unknown version {version}", "save it with another version of NumPy")

@@ -73,7 +73,9 @@ class AbstractTableImporter(AbstractImporter):
         """Files, clock, streams, and numbers that mean missing."""
         grouped: dict[str, Any] = {"action": _Grouped, "default": argparse.SUPPRESS}
         parser.epilog = COLUMNS_HELP
-        parser.add_argument("files", nargs="+", metavar="FILE", help=f"{cls.summary}; in order", **grouped)
+        parser.add_argument(
+            "files", nargs="+", metavar="FILE", help="files of one layout, in the order of recording", **grouped
+        )
         text = "the clock's column and unit, as 0:ms; the unit may be left out where the header says it, as time (ms)"
         parser.add_argument("--time", metavar="COLUMN:UNIT", help=text, **grouped)
         text = "rate of a table without a clock, in Hz; instead of --time"
