@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import one_by_one, verb
+from .._compile import sequential_on_cpu, verb
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
@@ -296,7 +296,7 @@ def _padded(fit: ContactFit, most: int) -> ContactFit:
     return fit._replace(flat=jnp.pad(fit.flat, (0, 4 * most - len(fit.flat))))
 
 
-_alone = one_by_one(lambda finder, frame: finder.frame(frame))
+_alone = sequential_on_cpu(lambda finder, frame: finder.frame(frame))
 
 
 @verb

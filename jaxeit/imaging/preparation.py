@@ -17,7 +17,8 @@ from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
 from ..model.sensitivity import pair_jacobian
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
-from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, one_step
+from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
+from .methods.one_step import one_step_image
 from .noise import InverseError, Whitened, Whitening, whitened_readings
 from .priors import AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
@@ -154,7 +155,7 @@ def _build(
     noise_is_known: bool,
 ) -> tuple[Reconstructor, Float[Array, "r k"]]:
     """The reconstructor, and what a one-step image predicts for the whitened readings, per pair sum."""
-    image, followed = one_step(problem, problem.precision(), compress)
+    image, followed = one_step_image(problem, problem.precision(), compress)
     recon = Reconstructor(
         factor=image if isinstance(method, OneStep) else method.image(problem, compress),
         variance=method.variance(problem) if noise_is_known else jnp.full_like(problem.picture.areas, jnp.inf),
