@@ -7,9 +7,9 @@ from .base import AbstractLinearMethod, Problem
 
 
 class BackProjection(AbstractLinearMethod):
-    """Each pixel the mean of the readings weighed by its sensitivity, ``x_j = J_j . y / (|J_j|^2 + floor)``.
+    """Each pixel is the mean of the readings weighted by its sensitivity, ``x_j = J_j . y / (|J_j|^2 + floor)``.
 
-    The oldest method, for comparison; it knows neither prior nor hyperparameter, and its images are blurred.
+    The oldest method, for comparison; it uses neither prior nor hyperparameter, and its images are blurred.
     """
 
     floor: float = 1e-3

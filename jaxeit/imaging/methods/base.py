@@ -12,12 +12,12 @@ from ..priors import AbstractPrecision, AbstractPrior
 
 
 class Problem(eqx.Module):
-    """A linearised problem, whitened.
+    """A linearised problem in whitened readings.
 
     | meaning                                            | shape      | unit |
     |----------------------------------------------------|------------|------|
     | jacobian                                           | (k, basis) | 1/S  |
-    | readings: how many of them the k numbers stand for | ()         |      |
+    | readings: number of readings that the k numbers represent | ()  |      |
     | hyperparameter                                     | ()         |      |
     | prior, and the picture it is for                   |            |      |
     """
@@ -44,7 +44,7 @@ class Problem(eqx.Module):
 class AbstractMethod(eqx.Module):
     """A choice of method: an `AbstractLinearMethod` or an `AbstractIterativeMethod`.
 
-    ``follows_prior``: whether the method asks for the prior anew at each image, as `TotalVariation` needs.
+    ``follows_prior``: whether the method evaluates the prior again at each image, as `TotalVariation` needs.
     """
 
     follows_prior: ClassVar[bool] = False
@@ -55,16 +55,16 @@ class AbstractLinearMethod(AbstractMethod):
 
     @abstractmethod
     def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
-        """``Q y``, the images of whitened frames: a frame a column."""
+        """``Q y``, (basis, m) S: the images of m whitened frames, (k, m), one in each column."""
 
     def variance(self, problem: Problem) -> Float[Array, " basis"]:
-        """What noise and prior leave uncertain in each coefficient, for noise of unit variance; infinite: not known."""
+        """Posterior variance of each coefficient, (basis,) S^2, for noise of unit variance; infinite if unknown."""
         return jnp.full_like(problem.picture.areas, jnp.inf)
 
 
 class AbstractIterativeMethod(AbstractMethod):
-    """A method that works on each frame anew, in a fixed number of steps."""
+    """A method that solves a problem for each frame, in a limited number of steps."""
 
     @abstractmethod
     def image(self, problem: Problem, y: Float[Array, " k"]) -> Float[Array, " basis"]:
-        """The image of one whitened frame."""
+        """The image, (basis,) S, of one whitened frame, (k,)."""

@@ -13,9 +13,9 @@ from .base import AbstractIterativeMethod, Problem
 
 
 class Reweighted(AbstractIterativeMethod):
-    """`OneStep` again and again, the prior taken at the last image: for `TotalVariation`.
+    """Iteratively reweighted least squares: `OneStep` repeated with the prior at the last image, for `TotalVariation`.
 
-    Iteratively reweighted least squares; the scale of the hyperparameter is taken anew in each step.
+    The scale of the hyperparameter is computed again in each step.
     """
 
     follows_prior: ClassVar[bool] = True
@@ -30,7 +30,7 @@ class Reweighted(AbstractIterativeMethod):
 
 
 def _by_squares(problem: Problem, precision: AbstractPrecision, y: Float[Array, " k"]) -> Float[Array, " basis"]:
-    """``Q y`` by Cholesky: for a precision that serves one frame, where a hyperparameter near zero makes no sense."""
+    """``Q y`` from the Cholesky factor of normal equations, for a precision that is used for one frame only."""
     j = problem.jacobian
     gained = precision.solve(j.T)
     return gained @ cho_solve(cho_factor(j @ gained + problem.strength(gained) * jnp.eye(len(j), dtype=j.dtype)), y)

@@ -11,9 +11,9 @@ from .base import AbstractLinearMethod, Problem
 class TruncatedSvd(AbstractLinearMethod):
     """The pseudo-inverse on the singular values of ``J R^-1/2`` above l, the others left out.
 
-    l as for `OneStep`, which halves what lies there; values that are only rounding are left out in any case. The image
-    jumps where the hyperparameter passes a singular value and is constant between: its derivative with respect to the
-    hyperparameter is zero.
+    l as for `OneStep`, which halves the contribution of a singular value of l; values that are only rounding are left
+    out in any case. The image jumps where the hyperparameter passes a singular value and is constant between: its
+    derivative with respect to the hyperparameter is zero.
     """
 
     def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
