@@ -11,11 +11,11 @@ the conditions of the solution are met to 1e-13 or after 160 steps, and the CPU 
 | prior, hyperparameter | 400 pixels: steps, ms | here, ms | 900 pixels: steps, ms | here, ms |
 |-----------------------|-----------------------|----------|-----------------------|----------|
 | `Noser`, 0.1          | 26, 66                | 13       | 58, 1096              | 47       |
-| `Noser`, 0.01         | 60, 131               | 71       | 126, 2318             | N001     |
-| `Noser`, 1e-6         | 93, 215               | 122      | 160 (not met), 4040   | N16      |
-| `Laplace`, 0.1        | 6, 19                 | 49       | 7, 184                | L01      |
-| `Laplace`, 0.01       | 32, 76                | 50       | 79, 1663              | L001     |
-| `Laplace`, 1e-6       | 93, 200               | 51       | 160 (not met), 3281   | L16      |
+| `Noser`, 0.01         | 60, 131               | 71       | 126, 2318             | 483      |
+| `Noser`, 1e-6         | 93, 215               | 122      | 160 (not met), 4040   | 567      |
+| `Laplace`, 0.1        | 6, 19                 | 49       | 7, 184                | 447      |
+| `Laplace`, 0.01       | 32, 76                | 50       | 79, 1663              | 463      |
+| `Laplace`, 1e-6       | 93, 200               | 51       | 160 (not met), 3281   | 466      |
 """
 
 from typing import Any, NamedTuple
@@ -34,7 +34,8 @@ Data = Float[Array, " m"]
 Flags = Bool[Array, " k"]
 Ended = tuple[Bool[Array, ""], optx.RESULTS]
 
-# Lengths that `DualNewton` compares, as powers of a half: shorter steps change the objective by less than rounding.
+# Number of step lengths, 1, 1/2, 1/4 ..., that `DualNewton` compares. Problems on which it still does not end after its
+# steps are badly conditioned and left to `InteriorPoint`.
 HALVINGS = 12
 # Factor of the duality gap that a step of `InteriorPoint` aims at, and the part of the way to the boundary that it goes
 # at most (Nocedal and Wright 2006, section 16.6).
