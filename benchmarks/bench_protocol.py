@@ -61,7 +61,9 @@ class Bench:
         self.sites, self.frames, noise = self._simulated(4 if smoke else PRESSES, 0.06 if smoke else 0.026)
         self.model = je.discretise(je.Scene(self.skin), je.Fidelity.draft())
         std = np.full(self.skin.protocol.readings, noise)
-        self.fit = je.prepare_contacts(self.model, noise=std, most=2, columns=21 if smoke else 41)
+        self.fit = je.prepare_contacts(
+            self.model, je.contacts.ContactSettings(most=2, columns=21 if smoke else 41), noise=std
+        )
         self.image = je.prepare(self.model, noise=std)
         self.basis = je.Pixels(20).on(self.model)
 

@@ -146,7 +146,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     """The fields of the calibration that `to_archive` described.
 
     Raises:
-        KeyError, ValueError: for what is missing, or does not fit; `StoreError` for the image's numbers.
+        KeyError, ValueError: for what is missing, or does not fit; `StorageError` for the image's numbers.
     """
     attrs, arrays = archive.attrs, archive.arrays
     skin = je.skin.parse_skin(str(attrs["skin_toml"]), "calibration: skin_toml")
