@@ -117,7 +117,7 @@ def test_arrays_of_the_file_are_named_when_one_is_not_there(saved, here, capsys)
     words = [word.replace("force=f", "force=load") for word in WORDS]
     line = refusal(capsys, *saved, *words)
     assert "column 'load': not there; header names: " in line
-    assert "p[3]" in line
+    assert "p[0]-p[3]" in line
     assert "note" not in line
 
 
@@ -297,7 +297,8 @@ def test_a_missing_library_is_named_with_what_installs_it(kind, module, tmp_path
         pytest.skip(f"{module} is installed")
     path = tmp_path / f"log.{kind}"
     path.write_bytes(b"anything")
-    assert f"needs {module}: pip install 'jaxeit[tables]'" in refusal(capsys, kind, path, *BAG_WORDS)
+    words = ("--time", "t:s", "--stream", "force=/f.f:N")
+    assert f"needs {module}: pip install 'jaxeit[tables]'" in refusal(capsys, kind, path, *words)
 
 
 # --- the child process ---------------------------------------------------------------------------

@@ -9,8 +9,8 @@ import pytest
 
 from calib.cli import main
 from calib.session import SessionError, Status, open_session
-from calib.session.importers import text_files
-from calib.session.importers.csv_tables import CsvFile
+from calib.session.importers.formats import text_files
+from calib.session.importers.formats.csv_tables import CsvFile
 
 TIME = np.arange(5) / 4
 PRESSURE = np.array([0.5, 1.25, -2.5, 1000.75, 3.0])
@@ -90,7 +90,7 @@ def test_names_may_hold_delimiters_and_line_ends(tmp_path):
 
 def test_a_quoted_cell_of_several_lines_does_not_shift_the_line_numbers(tmp_path, monkeypatch):
     """The note of the second row runs over three lines, across the end of a block."""
-    monkeypatch.setattr("calib.session.importers.csv_tables.BLOCK_CELLS", 6)
+    monkeypatch.setattr("calib.session.importers.formats.csv_tables.BLOCK_CELLS", 6)
     text = 't,f,note\n0,1,a\n1,2,"b\n\n# c\nd"\n2,bad,e\n3,4,f\n'
     table = CsvFile(written(tmp_path, text)).read([0, 1], 0, iter)
     np.testing.assert_array_equal(table.values, [[0, 1], [1, 2], [2, np.nan], [3, 4]])

@@ -1,7 +1,7 @@
 """Bring recordings made elsewhere into the session format: a class for each format.
 
-A new format is one class derived from `AbstractImporter` in a module of this room, and its import here; another
-package adds one by an entry point of the group ``calib.importers``. A format of tables derives from
+A new format is one class derived from `AbstractImporter` in a module of `formats`, and its import in the ``__init__``
+there; another package adds one by an entry point of the group ``calib.importers``. A format of tables derives from
 `AbstractTableImporter`, or from `AbstractArrayImporter` where a file holds named arrays: it then has the options of all
 tables.
 """
@@ -19,13 +19,8 @@ from tqdm import tqdm
 from .arrays import AbstractArrayImporter
 from .base import About, AbstractImporter, add_common_arguments, parse_epoch
 from .columns import FileSpec, StreamSpec
-from .csv_tables import CsvImporter, import_csv
-from .hdf5_files import Hdf5Importer
-from .mat_files import MatImporter
-from .npz_files import NpzImporter
-from .parquet_files import ParquetImporter
+from .formats import CsvImporter, Hdf5Importer, MatImporter, McapImporter, NpzImporter, ParquetImporter, import_csv
 from .reports import FileReport, ImportReport, StreamReport
-from .ros_bags import McapImporter
 from .table_importer import AbstractTableImporter
 from .table_session import import_tables
 from .tables import AbstractTableFile, Table

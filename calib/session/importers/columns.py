@@ -141,8 +141,15 @@ def column_indices(path: Path, column: str, header: Sequence[str], columns: int)
     names = _range_of_names(path, column, header)
     if names is not None:
         return names
-    what = f"not there; header names: {', '.join(header) or 'none, it has no header'}"
+    what = f"not there; header names: {_listed(header) or 'none, it has no header'}"
     raise problem(path, f"column {column!r}", what, "use one of them, or count from zero")
+
+
+def _listed(header: Sequence[str]) -> str:
+    """Names in the header; those of one array as a range."""
+    groups = itertools.groupby(header, key=lambda head: re.sub(r"\[\d+\]$", "[]", head))
+    ends = [(names[0], names[-1]) for names in (list(group) for _, group in groups)]
+    return ", ".join(first if first == last else f"{first}-{last}" for first, last in ends)
 
 
 def _named(path: Path, column: str, header: Sequence[str]) -> int | None:

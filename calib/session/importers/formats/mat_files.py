@@ -8,12 +8,12 @@ import h5py
 import numpy as np
 from scipy import io
 
-from ..errors import problem
-from .arrays import AbstractArrayImporter, ArrayShape, known, table_shape, table_values
-from .child import DAMAGED
+from ...errors import problem
+from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape, table_values
+from ..child import DAMAGED
+from ..limits import MAX_NAMES
+from ..tables import first_bytes
 from .hdf5_arrays import datasets, values_of
-from .limits import MAX_NAMES
-from .tables import first_bytes
 
 NUMERIC_CLASSES = {
     "double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",

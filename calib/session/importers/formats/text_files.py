@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from io import BufferedReader, TextIOWrapper
 from pathlib import Path
 
-from ..errors import problem
-from .limits import MAX_LINE, MAX_ROWS, MAX_TEXT_BYTES
-from .tables import first_bytes
+from ...errors import problem
+from ..limits import MAX_LINE, MAX_ROWS, MAX_TEXT_BYTES
+from ..tables import first_bytes
 
 PIECE = 1 << 20
 _SEPARATOR_LINE = re.compile(r'"?sep=.?"?\s*')

@@ -4,17 +4,18 @@ import contextlib
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO, ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.lib import format as npy
 
-from ..errors import SessionError, problem
-from .arrays import AbstractArrayImporter, ArrayShape, table_shape, table_values
-from .child import DAMAGED
-from .limits import MAX_NAMES
-from .tables import first_bytes
+from ...errors import SessionError, problem
+from ..arrays import AbstractArrayImporter, ArrayShape, table_shape, table_values
+from ..child import DAMAGED
+from ..limits import MAX_NAMES
+from ..tables import first_bytes
 
 NUMBERS = "biufmM"
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -36,10 +37,9 @@ class NpzImporter(AbstractArrayImporter):
         shapes = {}
         with _members(path) as members:
             for name, stream in members:
-                shape, kind = _header(path, name, stream)
-                table = table_shape(shape, "s" if kind.kind == "M" else "")
-                if table is not None and kind.kind in NUMBERS:
-                    shapes[name] = table
+                shape = _claimed_shape(path, name, stream)
+                if shape is not None:
+                    shapes[name] = shape
         return shapes
 
     @classmethod
@@ -57,7 +57,7 @@ class NpzImporter(AbstractArrayImporter):
 
 
 @contextlib.contextmanager
-def _members(path: Path, wanted: set[str] | None = None) -> Iterator[Iterator[tuple[str, IO[bytes]]]]:
+def _members(path: Path, wanted: set[str] | None = None) -> Iterator[Iterator[tuple[str, BufferedIOBase]]]:
     """Names and streams of the arrays of a file, or of those wanted; any error becomes one `SessionError`."""
     single = first_bytes(path).startswith(npy.MAGIC_PREFIX)
     try:
@@ -68,12 +68,12 @@ def _members(path: Path, wanted: set[str] | None = None) -> Iterator[Iterator[tu
         raise problem(path, "file", f"cannot be read ({' '.join(str(error).split())})", DAMAGED) from error
 
 
-def _single(path: Path) -> Iterator[tuple[str, IO[bytes]]]:
+def _single(path: Path) -> Iterator[tuple[str, BufferedIOBase]]:
     with path.open("rb") as stream:
         yield path.stem, stream
 
 
-def _zipped(path: Path, wanted: set[str] | None) -> Iterator[tuple[str, IO[bytes]]]:
+def _zipped(path: Path, wanted: set[str] | None) -> Iterator[tuple[str, BufferedIOBase]]:
     with zipfile.ZipFile(path) as archive:
         members = archive.namelist()
         if len(members) > MAX_NAMES:
@@ -82,12 +82,13 @@ def _zipped(path: Path, wanted: set[str] | None) -> Iterator[tuple[str, IO[bytes
             name = member.removesuffix(".npy")
             if member.endswith(".npy") and (wanted is None or name in wanted):
                 with archive.open(member) as stream:
-                    yield name, stream
+                    yield name, cast(BufferedIOBase, stream)
 
 
-def _header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+def _claimed_shape(path: Path, name: str, stream: BufferedIOBase) -> ArrayShape | None:
+    """What the header of an array says; None for an array that is no table of numbers."""
     version = npy.read_magic(stream)
     if version not in HEADERS:
         raise problem(path, name, f"is of the unknown version {version}", "save it with another version of NumPy")
     shape, _, kind = HEADERS[version](stream)
-    return shape, kind
+    return table_shape(shape, "s" if kind.kind == "M" else "") if kind.kind in NUMBERS else None

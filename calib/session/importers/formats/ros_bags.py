@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..errors import printable, problem
-from .arrays import AbstractArrayImporter, ArrayShape
-from .child import library
-from .columns import FileSpec
-from .limits import MAX_NAMES, MAX_ROWS, check_size
-from .tables import first_bytes
+from ...errors import printable, problem
+from ..arrays import AbstractArrayImporter, ArrayShape
+from ..child import library
+from ..columns import FileSpec
+from ..limits import MAX_NAMES, MAX_ROWS, check_size
+from ..tables import first_bytes
 
 EXTRA = "tables"
 LOG_TIME = "log_time"

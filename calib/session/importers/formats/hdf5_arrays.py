@@ -6,9 +6,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ..errors import problem
-from .arrays import ArrayShape, table_values
-from .limits import MAX_NAMES
+from ...errors import problem
+from ..arrays import ArrayShape, table_values
+from ..limits import MAX_NAMES
 
 MAX_DEPTH = 8
 

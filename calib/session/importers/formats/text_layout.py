@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import SessionError, problem
+from ...errors import SessionError, problem
 
 FIRST_LINES = 200
 """Lines from which the layout is found."""

@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..errors import problem
-from .arrays import AbstractArrayImporter, ArrayShape
-from .child import library
-from .limits import check_size
-from .tables import first_bytes
+from ...errors import problem
+from ..arrays import AbstractArrayImporter, ArrayShape
+from ..child import library
+from ..limits import check_size
+from ..tables import first_bytes
 
 EXTRA = "tables"
 

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
-from ..errors import printable, problem
-from ..reader import Session, open_session
-from ..storage import (
+from ...errors import printable, problem
+from ...reader import Session, open_session
+from ...storage import (
     AttributeValue,
     make_array,
     make_dataset,
@@ -28,13 +28,13 @@ from ..storage import (
     text_array,
     writing,
 )
-from ..tables import FORMAT, STREAM_EXTRAS
-from .arrays import AbstractArrayImporter, ArrayShape, known, table_shape
-from .base import About
-from .child import in_child
+from ...tables import FORMAT, STREAM_EXTRAS
+from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape
+from ..base import About
+from ..child import in_child
+from ..reports import FileReport, ImportReport, StreamReport
+from ..tables import first_bytes
 from .hdf5_arrays import MAX_DEPTH, data_inside, datasets, members, values_of
-from .reports import FileReport, ImportReport, StreamReport
-from .tables import first_bytes
 
 MAX_BYTES = 16 << 30
 """Bytes of the arrays of a session that is converted."""

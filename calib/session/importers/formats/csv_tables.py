@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from ..errors import printable, problem
-from .base import About
-from .columns import FileSpec
-from .limits import check_size
-from .reports import ImportReport
-from .table_importer import AbstractTableImporter
-from .table_session import import_tables
-from .tables import AbstractTableFile, CountedSteps, Progress, Table
+from ...errors import printable, problem
+from ..base import About
+from ..columns import FileSpec
+from ..limits import check_size
+from ..reports import ImportReport
+from ..table_importer import AbstractTableImporter
+from ..table_session import import_tables
+from ..tables import AbstractTableFile, CountedSteps, Progress, Table
 from .text_files import count_lines, lines_of
 from .text_layout import FIRST_LINES, layout_of, wrong_sign
 
