@@ -34,8 +34,7 @@ from calib.bench import load_bench
 from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.cli import main as command
-from calib.fitting.curve_fit import FittedCurve
-from calib.fitting.curves import PowerLaw
+from calib.fitting.curves import FittedCurve, PowerLaw
 from calib.record.conversion import convert_journal
 from calib.record.decoding import DecoderState, decode, decode_lines
 from calib.record.encoding import encode_frame

@@ -15,11 +15,9 @@ from calib.fitting.curves import (
     Play,
     PlaySpline,
     PowerLaw,
-    Scale,
-    play,
-    resistant_line,
-    scale_of,
 )
+from calib.fitting.curves.base import Scale, resistant_line, scale_of
+from calib.fitting.curves.play_operators import play
 
 CASES = [
     (Linear(), [4e-3]),
