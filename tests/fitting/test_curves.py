@@ -51,6 +51,15 @@ def test_free_and_bound_are_inverses(curve, params):
     assert np.abs(free).max() < 10
 
 
+def test_the_order_of_curves_is_that_in_which_ties_are_broken():
+    """`simplest` takes the earlier of two curves of one size, and a short log is fitted with the first of all."""
+    names = list(CURVES)
+    assert names[0] == "linear"
+    for earlier, later in (("affine", "power"), ("spline", "hysteresis")):
+        assert CURVES[earlier]().size == CURVES[later]().size
+        assert names.index(earlier) < names.index(later)
+
+
 @pytest.mark.parametrize("name", CURVES)
 def test_every_curve_rises_whatever_its_free_parameters(name):
     curve = CURVES[name]().at(some_scale())
