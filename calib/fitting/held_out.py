@@ -119,7 +119,7 @@ def leave_out(
 def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., Hybrid]) -> Split:
     data, parts = presses.data, np.unique(part[part >= 0])
     if len(parts) < 2:
-        return Split(by, len(parts), note=f"all presses are of one {by}: press with another one too, to measure the error of a new {by}")
+        return Split(by, len(parts), note=f"the presses are of one {by} only: record presses of another too")
     error = np.full(len(data.force), np.nan)
     for k in parts:
         held = part == k
