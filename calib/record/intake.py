@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from ..session import Status
-from .decoding import DecoderCounts, DecoderState
-from .encoding import encode_ping
-from .records import EVENT, PONG, RESTARTED, EventCode, pack_event, pack_frame, pack_pong
-from .sequence import SequencePlace, SequenceState, place_frame
+from .journal.records import EVENT, PONG, RESTARTED, EventCode, pack_event, pack_frame, pack_pong
 from .sources import Link, Source
-from .wire import Frame
+from .wire.decoding import DecoderCounts, DecoderState
+from .wire.encoding import encode_ping
+from .wire.messages import Frame
+from .wire.sequence import SequencePlace, SequenceState, place_frame
 
 RETRY_INTERVAL = 0.25  # s between attempts to connect
 TIMEOUT_PERIODS = 3  # periods of silence after which a link is opened again

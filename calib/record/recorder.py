@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from .conversion import Progress, convert_journal
 from .intake import FrameCallback, RecordSink, StreamReceiver, explain_silence
-from .journal import Journal, JournalError, JournalReader
+from .journal.conversion import Progress, convert_journal
+from .journal.file import Journal, JournalError, JournalReader
+from .journal.records import END, PLAN, PONG, pack_end
 from .plan import RecordingPlan
-from .records import END, PLAN, PONG, pack_end
 from .sources import Source
 from .summary import RecordingSummary
 

@@ -18,14 +18,10 @@ import pytest
 
 from benchmarks.memory import Growth, growth, resident
 from calib.cli import main
-from calib.record.conversion import convert_journal
 from calib.record.device import SimulatedDevice
-from calib.record.encoding import encode_frame
-from calib.record.journal import MAX_PAYLOAD, SYNC_INTERVAL, Journal, JournalError, JournalReader
-from calib.record.plan import STREAM_KINDS, PlanError, RecordingPlan, StreamPlan, plan_from_json
-from calib.record.planning import plan_recording
-from calib.record.recorder import StopRequest, record_session
-from calib.record.records import (
+from calib.record.journal.conversion import convert_journal
+from calib.record.journal.file import MAX_PAYLOAD, SYNC_INTERVAL, Journal, JournalError, JournalReader
+from calib.record.journal.records import (
     END,
     EVENT,
     PLAN,
@@ -37,8 +33,12 @@ from calib.record.records import (
     pack_frame,
     pack_pong,
 )
+from calib.record.plan import STREAM_KINDS, PlanError, RecordingPlan, StreamPlan, plan_from_json
+from calib.record.planning import plan_recording
+from calib.record.recorder import StopRequest, record_session
 from calib.record.sources import MAX_READ_BYTES, source_from_url
-from calib.record.wire import Frame, Pong
+from calib.record.wire.encoding import encode_frame
+from calib.record.wire.messages import Frame, Pong
 from calib.session import SessionError, Status, open_session
 
 S = 1_000_000_000
@@ -289,7 +289,7 @@ def test_a_thousand_power_cuts_cost_what_was_not_synced(history, tmp_path, hard)
 
 FULL = """
 import resource, signal, sys
-from calib.record.journal import Journal
+from calib.record.journal.file import Journal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
 try:
@@ -726,7 +726,7 @@ def test_what_was_received_is_on_the_disk_when_the_recorder_is_killed(device, tm
     """At most one frame per stream: a record is written before the next frame is looked at."""
     path = tmp_path / "j"
     code = (
-        "import os, sys; from calib.record.journal import Journal\n"
+        "import os, sys; from calib.record.journal.file import Journal\n"
         "out = Journal(sys.argv[1])\n"
         "for n in range(500): out.append(0, 0, n, bytes(3700))\n"
         "os.kill(os.getpid(), 9)"
@@ -740,7 +740,7 @@ def kills_while_finishing(folder, count):
     records = [sample(*where) for n in range(3000) for where in ((0, n), (1, 2 * n), (1, 2 * n + 1))]
     part, output = journal(folder / "s.h5.part", records), folder / "s.h5"
     code = (
-        "import sys; from calib.record.conversion import convert_journal\n"
+        "import sys; from calib.record.journal.conversion import convert_journal\n"
         "print(1, flush=True); convert_journal(*sys.argv[1:])"
     )
     rng, new = np.random.default_rng(0), 0

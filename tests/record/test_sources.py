@@ -12,11 +12,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.record.decoding import DecoderState, decode
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
-from calib.record.encoding import encode_frame, encode_read
 from calib.record.intake import MIN_TIMEOUT, StreamReceiver
-from calib.record.records import EVENT, RESTARTED, EventCode, pack_frame, unpack_event
+from calib.record.journal.records import EVENT, RESTARTED, EventCode, pack_frame, unpack_event
 from calib.record.sources import (
     POLL_INTERVAL,
     ReplayLink,
@@ -26,6 +24,8 @@ from calib.record.sources import (
     session_packets,
     source_from_url,
 )
+from calib.record.wire.decoding import DecoderState, decode
+from calib.record.wire.encoding import encode_frame, encode_read
 from calib.session import Status, open_session
 
 S = 1_000_000_000

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.record.decoding import DecoderCounts, DecoderState, decode, decode_lines
-from calib.record.encoding import (
+from calib.record.wire.decoding import DecoderCounts, DecoderState, decode, decode_lines
+from calib.record.wire.encoding import (
     encode_frame,
     encode_note,
     encode_ping,
@@ -23,9 +23,9 @@ from calib.record.encoding import (
     parse_requests,
     select_readings,
 )
-from calib.record.framing import cobs_decode, cobs_encode, crc16
-from calib.record.sequence import REORDER_WINDOW, SequencePlace, SequenceState, place_frame
-from calib.record.wire import MAX_FRAME_BYTES, Layout, Pong, WireError
+from calib.record.wire.framing import cobs_decode, cobs_encode, crc16
+from calib.record.wire.messages import MAX_FRAME_BYTES, Layout, Pong, WireError
+from calib.record.wire.sequence import REORDER_WINDOW, SequencePlace, SequenceState, place_frame
 
 LAYOUTS = {1: Layout(1, 5, limit=1e3), 2: Layout(2, 2, scale=1e-3, limit=1e3)}
 LINES = {1: Layout(1, 2, limit=1e3)}

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..session import ClockTable, SessionFacts, SessionWriter, Status, StreamFacts
-from .clock import METHOD, ClockFit
-from .journal import JournalError, JournalReader, Record
-from .plan import RecordingPlan, plan_from_json
+from ...session import ClockTable, SessionFacts, SessionWriter, Status, StreamFacts
+from ..clock import METHOD, ClockFit
+from ..plan import RecordingPlan, plan_from_json
+from ..summary import ARRIVAL_CLOCK, RecordingSummary
+from .file import JournalError, JournalReader, Record
 from .records import (
     END,
     EVENT,
@@ -29,7 +30,6 @@ from .records import (
     unpack_event,
     unpack_pong,
 )
-from .summary import ARRIVAL_CLOCK, RecordingSummary
 from .survey import FrameBlock, SequenceAndClock, StreamSurvey, UnpackedBlock
 
 MAX_EVENTS = 100_000

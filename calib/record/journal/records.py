@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .journal import JournalError
-from .wire import Frame, Pong
+from ..wire.messages import Frame, Pong
+from .file import JournalError
 
 PLAN, EVENT, END, PONG = 0xFFFF, 0xFFFE, 0xFFFD, 0xFFFC  # stream numbers of records that are no frames
 RESTARTED = 1 << 15  # a flag beside those of `Status`: the sequence numbers restarted before this frame

@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..session import Status
-from .clock import METHOD, NO_LATENCY, ClockFit, DeviceClock, Latency, smallest_latency
-from .journal import Record
-from .plan import StreamPlan
+from ...session import Status
+from ..clock import METHOD, NO_LATENCY, ClockFit, DeviceClock, Latency, smallest_latency
+from ..plan import StreamPlan
+from ..summary import ARRIVAL_CLOCK, StreamSummary
+from ..wire.messages import Pong
+from .file import Record
 from .records import RESTARTED, FrameBatch, check_frame, layout_key, unpack_frames
-from .summary import ARRIVAL_CLOCK, StreamSummary
-from .wire import Pong
 
 MAX_BATCH_FRAMES = 512
 MAX_PONGS = 100_000  # answers to pings that are kept of each stream
