@@ -126,7 +126,8 @@ def on_a_loop(noise: float, width: float):
     """Pressure up and down twice, and the force of a bent spline with noise, more on the way up than down."""
     pressure = 2000 * (1 - np.cos(np.linspace(0, 4 * np.pi, N)))
     side = width * np.sign(np.gradient(pressure)) + noise * np.random.default_rng(5).normal(size=N)
-    return pressure, np.asarray(MonotoneSpline(4000.0)(jnp.asarray(SLOPES), pressure)) + side
+    force = MonotoneSpline(4000.0)(jnp.asarray(SLOPES), jnp.asarray(pressure))
+    return pressure, np.asarray(force) + side
 
 
 @pytest.mark.parametrize("groups", [None, GROUPS], ids=["blocks", "presses"])
