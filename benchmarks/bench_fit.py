@@ -1,7 +1,5 @@
 """What calibrating costs: a session of 225 presses end to end, many sessions by workers, and the fits alone.
 
-python -m benchmarks.bench_fit [--sessions 24] [--workers 1 2] [--smoke]
-
 end to end: the bundled session, whose streams are slow, and one with all the frames that a bench records in 25 minutes
 (scene paper_bench, simulated first), without and with a correction by location. Each stage apart, in the first call,
 which compiles (or reads the cache of compiled programs), and in the second.

@@ -1,7 +1,4 @@
-"""Forward solves of every tool on the same work, in one run.
-
-python -m benchmarks.bench_forward [--smoke] [--no-memory]
-"""
+"""Forward solves of every tool on the same work, in one run."""
 
 from .comparison import OPTIONS, Comparison, factorisation
 from .harness import Question

@@ -1,7 +1,5 @@
 """How time and memory grow: with nodes, electrodes, readings, pixels, frames of a batch, and pads.
 
-python -m benchmarks.bench_growth [--smoke]
-
 One size varies at a time, on the square of the other benchmarks.  The exponents are the slopes of a line through the
 logarithms, over all sizes and from the last but one to the last; beside them what the theory expects for large sizes.
 Memory is what XLA states for the compiled program: arguments, results and temporaries.

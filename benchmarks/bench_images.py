@@ -1,7 +1,5 @@
 """Localisation with every imaging method: the testbed of the paper, simulated on another mesh, six seeds.
 
-python -m benchmarks.bench_images [--smoke] [--seeds 6] [--methods TEXT]
-
 For each seed the sheet is coated anew (CoatingNonUniformity 0.15, ContactGain 0.12), pressed to 20 N by a 20 mm tip
 on the 15 x 15 grid, and pressed at two places at once; noise is 60 dB below the readings. Columns: localisation by
 each estimator and inward bias (mean over the grid, mm; the uneven contact gain alone moves the centre of a press by

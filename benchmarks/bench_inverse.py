@@ -1,7 +1,4 @@
-"""One-step reconstruction (NOSER) of every tool on the same work, in one run: preparation and application.
-
-python -m benchmarks.bench_inverse [--smoke] [--no-memory] [--only application]
-"""
+"""One-step reconstruction (NOSER) of every tool on the same work, in one run: preparation and application."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Jacobians of every tool on the same work, in one run: onto elements, and onto 30 x 30 pixels.
-
-python -m benchmarks.bench_jacobian [--smoke] [--no-memory]
-"""
+"""Jacobians of every tool on the same work, in one run: onto elements, and onto 30 x 30 pixels."""
 
 from .comparison import OPTIONS, Comparison, jacobian_work
 from .harness import Question

@@ -1,7 +1,5 @@
 """Kuopio Tomography Challenge 2023: untrained methods on its four training frames, with electrodes taken away.
 
-python -m benchmarks.bench_ktc --data FOLDER     # --smoke: one frame at two levels, nothing written
-
 A water tank of 0.115 m radius with 32 electrodes around it, plastic and metal pieces in it (Räsänen et al. 2023). The
 challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, with every reading that uses one. Its
 evaluation frames are not used here; the levels are made by leaving those readings of the training frames out.

@@ -5,8 +5,6 @@ First a soak, which is recorded as well, and another at real-time priority where
 many frames in a tenth of the time; then the highest rate of frames that is sustained, by doubling and bisection. A rate
 at which frames are dropped is tried once more: a machine that stands still for a moment drops them at any rate.
 
-python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5 --section NAME] [--only rates]
-
 Latency counts from when the bytes that end a frame were read; `since_due` from when the simulated device should have
 sent it: the device's own lateness, and what the bytes waited to be read, are in it. `woken` is how late a process wakes
 that does nothing but sleep from one hundredth of a second to the next, at the same time: no program on this machine can

@@ -1,7 +1,5 @@
 """The shipped scene `paper_bench` against the paper, over seeds; and the same at fixed force for other load spreading.
 
-python -m benchmarks.bench_paper [--seeds 6] [--smoke]
-
 Each seed has a sheet, a protrusion layer, noise and drift of its own.  Localisation by centroids of the image and by
 the fit of contacts; coefficients of variation of the EIT sum, of the hybrid (the paper's recipe) and of that corrected
 for the contact's place, predicted by fits that have not seen the place, as `jaxeit calibrate --location edge` prints

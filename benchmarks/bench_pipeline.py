@@ -1,7 +1,5 @@
 """From the mesh to images of 100 frames with every tool, and the time that each tool needs to reach an accuracy.
 
-python -m benchmarks.bench_pipeline [--smoke] [--no-memory] [--largest CELLS] [--only accuracy]
-
 Pipeline: nodes, triangles, electrodes, pairs and 100 frames are given as arrays; the result is the images by one-step
 NOSER, linearised at a conductivity that varies. Every tool repeats in each call what depends on the mesh; ours is
 timed with its programs compiled (`first_call_s` holds the compilation). Tools without pixels are given the

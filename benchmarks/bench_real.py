@@ -1,7 +1,5 @@
 """Recordings of others on real hardware, which are not part of this project: what the fits make of them.
 
-python -m benchmarks.bench_real FOLDER [--only NAME] [--smoke]
-
 FOLDER holds the public recordings eflesh, pneumatic_actuator and insole_plenum (benchmarks/README.md says whose they
 are).
 

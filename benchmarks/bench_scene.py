@@ -1,7 +1,5 @@
 """The cost of a scene's effects; an effect that is not listed costs nothing.
 
-python -m benchmarks.bench_scene [--smoke] [--only sessions] [--presets NAME ...]
-
 The first table has the program of one frame of a touch on the testbed (load, sheet, electrodes, voltages) and the
 program of a block of 1,024 frames (histories and readout), as effects are added one by one in the order of the
 stages: compile time, operations of the optimised program, floating-point operations by XLA's count, run time. The

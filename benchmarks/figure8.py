@@ -1,7 +1,5 @@
 """Two contacts that come and go one by one, as in the paper's figure 8: force over time, its error, and interference.
 
-python -m benchmarks.figure8 [--smoke]
-
 The shipped scene `two_contacts` (SIMULATED): press 1, press 2, release 1, release 2, three times with both tips on one
 pad and on neighbouring ones otherwise.  The calibration is of single presses on a grid over the same sheet, as a bench
 makes them: it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump, and

@@ -1,7 +1,4 @@
-"""What accuracy costs in time on the shipped skins: `jaxeit bench` for both, kept and drawn.
-
-python -m benchmarks.ladder [--smoke | --draw-only]
-"""
+"""What accuracy costs in time on the shipped skins: `jaxeit bench` for both, kept and drawn."""
 
 from collections.abc import Iterator, Mapping
 

@@ -1,7 +1,4 @@
-"""Numerical limits: error against severity on nine hard axes, in both precisions and in a textbook form.
-
-python -m benchmarks.stability [--smoke | --draw-only]
-"""
+"""Numerical limits: error against severity on nine hard axes, in both precisions and in a textbook form."""
 
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction

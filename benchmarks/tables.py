@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import jaxeit as je
 
 from .repeat import compared
-
-Row = dict[str, Any]
+from .rows import Row
 
 
 class _Format(string.Formatter):
