@@ -14,10 +14,10 @@ from jaxeit.linalg import NestedDissection
 from .clock import Call, Tool, interleaved, seconds, spread, taken
 from .figures import BLUE, GREY, ORANGE, curves, legend, logarithmic, panels
 from .harness import Question, Run
+from .markdown import cell
 from .peers import cholmod, eidors
 from .problems import CONTACT, ELECTRODES, Case, Problem, disc, rectangle
 from .rows import Row, grouped
-from .tables import cell
 from .tools import Entry, forward_of, present
 
 GRADINGS = (1.2, 1.4, 1.7)

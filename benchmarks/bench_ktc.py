@@ -27,7 +27,7 @@ from calib.report.figures import write_figure
 from .clock import seconds
 from .figures import panels
 from .harness import ROOT, Question, Row, Run
-from .tables import crossed
+from .markdown import crossed
 
 PICTURE = ROOT / "docs" / "ktc.png"
 RADIUS, ELECTRODES, GRID = 0.115, 32, 256

@@ -23,7 +23,7 @@ import jaxeit as je
 
 from .figures import curves, logarithmic, panels
 from .harness import Question, Run
-from .problems import noise_of, readings_of_presses
+from .problems import pressed
 from .rows import Row, averaged
 
 COUNTS = (10, 20, 40, 80, 160, 275, 550)
@@ -57,23 +57,16 @@ class Bench:
 
     def __init__(self, smoke: bool) -> None:
         self.skin = je.load_skin("testbed")
-        self.sites, self.frames, noise = self._simulated(4 if smoke else PRESSES, 0.06 if smoke else 0.026)
+        rng, presses = np.random.default_rng(0), 4 if smoke else PRESSES
+        low, high = self.skin.domain.bounds
+        self.sites = rng.uniform(np.add(low, MARGIN), np.subtract(high, MARGIN), (presses, 2))
+        found = pressed((), self.sites[:, None], np.full((presses, 1), LOAD), 0.06 if smoke else 0.026)
+        self.frames = found.change + found.noise * rng.normal(size=found.change.shape)
         self.model = je.discretise(je.Scene(self.skin), je.Fidelity.draft())
-        std = np.full(self.skin.protocol.readings, noise)
+        std = np.full(self.skin.protocol.readings, found.noise)
         self.fit = je.prepare_contacts(self.model, noise=std, most=2, columns=21 if smoke else 41)
         self.image = je.prepare(self.model, noise=std)
         self.basis = je.Pixels(20).on(self.model)
-
-    def _simulated(self, presses: int, edge_length: float) -> tuple[np.ndarray, np.ndarray, float]:
-        effects = (je.effects.LoadSpreading(0.012), je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
-        model = je.discretise(je.Scene(self.skin, effects), je.Fidelity.standard(edge_length=edge_length))
-        rng = np.random.default_rng(0)
-        low, high = self.skin.domain.bounds
-        sites = rng.uniform(np.add(low, MARGIN), np.subtract(high, MARGIN), (presses, 2))
-        touched = readings_of_presses(model, sites[:, None], np.full((presses, 1), LOAD))
-        v0 = np.asarray(je.forward(model))
-        noise = noise_of(v0)
-        return sites, touched - v0 + noise * rng.normal(size=touched.shape), noise
 
     def pads_at(self, places: np.ndarray) -> np.ndarray:
         """The pad of the pixel that is nearest to each place."""
@@ -116,8 +109,8 @@ class Bench:
     def row(self, name: str, count: int, orders: Orders) -> Row:
         rows = [np.sort(order[:count]) for order in orders]
         frames = np.full(self.frames.shape, np.nan)
-        for frame, seen, kept in zip(frames, self.frames, rows, strict=True):
-            frame[kept] = seen[kept]
+        for number, kept in enumerate(rows):
+            frames[number, kept] = self.frames[number, kept]
         fitted = np.asarray(je.localisation_error(je.contacts.strongest(self.fit(frames)), self.sites))
         pictured = np.asarray(je.localisation_error(ESTIMATOR(self.image(frames), self.image), self.sites))
         return {
@@ -160,12 +153,12 @@ def events(bench: Bench, idle: int, local: int) -> Row:
     step = eqx.filter_jit(lambda state, pressure, places: scan.step(state, pressure, places))
     masks: dict[str, list] = {"rest": [], "first": [], "next": []}
     errors: dict[str, list[float]] = {"first": [], "next": []}
-    for site, seen, pressed in zip(bench.sites, bench.frames, bench.pads_at(bench.sites), strict=True):
+    for site, seen, pad in zip(bench.sites, bench.frames, bench.pads_at(bench.sites), strict=True):
         pressure, places = np.zeros(len(bench.skin.pads)), jnp.full((bench.fit.most, 2), jnp.nan)
         state, _ = step(scan.start(), pressure, places)  # the whole scan
         state, mask = step(state, pressure, places)
         masks["rest"].append(mask)
-        pressure[pressed] = 5e3
+        pressure[pad] = 5e3
         for name, apart in errors.items():
             state, mask = step(state, pressure, places)
             contacts = bench.fit(jnp.where(mask, seen, jnp.nan))
