@@ -18,7 +18,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import count
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
@@ -155,14 +155,39 @@ class Received:
         return self._due.get(host)
 
 
+class Memory:
+    """Samples (n, 2) of the time, s, and the memory of this process, MB; all room is taken at the beginning."""
+
+    def __init__(self, most: int):
+        self._samples, self._used = np.full((most, 2), np.nan), 0
+
+    def note(self, at_least: float = 0.0) -> None:
+        """Take a sample, unless the last is younger than that many seconds."""
+        now = time.monotonic()
+        if not self._used or now - self._samples[self._used - 1, 0] >= at_least:
+            self._samples[self._used] = now, resident()
+            self._used += 1
+
+    def found(self, rate: int, last: int | None = None) -> dict[str, float]:
+        """MB at the end, and the growth in an hour of frames at the rate of the paper with its standard error.
+
+        No growth where a run was too short to tell; ``last``: the end of the samples that count.
+        """
+        samples = self._samples[: self._used][:last]
+        slope, error = growth(samples)
+        if not np.isfinite(error):
+            return {"memory_mb": round(samples[-1, 1], 1)}
+        hour = {"memory_mb_per_hour": slope * RATE / rate, "memory_mb_per_hour_error": error * RATE / rate}
+        return {"memory_mb": round(samples[-1, 1], 1)} | {name: round(mb, 2) for name, mb in hour.items()}
+
+
 class Watch:
     """Latencies, s, and the memory of this process once a second; all room is taken at the beginning."""
 
     def __init__(self, rate: int, seconds: float, begin: int, received: Received):
         most = int(1.5 * rate * seconds) + 1000
         self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
-        self._memory, self._used = np.full((int(seconds) + 60, 2), np.nan), 0
-        self._rate, self._begin, self._received = rate, begin, received
+        self._rate, self._begin, self._received, self._memory = rate, begin, received, Memory(int(seconds) + 60)
         self.last: FrameResult | None = None
 
     def __call__(self, result: FrameResult) -> None:
@@ -172,35 +197,18 @@ class Watch:
         due = self._received.due(result.host)
         if due is not None:
             self._since_due[row] = ((now - self._begin) // 1000 - due) % 2**32 / 1e6
-        if not self._used or now / 1e9 - self._memory[self._used - 1, 0] >= 1.0:
-            self._memory[self._used] = now / 1e9, resident()
-            self._used += 1
+        self._memory.note(at_least=1.0)
 
     def found(self) -> Row:
         """In ms, and MB."""
-        out = spread("latency", self._latency) | spread("since_due", self._since_due)
-        memory = self._memory[: self._used]
-        return out | {"memory_mb": round(memory[-1, 1])} | grown(memory, self._rate)
+        times = percentiles("latency", self._latency) | percentiles("since_due", self._since_due)
+        return times | self._memory.found(self._rate)
 
 
-def spread(name: str, seconds: np.ndarray) -> dict[str, float]:
-    """Percentiles, ms."""
+def percentiles(name: str, seconds: np.ndarray) -> dict[str, float]:
+    """Median, 99th percentile and most, ms."""
     values = 1e3 * np.nanpercentile(seconds, [50, 99, 100])
     return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
-
-
-def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
-    """By how much memory grows in an hour of frames at the rate of the paper, MB, and the standard error of that.
-
-    Nothing where a run was too short to tell.
-    """
-    found, share = growth(memory), RATE / rate
-    if not np.isfinite(found.error):
-        return {}
-    return {
-        "memory_mb_per_hour": round(found.slope * share, 2),
-        "memory_mb_per_hour_error": round(found.error * share, 2),
-    }
 
 
 @contextmanager
@@ -235,7 +243,7 @@ def metronome(realtime: bool) -> Iterator[dict[str, float]]:
             yield found
         finally:
             stop.set()
-            found |= spread("woken", told.get(timeout=10))
+            found |= percentiles("woken", told.get(timeout=10))
 
 
 def sleeping(realtime: bool, told: Any, stop: Event) -> None:
@@ -252,24 +260,19 @@ def sleeping(realtime: bool, told: Any, stop: Event) -> None:
 
 def tenfold(calibration: calib.Calibration, seconds: float) -> Row:
     """A recording at ten times the rate of the paper: frames, those lost, and what memory did."""
-    rates, memory = (10 * RATE, 10 * PRESSURE_RATE), np.full((int(10 * seconds) + 1000, 2), np.nan)
-    used = count()
-
-    def note(line: str) -> None:
-        row = next(used)
-        memory[row] = time.monotonic(), resident()
-
+    rates, memory = (10 * RATE, 10 * PRESSURE_RATE), Memory(int(10 * seconds) + 1000)
     with device(calibration, rates) as (_, (eit, pressure)), tempfile.TemporaryDirectory() as folder:
         plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
-        summary = record_session(plan, sources, Path(folder) / "session.h5", seconds=seconds, progress=note)
-    recorded = memory[: next(used) - 1]  # the last is told when the session is written
+        path = Path(folder) / "session.h5"
+        summary = record_session(plan, sources, path, seconds=seconds, progress=lambda line: memory.note())
+    grown = memory.found(rates[0], last=-1)  # the last is told when the session is written
     return {
         "rate_hz": rates[0],
         "seconds": seconds,
         "recorded": [stream.frames for stream in summary.streams],
         "lost": [stream.lost for stream in summary.streams],
         "complete": summary.complete,
-        **grown(recorded, rates[0]),
+        **{name: mb for name, mb in grown.items() if name != "memory_mb"},
     }
 
 
@@ -290,17 +293,13 @@ def watched(
     calibration: calib.Calibration, rate: int, seconds: float, output: Path | None = None, realtime: bool = False
 ) -> Row:
     """One run: frames and what became of them, the latencies in ms, and what memory did."""
+    show, settings = LiveControl(), LiveSettings(REST, realtime=realtime)
     with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
-        with ExitStack() as stack:
-            show, received = (
-                LiveControl(),
-                Received(stack.enter_context(session_journal(output)) if output is not None else NullSink()),
-            )
-            watch, woken = Watch(rate, seconds, begin, received), stack.enter_context(metronome(realtime))
-            timer = threading.Timer(seconds, show.stop.set)
+        with session_journal(output) if output else nullcontext(NullSink()) as sink, metronome(realtime) as woken:
+            received = Received(sink)
+            watch, timer = Watch(rate, seconds, begin, received), threading.Timer(seconds, show.stop.set)
             plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
-            how: Any = {"log": received, "begun": timer.start}
-            run_live(calibration, plan, sources, [watch], show, LiveSettings(REST, realtime=realtime), **how)
+            run_live(calibration, plan, sources, [watch], show, settings, log=received, begun=timer.start)
             timer.cancel()
             ended = time.monotonic()
         finishing = time.monotonic() - ended
