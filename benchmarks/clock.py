@@ -18,9 +18,7 @@ import numpy as np
 
 import jaxeit as je
 
-MAX_DIFFERENCE = (
-    1e-9  # largest difference of results, relative to the largest value, up to which tools do the same work
-)
+MAX_DIFFERENCE = 1e-9  # of results of tools that do the same work, relative to the largest value
 TURN_SECONDS = 0.1  # s
 MIN_TURNS = 5  # turns: the least and most of fewer times say little about their spread
 
