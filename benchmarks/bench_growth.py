@@ -17,8 +17,9 @@ import jaxeit as je
 from jaxeit.linalg import NestedDissection
 
 from .clock import in_turns, program, spread
-from .harness import Question, Row, Run
+from .harness import Question, Run
 from .problems import SIDE, square
+from .rows import Row
 
 PIXELS, BASE_CELLS, BASE_GRID = 30, 60, 5
 REPEATS, BUDGET = 15, 1.0  # calls of each that are timed, and s for a slow one

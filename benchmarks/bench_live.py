@@ -39,8 +39,9 @@ from calib.record.recorder import record_session, session_journal
 from calib.record.records import unpack_frames
 from calib.runtime import set_up_live
 
-from .harness import Question, Row, Run
+from .harness import Question, Run
 from .memory import growth, resident
+from .rows import Row
 
 RATE, PRESSURE_RATE = 100, 1000
 REST = 1.0

@@ -22,7 +22,8 @@ import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.runtime import set_up
 
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 from .tables import PAPER_BENCH
 
 SCENE = 0.01  # m, the spreading of the shipped scene

@@ -17,9 +17,10 @@ from typing import Any
 from .bench_accuracy import Solve, graded, peers, regular, timed
 from .clock import require_agreement
 from .comparison import OPTIONS, Comparison, inverse_work
-from .harness import Question, Row, Run
+from .harness import Question, Run
 from .peers import cholmod, eidors, pyeit, superlu
 from .problems import Problem, rectangle
+from .rows import Row
 from .tools import IN_IMAGE, Entry, forward, present
 
 TARGETS = (1e-2, 1e-3, 2e-4)

@@ -34,7 +34,8 @@ from calib.fitting.results import FitResult
 from calib.fitting.validation import fit_log, rmse
 from calib.runtime import set_up
 
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 
 GRAM = 9.80665e-3  # N
 EFLESH = "eflesh/20250401_014340_probe"

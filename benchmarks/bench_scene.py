@@ -24,7 +24,8 @@ from calib.bench import load_bench, presets, simulate
 from jaxeit import effects as fx
 
 from .clock import in_turns, program, seconds
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 
 ROWS = 1024
 LEFT_OUT = (

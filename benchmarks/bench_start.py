@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from functools import partial
 
 from .clock import fresh, in_turns, spread
-from .harness import ROOT, Question, Row, Run
+from .harness import ROOT, Question, Run
+from .rows import Row
 
 COMMANDS = {
     "python": "pass",

@@ -9,8 +9,9 @@ import numpy as np
 import jaxeit as je
 
 from .clock import Call, alone, interleaved, limits, peak_megabytes, peaks, require_agreement, seconds, spread, taken
-from .harness import Row, Run, set_up
+from .harness import Run, set_up
 from .problems import SIZES, SMOKE, Problem
+from .rows import Row
 from .tools import PIXELS, TOOLS, basis_of, present
 
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -10,7 +10,8 @@ from jaxeit.linalg import NestedDissection
 
 from .clock import limits
 from .comparison import factorisation_of, least_ms
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 
 SKINS = ("testbed", "chest")
 
