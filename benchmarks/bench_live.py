@@ -157,10 +157,15 @@ class Received:
 
 
 class Memory:
-    """Samples (n, 2) of the time, s, and the memory of this process, MB; all room is taken at the beginning."""
+    """Samples of the time, s, and the memory of this process, MB; all room is taken at the beginning."""
 
     def __init__(self, most: int):
         self._samples, self._used = np.full((most, 2), np.nan), 0
+
+    @property
+    def samples(self) -> np.ndarray:
+        """(n, 2)."""
+        return self._samples[: self._used]
 
     def note(self, at_least: float = 0.0) -> None:
         """Take a sample, unless the last is younger than that many seconds."""
@@ -169,17 +174,18 @@ class Memory:
             self._samples[self._used] = now, resident()
             self._used += 1
 
-    def found(self, rate: int, last: int | None = None) -> dict[str, float]:
-        """MB at the end, and the growth in an hour of frames at the rate of the paper with its standard error.
 
-        No growth where a run was too short to tell; ``last``: the end of the samples that count.
-        """
-        samples = self._samples[: self._used][:last]
-        slope, error = growth(samples)
-        if not np.isfinite(error):
-            return {"memory_mb": round(samples[-1, 1], 1)}
-        hour = {"memory_mb_per_hour": slope * RATE / rate, "memory_mb_per_hour_error": error * RATE / rate}
-        return {"memory_mb": round(samples[-1, 1], 1)} | {name: round(mb, 2) for name, mb in hour.items()}
+def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
+    """By how much memory grows in an hour of frames at the rate of the paper, MB, and the standard error of that.
+
+    Nothing where a run was too short to tell.
+    """
+    found, share = growth(memory), RATE / rate
+    if not np.isfinite(found.error):
+        return {}
+    return {
+        f"memory_mb_per_hour{end}": round(mb * share, 2) for end, mb in (("", found.slope), ("_error", found.error))
+    }
 
 
 class Watch:
@@ -203,7 +209,8 @@ class Watch:
     def found(self) -> Row:
         """In ms, and MB."""
         times = percentiles("latency", self._latency) | percentiles("since_due", self._since_due)
-        return times | self._memory.found(self._rate)
+        memory = self._memory.samples
+        return times | {"memory_mb": round(memory[-1, 1])} | grown(memory, self._rate)
 
 
 def percentiles(name: str, seconds: np.ndarray) -> dict[str, float]:
@@ -266,14 +273,13 @@ def tenfold(calibration: calib.Calibration, seconds: float) -> Row:
         plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
         path = Path(folder) / "session.h5"
         summary = record_session(plan, sources, path, seconds=seconds, progress=lambda line: memory.note())
-    grown = memory.found(rates[0], last=-1)  # the last is told when the session is written
     return {
         "rate_hz": rates[0],
         "seconds": seconds,
         "recorded": [stream.frames for stream in summary.streams],
         "lost": [stream.lost for stream in summary.streams],
         "complete": summary.complete,
-        **{name: mb for name, mb in grown.items() if name != "memory_mb"},
+        **grown(memory.samples[:-1], rates[0]),  # the last is told when the session is written
     }
 
 
