@@ -33,10 +33,10 @@ from calib.live.loop import LiveControl, LiveSettings, run_live
 from calib.live.results import FrameResult
 from calib.record.device import Packets, SimulatedDevice, frame_packets
 from calib.record.intake import NullSink, RecordSink
+from calib.record.journal.records import unpack_frames
 from calib.record.planning import plan_recording
 from calib.record.priority import real_time, refusal
 from calib.record.recorder import record_session, session_journal
-from calib.record.records import unpack_frames
 from calib.runtime import set_up_live
 
 from .harness import Question, Run

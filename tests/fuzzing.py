@@ -36,13 +36,13 @@ from calib.calibration.evaluation import Evaluation
 from calib.cli import main as command
 from calib.fitting.curve_fit import FittedCurve
 from calib.fitting.curves import PowerLaw
-from calib.record.conversion import convert_journal
-from calib.record.decoding import DecoderState, decode, decode_lines
-from calib.record.encoding import encode_frame
-from calib.record.framing import cobs_encode, crc16
-from calib.record.journal import Journal, JournalError, JournalReader
-from calib.record.records import END, EVENT, PLAN, PONG, EventCode, pack_event, pack_pong
-from calib.record.wire import Layout, Pong
+from calib.record.journal.conversion import convert_journal
+from calib.record.journal.file import Journal, JournalError, JournalReader
+from calib.record.journal.records import END, EVENT, PLAN, PONG, EventCode, pack_event, pack_pong
+from calib.record.wire.decoding import DecoderState, decode, decode_lines
+from calib.record.wire.encoding import encode_frame
+from calib.record.wire.framing import cobs_encode, crc16
+from calib.record.wire.messages import Layout, Pong
 from calib.session import SessionError, open_session
 from calib.session.importers import FileSpec, StreamSpec, import_csv
 from tests.record.test_recorder import both, journal

@@ -21,7 +21,7 @@ COMMANDS = {
     "doctor": "examine this machine: versions, device, threads, cache, disk, ports",
     "recover": "make a session of what a crash left of a recording",
 }
-"""What each command does; the command ``name`` is the module ``name_command`` with `add_arguments` and `run`."""
+"""What each command does; ``name`` is the module ``commands/name_command.py`` with `add_arguments` and `run`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,7 +51,7 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == chosen:
-            module = import_module(f".{name}_command", __name__)
+            module = import_module(f".commands.{name}_command", __name__)
             command.set_defaults(command=module.run)
             module.add_arguments(command)
     return parser

@@ -19,7 +19,7 @@ from ..record.plan import RecordingPlan, StreamPlan
 from ..record.priority import real_time
 from ..record.recorder import Recorder
 from ..record.sources import Source
-from ..record.wire import Frame
+from ..record.wire.messages import Frame
 from .engine import Engine, ReceivedFrame
 from .results import FrameResult
 from .scan_control import ScanDirector, prepare_director

@@ -9,7 +9,7 @@ import numpy as np
 import jaxeit as je
 
 from ..calibration.calibration import Calibration
-from ..record.encoding import encode_read
+from ..record.wire.encoding import encode_read
 
 REPEAT_INTERVAL = 0.3  # s between equal requests; a device forgets a request after a second
 ONSET_FRACTION = 0.01  # of the largest calibrated pressure; less is no contact

@@ -1,9 +1,9 @@
 """Record sessions from devices: what devices send becomes a session file, and nothing that arrived is lost.
 
-From the wire to the file: `wire`, `framing`, `encoding` and `decoding` (messages), `sequence` (order of frames),
-`sources` (TCP, serial, replay), `intake` and `recorder` (threads that only move bytes), `journal` and `records` (what
-survives a crash), `clock` (device time to host time), `survey` and `conversion` (journal to session). `priority` gives
-threads real-time scheduling, and `device` simulates a skin that uses the same wire format.
+From the wire to the file: `wire` (messages and the order of frames), `sources` (TCP, serial, replay), `intake` and
+`recorder` (threads that only move bytes), `journal` (the file that survives a crash, and its conversion to a session),
+`clock` (device time to host time). `priority` gives threads real-time scheduling, and `device` simulates a skin that
+uses the same wire format.
 """
 
 from typing import TYPE_CHECKING
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from .._lazy import lazy_names
 
 if TYPE_CHECKING:
-    from .conversion import convert_journal
     from .device import SimulatedDevice
-    from .journal import JournalError
+    from .journal.conversion import convert_journal
+    from .journal.file import JournalError
     from .plan import PlanError, RecordingPlan, StreamPlan
     from .planning import plan_recording
     from .priority import PriorityError, real_time
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 __getattr__, __all__ = lazy_names(
     __name__,
     {
-        "conversion": "convert_journal",
+        "journal.conversion": "convert_journal",
         "device": "SimulatedDevice",
-        "journal": "JournalError",
+        "journal.file": "JournalError",
         "plan": "PlanError RecordingPlan StreamPlan",
         "planning": "plan_recording",
         "priority": "PriorityError real_time",

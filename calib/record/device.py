@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from .broadcast import Broadcaster, Listener, send_to_all
-from .encoding import encode_frame, encode_pong, parse_requests, select_readings
 from .sources import session_packets
+from .wire.encoding import encode_frame, encode_pong, parse_requests, select_readings
 
 try:
     import tty

@@ -11,8 +11,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from ..session.guard import MAX_ATTRIBUTE_BYTES
-from .journal import JournalError
-from .wire import Layout
+from .journal.file import JournalError
+from .wire.messages import Layout
 
 PLAN_FORMAT = "jaxeit-journal"
 

@@ -29,10 +29,10 @@ import serial
 
 from ..session import Session, Stream, open_session
 from ..session.units import SECOND
-from .decoding import DecoderState, decode, decode_lines
-from .encoding import encode_frame, encode_note
 from .plan import STREAM_KINDS, StreamPlan
-from .wire import Frame, Layouts
+from .wire.decoding import DecoderState, decode, decode_lines
+from .wire.encoding import encode_frame, encode_note
+from .wire.messages import Frame, Layouts
 
 POLL_INTERVAL = 0.1  # s
 CONNECT_TIMEOUT = 1.0  # s

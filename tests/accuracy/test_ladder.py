@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import calib.cli
 import jaxeit as je
 from benchmarks import ladder as benchmark
-from calib.cli.bench_command import bench_scene
+from calib.cli.commands.bench_command import bench_scene
 from calib.report.accuracy_figure import ladder_figure
 from jaxeit.accuracy import study
 from jaxeit.accuracy.image_quality import misplaced

@@ -27,17 +27,18 @@ from calib.cli import main
 from calib.live import loop as live_module
 from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestLevels
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
-from calib.live.page import Page
+from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
 from calib.live.results import TouchEstimates
 from calib.live.scan_control import ScanDirector, prepare_director
-from calib.record import encoding
+from calib.record.broadcast import MAX_LISTENERS, Broadcaster
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
 from calib.record.plan import StreamPlan
 from calib.record.planning import plan_recording
 from calib.record.priority import PriorityError, real_time
 from calib.record.recorder import StopRequest, record_session
-from calib.record.wire import Frame
+from calib.record.wire import encoding
+from calib.record.wire.messages import Frame
 from jaxeit import effects as fx
 
 S = 1_000_000_000
@@ -512,7 +513,10 @@ def test_the_page_is_whole_and_asks_nothing_of_others(page):
     assert reply.status == 200
     assert b"http://" not in body.replace(b"http://www.w3.org", b"")
     assert b"https://" not in body
-    assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
+    policy = reply.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert reply.headers["X-Frame-Options"] == "DENY"
     link.close()
     link, reply, body = fetch(page, "/scene")
     scene = json.loads(body)
@@ -554,10 +558,37 @@ def test_only_our_own_page_may_ask(page):
     assert fetch(page, "/", headers=others)[1].status == 403
     assert fetch(page, "/tare", method="POST", headers={"Origin": "http://evil.example"})[1].status == 403
     assert fetch(page, "/else", method="POST")[1].status == 403
+    for site in ("cross-site", "same-site"):
+        assert fetch(page, "/tare", method="POST", headers={"Sec-Fetch-Site": site})[1].status == 403
     assert not page.control.tare.is_set()
-    own = {"Origin": f"http://127.0.0.1:{port}"}
+    own = {"Origin": f"http://127.0.0.1:{port}", "Sec-Fetch-Site": "same-origin"}
     assert fetch(page, "/tare", method="POST", headers=own)[1].status == 200
     assert page.control.tare.is_set()
+
+
+def test_a_flood_of_connections_leaves_the_viewers_there_are(page):
+    link, reply, _ = fetch(page, "/results")
+    events(reply, 1)
+    flood = [socket.create_connection(page.server_address[:2], timeout=5) for _ in range(3 * MAX_CONNECTIONS)]
+    assert sum(thread.name.startswith("Thread-") for thread in threading.enumerate()) < 2 * MAX_CONNECTIONS
+    assert flood[-1].recv(1) == b""  # closed at once
+    events(reply, 1)
+    for client in flood:
+        client.close()
+    link.close()
+
+
+def test_a_flood_of_listeners_leaves_those_there_are():
+    with Broadcaster() as lines:
+        first = socket.create_connection(lines.address, timeout=5)
+        lines.publish([b"1\n"])
+        flood = [socket.create_connection(lines.address, timeout=5) for _ in range(2 * MAX_LISTENERS)]
+        lines.publish([b"2\n"])
+        assert len(lines.listeners) == MAX_LISTENERS
+        assert flood[-1].recv(1) == b""
+        assert first.recv(10, socket.MSG_WAITALL | socket.MSG_DONTWAIT) == b"1\n2\n"
+        for client in (first, *flood):
+            client.close()
 
 
 def listening(process="self"):

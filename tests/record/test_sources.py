@@ -12,11 +12,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.record.decoding import DecoderState, decode
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
-from calib.record.encoding import encode_frame, encode_read
 from calib.record.intake import MIN_TIMEOUT, StreamReceiver
-from calib.record.records import EVENT, RESTARTED, EventCode, pack_frame, unpack_event
+from calib.record.journal.records import EVENT, RESTARTED, EventCode, pack_frame, unpack_event
 from calib.record.sources import (
     POLL_INTERVAL,
     ReplayLink,
@@ -26,6 +24,8 @@ from calib.record.sources import (
     session_packets,
     source_from_url,
 )
+from calib.record.wire.decoding import DecoderState, decode
+from calib.record.wire.encoding import encode_frame, encode_read
 from calib.session import Status, open_session
 
 S = 1_000_000_000
@@ -489,7 +489,7 @@ def test_repeated_and_reordered_frames_are_kept_once_in_order(hard):
         until(lambda: run.counters.frames == 7)
     assert run.kept.seq == [0, 1, 2, 5, 6, 7, 8]
     assert np.flatnonzero(run.kept.flags & Status.gap_before).tolist() == [3]
-    assert (run.counters.lost, run.counters.repeated) == (2, 6)
+    assert (run.counters.lost, run.counters.rejected) == (2, 6)
     told = "kept once, in order; what comes after a later one is counted as lost, and flagged"
     hard("fault 9: frames repeated and reordered", "up to 64 behind", beyond=told)
 

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.record.decoding import DecoderCounts, DecoderState, decode, decode_lines
-from calib.record.encoding import (
+from calib.record.wire.decoding import DecoderCounts, DecoderState, decode, decode_lines
+from calib.record.wire.encoding import (
     encode_frame,
     encode_note,
     encode_ping,
@@ -23,9 +23,9 @@ from calib.record.encoding import (
     parse_requests,
     select_readings,
 )
-from calib.record.framing import cobs_decode, cobs_encode, crc16
-from calib.record.sequence import REORDER_WINDOW, SequencePlace, SequenceState, place_frame
-from calib.record.wire import MAX_FRAME_BYTES, Layout, Pong, WireError
+from calib.record.wire.framing import cobs_decode, cobs_encode, crc16
+from calib.record.wire.messages import MAX_FRAME_BYTES, Layout, Pong, WireError
+from calib.record.wire.sequence import REORDER_WINDOW, SequencePlace, SequenceState, place_frame
 
 LAYOUTS = {1: Layout(1, 5, limit=1e3), 2: Layout(2, 2, scale=1e-3, limit=1e3)}
 LINES = {1: Layout(1, 2, limit=1e3)}
@@ -366,6 +366,17 @@ def test_a_restart_is_believed_once_two_frames_agree():
         SequencePlace.SUSPECT,
         SequencePlace.NEXT,
     ]
+
+
+@pytest.mark.parametrize("numbers", [[7] * 4, [9, 8, 7, 6], [30, 31, 0, 1], [65534, 65535, 0, 1]])
+def test_frames_that_a_device_took_later_are_new_whatever_their_numbers_say(numbers):
+    order, places = SequenceState(), []
+    for number in numbers:
+        order, place, lost = place_frame(order, number, newer=True)
+        places.append(place)
+        assert lost == 0
+    assert all(place.kept for place in places)
+    assert SequencePlace.MISCOUNTED in places
 
 
 @given(st.permutations(range(100, 100 + REORDER_WINDOW)), st.integers(0, 3))

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from ..calibration import Recipe
-from ..calibration.recipe_text import AUTO, NONE
-from ..fitting import CURVES
-from ..session import Session
-from .arguments import count, prepare_outputs, require_matplotlib_for, skin_of
-from .recipe_options import IMAGING, add_recipe_arguments, recipe_of
-from .terminal import stage_bar, title
+from ...calibration import Recipe
+from ...calibration.recipe_text import AUTO, NONE
+from ...fitting import CURVES
+from ...session import Session
+from ..arguments import count, prepare_outputs, require_matplotlib_for, skin_of
+from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
+from ..terminal import stage_bar, title
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate from all sessions together, or from each by itself."""
-    from ..runtime import set_up
+    from ...runtime import set_up
 
     set_up()
     if args.report is not None:
@@ -50,9 +50,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate_together(args: argparse.Namespace) -> int:
-    from ..calibration.evaluation import render_table
-    from ..calibration.procedure import STAGES, calibrate, evaluate
-    from ..session import open_session
+    from ...calibration.evaluation import render_table
+    from ...calibration.procedure import STAGES, calibrate, evaluate
+    from ...session import open_session
 
     prepare_outputs(args.output, args.report)
     recipe, skin = recipe_of(args), skin_of(args.skin)
@@ -66,7 +66,7 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         tried = {name: evaluate(calibration, session) for name, session in tests.items()}
     calibration.save(args.output)
     if args.report:
-        from ..report.document import write_report
+        from ...report.document import write_report
 
         write_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
@@ -87,8 +87,8 @@ def _calibrate_many(args: argparse.Namespace) -> int:
     """Each session by itself; status 2 if one failed, when all others are done."""
     from tqdm import tqdm
 
-    from ..batch.cluster import dask_executor
-    from ..batch.sessions import Outcome, calibrate_many, render_outcomes
+    from ...batch.cluster import dask_executor
+    from ...batch.sessions import Outcome, calibrate_many, render_outcomes
 
     if args.test:
         raise ValueError("--test is for one calibration; try those of a folder with jaxeit evaluate")
@@ -125,7 +125,7 @@ _NEED_EIT = ("report", "test", "skin", "location", "locator", "folds", "fidelity
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
     """Sessions without EIT: one curve per log, tested on its second half."""
-    from ..calibration.logs import fit_session, render_log, save_logs
+    from ...calibration.logs import fit_session, render_log, save_logs
 
     given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, [], NONE)]
     if given:

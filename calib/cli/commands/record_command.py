@@ -3,9 +3,9 @@
 import argparse
 import sys
 
-from .arguments import above_zero, prepare_outputs, skin_of
-from .signals import orderly_end
-from .terminal import status_line
+from ..arguments import above_zero, prepare_outputs, skin_of
+from ..signals import orderly_end
+from ..terminal import status_line
 
 _STREAMS = ("eit", "pressure", "force", "stage", "temperature", "barometer")
 
@@ -27,8 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Record until the time is over or somebody stops it."""
-    from ..record.planning import plan_recording
-    from ..record.recorder import StopRequest, journal_path, record_session
+    from ...record.planning import plan_recording
+    from ...record.recorder import StopRequest, journal_path, record_session
 
     urls = {name: getattr(args, name) for name in _STREAMS if getattr(args, name) is not None}
     if not urls:
@@ -47,4 +47,4 @@ def run(args: argparse.Namespace) -> int:
         )
         return 130
     print(summary.render())
-    return orders.status
+    return orders.status or (0 if summary.complete else 2)

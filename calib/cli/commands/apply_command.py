@@ -2,9 +2,9 @@
 
 import argparse
 
-from .arguments import prepare_outputs
-from .recipe_options import add_low_pass_argument, processing_of
-from .terminal import progress_bar
+from ..arguments import prepare_outputs
+from ..recipe_options import add_low_pass_argument, processing_of
+from ..terminal import progress_bar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,12 +17,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the force map of every frame."""
-    from ..runtime import set_up
+    from ...runtime import set_up
 
     set_up()
-    from ..calibration.calibration import load_calibration
-    from ..calibration.force_maps import apply
-    from ..session import open_session
+    from ...calibration.calibration import load_calibration
+    from ...calibration.force_maps import apply
+    from ...session import open_session
 
     prepare_outputs(args.output)
     calibration = load_calibration(args.calibration)

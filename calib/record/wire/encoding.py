@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .framing import cobs_decode, crc_holds, seal
-from .wire import (
+from .messages import (
     ECHO,
     HEADS,
     LONG_TICKS,

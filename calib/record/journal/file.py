@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from ..session.storage import sync
+from ...session.storage import sync
 
 try:
     import fcntl

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .arguments import above_zero, prepare_outputs, require_matplotlib_for
-from .recipe_options import add_imaging_arguments, imaging_of
-from .terminal import progress_bar
+from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
+from ..recipe_options import add_imaging_arguments, imaging_of
+from ..terminal import progress_bar
 
 if TYPE_CHECKING:
     from jaxeit.accuracy import Choice, Ladder
@@ -85,7 +85,7 @@ def bench_scene(what: str) -> "Scene":
 
     import jaxeit as je
 
-    from ..bench import load_bench, presets
+    from ...bench import load_bench, presets
 
     path = Path(what)
     if what in je.skin.shipped_skins():
@@ -99,7 +99,7 @@ def bench_scene(what: str) -> "Scene":
 
 
 def _write_ladder_figure(found: "Ladder", path: Path) -> None:
-    from ..report.accuracy_figure import ladder_figure
-    from ..report.figures import write_figure
+    from ...report.accuracy_figure import ladder_figure
+    from ...report.figures import write_figure
 
     write_figure(ladder_figure([found.summary()]), path)

@@ -5,8 +5,8 @@ import os
 import sys
 from contextlib import ExitStack
 
-from .arguments import above_zero, prepare_outputs
-from .signals import orderly_end
+from ..arguments import above_zero, prepare_outputs
+from ..signals import orderly_end
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +35,7 @@ _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 def run(args: argparse.Namespace) -> int:
     """Show force maps until somebody stops it."""
-    from ..record.priority import real_time
+    from ...record.priority import real_time
 
     with real_time(args.realtime):
         pass  # refused at once or not at all
@@ -43,16 +43,16 @@ def run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, "1")
     if args.rerun is not None:
         _require_rerun()
-    from ..runtime import set_up_live
+    from ...runtime import set_up_live
 
     set_up_live()
     from threading import Timer
 
-    from ..calibration.calibration import load_calibration
-    from ..live.loop import LiveControl, LiveSettings, Publish
-    from ..live.presentation import Presentation, present
-    from ..record.planning import plan_recording
-    from ..record.recorder import StopRequest
+    from ...calibration.calibration import load_calibration
+    from ...live.loop import LiveControl, LiveSettings, Publish
+    from ...live.presentation import Presentation, present
+    from ...record.planning import plan_recording
+    from ...record.recorder import StopRequest
 
     prepare_outputs(args.output)
     calibration = load_calibration(args.calibration)
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     timer.daemon = True
     with orderly_end(orders, planned=False), ExitStack() as stack:
         if args.rerun is not None:
-            from ..live.rerun_view import RerunView
+            from ...live.rerun_view import RerunView
 
             also.append(stack.enter_context(RerunView(calibration, show, args.rerun)).show_result)
         if args.seconds is not None:

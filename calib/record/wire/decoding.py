@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .framing import CRC, cobs_decode, crc_holds
-from .wire import (
+from .messages import (
     ECHO,
     HEADS,
     LONG_TICKS,

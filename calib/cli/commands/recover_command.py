@@ -3,8 +3,8 @@
 import argparse
 import os
 
-from .arguments import prepare_outputs
-from .terminal import byte_bar, file_size
+from ..arguments import prepare_outputs
+from ..terminal import byte_bar, file_size
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the session, and print what it holds."""
-    from ..record.conversion import convert_journal
+    from ...record.journal.conversion import convert_journal
 
     output = args.output or args.journal.removesuffix(".part")
     if output == args.journal:

@@ -11,7 +11,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print what this machine has; 2 if something is broken."""
     del args
-    from .diagnosis import examine
+    from ..diagnosis import examine
 
     lines = examine()
     print("\n".join(line.render() for line in lines))

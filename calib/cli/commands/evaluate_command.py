@@ -4,8 +4,8 @@ import argparse
 import json
 from pathlib import Path
 
-from .recipe_options import add_low_pass_argument, processing_of
-from .terminal import progress_bar, title
+from ..recipe_options import add_low_pass_argument, processing_of
+from ..terminal import progress_bar, title
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,12 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table for each session, or all as JSON."""
-    from ..runtime import set_up
+    from ...runtime import set_up
 
     set_up()
-    from ..calibration import evaluate, load_calibration
-    from ..calibration.evaluation import render_table
-    from ..session import open_session
+    from ...calibration import evaluate, load_calibration
+    from ...calibration.evaluation import render_table
+    from ...session import open_session
 
     calibration = load_calibration(args.calibration)
     results = {}

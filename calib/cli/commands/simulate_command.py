@@ -5,8 +5,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from .arguments import prepare_outputs, skin_of
-from .terminal import progress_bar
+from ..arguments import prepare_outputs, skin_of
+from ..terminal import progress_bar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,10 +25,10 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, explain, or serve a scene."""
     if bool(args.output) == args.explain:
         raise ValueError("give either -o SESSION.h5 to simulate, or --explain")
-    from ..runtime import set_up
+    from ...runtime import set_up
 
     set_up()
-    from ..bench import load_bench, measure_costs, render_costs, simulate
+    from ...bench import load_bench, measure_costs, render_costs, simulate
 
     if args.data_set:
         return _simulate_data_set(args)
@@ -52,8 +52,8 @@ def _serve(path: str) -> int:
     """Be a device until interrupted."""
     import threading
 
-    from ..record.device import SimulatedDevice, recording_packets
-    from ..session import open_session
+    from ...record.device import SimulatedDevice, recording_packets
+    from ...session import open_session
 
     with open_session(path) as session:
         names = [name for name in ("eit", "pressure", "force") if name in session.streams]
@@ -66,7 +66,7 @@ def _serve(path: str) -> int:
 
 
 def _simulate_data_set(args: argparse.Namespace) -> int:
-    from ..bench import write_data_set
+    from ...bench import write_data_set
 
     if args.explain or args.serve:
         raise ValueError("--explain and --serve are for scenes; leave them out")

@@ -3,8 +3,8 @@
 import argparse
 import sys
 
-from .arguments import skin_of
-from .terminal import one_line, progress_bar
+from ..arguments import skin_of
+from ..terminal import one_line, progress_bar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,11 +17,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a report of each session; 2 if one cannot be used."""
-    from ..runtime import set_up
+    from ...runtime import set_up
 
     set_up()
-    from ..check import check_session, render, to_json
-    from ..session import SessionError, open_session
+    from ...check import check_session, render, to_json
+    from ...session import SessionError, open_session
 
     skin, worst = skin_of(args.skin), 0
     for path in args.sessions:

@@ -1,0 +1,1 @@
+"""The journal of a recording: the file that survives a crash, its records, and their conversion to a session."""

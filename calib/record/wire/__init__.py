@@ -1,0 +1,1 @@
+"""The wire format between devices and host: messages, framing, encoding, decoding, and the order of frames."""
