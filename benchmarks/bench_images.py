@@ -188,7 +188,7 @@ def frame_time(apply: Callable, frames: np.ndarray) -> float:
 
 def measure(run: Run) -> Iterator[Row]:
     """A row for each method; with `--methods` those not named stay as stored."""
-    seeds, grid, pairs = (1, 4, 4) if run.smoke else (run.args.seeds, 15, 24)
+    seeds, grid, pairs = run.sizes((6, 15, 24), (1, 4, 4))
     model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
     simulated = [Simulated(seed, grid, pairs) for seed in range(seeds)]
     before = {row["method"]: row for row in stored(run.args.section)["rows"]} if run.args.methods else {}
@@ -199,10 +199,7 @@ def measure(run: Run) -> Iterator[Row]:
     yield {"seeds": seeds, "rows": rows}
 
 
-OPTIONS: Row = {
-    "--seeds": {"type": int, "default": 6},
-    "--methods": {"default": "", "metavar": "TEXT", "help": "measure methods whose name contains TEXT"},
-}
+OPTIONS: Row = {"--methods": {"default": "", "metavar": "TEXT", "help": "measure methods whose name contains TEXT"}}
 main = Question("images", __doc__, {"rows": measure}, OPTIONS)
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 import jaxeit as je
 
 from .clock import limits, require_agreement, seconds
-from .comparison import OPTIONS, Comparison, inverse_work
+from .comparison import Comparison, inverse_work
 from .harness import Question, Run
 from .problems import SMOKE, Problem
 from .rows import Row
@@ -245,7 +245,7 @@ def application(run: Run) -> Iterator[Row]:
 
 
 PREPARATION = Comparison("inverse", IN_DATA, "reconstruction matrices", inverse_work, 7, ("pixels", "elements"))
-main = Question("inverse", __doc__, {"preparation": PREPARATION, "application": application}, OPTIONS)
+main = Question("inverse", __doc__, {"preparation": PREPARATION, "application": application})
 
 if __name__ == "__main__":
     main()

@@ -28,15 +28,15 @@ from .tables import PAPER_BENCH
 
 SCENE = 0.01  # m, the spreading of the shipped scene
 WIDTHS = (0.006, 0.008, SCENE, 0.012, 0.016, 0.020)
-EIT_RATE, SCANS = 10.0, 18
+EIT_RATE, SCANS, SEEDS = 10.0, 18, 6
 PAPER = {"localisation_quarter_mean": "6.9", "cv_eit_ddof1": "0.31", "cv_hybrid_ddof1": "0.14"}
 
 
 def measure(run: Run) -> Iterator[Row]:
     """A row for each load spreading: mean and standard deviation over the seeds."""
-    seeds = 1 if run.smoke else run.args.seeds
+    seeds = 1 if run.smoke else SEEDS
     yield {"seeds": seeds, "paper": PAPER}
-    for width in (SCENE,) if run.smoke else WIDTHS:
+    for width in run.sizes(WIDTHS, (SCENE,)):
         found = [figures(seed, width, run.smoke) for seed in range(seeds if width == SCENE else 1)]
         row: Row = {"spreading_mm": 1e3 * width, "seeds": len(found)}
         for name in PAPER_BENCH:
@@ -76,7 +76,7 @@ def figures(seed: int, width: float, smoke: bool) -> dict[str, float]:
     return {name: float(found[name]) for name in PAPER_BENCH}
 
 
-main = Question("paper", __doc__, {"rows": measure}, {"--seeds": {"type": int, "default": 6}}, prepare=set_up)
+main = Question("paper", __doc__, {"rows": measure}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

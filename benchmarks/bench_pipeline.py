@@ -16,7 +16,7 @@ from typing import Any
 
 from .bench_accuracy import Solve, graded, peers, regular, timed
 from .clock import require_agreement
-from .comparison import OPTIONS, Comparison, inverse_work
+from .comparison import Comparison, inverse_work
 from .harness import Question, Run
 from .peers import cholmod, eidors, pyeit, superlu
 from .problems import Problem, rectangle
@@ -85,7 +85,7 @@ def accuracy(run: Run) -> Iterator[Row]:
 PIPELINES = Comparison(
     "pipeline", IN_IMAGE, "images", inverse_work, 5, ("pixels", "elements"), "voltage_difference", voltages
 )
-main = Question("pipeline", __doc__, {"rows": PIPELINES, "accuracy": accuracy}, OPTIONS)
+main = Question("pipeline", __doc__, {"rows": PIPELINES, "accuracy": accuracy})
 
 if __name__ == "__main__":
     main()
