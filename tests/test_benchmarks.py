@@ -227,6 +227,7 @@ def test_a_slow_tool_stops_after_its_budget():
     assert [len(own) for own, _ in times] == [clock.MIN_TURNS, clock.MIN_TURNS]
     ((own, _),) = clock.interleaved([call], 9, budget=60.0)
     assert clock.spread(own)["repeats"] == 9
+    assert [len(own) for own in clock.in_turns({"a": int, "b": int}, 9, budget=0.0).values()] == [clock.MIN_TURNS] * 2
 
 
 def test_results_keep_other_sections(tmp_path):
