@@ -1000,7 +1000,7 @@ def test_a_device_that_lies_is_named_and_its_frames_are_kept(lies, name):
         stream = session.stream(name)
         expected = 40 if name == "eit" else 0.9 * LIE_SECONDS * LIE_RATE
         assert len(stream) >= expected
-        assert 5e-3 * (len(stream) - 1) == pytest.approx(np.ptp(stream.time) / 1e9, rel=0.1)
+        assert 5e-3 * (len(stream) - 1) == pytest.approx(np.ptp(stream.time) / 1e9, rel=0.5)
         assert not session.complete
         faults = [label for code, label in zip(session.events.code, session.events.label, strict=True) if code == 6]
         assert any(LIES[name][1] in label for label in faults if label.startswith(name))
