@@ -44,7 +44,7 @@ from .memory import growth, resident
 from .rows import Row
 
 RATE, PRESSURE_RATE = 100, 1000
-REST = 1.0
+REST = 0.5  # s; much shorter than a pause of the simulated skin
 LOST = 1e-3  # of the frames may be dropped at a rate that is sustained
 FASTEST = 6400  # Hz
 CLOSE = 1.1  # the rate that is sustained and the one that is not are not farther apart
@@ -117,12 +117,12 @@ def skin_process(rates: tuple[int, int], channels: tuple[int, int], told: Any, s
 
 
 def frames(number: int, rate: int, channels: int) -> Packets:
-    """Noise; on the pads a press of 2 kPa, half of the time, from two seconds on."""
+    """Noise; on the pads a press of 2 kPa, two seconds of every four: rest levels can be found in each pause."""
     rng = np.random.default_rng(number)
     pool = rng.normal(0, 1e-6, (64, channels)).astype("f4")
     pressed = pool + np.float32(2e-4 * rng.normal() if number == 1 else 2000.0)
     times = (n * 1_000_000_000 // rate for n in count())
-    choice = ((pressed if n > 2 * rate and n // rate % 2 else pool)[n % 64] for n in count())
+    choice = ((pressed if n // (2 * rate) % 2 else pool)[n % 64] for n in count())
     return frame_packets(number, times, choice)
 
 
