@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
-from calib.fitting.curve_fit import fit_curves
+from calib.fitting.curves import fit_curves
 from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
 

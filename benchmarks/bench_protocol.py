@@ -64,7 +64,8 @@ class Bench:
         self.frames = found.change + found.noise * rng.normal(size=found.change.shape)
         self.model = je.discretise(je.Scene(self.skin), je.Fidelity.draft())
         std = np.full(self.skin.protocol.readings, found.noise)
-        self.fit = je.prepare_contacts(self.model, noise=std, most=2, columns=21 if smoke else 41)
+        settings = je.contacts.ContactSettings(most=2, columns=21 if smoke else 41)
+        self.fit = je.prepare_contacts(self.model, settings, noise=std)
         self.image = je.prepare(self.model, noise=std)
         self.basis = je.Pixels(20).on(self.model)
 

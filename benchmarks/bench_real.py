@@ -27,12 +27,11 @@ from scipy import io, ndimage
 
 import calib
 from calib.fitting.channel_faults import faults
-from calib.fitting.curve_fit import fit_curves
-from calib.fitting.curves import CURVES, AbstractCurve
-from calib.fitting.fitted_curve import predict_pads
-from calib.fitting.gaussian_process import SmoothChannels
+from calib.fitting.curves import CURVES, AbstractCurve, fit_curves
+from calib.fitting.curves.fitted import predict_pads
+from calib.fitting.logs import SmoothChannels, fit_log
 from calib.fitting.results import FitResult
-from calib.fitting.validation import fit_log, rmse
+from calib.fitting.validation import rmse
 from calib.runtime import set_up
 
 from .harness import Question, Run
