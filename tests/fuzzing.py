@@ -34,8 +34,7 @@ from calib.bench import load_bench
 from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.cli import main as command
-from calib.fitting.curve_fit import FittedCurve
-from calib.fitting.curves import PowerLaw
+from calib.fitting.curves import FittedCurve, PowerLaw
 from calib.record.journal.conversion import convert_journal
 from calib.record.journal.file import Journal, JournalError, JournalReader
 from calib.record.journal.records import END, EVENT, PLAN, PONG, EventCode, pack_event, pack_pong

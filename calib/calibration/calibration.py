@@ -9,8 +9,8 @@ from jaxtyping import Array
 
 import jaxeit as je
 
+from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
-from ..fitting.fitted_curve import FittedCurve
 from ..fitting.pads import Hybrid
 from ..fitting.selection import Candidate
 from ..presses.table import Processing

@@ -12,9 +12,9 @@ import numpy as np
 import jaxeit as je
 from jaxeit.toml import TomlTable, parse_toml
 
-from ..fitting.curves import CURVES, AbstractCurve, Linear
-from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry, restored
-from ..fitting.fitted_curve import FittedCurve
+from ..fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
+from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry
+from ..fitting.fields.base import restored
 from ..fitting.selection import Candidate, Choice
 from ..presses.table import Processing
 from ..session import Archive

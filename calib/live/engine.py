@@ -21,7 +21,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of, remembered
 from ..calibration.localisation import ContactLocator
 from ..fitting.fields import Places
-from ..fitting.pads import nowhere
+from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
 from .results import NO_TOUCHES, FrameResult, TouchEstimates
 

@@ -86,6 +86,10 @@ class FrameQueue:
             return max(0.0, (self._last + self._period - time.monotonic_ns()) / 1e9)
 
 
+def _ignore(line: str) -> None:
+    """Tell nobody."""
+
+
 @dataclass
 class LiveControl:
     """Controls of a running live view (stop, measure rest levels again), and its state for viewers."""
@@ -95,7 +99,7 @@ class LiveControl:
     state: str = "waiting for the devices"
     lost: int = 0  # frames that were sent and did not arrive
     simulated: bool = False  # whether a device reports that its values are simulated
-    warn: Callable[[str], object] = lambda line: None  # called with what the operator should know
+    warn: Callable[[str], object] = _ignore  # called with what the operator should know
 
 
 Publish = Callable[[FrameResult], object]

@@ -68,7 +68,7 @@ class UnfinishedFit(NamedTuple):
         return ContactFit(self.flat, self.state.square, self.state.converged)
 
 
-def one_row_each(flat: Float[Array, " 4n"]) -> Float[Array, "n 4"]:
+def one_row_each(flat: Float[Array, " parameters"]) -> Float[Array, "contacts 4"]:
     """Contacts (x, y, log width, strength) from all parameters."""
     return flat.reshape(-1, 4)
 

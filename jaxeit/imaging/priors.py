@@ -257,7 +257,9 @@ def _areas(picture: Picture) -> Float[Array, " basis"]:
     return jnp.maximum(picture.areas, 1e-3 * jnp.max(picture.areas))
 
 
-def _laplacian(picture: Picture, weight: Float[Array, " edges"], floor: float) -> Float[Array, "basis basis"]:
+def _laplacian(
+    picture: Picture, weight: Float[Array, " edges"], floor: Float[Array, ""] | float
+) -> Float[Array, "basis basis"]:
     """``D^T diag(weight) D``, with ``floor`` of its mean diagonal added."""
     first, second = picture.edges.T
     r = jnp.zeros((picture.size, picture.size), weight.dtype)

@@ -168,7 +168,7 @@ class Reconstructor(AbstractReconstructor):
         )
         return other
 
-    def without(self, channels: Bool[Array, " readings"]) -> "Reconstructor":
+    def without(self, channels: Bool[ArrayLike, " readings"]) -> "Reconstructor":
         """The reconstructor that never had these readings, by an update of its rank; prior and strength stay the same.
 
         Under jit and vmap the flags may be traced; that no reading is left is then not an error.

@@ -11,11 +11,13 @@ import subprocess
 import sys
 import threading
 import time
+from inspect import unwrap
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -76,10 +78,18 @@ class SearchingPrograms(FakePrograms):
     searches = True
 
 
+@pytest.fixture(scope="module", autouse=True)
+def stand_ins():
+    """Annotations are not checked here: calibrations and reconstructors are stand-ins of no class of the packages."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+        yield
+
+
 @pytest.fixture
 def calibration(monkeypatch, skin):
     """What live needs of one, of two pads and four pixels, without a computation."""
-    monkeypatch.setattr(Engine.__init__, "__defaults__", (2.0, FakePrograms))
+    monkeypatch.setattr(unwrap(Engine.__init__), "__defaults__", (2.0, FakePrograms))
     channels = np.arange(READINGS) > 0
     recon = SimpleNamespace(
         centres=CENTRES, areas=np.ones(4), readings=READINGS, channels=channels, shape=(2, 2), factor=None

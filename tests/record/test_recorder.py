@@ -721,7 +721,7 @@ def test_two_hundred_killed_recorders_leave_sessions(device, tmp_path, hard):
             path.unlink()
     taken, decoded = max(kill.taken for kill in found), max(kill.decoded for kill in found)
     told = f"all opened, marked not complete; lost of a stream at most {taken} frame in work, {decoded} read with it, "
-    told += f"of at most {PIECE >> 10} KiB that one read brings; the last one left had come "
+    told += f"of at most {MAX_READ_BYTES >> 10} KiB that one read brings; the last one left had come "
     told += f"{np.median([kill.age for kill in found]):.0f} ms before the kill (median)"
     hard("fault 1: kill -9 of the recorder", "200 kills at random moments", beyond=told)
 
