@@ -110,6 +110,7 @@ LIES = {
     "thousands or decimals": ('t,f\n0,"1,234"\n1,"2,345"\n', "may have a decimal comma or separate thousands"),
     "a comma late": ("t;f\n" + "0;1\n" * 300 + "1;2,5\n", "line 302: '2,5' has a comma where the table has a decimal"),
     "a point late": ("t;f\n" + "0;1,5\n" * 300 + "1;2.500\n", "'2.500' has a point where the table has a decimal"),
+    "names that are numbers": ("0,1,2\n0.5,7,8\n1.5,9,10\n", "may be names or readings"),
     "an open quote": ("t,f\n" + "0,1\n" * 9 + '1,"2\n2,3\n3,4\n', "line 11: quotes do not match"),
     "words after a quote": ('t,f\n0,1\n1,"2"x\n2,3\n', "line 3: quotes do not match"),
 }

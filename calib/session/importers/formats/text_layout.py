@@ -119,12 +119,20 @@ def _with_header(path: Path, dialect: Dialect, rows: list[tuple[int, list[str]]]
     widths = [len(row) for row in data] or [len(head)]
     columns = max(widths, key=widths.count)
     if not named:
+        _check_numbered(path, head_lines, head, len(rows))
         return replace(dialect, columns=columns)
     surplus = itertools.chain(head[columns:], *(row[len(head) : columns] for row in data))
     if any(surplus):
         what = f"the header has {len(head)} names, the rows have {columns} cells"
         raise problem(path, f"line {head_lines}", what, "correct the header, or quote cells that hold the delimiter")
     return replace(dialect, header=tuple(head), header_lines=head_lines, columns=max(columns, len(head)))
+
+
+def _check_numbered(path: Path, line: int, head: Sequence[str], rows: int) -> None:
+    """Refuse a first row 0, 1, 2 of three or more: pandas names columns so, and no reading may be made of names."""
+    if rows > 1 and len(head) > 2 and list(head) == [str(number) for number in range(len(head))]:
+        what = f"{', '.join(head[:3])}, as far as {head[-1]}, may be names or readings"
+        raise problem(path, f"line {line}", what, "give the columns names, or leave out the line")
 
 
 def wrong_sign(path: Path, line: int, cell: str, dialect: Dialect) -> SessionError:
