@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SessionError, printable, problem
+from ..storage import writing
 from .limits import CHILD_BYTES, CHILD_SECONDS
 
 try:
@@ -124,5 +125,6 @@ def _done(request: dict[str, Any], path: Path) -> Any:
     if not more:
         return task(path, folder)
     for number, array in enumerate(task(path, *more)):
-        np.save(folder / f"{number}.npy", array, allow_pickle=False)
+        with writing(folder / f"{number}.npy"):
+            np.save(folder / f"{number}.npy", array, allow_pickle=False)
     return None
