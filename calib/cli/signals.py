@@ -49,6 +49,7 @@ def termination_raised() -> Iterator[None]:
 @contextmanager
 def orderly_end(orders: "StopRequest", planned: bool) -> Iterator[None]:
     """The first signal ends a recording in order, a second one at once; Ctrl-C is how one without end is ended."""
+
     def tell(number: int, _frame: FrameType | None) -> None:
         if orders.stop.is_set():
             raise KeyboardInterrupt
