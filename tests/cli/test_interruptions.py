@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from calib.cli import main
-from calib.record.journal.file import Journal
 from calib.session import storage
 from tests.record.test_full_disk import SCENE
 from tests.record.test_recorder import both, journal
