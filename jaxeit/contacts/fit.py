@@ -58,7 +58,7 @@ class UnfinishedFit(NamedTuple):
     state: LeastSquaresState
 
     @property
-    def square(self) -> Float[Array, ""]:
+    def square(self) -> Float[Array, "..."]:
         """Sum of the squares of what the contacts do not explain."""
         return self.state.square
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .searches import BoundedDescent, DampingSearch, Parameters, Quadratic, Scalar, normal_equations
 
@@ -39,7 +39,7 @@ class LeastSquaresState(eqx.Module):
     hopeless: Bool[Array, ""]
 
     @property
-    def square(self) -> Scalar:
+    def square(self) -> Float[Array, "..."]:
         """Sum of squares at the solution: where the fit has converged, after the step to the trial."""
         return 2 * (self.quadratic.f - jnp.where(self.converged, self.promised, 0))
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from . import lapack
@@ -31,7 +32,7 @@ class ArrayLibrary(NamedTuple):
     add_at: Callable[..., Any]
 
 
-def _jax_solve_lower(lower: Array, b: Array, trans: int = 0) -> Array:
+def _jax_solve_lower(lower: Array, b: ArrayLike, trans: int = 0) -> Array:
     return lapack.solve_triangular(lower, b, trans=trans, lower=True)
 
 

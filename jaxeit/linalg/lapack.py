@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 Stacks = tuple[Array, ...]
@@ -119,14 +120,14 @@ def cho_factor(a: Float[Array, "n n"], lower: bool = False) -> tuple[Float[Array
     return cholesky(a, lower), lower
 
 
-def cho_solve(c_and_lower: tuple[Float[Array, "n n"], bool], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def cho_solve(c_and_lower: tuple[Float[Array, "n n"], bool], b: Float[ArrayLike, "n ..."]) -> Float[Array, "n ..."]:
     """x with a x = b, from `cho_factor`."""
     c, lower = c_and_lower
     return solve_triangular(c, solve_triangular(c, b, not lower, lower), lower, lower)
 
 
 def solve_triangular(
-    a: Float[Array, "n n"], b: Float[Array, "n ..."], trans: int = 0, lower: bool = False
+    a: Float[Array, "n n"], b: Float[ArrayLike, "n ..."], trans: int = 0, lower: bool = False
 ) -> Float[Array, "n ..."]:
     """x with a x = b, or with a^T x = b where ``trans`` is 1, of which only the triangle named is read."""
 
@@ -137,7 +138,7 @@ def solve_triangular(
     return _linear(product, partial(_solved(bool(trans), lower), a), partial(_solved(not trans, lower), a), b)
 
 
-def solve(a: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def solve(a: Float[Array, "n n"], b: Float[ArrayLike, "n ..."]) -> Float[Array, "n ..."]:
     """x with a x = b, by LU; not finite where a is singular."""
     return _linear(lambda x: a @ x, partial(_general, a), partial(_general, a.T), b)
 
@@ -157,7 +158,8 @@ def qr(a: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Array, "n n"]
     return _qr(a)
 
 
-def _linear(product: Linear, solve: Linear, transposed: Linear, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def _linear(product: Linear, solve: Linear, transposed: Linear, b: Float[ArrayLike, "n ..."]) -> Float[Array, "n ..."]:
+    b = jnp.asarray(b)
     many = b if b.ndim == 2 else b[:, None]
     found: Array = lax.custom_linear_solve(product, many, lambda _, b: solve(b), lambda _, b: transposed(b))
     return found.reshape(b.shape)

@@ -313,14 +313,14 @@ def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     return [piece.reshape(*shape, *rows.shape[1:]) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
-def _root_loads(plan: NestedDissectionPlan, front: Front) -> list[Float[Array, "1 p r"]]:
+def _root_loads(plan: NestedDissectionPlan, front: Front) -> list[Float[Array, "1 _ r"]]:
     """U^-T of the unit loads on the unknowns of the root, panel by panel."""
     size = sum(panel.upper.shape[1] for panel in front) + front[-1].beside.shape[2]
     unit = jnp.arange(size)[:, None] == plan.scatter[plan.root]
     return _through(front, unit[None].astype(front[0].upper.dtype))[0]
 
 
-def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Array, "m p k"]], Float[Array, "m b k"]]:
+def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Array, "m _ k"]], Float[Array, "m b k"]]:
     """y = U^-T r of every panel, and what is left for the boundary."""
     ys = []
     for panel in front:
@@ -331,7 +331,7 @@ def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Arra
     return ys, load
 
 
-def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "m p k"]]) -> list[list[Float[Array, "m p k"]]]:
+def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "_ _ k"]]) -> list[list[Float[Array, "_ _ k"]]]:
     """y = U^-T r from the leaves up; every front hands what its boundary gained to its parent."""
     ys = []
     handed = jnp.zeros_like(loads[0], shape=(0, 1, loads[0].shape[2]))
@@ -348,7 +348,7 @@ def _gained(level: LevelPlan, handed: Float[Array, "mc b k"]) -> Float[Array, "m
 
 
 def _backward(
-    factor: NestedDissectionFactor, ys: Sequence[list[Float[Array, "m p k"]] | None]
+    factor: NestedDissectionFactor, ys: Sequence[list[Float[Array, "_ _ k"]] | None]
 ) -> Float[Array, "places k"]:
     """x = U^-1 y from the root down; every front finds its boundary's x in its parent's front.
 

@@ -68,9 +68,10 @@ def test_float32_stays(effect):
 
 def test_readings_are_taken_at_the_times_of_the_protocol(skin):
     nominal = skin.protocol.reading_time * jnp.arange(skin.protocol.readings)
-    np.testing.assert_allclose(je.effects.ScanSkew()(0.5, nominal), 0.5 + nominal)
+    when = jnp.full(nominal.shape, 0.5)
+    np.testing.assert_allclose(je.effects.ScanSkew()(when, nominal), 0.5 + nominal)
     assert float(nominal[-1]) == pytest.approx(5.49e-3)  # 25 x 22 readings of 10 us
-    np.testing.assert_array_equal(je.effects.ScanSkew(stretch=0.0)(0.5, nominal), 0.5)
+    np.testing.assert_array_equal(je.effects.ScanSkew(stretch=0.0)(when, nominal), 0.5)
 
 
 def test_the_multiplexer_goes_from_reading_to_reading_across_frames():

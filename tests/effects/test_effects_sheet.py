@@ -27,8 +27,8 @@ def _pressed(effect, x):
 
 
 def _sheet(pressure=PRESSURES, size=1e-3, temperature=0.0, sigma=1 / 150):
-    even = partial(np.full, len(pressure), dtype=pressure.dtype)
-    places, warmer = np.zeros((len(pressure), 2), pressure.dtype), np.asarray(temperature, pressure.dtype)
+    even = partial(jnp.full, len(pressure), dtype=pressure.dtype)
+    places, warmer = jnp.zeros((len(pressure), 2), pressure.dtype), jnp.asarray(temperature, pressure.dtype)
     return fx.Sheet(even(sigma), pressure, places, even(size), warmer)
 
 

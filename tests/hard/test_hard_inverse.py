@@ -366,7 +366,7 @@ def test_a_sheet_around_a_hole_has_a_noise_figure():
     hole = np.isin(np.arange(SIDE**2), [14, 15, 20, 21])
     problem = _problem(np.random.default_rng(7).normal(size=(20, SIDE**2)) * ~hole, 1, je.Tikhonov())
     problem = replace(problem, picture=replace(problem.picture, areas=problem.picture.areas * ~hole))
-    assert 1e-4 < je.NoiseFigure(1).choose(spectrum(problem), None) < 100
+    assert 1e-4 < je.NoiseFigure(1).choose(spectrum(problem), lambda frames: frames) < 100
 
 
 @pytest.mark.parametrize("prior", [je.Tikhonov(), je.GaussianSmooth(0.03)])
@@ -381,7 +381,7 @@ def test_pixels_beside_the_sheet_have_a_prior_too(prior):
 def test_pixels_without_neighbours_have_a_prior_too(prior):
     picture = _picture("float64")
     picture = replace(picture, edges=picture.edges[:0], edge_length=picture.edge_length[:0])
-    np.testing.assert_allclose(prior.precision(None, picture).solve(jnp.ones(SIDE**2)), 1e3)
+    np.testing.assert_allclose(prior.precision(jnp.zeros((1, SIDE**2)), picture).solve(jnp.ones(SIDE**2)), 1e3)
 
 
 @pytest.mark.parametrize("greit", [je.Greit(), je.Greit(radius=1e-3, edge=1e-5)])
@@ -598,10 +598,10 @@ def test_a_noise_that_is_none_is_refused_by_the_number_of_its_reading(model, pix
         je.prepare(model, basis=pixels, noise=np.where(np.arange(550) == 7, bad, STD))
 
 
-@pytest.mark.parametrize("second", [[1, 1, -1, -1], [1 + 1e-3, 1, -1, -1], [0, 1, 0, -1]])
+@pytest.mark.parametrize("second", [[1.0, 1, -1, -1], [1 + 1e-3, 1, -1, -1], [0.0, 1, 0, -1]])
 def test_a_covariance_of_frames_that_share_next_to_nothing(second):
     """Then the formula for the weight of the diagonal divides by next to nothing: the weight is one, not 1e6."""
-    blank = np.array([[1, 0, -1, 0] if second[0] == 0 else [1, -1, 1, -1], second]).T
+    blank = np.array([[1, 0, -1, 0] if second[0] == 0 else [1, -1, 1, -1], second], float).T
     np.testing.assert_allclose(je.noise_covariance(blank), np.diag(np.var(blank, 0, ddof=1)), rtol=1e-12)
 
 

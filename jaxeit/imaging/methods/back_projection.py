@@ -14,6 +14,6 @@ class BackProjection(AbstractLinearMethod):
 
     floor: float = 1e-3
 
-    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+    def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         power = jnp.sum(problem.jacobian**2, 0)
         return (y.T @ problem.jacobian / (power + self.floor * jnp.max(power))).T

@@ -54,7 +54,7 @@ class AbstractLinearMethod(AbstractMethod):
     """A method whose image is a matrix Q times the readings."""
 
     @abstractmethod
-    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+    def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         """``Q y``, (basis, m) S: the images of m whitened frames, (k, m), one in each column."""
 
     def variance(self, problem: Problem) -> Float[Array, " basis"]:

@@ -27,7 +27,7 @@ class Greit(AbstractLinearMethod):
     radius: float = 0.02
     edge: float = 0.004
 
-    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+    def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         areas, centres = problem.picture.areas, problem.picture.centres
         square = jnp.sum((centres[:, None] - centres) ** 2, -1)
         distance = jnp.sqrt(square)

@@ -18,7 +18,7 @@ class OneStep(AbstractLinearMethod):
     ``Q = R^-1 J^T (J R^-1 J^T + l^2 I)^-1``.
     """
 
-    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+    def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         return one_step_image(problem, problem.precision(), y)[0]
 
     def variance(self, problem: Problem) -> Float[Array, " basis"]:

@@ -16,14 +16,16 @@ class TruncatedSvd(AbstractLinearMethod):
     derivative with respect to the hyperparameter is zero.
     """
 
-    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+    def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         precision = problem.precision()
         b = precision.seen(problem.jacobian)
         return precision.image(_truncated_inverse(b, problem.level(b), y))
 
 
 @jax.custom_jvp
-def _truncated_inverse(b: Float[Array, "k n"], level: Float[Array, ""], y: Float[Array, "k m"]) -> Float[Array, "n m"]:
+def _truncated_inverse(
+    b: Float[Array, "k n"], level: Float[Array, ""], y: Float[Array, "k ..."]
+) -> Float[Array, "n ..."]:
     """``V f(S) U^T y`` with ``f(s) = 1/s`` for the singular values of b above ``level``, else 0."""
     u, s, v = _thin_svd(b)
     return v @ (_inverse_above(level, b, s) * (u.T @ y).T).T
@@ -32,7 +34,7 @@ def _truncated_inverse(b: Float[Array, "k n"], level: Float[Array, ""], y: Float
 @_truncated_inverse.defjvp
 def _(
     primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
-) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
+) -> tuple[Float[Array, "n ..."], Float[Array, "n ..."]]:
     """The derivative of a generalised matrix function (Noferini 2017), which no pair of equal singular values upsets.
 
     Which values are kept is constant but for jumps, so the level has no derivative.
