@@ -488,7 +488,7 @@ def test_a_pressure_sensor_at_its_end(parts, look):
 
 def test_pads_in_another_order(parts, look):
     parts.change("pressure", parts.values("pressure")[:, [1, 0, 2, 3]])
-    parts.presses = table(x=np.array([0.05, 0.05]), y=np.array([0.05, 0.05]))
+    parts.presses = table(x=np.array([0.05, 0.05]), y=np.array([0.05, 0.05]), pad=np.array([0, 0]))
     pressure = parts.values("pressure")
     pressure[:, 1] += pressure[:, 3]
     pressure[:, 3] = pressure[::-1, 2]
