@@ -19,6 +19,7 @@ TARGET_RATIO_RANGE = 0.5, 2.0
 # Force over pressure times area of the pads: 1 for a pad that carries the press alone, more where walls bear a part.
 BORNE_RATIO_RANGE = 0.03, 30.0
 MIN_PRESS_FRACTION = 0.1  # of the median force: a press below it is none
+UNLISTED_FRACTION = 0.3  # of the usual force, from which a contact should have been listed
 MIN_UNLISTED_SECONDS = 0.2  # a shorter contact is a knock
 MIN_FOLLOWING = 0.3  # correlation, without sign, of pressure and force, from which its sign counts
 
@@ -115,13 +116,13 @@ def _empty_findings(evidence: PressEvidence, force: np.ndarray) -> Iterator[Find
 
 
 def _unlisted_findings(evidence: PressEvidence, force: np.ndarray, stats: StreamStatistics) -> Iterator[Finding]:
-    """Contacts of half the usual force outside of all listed presses."""
+    """Contacts with a good part of the usual force outside of all listed presses."""
     presses, time, values = evidence.presses, stats.time, stats.stream.read()[:, 0]
     listed_time = np.zeros(len(time), bool)
     for start, stop in index_ranges(time, np.stack([presses.t_press - SECOND // 2, presses.t_release + SECOND], 1)):
         listed_time[start:stop] = True
     rest = np.nanmedian(values[~listed_time]) if np.isfinite(values[~listed_time]).any() else np.nan
-    loaded = ~listed_time & (values - rest > 0.5 * np.nanmedian(force))
+    loaded = ~listed_time & (values - rest > UNLISTED_FRACTION * np.nanmedian(force))
     runs = true_runs(loaded)
     seconds = (time[runs[:, 1] - 1] - time[runs[:, 0]]) / SECOND if len(runs) else np.empty(0)
     count = int((seconds > MIN_UNLISTED_SECONDS).sum())

@@ -74,9 +74,7 @@ def _unfelt_findings(evidence: PressEvidence, response: np.ndarray) -> Iterator[
         yield Finding(Severity.WARNING, PRESSURE, what, remedy)
 
 
-def _order_findings(
-    skin: je.Skin, under: np.ndarray, pressure: np.ndarray, strongest: np.ndarray
-) -> Iterator[Finding]:
+def _order_findings(skin: je.Skin, under: np.ndarray, pressure: np.ndarray, strongest: np.ndarray) -> Iterator[Finding]:
     """Compare the column that responds with the pad under the tip, pad by pad."""
     alone = np.where(under.sum(0) == 1, under.argmax(0), -1)
     wrong: dict[int, int] = {}

@@ -110,9 +110,7 @@ def _statistics(stream: Stream, limit: float, progress: Progress) -> StreamStati
         fingerprint[start:stop] = np.nan_to_num(values) @ weights
     missing = 1 - finite.sum() / (n * len(stream))
     row = _summary_row(stream, missing)
-    return StreamStatistics(
-        stream, row, stream.time, finite, low, high, at_low, at_high, full, activity, fingerprint
-    )
+    return StreamStatistics(stream, row, stream.time, finite, low, high, at_low, at_high, full, activity, fingerprint)
 
 
 def _activity(values: np.ndarray) -> np.ndarray:
