@@ -181,7 +181,7 @@ def pasted_twice(r):
 
 def clipped(r):
     values = r.values("eit")
-    limit = np.sort(np.abs(values).max(0))[-20]
+    limit = np.sort(np.abs(values).max(0))[-80]
     return r.change("eit", np.clip(values, -limit, limit))
 
 

@@ -1,0 +1,164 @@
+"""What `check` calls an error is not calibrated, evaluated or applied, unless a person says so; then results tell."""
+
+from concurrent.futures import Future
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.batch.sessions import calibrate_many
+from calib.bench import Bench, Timing, simulate
+from calib.check import RecordingError
+from calib.cli import main
+from calib.report import document as report
+from calib.session import open_session, read_archive
+
+from ..check.recording import Recording
+
+QUICK = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft())
+FAST = ["--pixels", "20", "--fidelity", "draft"]
+
+
+@pytest.fixture(scope="module")
+def honest(skin, tmp_path_factory):
+    """Sixteen presses, as a file would hold them."""
+    effects = (je.effects.ContactPiezoresistance(), je.effects.Noise(std=1e-5))
+    sites = np.stack(np.meshgrid([0.03, 0.07, 0.12, 0.17], [0.03, 0.07, 0.13, 0.16]), -1).reshape(-1, 2)
+    timing = Timing(rest=0.6, ramp=0.4, hold=1.1, release=0.4, recovery=0.6)
+    settings = {"timing": timing, "blank": 2.0, "eit_rate": 10.0, "pad_rate": 50.0, "eit_step": 3e-6, "seed": 1}
+    bench = Bench(je.Scene(skin, effects), sites, np.array([10.0, 20.0]), **settings, toml="x")
+    path = simulate(bench, tmp_path_factory.mktemp("honest") / "s.h5", fidelity=je.Fidelity.draft())
+    with open_session(path) as session:
+        return Recording.of(session)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("refusal")
+
+
+@pytest.fixture(scope="module")
+def sound(honest, folder):
+    return honest.write(folder / "sound.h5")
+
+
+@pytest.fixture(scope="module")
+def reversed_(honest, folder):
+    """Each frame comes in reversed order."""
+    return honest.change("eit", honest.values("eit")[:, ::-1]).write(folder / "reversed.h5")
+
+
+@pytest.fixture(scope="module")
+def calibration(sound, folder):
+    with open_session(sound) as session:
+        made = calib.calibrate([session], recipe=QUICK)
+    made.save(folder / "calibration.h5")
+    return made
+
+
+REFUSED = {
+    "readings in reversed order": (lambda r: r.change("eit", r.values("eit")[:, ::-1]), "order looks wrong"),
+    "EIT that never changes": (lambda r: r.change("eit", 0 * r.values("eit") + r.values("eit")[0]), "never change"),
+    "places 100 km off": (lambda r: r.pressed(x=r.presses.x + 1e5), "outside the sheet"),
+    "pressure columns exchanged": (lambda r: r.change("pressure", r.values("pressure")[:, [1, 0, 2, 3]]), "column 1"),
+}
+
+
+@pytest.mark.parametrize("lie", REFUSED)
+def test_calibrate_refuses_what_check_calls_an_error(lie, honest, tmp_path):
+    tell, words = REFUSED[lie]
+    path = tell(honest).write(tmp_path / "lie.h5")
+    with open_session(path) as session, pytest.raises(RecordingError, match=words) as caught:
+        calib.calibrate([session], recipe=QUICK)
+    assert str(caught.value).startswith("lie.h5: /")
+    assert "--force" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_forced_it_is_calibrated_and_says_so(calibration, reversed_, tmp_path, capsys):
+    out = str(tmp_path / "c.h5")
+    assert main(["calibrate", str(reversed_), "-o", out, *FAST]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "reversed order" in said
+    assert main(["calibrate", str(reversed_), "-o", out, "--force", *FAST]) == 0
+    assert "note: reversed.h5: error ignored: /streams/eit" in capsys.readouterr().out
+    made = calib.load_calibration(out)
+    assert "reversed order" in made.provenance["ignored_errors"]
+    report.write_report(made, tmp_path / "report.html")
+    assert "error ignored: /streams/eit" in (tmp_path / "report.html").read_text()
+    assert "ignored_errors" not in calibration.provenance
+
+
+def test_evaluate_and_apply_refuse_as_well(calibration, reversed_, folder, tmp_path, capsys):
+    made, out = str(folder / "calibration.h5"), str(tmp_path / "map.h5")
+    for command in (["evaluate", made, str(reversed_)], ["apply", made, str(reversed_), "-o", out]):
+        assert main(command) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "reversed order" in said
+        assert main([*command, "--force"]) == 0
+        capsys.readouterr()
+    assert "reversed order" in read_archive(out, "skin-forcemap").attrs["ignored_errors"]
+
+
+def test_apply_does_not_mind_the_force(calibration, honest, folder, tmp_path, capsys):
+    """A force map is made of frames and pressures; a load cell the wrong way round does not touch it."""
+    path = str(honest.change("force", -honest.values("force")).write(tmp_path / "s.h5"))
+    made = str(folder / "calibration.h5")
+    assert main(["apply", made, path, "-o", str(tmp_path / "map.h5")]) == 0
+    assert main(["evaluate", made, path]) == 2
+    assert "none of 16 presses can be used: no force; see jaxeit check" in capsys.readouterr().err
+
+
+def test_a_batch_refuses_too(reversed_, sound, tmp_path, calibration):
+    class Here:
+        """An executor that works at once, in this process."""
+
+        def submit(self, work, *args):
+            done = Future()
+            done.set_result(work(*args))
+            return done
+
+    paths = [sound, reversed_]
+    good, bad = calibrate_many(paths, tmp_path, recipe=QUICK, executor=Here())
+    assert good.reason == ""
+    assert "reversed order" in bad.reason
+    _, forced = calibrate_many(paths, tmp_path, recipe=QUICK, executor=Here(), ignore_errors=True)
+    assert forced.reason == ""
+
+
+# --- nothing at all ------------------------------------------------------------------------------
+
+
+def emptied(recording, name):
+    samples = recording.streams[name]
+    return recording.with_stream(name, replace(samples, time=samples.time[:0], values=samples.values[:0]))
+
+
+@pytest.mark.parametrize("name", ["eit", "pressure", "force"])
+@pytest.mark.parametrize("command", ["calibrate", "evaluate", "apply"])
+def test_a_stream_without_a_sample_is_one_clear_line(name, command, calibration, honest, folder, tmp_path, capsys):
+    path = str(emptied(honest, name).write(tmp_path / "s.h5"))
+    out = ["-o", str(tmp_path / "out.h5")]
+    made = str(folder / "calibration.h5")
+    words = {"calibrate": [path, *out, *FAST], "evaluate": [made, path], "apply": [made, path, *out]}[command]
+    needless = command == "apply" and name == "force"
+    assert main([command, *words]) == (0 if needless else 2)
+    said = capsys.readouterr().err
+    assert needless or f"s.h5: /streams/{name}: holds no sample; record again" in said
+    assert needless or said.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["calibrate", "evaluate"])
+def test_no_press_at_all_is_one_clear_line(command, calibration, honest, folder, tmp_path, capsys):
+    none = {n: getattr(honest.presses, n)[:0] for n in honest.presses.__dataclass_fields__}
+    path = str(replace(honest, presses=replace(honest.presses, **none)).write(tmp_path / "s.h5"))
+    made = str(folder / "calibration.h5")
+    words = {"calibrate": [path, "-o", str(tmp_path / "c.h5"), *FAST], "evaluate": [made, path]}[command]
+    assert main([command, *words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("jaxeit: s.h5: /presses: ")
+    assert said.count("\n") == 1
