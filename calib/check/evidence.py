@@ -78,4 +78,4 @@ def _sites(streams: Mapping[str, Stream], presses: PressColumns, rows: np.ndarra
     if stage is None or stage.channels < 2:
         return None
     place = hold_positions(select(presses, rows), stage)[:, :2]
-    return place if np.isfinite(place).all() else None
+    return np.asarray(place) if np.isfinite(place).all() else None

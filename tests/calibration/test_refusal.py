@@ -2,7 +2,9 @@
 
 from concurrent.futures import Future
 from dataclasses import replace
+from datetime import UTC, datetime
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -10,12 +12,17 @@ import calib
 import jaxeit as je
 from calib.batch.sessions import calibrate_many
 from calib.bench import Bench, Timing, simulate
+from calib.calibration import logs
 from calib.check import RecordingError
 from calib.cli import main
+from calib.fitting import selection
+from calib.fitting.response import fitting_problem
+from calib.fitting.results import FitError, FitResult
+from calib.presses.pooled import pool_presses
 from calib.report import document as report
-from calib.session import open_session, read_archive
+from calib.session import SessionFacts, StreamFacts, open_session, read_archive
 
-from ..check.recording import Recording
+from ..check.recording import SECOND, Recording, Samples
 
 QUICK = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft())
 FAST = ["--pixels", "20", "--fidelity", "draft"]
@@ -162,3 +169,74 @@ def test_no_press_at_all_is_one_clear_line(command, calibration, honest, folder,
     said = capsys.readouterr().err
     assert said.startswith("jaxeit: s.h5: /presses: ")
     assert said.count("\n") == 1
+
+
+# --- fits that fail ------------------------------------------------------------------------------
+
+
+def failing(fit, curve):
+    """`fit` whose result for one kind of curve is that the solver ran out of steps, with NaN for numbers."""
+
+    def failed(fitted):
+        return eqx.tree_at(
+            lambda f: (f.result, f.parameters),
+            fitted,
+            (0 * fitted.result + FitResult.MAX_STEPS, np.nan * fitted.parameters),
+        )
+
+    def run(chosen, *args, **kwargs):
+        found = fit(chosen, *args, **kwargs)
+        if not isinstance(chosen, curve):
+            return found
+        if hasattr(found, "fitted"):
+            return replace(found, fitted=failed(found.fitted))
+        return replace(found, curves=failed(found.curves))
+
+    return run
+
+
+@pytest.fixture
+def curved_log(tmp_path):
+    """A log in which the force follows the square root of the pressure."""
+    time = np.arange(3000) * (SECOND // 50)
+    pressure = 1000 * (1 - np.cos(time / SECOND)) + np.random.default_rng(0).normal(0, 1, len(time))
+    force = np.sqrt(np.abs(pressure))
+    streams = {
+        name: Samples(StreamFacts(name, units=unit, channels=1, rate_hz=50.0), time, values[:, None])
+        for name, unit, values in (("force", "N", force), ("pressure", "Pa", pressure))
+    }
+    facts = SessionFacts(epoch=datetime(2026, 1, 1, tzinfo=UTC))
+    return Recording(facts, streams, None).write(tmp_path / "log.h5")
+
+
+def test_a_log_s_curve_that_does_not_converge_is_neither_chosen_nor_saved(curved_log, monkeypatch):
+    curves = [calib.Linear(), calib.Affine(), calib.PowerLaw()]
+    with open_session(curved_log) as session:
+        assert isinstance(logs.fit_session(session, curves).fit.fitted.curve, calib.PowerLaw)
+        monkeypatch.setattr(logs, "fit_log", failing(logs.fit_log, calib.PowerLaw))
+        found = logs.fit_session(session, curves)
+        assert not isinstance(found.fit.fitted.curve, calib.PowerLaw)
+        assert "power not determined" in found.why
+        with pytest.raises(
+            FitError, match=r"log\.h5: the power curve could not be fitted: the solver ran out of steps"
+        ):
+            logs.fit_session(session, [calib.PowerLaw()])
+
+
+def test_a_pad_s_curve_that_does_not_converge_is_not_chosen(sound, skin, monkeypatch):
+    curves = [calib.PowerLaw(), calib.Linear()]
+    with open_session(sound) as session:
+        data = pool_presses([session], skin).data
+        problem = fitting_problem(skin, data, None, QUICK.loss, QUICK.folds)
+    monkeypatch.setattr(selection, "fit_hybrid", failing(selection.fit_hybrid, calib.PowerLaw))
+    choice = selection.choose(curves, [None], problem.presses, problem.loss, problem.fold)
+    assert isinstance(choice.curve, calib.Linear)
+    assert "power not determined" in choice.why
+
+
+def test_a_log_that_check_refuses_is_not_fitted(curved_log, tmp_path, capsys):
+    with open_session(curved_log) as session:
+        recording = Recording.of(session)
+    path = str(recording.change("force", np.nan * recording.values("force")).write(tmp_path / "s.h5"))
+    assert main(["calibrate", path, "-o", str(tmp_path / "c.h5")]) == 2
+    assert "s.h5: /streams/force: holds no finite value" in capsys.readouterr().err
