@@ -73,7 +73,7 @@ def _chosen(presses: PressColumns, windows: PressWindows, rows: np.ndarray) -> t
 def _sites(streams: Mapping[str, Stream], presses: PressColumns, rows: np.ndarray) -> np.ndarray | None:
     """Places from the table, or from the stage over the holds."""
     if isinstance(presses, PressTable):
-        return np.stack([presses.x, presses.y], 1)[rows]
+        return np.asarray(np.stack([presses.x, presses.y], 1)[rows])
     stage = streams.get("stage")
     if stage is None or stage.channels < 2:
         return None

@@ -33,7 +33,8 @@ def place_findings(
         return
     outside = np.flatnonzero(~skin.domain.contains(site))
     if len(outside):
-        first = f"press {evidence.number[outside[0]]} at {site[outside[0]]} m"
+        x, y = site[outside[0]]
+        first = f"press {evidence.number[outside[0]]} at x = {x:.4g} m, y = {y:.4g} m"
         what = f"{len(outside)} of {len(site)} presses lie outside the sheet ({first})"
         yield Finding(Severity.ERROR, WHERE, what, REMEDY)
         return

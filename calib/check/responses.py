@@ -11,7 +11,9 @@ from .places import pads_under
 from .report import ChannelTable, Finding, Severity, counted, listed
 
 PRESSURE = "/streams/pressure"
-MIN_RESPONSE = 1.2  # of the standard error of a reading's change, as the median over readings; chance gives 0.67
+# A touch changes all readings a little, or a few of them much: quantile of the readings, and how many standard errors
+# their changes must exceed there. Chance gives 0.67 and 2.
+RESPONSES = ((0.5, 1.2), (0.95, 4.0))
 MIN_PAD_RESPONSE = 0.05  # of the usual change of pressure per newton: a press below it is not felt
 MIN_PRESSES_PER_PAD = 3  # from so many presses on, each pad should have been pressed
 MIN_STRONGER = 3.0  # times its own pad's response: another column that responds so is that pad's
@@ -42,7 +44,8 @@ def _changes(change: np.ndarray, error: np.ndarray) -> bool:
     known = np.isfinite(error) & (error > 0)
     if not known.any():
         return bool((change != 0).any())
-    return bool(np.median(np.abs(change[known]) / error[known]) > MIN_RESPONSE)
+    ratio = np.abs(change[known]) / error[known]
+    return any(bool(np.quantile(ratio, q) > least) for q, least in RESPONSES)
 
 
 def pad_response_findings(evidence: PressEvidence, skin: je.Skin) -> Iterator[Finding]:
