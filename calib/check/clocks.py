@@ -14,6 +14,7 @@ from .streams import StreamStatistics
 
 ALLOWED_SHIFT = 0.3  # of the ramp, beyond which a shift of the whole rise is no property of the skin
 MIN_ALLOWED_SHIFT = 0.05  # s
+SPREADS = 2.0  # of the delays over the presses: a clock is late by the same time in all of them
 GRID_STEP, MAX_GRID = 0.05, 2**18  # s and samples of the time axis on which streams are correlated
 SLOW = 30.0  # s: what is slower is drift
 MAX_LAG = 60.0  # s
@@ -31,7 +32,7 @@ def compare_clocks(
     ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
     for name, onset in onsets.items():
         allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / streams[name].nominal_rate
-        if onset.presses and abs(onset.shift) > allowed:
+        if onset.presses and abs(onset.shift) > max(allowed, SPREADS * onset.spread):
             what = f"rises {onset.delay:+.3f} s after the force; the ramp takes {ramp:.2f} s"
             findings.append(_disagreement(name, what))
     return tuple(sorted(onsets.items()))

@@ -1,6 +1,6 @@
 """What `check` calls an error is not calibrated, evaluated or applied, unless a person says so; then results tell."""
 
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -120,15 +120,16 @@ def test_apply_does_not_mind_the_force(calibration, honest, folder, tmp_path, ca
     assert "none of 16 presses can be used: no force; see jaxeit check" in capsys.readouterr().err
 
 
+class Here(Executor):
+    """Works at once, in this process."""
+
+    def submit(self, call, task):
+        done = Future()
+        done.set_result(call(task))
+        return done
+
+
 def test_a_batch_refuses_too(reversed_, sound, tmp_path, calibration):
-    class Here:
-        """An executor that works at once, in this process."""
-
-        def submit(self, work, *args):
-            done = Future()
-            done.set_result(work(*args))
-            return done
-
     paths = [sound, reversed_]
     good, bad = calibrate_many(paths, tmp_path, recipe=QUICK, executor=Here())
     assert good.reason == ""

@@ -221,6 +221,13 @@ def test_faulty_channels_of_an_array_are_named(parts, look):
     assert report.count(Severity.WARNING) == 4
 
 
+def test_a_saturated_channel_of_an_array_is_named(parts, look):
+    array_log(parts, faulty=False)
+    values = parts.values("pressure")
+    values[:, 11] = np.minimum(3 * values[:, 11], 4000.0)  # beyond the range of the others
+    only(look(parts), Severity.WARNING, "/streams/pressure", "1 of 12 channels", "(saturated): 11")
+
+
 def test_a_healthy_array_has_no_finding_above_a_note(parts, look):
     array_log(parts, faulty=False)
     assert all(f.severity is Severity.OK for f in look(parts).findings)

@@ -7,6 +7,7 @@ import pytest
 from scipy import io
 
 import jaxeit as je
+from benchmarks.bench_real import aligned
 from calib.bench import simulate
 from calib.check import Severity, check_session, transfer_matrix
 from calib.cli import main
@@ -87,11 +88,12 @@ def test_an_insole_in_a_chamber_is_accused_of_its_faulty_taxels_only(tmp_path):
     found = io.loadmat(real("insole_plenum/calibration_dataset.mat"), squeeze_me=True, struct_as_record=False)[
         "experiment"
     ]
-    counts, chamber = np.asarray(found.C)[:, 2:], np.asarray(found.P).reshape(-1, 1)
-    time, other = (np.linspace(0, 522 * SECOND, n).astype(np.int64) for n in (len(counts), len(chamber)))
+    counts = np.asarray(found.C)[:, 2:]
+    chamber, *_ = aligned(counts, found.P)  # the two were recorded by clocks of their own
+    time = (np.arange(len(counts)) * (SECOND / 48.7)).astype(np.int64)
     streams = {
         "pressure": Samples(StreamFacts("counts", units="1", channels=280, rate_hz=48.7), time, counts),
-        "force": Samples(StreamFacts("force", units="N", channels=1, rate_hz=48.5), other, chamber),
+        "force": Samples(StreamFacts("force", units="N", channels=1, rate_hz=48.7), time, chamber.reshape(-1, 1)),
     }
     path = Recording(SessionFacts(epoch=datetime(2023, 1, 1, tzinfo=UTC)), streams, None).write(tmp_path / "s.h5")
     with open_session(path) as session:
