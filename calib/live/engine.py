@@ -55,20 +55,24 @@ class RestLevels:
     def __init__(self, seconds: float):
         self._seconds = seconds
         self._since: int | None = None
-        self._rows: list[tuple[np.ndarray, np.ndarray]] = []
+        self._rows: list[tuple[np.ndarray, np.ndarray, int]] = []
         self.levels: tuple[np.ndarray, np.ndarray] | None = None
         self.change = np.zeros(0)
 
     def add(self, arrival: ReceivedFrame) -> None:
         """Add a frame without contact."""
         self._since = arrival.host if self._since is None else self._since
-        self._rows.append((arrival.voltage, arrival.pressure))
+        self._rows.append((arrival.voltage, arrival.pressure, arrival.host))
         if arrival.host - self._since >= self._seconds * 1e9:
-            voltages, pressures = zip(*self._rows, strict=True)
+            voltages, pressures, _ = zip(*self._rows, strict=True)
             first, second = np.array_split(np.stack(pressures), 2)
             self.levels = finite_mean(np.stack(voltages)), finite_mean(np.stack(pressures))
             self.change = finite_mean(second) - finite_mean(first) if len(second) else np.zeros_like(pressures[0])
-            self._rows = []
+
+    def slide(self) -> None:
+        """Drop the first half of the frames, and wait for as many new ones."""
+        self._rows = self._rows[-(-len(self._rows) // 2) :]
+        self._since, self.levels = (self._rows[0][2] if self._rows else None), None
 
 
 class FrameForces(NamedTuple):
@@ -235,13 +239,14 @@ class Engine:
         return self._negative_since is not None and now - self._negative_since > MAX_NEGATIVE_TIME * 1e9
 
     def _add_rest(self, arrival: ReceivedFrame) -> None:
-        """Add a frame to the rest levels, and begin anew if the skin was pressed or released meanwhile."""
+        """Add a frame to the rest levels, and go on measuring if the skin was pressed or released meanwhile."""
         self._rest_levels.add(arrival)
         if self._rest_levels.levels is not None:
             change = np.nan_to_num(self._rest_levels.change)
             found = self._programs.map(np.zeros(arrival.voltage.size), change, self._programs.nowhere, self._before)
             self.restless = bool((found.loaded | found.negative).any())
-            self._rest_levels = RestLevels(self._rest) if self.restless else self._rest_levels
+            if self.restless:
+                self._rest_levels.slide()
 
     def _note_negative(self, negative: np.ndarray, loaded: np.ndarray, now: int) -> None:
         """Note since when pads read below zero while none is pressed."""

@@ -173,14 +173,14 @@ def test_zero_may_be_set_again(calibration):
 def test_zero_waits_for_rest(calibration):
     """A skin that is pressed or released while zero is measured is not at rest."""
     engine = Engine(calibration, 1.0)
-    for n in range(8):
+    for n in range(7):
         pressure = 60.0 if n < 5 else 10.0
         assert engine.step(arrival([pressure, 20.0], n * S // 2)) is None
         assert engine.restless == (n >= 5)  # the windows are frames 0 to 2, which are alike, and 3 to 5
         if n == 2:
             engine.tare()
     assert "at rest" in engine.state
-    assert engine.step(arrival([10.0, 20.0], 4 * S)) is None
+    assert engine.step(arrival([10.0, 20.0], 7 * S // 2)) is None
     assert engine.state == "running"
     np.testing.assert_allclose(engine.step(arrival([11.0, 20.0], 5 * S)).force, [1.0, 0.0])
 
