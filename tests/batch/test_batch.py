@@ -329,7 +329,7 @@ def test_a_log_is_done_once_and_shown_in_the_table(logs, tmp_path):
 
 def test_auto_lets_all_curves_compete_for_a_log(logs, tmp_path, monkeypatch):
     tried = []
-    monkeypatch.setattr(batch_logs, "fit_session", lambda session, curves, loss: tried.append(len(curves)))
+    monkeypatch.setattr(batch_logs, "fit_session", lambda session, curves, loss, **_: tried.append(len(curves)))
     recipe = calib.Recipe(curve=curve_choice("auto"))
     assert batch.calibrate_many(logs[:1], tmp_path / "out", executor=Here(), recipe=recipe)[0].reason
     assert tried == [len(calib.fitting.CURVES.shipped)]
