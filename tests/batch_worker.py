@@ -27,7 +27,7 @@ def begin_quick(made: str, log: str) -> None:
         os.close(file)
 
     Calibration.save = logged
-    batch.calibrate = lambda sessions, **options: ready
+    batch.calibrate = lambda sessions, skin, **options: ready
 
 
 def begin_deadly(made: str) -> None:
@@ -35,7 +35,7 @@ def begin_deadly(made: str) -> None:
     begin()
     ready = load_calibration(made)
 
-    def calibrate(sessions, **options):
+    def calibrate(sessions, skin, **options):
         if sessions[0].name == "kills.h5":
             os._exit(9)
         return ready

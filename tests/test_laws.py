@@ -24,7 +24,7 @@ ORDER = [
     "imaging", "metrics", "fusion", "contacts", "scan", "accuracy",
 ]  # fmt: skip
 BENCH = [
-    "_lazy", "session", "presses", "fitting", "calibration", "runtime", "record", "bench", "check", "live", "report",
+    "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "bench", "live", "report",
     "batch", "cli",
 ]  # fmt: skip
 

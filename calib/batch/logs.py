@@ -22,13 +22,16 @@ def log_summary(path: str, mark: str) -> dict[str, float]:
     return {}
 
 
-def fit_log_into(path: str, session: Session, recipe: Recipe, mark: str) -> Mapping[str, float]:
+def fit_log_into(
+    path: str, session: Session, recipe: Recipe, mark: str, ignore_errors: bool = False
+) -> Mapping[str, float]:
     """Fit the curve of a session without EIT, write it with its mark, and return its summary.
 
     Raises:
         SessionError, FitError: if a stream is missing or nothing can be fitted.
+        RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
     """
-    found = fit_session(session, _curves(recipe), recipe.loss)
+    found = fit_session(session, _curves(recipe), recipe.loss, ignore_errors=ignore_errors)
     held = found.fit.held_out
     summary = dict(zip(SUMMARY, map(float, (held.n, held.rmse, held.percent_full_scale)), strict=True))
     save_logs({session.name: found}, path, batch=mark, **summary)

@@ -71,8 +71,8 @@ class Outcome:
 class _Task:
     """A session, where its results go, and all that a worker needs to know.
 
-    The choices (skin, recipe) are pickled, so that a worker takes over the settings of JAX before it reads numbers of
-    64 bits; the mark is a digest of them.
+    The choices (skin, recipe, whether errors are ignored) are pickled, so that a worker takes over the settings of JAX
+    before it reads numbers of 64 bits; the mark is a digest of them.
     """
 
     session: str
@@ -89,6 +89,7 @@ def calibrate_many(
     *,
     recipe: Recipe | None = None,
     skin: je.Skin | None = None,
+    ignore_errors: bool = False,
     executor: Executor | None = None,
     jobs: int | None = None,
     report: bool = False,
@@ -99,7 +100,7 @@ def calibrate_many(
     Args:
         paths: of session files.
         out: a folder, made if need be; sessions that are done there already are skipped.
-        recipe, skin: as for `calibrate`.
+        recipe, skin, ignore_errors: as for `calibrate`.
         executor: what runs the work; default: a pool of spawned processes with one thread of computation each.
             `distributed.Client(address).get_executor(pure=False)` is one too; its workers must see the same files.
         jobs: processes of the default pool; default: one a core.
@@ -116,7 +117,7 @@ def calibrate_many(
     """
     if report:
         require_matplotlib()
-    tasks = _tasks(paths, Path(out), report, skin, recipe or Recipe())
+    tasks = _tasks(paths, Path(out), report, skin, recipe or Recipe(), ignore_errors)
     outcomes: dict[str, Outcome] = {}
 
     def note(outcome: Outcome) -> None:
@@ -132,16 +133,21 @@ def calibrate_many(
 
 
 def _tasks(
-    paths: Sequence[str | os.PathLike[str]], out: Path, report: bool, skin: je.Skin | None, recipe: Recipe
+    paths: Sequence[str | os.PathLike[str]],
+    out: Path,
+    report: bool,
+    skin: je.Skin | None,
+    recipe: Recipe,
+    ignore_errors: bool,
 ) -> list[_Task]:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
-    mark = _digest(recipe.to_toml(), _described(skin), je.__version__, jax.__version__)
+    mark = _digest(recipe.to_toml(), _described(skin), str(ignore_errors), je.__version__, jax.__version__)
     shared: dict[str, Any] = {
         "report": report,
-        "choices": pickle.dumps((skin, recipe)),
+        "choices": pickle.dumps((skin, recipe, ignore_errors)),
         "mark": mark,
         "settings": settings(),
     }
@@ -293,8 +299,8 @@ def _fitted_log(task: _Task, session: Session, mark: str) -> Outcome:
     outcome = Outcome(task.session, task.calibration, simulated=session.simulated)
     if summary := log_summary(task.calibration, mark):
         return replace(outcome, skipped=True, summary=summary)
-    _, recipe = pickle.loads(task.choices)
-    return replace(outcome, summary=fit_log_into(task.calibration, session, recipe, mark))
+    _, recipe, ignore_errors = pickle.loads(task.choices)
+    return replace(outcome, summary=fit_log_into(task.calibration, session, recipe, mark, ignore_errors))
 
 
 def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
@@ -304,8 +310,8 @@ def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, 
         if found.provenance.get("batch") == mark:
             return found, True
     _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
-    skin, recipe = pickle.loads(task.choices)
-    made = calibrate([session], skin, recipe=recipe)
+    skin, recipe, ignore_errors = pickle.loads(task.choices)
+    made = calibrate([session], skin, recipe=recipe, ignore_errors=ignore_errors)
     made = replace(made, provenance=made.provenance | {"batch": mark})
     made.save(task.calibration)
     return made, False

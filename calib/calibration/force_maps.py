@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 
+from ..check.acceptance import accept
 from ..fitting.curves import FittedCurve
 from ..fitting.curves.samples import bucket
 from ..fitting.fields import FittedField, Places
@@ -26,6 +27,7 @@ from .localisation import AbstractLocator
 
 FORMAT = "skin-forcemap"
 _BLOCK = 512  # frames held in memory at once
+USED = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session that forces are made of
 _MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
@@ -209,17 +211,25 @@ def apply(
     path: str | Path,
     *,
     processing: Processing | None = None,
+    ignore_errors: bool = False,
     progress: Progress = iter,
 ) -> Path:
     """Write the force map of every EIT frame of a session; memory does not grow with its length.
 
     The file, format skin-forcemap, appears only when complete.
 
+    Args:
+        processing: how the session is corrected; default: as those that were calibrated from.
+        ignore_errors: apply also to a session whose frames or pressures `check_session` finds an error in; the file
+            then names the errors.
+
     Raises:
-        SessionError: if the session was recorded on another skin or lacks a stream.
+        SessionError: if the session was recorded on another skin, lacks a stream, or holds no frame.
+        RecordingError: if `check_session` finds an error in its skin, frames or pressures.
     """
     processing = processing or calibration.processing
     levels = resting_levels(session, calibration.skin, processing)
+    ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     eit, pressure = session.stream("eit"), session.stream("pressure")
     filters = {s.name: processing.of(s)[0] for s in (eit, pressure)}
     recon = calibration.recon
@@ -233,6 +243,7 @@ def apply(
         "image_columns": recon.shape[1],
         "calibration_created_utc": calibration.provenance["created_utc"],
     }
+    attrs |= {"ignored_errors": "\n".join(ignored)} if ignored else {}
     kinds = _rows(calibration)
     with ArchiveWriter(path, FORMAT, attrs) as writer:
         writer.add("centres", np.asarray(recon.centres), "m", "centres of the pixels")

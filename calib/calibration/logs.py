@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ..check.acceptance import accept
 from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ..fitting.curves import CURVES, AbstractCurve, Linear
 from ..fitting.logs import BlendChannels, LogFit, SmoothChannels, fit_log, time_split
 from ..fitting.losses import AbstractLoss, SoftL1
-from ..fitting.results import FitError
+from ..fitting.results import FitError, FitResult
 from ..fitting.selection import Tried, simplest
 from ..presses.streams import resample
 from ..session import Session, Stream, write_archive
@@ -44,7 +45,13 @@ class SessionFit:
         return tuple(unit.replace("Pa", self.unit) for unit in self.fit.fitted.curve.units)
 
 
-def fit_session(session: Session, curves: Sequence[AbstractCurve], loss: AbstractLoss | None = None) -> SessionFit:
+def fit_session(
+    session: Session,
+    curves: Sequence[AbstractCurve],
+    loss: AbstractLoss | None = None,
+    *,
+    ignore_errors: bool = False,
+) -> SessionFit:
     """Fit force against the session's signal on its first half; the second half is held out.
 
     The signal is the stream "pressure", or the only one that is not a force, a place or the weather;
@@ -53,18 +60,37 @@ def fit_session(session: Session, curves: Sequence[AbstractCurve], loss: Abstrac
     it, of several channels, the way to make one signal of them: a static blend, or a Gaussian process that knows of
     creep. Channels of a wide array that are dead, stuck or silent on the first half are left out of both.
 
+    Args:
+        ignore_errors: fit also a session in which `check_session` finds an error, and note it.
+
     Raises:
         SessionError, FitError: if a stream is missing or nothing can be fitted.
+        RecordingError: if `check_session` finds an error in the session.
     """
+    ignored = accept([session], None, ignore_errors=ignore_errors)
     force, signal = session.stream("force"), _signal(session)
     values = resample(signal.time, signal.read(), force.time)
     log = _Log(force.time, values, force.read()[:, 0], loss or SoftL1())
     log, note = _informative(log, f"{session.name}: /streams/{signal.name}")
     unit = "N" if signal.channels > 1 else _unit(signal)
+    note = "; ".join(filter(None, [*ignored, note]))
     if len(curves) == 1:
-        return SessionFit(fit_log(curves[0], log.time, log.values, log.force, loss=log.loss), unit, note=note)
-    fit, why = _chosen(log, curves)
+        fit, why = fit_log(curves[0], log.time, log.values, log.force, loss=log.loss), ""
+    else:
+        fit, why = _chosen(log, curves)
+    _require_fit(session, fit)
     return SessionFit(fit, unit, why, note)
+
+
+def _require_fit(session: Session, fit: LogFit) -> None:
+    fitted = fit.fitted
+    if not _converged(fit) or not np.isfinite(np.asarray(fitted.parameters)).all() or not np.isfinite(fit.train.rmse):
+        curve = CURVES.name_of(fitted.curve)
+        raise FitError(f"{session.name}: the {curve} curve could not be fitted: {fitted.message()}")
+
+
+def _converged(fit: LogFit) -> bool:
+    return int(fit.fitted.result) == FitResult.SUCCESS
 
 
 def _unit(signal: Stream) -> str:
@@ -111,8 +137,11 @@ class _Log:
         return way(self.time, self.values, np.where(known, self.force, np.nan), Linear())
 
     def errors(self, curve: AbstractCurve, signal: np.ndarray) -> np.ndarray:
-        """Mean square errors on stretches of its second half, N^2, of a curve fitted on the first."""
-        predicted = fit_log(curve, self.time, signal, self.force, loss=self.loss).predicted
+        """Mean square errors on stretches of its second half, N^2, of a curve fitted on the first; NaN: no fit."""
+        fit = fit_log(curve, self.time, signal, self.force, loss=self.loss)
+        if not _converged(fit):
+            return np.full(_STRETCHES, np.nan)
+        predicted = fit.predicted
         _, rest = time_split(self.time)
         rest &= np.isfinite(self.force) & np.isfinite(signal.reshape(len(rest), -1)).all(1)
         return np.array([np.mean(part**2) for part in np.array_split((predicted - self.force)[rest], _STRETCHES)])

@@ -9,6 +9,7 @@ import numpy as np
 
 import jaxeit as je
 
+from ..check.acceptance import accept
 from ..fitting.fields import single_places
 from ..fitting.pads import Hybrid
 from ..fitting.response import PadResponse, fit_response, fitting_problem, hold_out_response, require_every_pad_pressed
@@ -30,6 +31,7 @@ def calibrate(
     skin: je.Skin | None = None,
     *,
     recipe: Recipe | None = None,
+    ignore_errors: bool = False,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Calibration:
     """Fit one pressure-force curve per pad, and a correction by location, and prepare the image reconstruction.
@@ -38,10 +40,13 @@ def calibrate(
         sessions: recorded on one skin, from `open_session`.
         skin: default: the one described in the first session.
         recipe: all choices on the way; default: those of the paper.
+        ignore_errors: calibrate also from sessions in which `check_session` finds an error; the errors are then kept in
+            the calibration's notes and provenance.
         progress: told the name of each of the `STAGES` as it begins.
 
     Raises:
         SessionError: a session cannot be used, or was recorded on another skin.
+        RecordingError: `check_session` finds an error in a session.
         FitError: a pad was not pressed enough to fit its curve, or there are too few presses for a field.
         InverseError, HyperparameterError: no image can be made as the recipe asks.
     """
@@ -51,6 +56,7 @@ def calibrate(
     skin = skin or je.skin.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
     progress("reading")
     presses = pool_presses(sessions, skin, recipe.processing)
+    ignored = accept(sessions, skin, ignore_errors=ignore_errors)
     require_every_pad_pressed(skin, presses.data)
     progress("model and images")
     imager = prepare_imager(skin, presses, recipe)
@@ -80,9 +86,9 @@ def calibrate(
             recipe=choice.title,
             splits=held_out.splits,
         ),
-        provenance=_provenance(sessions, recipe, imager, response),
+        provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=(*presses.notes, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
+        notes=(*ignored, *presses.notes, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
         field=hybrid.field,
         locator=imager.locator if hybrid.field is not None else None,
         baseline=response.baseline,
@@ -99,8 +105,11 @@ def _gains(hybrid: Hybrid, images: PressImages) -> np.ndarray | None:
     return np.asarray(np.exp(hybrid.log_gains(images.places)))
 
 
-def _provenance(sessions: Sequence[Session], recipe: Recipe, imager: Imager, response: PadResponse) -> dict[str, str]:
+def _provenance(
+    sessions: Sequence[Session], recipe: Recipe, imager: Imager, response: PadResponse, ignored: Sequence[str]
+) -> dict[str, str]:
     return {
+        **({"ignored_errors": "\n".join(ignored)} if ignored else {}),
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, Python {platform.python_version()}",
         "sessions": "\n".join(f"{s.hash}  {s.name}" for s in sessions),
@@ -108,16 +117,25 @@ def _provenance(sessions: Sequence[Session], recipe: Recipe, imager: Imager, res
     }
 
 
-def evaluate(calibration: Calibration, session: Session, processing: Processing | None = None) -> Evaluation:
+def evaluate(
+    calibration: Calibration,
+    session: Session,
+    processing: Processing | None = None,
+    *,
+    ignore_errors: bool = False,
+) -> Evaluation:
     """How well a calibration does on the presses of another session.
 
     Args:
         processing: how the session is cut and corrected; default: as those that were calibrated from.
+        ignore_errors: evaluate also on a session in which `check_session` finds an error, and note it.
 
     Raises:
         SessionError: if the session was recorded on another skin or cannot be used.
+        RecordingError: if `check_session` finds an error in the session.
     """
     found = measure(session, calibration.skin, processing or calibration.processing)
+    ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
     force, _, _ = calibration.pad_forces(found.pressure, images.places)
@@ -130,7 +148,7 @@ def evaluate(calibration: Calibration, session: Session, processing: Processing 
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
         held_out_by="session",
-        notes=found.notes,
+        notes=(*ignored, *found.notes),
         others=_by_others(calibration, found, images.integral),
         recipe=calibration.evaluation.recipe,
     )

@@ -19,6 +19,8 @@ NOISE_RATIO = 5.0  # over the median noise of the readings
 MAX_RECIPROCITY_ERROR = 0.02
 SATURATED_FRACTION = 0.01  # of the samples at the converter's end
 MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the converter's end; fewer may be chance
+MAX_EMPTY_FRACTION = 0.25  # of the readings without a value, up to which the others make an image
+MAX_SATURATED_FRACTION = 0.05  # of the readings: those beside the drive may clip without much harm to an image
 MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
 AMPLITUDE_RATIO_RANGE = 0.03, 30.0  # of measured over modelled voltage: outside it, a unit is wrong
 MIN_CORRELATION = 0.9  # with the model: readings below it do not look like this skin
@@ -133,11 +135,17 @@ def _saturated(stats: StreamStatistics) -> np.ndarray:
 
 def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[Finding]:
     where = "/streams/eit"
-    dead, remedy = table.dead, "check the wires and terminals of these electrodes"
+    remedy = "check the wires and terminals of these electrodes"
+    empty = stats.finite == 0
+    # A calibration leaves out readings without a value, and so loses little if they are few.
+    severity = Severity.WARNING if empty.mean() < MAX_EMPTY_FRACTION else Severity.ERROR
+    yield from _channel_list_finding(empty, table, severity, "hold no finite value (dead)", remedy)
+    dead = table.dead & ~empty
     yield from _channel_list_finding(dead, table, Severity.ERROR, _dead_text(stats, dead), remedy)
     what = "sit at the converter's end (saturated)"
     gain = "lower the gain or the drive current"
-    yield from _channel_list_finding(table.saturated, table, Severity.ERROR, what, gain)
+    severity = Severity.WARNING if table.saturated.mean() < MAX_SATURATED_FRACTION else Severity.ERROR
+    yield from _channel_list_finding(table.saturated, table, severity, what, gain)
     what = f"are more than {NOISE_RATIO:g} times noisier than most and below {MIN_SNR:g} dB"
     yield from _channel_list_finding(table.noisy, table, Severity.WARNING, what, remedy)
     snr = table.snr[~table.bad & ~np.isnan(table.snr)]
@@ -156,8 +164,6 @@ def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[
 
 
 def _dead_text(stats: StreamStatistics, dead: np.ndarray) -> str:
-    if (stats.finite[dead] == 0).all():
-        return "hold no finite value (dead)"
     if (stats.low[dead] == 0).all():
         return "are always zero (dead)"
     return "never change (dead)"

@@ -105,6 +105,10 @@ def _array_findings(stats: StreamStatistics, force: Stream | None) -> Iterator[F
     kinds = {
         "hold no finite sample (dead)": (found.dead, repair),
         "have one value in 99 % of the samples (stuck)": (found.stuck, repair),
+        "sit at one end of the range of all for 1 % of the samples (saturated)": (
+            found.saturated,
+            "lower the gain, or press less: the fit of such a channel is wrong there",
+        ),
         "do not follow the force (silent)": (found.silent, repair),
         "jump away from their neighbours in time and back (spiking)": (found.spiking, "check their wires and plugs"),
     }

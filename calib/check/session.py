@@ -6,14 +6,21 @@ import numpy as np
 
 import jaxeit as je
 
+from ..presses.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
+from .clocks import compare_clocks, lag_findings
 from .eit import check_eit
+from .evidence import PressEvidence
+from .force import force_findings
 from .pads import check_pads
-from .presses import list_presses, press_findings, press_summary
-from .report import CheckReport, Finding, Severity
+from .places import place_findings
+from .presses import NAMES, list_presses, press_evidence, press_summary
+from .reading_order import OrderCheck
+from .report import ChannelTable, CheckReport, Finding, Severity
+from .responses import pad_response_findings, reading_response_findings
 from .skin import check_skin
-from .streams import Progress, stream_findings, stream_statistics
+from .streams import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
 
 
 def check_session(
@@ -38,10 +45,13 @@ def check_session(
     statistics = stream_statistics(session, skin, progress, findings)
     for stats in statistics.values():
         findings += stream_findings(stats)
+        findings += [] if session.simulated else copy_findings(stats)  # a simulation may be free of noise
     presses, source = list_presses(session, statistics, findings)
-    presses, onsets = press_findings(statistics, presses, skin, findings)
+    evidence = press_evidence(statistics, presses, findings)
+    presses = presses if evidence is None else evidence.presses
     channels, order = check_eit(session, statistics.get("eit"), presses, skin, transfer, findings)
     pads = check_pads(statistics, skin, findings)
+    onsets = _compare(session, statistics, evidence, skin, channels, order, findings)
     return CheckReport(
         name=session.name,
         title=session.title,
@@ -56,6 +66,36 @@ def check_session(
         presses=press_summary(presses, source),
         onsets=onsets,
     )
+
+
+def _compare(
+    session: Session,
+    statistics: dict[str, StreamStatistics],
+    evidence: PressEvidence | None,
+    skin: je.Skin | None,
+    channels: ChannelTable | None,
+    order: OrderCheck | None,
+    findings: list[Finding],
+) -> tuple[tuple[str, OnsetDelay], ...]:
+    """Compare the streams with each other by the presses that all of them see; returns the onset delays by stream."""
+    if evidence is None or not len(evidence.number):
+        return ()
+    streams = {name: s.stream for name, s in statistics.items() if name in NAMES}
+    onsets = compare_clocks(streams, evidence, findings)
+    findings += lag_findings(statistics, findings)
+    if "force" in statistics:
+        findings += force_findings(evidence, skin, statistics["force"])
+    if channels is not None:
+        findings += reading_response_findings(evidence, channels)
+    if skin is None:
+        return onsets
+    # A wrong order of the readings, or of the pads, would show as wrong places too.
+    pattern = None if order is None or order.claimed else session.pattern
+    places = list(place_findings(evidence, skin, pattern, {n: s.stream for n, s in statistics.items()}))
+    findings += places
+    if all(f.severity < Severity.ERROR for f in places):
+        findings += pad_response_findings(evidence, skin)
+    return onsets
 
 
 def _session_findings(session: Session) -> Iterator[Finding]:

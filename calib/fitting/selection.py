@@ -9,6 +9,7 @@ from .curves import CURVES, AbstractCurve
 from .fields import FIELDS, AbstractField
 from .losses import AbstractLoss
 from .pads import LocatedPresses, fit_hybrid, sample_forces
+from .results import FitResult
 
 
 class Candidate(NamedTuple):
@@ -123,11 +124,16 @@ def choose(
 def place_errors(
     curve: AbstractCurve, field: AbstractField | None, presses: LocatedPresses, loss: AbstractLoss, fold: np.ndarray
 ) -> np.ndarray:
-    """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place."""
+    """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place.
+
+    NaN at all places if one of the fits fails: its numbers must not be compared with those of others.
+    """
     data = presses.data
     total = np.full(data.sample_force.shape, np.nan)
     for k in np.unique(fold):
         hybrid = fit_hybrid(curve, field, presses, loss, use=fold != k)
+        if (np.asarray(hybrid.curves.result) != FitResult.SUCCESS).any():
+            return np.full(data.place.max() + 1, np.nan)
         held = fold[data.sample_press] == k
         total[held] = sample_forces(hybrid, presses).sum(0)[held]
     square = (total - data.sample_force) ** 2

@@ -12,16 +12,30 @@ from .streams import MAD_TO_SIGMA, ReadableStream, index_ranges
 from .times import PressColumns
 from .windows import PressWindows
 
-RISE_FRACTION = 0.5  # of the way from rest to hold: the steepest part of a ramp, and far from noise at either end
+RISE_FRACTIONS = (0.2, 0.5, 0.8)  # of the way from rest to hold: far from noise at either end
+HALF = RISE_FRACTIONS.index(0.5)
 
 
 @dataclass(frozen=True)
 class OnsetDelay:
-    """Delay of a stream after the force: median and MAD-based spread over presses (s), and number of presses used."""
+    """Delay of a stream after the force.
+
+    | field   | meaning                                                                             | unit |
+    |---------|-------------------------------------------------------------------------------------|------|
+    | delay   | at half of the hold value, median over presses                                      | s    |
+    | spread  | of that delay over presses, from the median absolute deviation                      | s    |
+    | presses | number of presses used                                                              |      |
+    | shift   | part of the delay that all of `RISE_FRACTIONS` share: the least of their delays, or | s    |
+    |         | 0 if their signs differ                                                             |      |
+
+    A clock moves the whole rise alike. A curved response, friction and creep move its parts differently, and the start
+    of the rise hardly at all, so that `shift` is what a clock alone may explain.
+    """
 
     delay: float
     spread: float
     presses: int
+    shift: float
 
 
 def crossing(time: np.ndarray, signal: np.ndarray, level: float) -> float:
@@ -40,15 +54,16 @@ def _magnitude(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(values[:, good], axis=1))
 
 
-def _rise_time(stream: ReadableStream, windows: PressWindows, i: int) -> float:
-    """Time (ns) from the contact to the rise through `RISE_FRACTION` of the way from rest to hold."""
+def _rise_times(stream: ReadableStream, windows: PressWindows, i: int) -> list[float]:
+    """Times (ns) from the contact to the rise through `RISE_FRACTIONS` of the way from rest to hold."""
     time, values = remove_baseline(stream, windows, i, TwoSided(), ())
     signal = _magnitude(values)
     rest, hold = (
         float(signal[slice(*index_ranges(time, getattr(windows, name)[i]))].mean()) for name in ("rest_before", "hold")
     )
     stop = np.searchsorted(time, windows.hold[i, 0])
-    return float(crossing(time[:stop], signal[:stop], rest + RISE_FRACTION * (hold - rest)) - windows.ramp[i, 0])
+    levels = [rest + fraction * (hold - rest) for fraction in RISE_FRACTIONS]
+    return [crossing(time[:stop], signal[:stop], level) - float(windows.ramp[i, 0]) for level in levels]
 
 
 def onset_delays(
@@ -57,23 +72,28 @@ def onset_delays(
     presses: PressColumns,
     windows: PressWindows,
 ) -> dict[str, OnsetDelay]:
-    """Delay of each stream after the force at half of the hold value, by name of the stream.
+    """Delay of each stream after the force, by name of the stream.
 
     The delay checks clocks and is no clock itself: a curved response shifts the crossing too (a stream that follows
-    force**0.7 reaches half its value sooner), so a delay well below the ramp time does not prove a wrong clock.
+    force**0.7 reaches half its value sooner), which `OnsetDelay.shift` leaves out as far as it can be told.
     """
     rows = np.flatnonzero(presses.accepted)
 
     def rise_times(stream: ReadableStream) -> np.ndarray:
-        return np.array([_rise_time(stream, windows, int(i)) for i in rows])
+        return np.array([_rise_times(stream, windows, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS))
 
     reference = rise_times(force)
     return {stream.name: _onset_delay(rise_times(stream) - reference) for stream in others}
 
 
-def _onset_delay(delay: np.ndarray) -> OnsetDelay:
-    good = delay[np.isfinite(delay)] / SECOND
+def _onset_delay(delays: np.ndarray) -> OnsetDelay:
+    """Summary of delays (presses, fractions) in ns."""
+    good = delays[np.isfinite(delays[:, HALF])] / SECOND
     if not len(good):
-        return OnsetDelay(float("nan"), float("nan"), 0)
-    middle = float(np.median(good))
-    return OnsetDelay(middle, float(MAD_TO_SIGMA * np.median(np.abs(good - middle))), len(good))
+        return OnsetDelay(float("nan"), float("nan"), 0, float("nan"))
+    middle = float(np.median(good[:, HALF]))
+    spread = float(MAD_TO_SIGMA * np.median(np.abs(good[:, HALF] - middle)))
+    sign = np.sign(good[:, HALF])
+    one_sign = ((np.sign(good) == sign[:, None]) | np.isnan(good)).all(axis=1)
+    shift = np.where(one_sign, sign * np.nanmin(np.abs(good), axis=1), 0.0)
+    return OnsetDelay(middle, spread, len(good), float(np.median(shift)))

@@ -143,6 +143,9 @@ def _error(session: Session, where: str, what: str, todo: str) -> SessionError:
 
 
 def _require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) -> None:
+    for name, stream in streams.items():
+        if not len(stream):
+            raise _error(session, f"/streams/{name}", "holds no sample", "record again")
     pattern = session.pattern
     if pattern is None:
         raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
@@ -230,6 +233,8 @@ def _without_force(force: np.ndarray, pressure: np.ndarray) -> Sequence[str]:
 
 
 def _why_none(presses: PressTable) -> str:
+    if not len(presses):
+        return "no press is listed or found in the force"
     reasons = sorted({r for r in presses.reason if r})
     return f"none of {len(presses)} presses can be used" + (f": {reasons[0]}" if reasons else "")
 

@@ -13,7 +13,7 @@ Functions of this room accept any table with the columns of `PressColumns`: the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -69,3 +69,10 @@ def reject(presses: P, reasons: Sequence[str]) -> P:
     why = tuple(old or new for old, new in zip(presses.reason, reasons, strict=True))
     accepted = presses.accepted & np.array([not r for r in reasons], bool)
     return replace(presses, accepted=accepted, reason=why)  # type: ignore[type-var]
+
+
+def select(presses: P, rows: np.ndarray) -> P:
+    """Some of the presses, in the order of `rows`."""
+    columns = {f.name: getattr(presses, f.name) for f in fields(presses)}  # type: ignore[arg-type]
+    chosen = {n: tuple(c[i] for i in rows.tolist()) if isinstance(c, tuple) else c[rows] for n, c in columns.items()}
+    return replace(presses, **chosen)  # type: ignore[type-var]

@@ -54,7 +54,7 @@ def quick(made, monkeypatch):
     """Calibrations that take no time; the sessions for which one was made."""
     ready, names = calib.load_calibration(made[0] / "testbed_grid.h5"), []
 
-    def calibrate(sessions, skin, *, recipe):
+    def calibrate(sessions, skin, *, recipe, ignore_errors):
         names.append(sessions[0].name)
         return ready
 
@@ -329,7 +329,7 @@ def test_a_log_is_done_once_and_shown_in_the_table(logs, tmp_path):
 
 def test_auto_lets_all_curves_compete_for_a_log(logs, tmp_path, monkeypatch):
     tried = []
-    monkeypatch.setattr(batch_logs, "fit_session", lambda session, curves, loss: tried.append(len(curves)))
+    monkeypatch.setattr(batch_logs, "fit_session", lambda session, curves, loss, **_: tried.append(len(curves)))
     recipe = calib.Recipe(curve=curve_choice("auto"))
     assert batch.calibrate_many(logs[:1], tmp_path / "out", executor=Here(), recipe=recipe)[0].reason
     assert tried == [len(calib.fitting.CURVES.shipped)]

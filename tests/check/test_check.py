@@ -221,6 +221,13 @@ def test_faulty_channels_of_an_array_are_named(parts, look):
     assert report.count(Severity.WARNING) == 4
 
 
+def test_a_saturated_channel_of_an_array_is_named(parts, look):
+    array_log(parts, faulty=False)
+    values = parts.values("pressure")
+    values[:, 11] = np.minimum(3 * values[:, 11], 4000.0)  # beyond the range of the others
+    only(look(parts), Severity.WARNING, "/streams/pressure", "1 of 12 channels", "(saturated): 11")
+
+
 def test_a_healthy_array_has_no_finding_above_a_note(parts, look):
     array_log(parts, faulty=False)
     assert all(f.severity is Severity.OK for f in look(parts).findings)
@@ -310,13 +317,25 @@ def test_millivolts_are_suspected(parts, look):
 # --- channels ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("value", "words"), [(0.0, "always zero"), (np.nan, "no finite"), (0.1, "never change")])
-def test_dead_readings_are_listed(value, words, parts, look):
+@pytest.mark.parametrize(
+    ("value", "severity", "words"),
+    [
+        (0.0, Severity.ERROR, "always zero"),
+        (0.1, Severity.ERROR, "never change"),
+        (np.nan, Severity.WARNING, "no finite"),  # a calibration leaves these out
+    ],
+)
+def test_dead_readings_are_listed(value, severity, words, parts, look):
     parts.values("eit")[:, [7, 300]] = value
     report = look(parts)
-    only(report, Severity.ERROR, "2 of 550 readings", words, ": 7, 300")
+    only(report, severity, "2 of 550 readings", words, ": 7, 300")
     assert json.loads(to_json(report))["channels"]["dead"][7] is True
     assert np.flatnonzero(report.channels.dead).tolist() == [7, 300]
+
+
+def test_readings_without_any_value_are_an_error_if_they_are_many(parts, look):
+    parts.values("eit")[:, ::2] = np.nan
+    has(look(parts), Severity.ERROR, "275 of 550 readings", "no finite")
 
 
 def test_a_dead_electrode_is_named(parts, look):
@@ -325,13 +344,14 @@ def test_a_dead_electrode_is_named(parts, look):
     only(look(parts), Severity.ERROR, f"{uses.sum()} of 550 readings", "all of them use electrode 12")
 
 
-def test_a_converter_at_its_end_is_saturated(parts, look):
+@pytest.mark.parametrize(("count", "severity"), [(20, Severity.WARNING), (80, Severity.ERROR)])
+def test_a_converter_at_its_end_is_saturated(count, severity, parts, look):
     eit = parts.values("eit")
-    limit = np.sort(np.abs(eit).max(0))[-20]
+    limit = np.sort(np.abs(eit).max(0))[-count]
     parts.change("eit", np.clip(eit, -limit, limit))
     report = look(parts)
-    has(report, Severity.ERROR, "saturated")
-    assert 10 <= report.channels.saturated.sum() + report.channels.dead.sum() <= 20
+    has(report, severity, "saturated")
+    assert 0.5 * count <= report.channels.saturated.sum() + report.channels.dead.sum() <= count
 
 
 def test_the_status_flag_tells_which_reading_is_saturated(parts, look):
@@ -488,7 +508,7 @@ def test_a_pressure_sensor_at_its_end(parts, look):
 
 def test_pads_in_another_order(parts, look):
     parts.change("pressure", parts.values("pressure")[:, [1, 0, 2, 3]])
-    parts.presses = table(x=np.array([0.05, 0.05]), y=np.array([0.05, 0.05]))
+    parts.presses = table(x=np.array([0.05, 0.05]), y=np.array([0.05, 0.05]), pad=np.array([0, 0]))
     pressure = parts.values("pressure")
     pressure[:, 1] += pressure[:, 3]
     pressure[:, 3] = pressure[::-1, 2]

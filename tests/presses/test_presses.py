@@ -227,6 +227,19 @@ def test_onset_delay_of_a_late_stream_is_found():
     assert onsets["same"].delay == 0.0
     assert onsets["eit"].presses == 6
     assert onsets["eit"].spread < 0.005
+    assert onsets["eit"].shift == pytest.approx(0.030, abs=0.005)
+
+
+def test_a_curved_response_is_delayed_but_not_shifted():
+    """What follows the square of the force rises late at its half, but begins and ends its rise with the force."""
+    times = edges(6)
+    time, presses = clock(200.0, 400.0), timeline(times)
+    force = trapezoids(time, times, 20.0)[:, None]
+    squared = ArrayStream("pressure", time, force**2)
+    found = onset_delays(ArrayStream("force", time, force), [squared], presses, press_windows(presses))["pressure"]
+    ramp = float(np.median(presses.t_hold0 - presses.t_press)) / 1e9
+    assert found.delay == pytest.approx((np.sqrt(0.5) - 0.5) * ramp, abs=0.01)
+    assert found.shift == pytest.approx((np.sqrt(0.8) - 0.8) * ramp, abs=0.01)
 
 
 def test_crossing_is_interpolated_and_final():

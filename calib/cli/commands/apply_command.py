@@ -12,6 +12,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("session", metavar="SESSION.h5")
     parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
+    text = "go on in spite of what `jaxeit check` calls an error; the results say so"
+    parser.add_argument("--force", action="store_true", help=text)
     add_low_pass_argument(parser)
 
 
@@ -32,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
             session,
             args.output,
             processing=processing_of(args, calibration.processing),
+            ignore_errors=args.force,
             progress=progress_bar("frames"),
         )
         frames = len(session.stream("eit"))

@@ -26,6 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "sessions the fit does not see, to judge it on"
     parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
+    text = "go on in spite of what `jaxeit check` calls an error; the results say so"
+    parser.add_argument("--force", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     many = parser.add_mutually_exclusive_group()
     text = "calibrate every session by itself, N at a time; those that are done in the output folder are skipped"
@@ -61,9 +63,9 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         if all("eit" not in session.streams for session in sessions):
             return _calibrate_logs(args, recipe, sessions)
         stages = stack.enter_context(stage_bar(len(STAGES)))
-        calibration = calibrate(sessions, skin, recipe=recipe, progress=stages)
+        calibration = calibrate(sessions, skin, recipe=recipe, ignore_errors=args.force, progress=stages)
         tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}
-        tried = {name: evaluate(calibration, session) for name, session in tests.items()}
+        tried = {name: evaluate(calibration, s, ignore_errors=args.force) for name, s in tests.items()}
     calibration.save(args.output)
     if args.report:
         from ...report.document import write_report
@@ -112,6 +114,7 @@ def _calibrate_many(args: argparse.Namespace) -> int:
             tell=tell,
             recipe=recipe_of(args),
             skin=skin_of(args.skin),
+            ignore_errors=args.force,
         )
     if args.json:
         print(json.dumps({o.session: o.summary or {"failed": o.reason} for o in outcomes}, indent=2, sort_keys=True))
@@ -131,7 +134,7 @@ def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence
     if given:
         raise ValueError(f"{', '.join(given)}: for sessions with EIT, and these hold none; leave it out")
     curves = tuple(CURVES.make(name) for name in CURVES.shipped) if args.curve == AUTO else recipe.curves
-    fits = {session.name: fit_session(session, curves, recipe.loss) for session in sessions}
+    fits = {s.name: fit_session(s, curves, recipe.loss, ignore_errors=args.force) for s in sessions}
     save_logs(fits, args.output)
     print("\n".join(render_log(name, fit) for name, fit in fits.items()))
     print(f"\nwrote {args.output}")

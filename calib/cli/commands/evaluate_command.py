@@ -13,6 +13,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
     add_low_pass_argument(parser)
+    text = "go on in spite of what `jaxeit check` calls an error; the results say so"
+    parser.add_argument("--force", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
 
 
@@ -29,7 +31,8 @@ def run(args: argparse.Namespace) -> int:
     results = {}
     for path in progress_bar("sessions")(args.sessions):
         with open_session(path) as session:
-            found = evaluate(calibration, session, processing_of(args, calibration.processing))
+            processing = processing_of(args, calibration.processing)
+            found = evaluate(calibration, session, processing, ignore_errors=args.force)
             heading = title(session.name, session.simulated)
         results[Path(path).name] = found.summary()
         if not args.json:

@@ -1,6 +1,7 @@
 """`jaxeit simulate`."""
 
 import argparse
+import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -58,12 +59,25 @@ def _serve(path: str) -> int:
 
     with open_session(path) as session:
         names = [name for name in ("eit", "pressure", "force") if name in session.streams]
+        skin = _name_skin(session.skin_name, session.skin_toml, Path(path))
     with SimulatedDevice([recording_packets(path, [name], rounds=10**6) for name in names]) as device:
-        where = " ".join(f"--{name} {url}" for name, url in zip(names, device.urls, strict=True))
+        urls = [word for name, url in zip(names, device.urls, strict=True) for word in (f"--{name}", url)]
+        command = shlex.join(["jaxeit", "record", "--skin", skin, *urls, "-o", "session.h5"])
         with suppress(KeyboardInterrupt):
-            print(f"serving {path}, SIMULATED; in another terminal: jaxeit record {where} -o session.h5", flush=True)
+            print(f"serving {path}, SIMULATED; in another terminal: {command}", flush=True)
             threading.Event().wait()
     return 0
+
+
+def _name_skin(name: str, text: str, session: Path) -> str:
+    """What `record --skin` needs: the name of a shipped skin, or a TOML file that is written beside the session."""
+    import jaxeit as je
+
+    if name in je.skin.shipped_skins() and je.load_skin(name).toml == text:
+        return name
+    path = session.with_suffix(".skin.toml")
+    path.write_text(text, encoding="utf-8")
+    return str(path)
 
 
 def _simulate_data_set(args: argparse.Namespace) -> int:

@@ -1,0 +1,105 @@
+"""Honest recordings are not accused: simulated sessions of all scenes, and real logs of others."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from scipy import io
+
+import jaxeit as je
+from benchmarks.bench_real import aligned
+from calib.bench import simulate
+from calib.check import Severity, check_session, transfer_matrix
+from calib.cli import main
+from calib.session import SessionFacts, StreamFacts, open_session
+
+from ..helpers import REAL_DATA
+from .honest import honest_bench
+from .recording import SECOND, Recording, Samples
+
+TRUE_WARNINGS = {
+    "DropOut": ("lost", "gap"),
+    "IntermittentElectrode": ("noisier than most", "median SNR"),
+    "ElectrodeFault": ("noisier than most",),
+}
+"""What an effect of a scene makes of a recording, and what may therefore be read of it."""
+
+
+@pytest.fixture(scope="module")
+def transfers():
+    """Transfer matrices by the name of the skin, computed once."""
+    return {name: transfer_matrix(je.load_skin(name)) for name in ("testbed", "chest")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(200))
+def test_an_honest_session_is_not_accused(number, transfers, tmp_path):
+    bench = honest_bench(number)
+    path = simulate(bench, tmp_path / "s.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    with open_session(path) as session:
+        report = check_session(session, transfer=transfers[bench.scene.skin.name])
+    allowed = [words for e in bench.scene.effects for words in TRUE_WARNINGS.get(type(e).__name__, ())]
+    raised = [f for f in report.findings if f.severity > Severity.OK]
+    assert report.ok, raised
+    assert [f for f in raised if not any(words in f.what for words in allowed)] == []
+
+
+def test_a_quick_honest_session_is_not_accused(transfers, tmp_path):
+    test_an_honest_session_is_not_accused(3, transfers, tmp_path)
+
+
+def real(name):
+    """A file of a real recording; the test skips where it is not at hand."""
+    path = REAL_DATA / name
+    if not path.exists():
+        pytest.skip(f"{name} is not at hand; set JAXEIT_REAL_DATA to its folder")
+    return path
+
+
+@pytest.mark.parametrize("name", ["Circle_1bar", "Circle_5bar", "O-ring257_3bar", "Stadium_1bar"])
+def test_a_pneumatic_cylinder_is_not_accused(name, tmp_path, capsys):
+    """Its friction lets the pressure rise late, and its pressure falls as the force rises in some of them."""
+    source = real(f"pneumatic_actuator/{name}.csv.gz")
+    streams = ["--stream", "pressure=5:bar", "--stream", "force=6:N"]
+    assert main(["import", "csv", str(source), "--time", "0:ms", *streams, "-o", str(tmp_path / "s.h5")]) == 0
+    with open_session(tmp_path / "s.h5") as session:
+        report = check_session(session)
+    capsys.readouterr()
+    warnings = [f for f in report.findings if f.severity > Severity.OK]
+    assert report.ok, warnings
+    assert all("gap" in f.what for f in warnings), warnings  # of up to 0.28 s; there are
+
+
+def test_a_magnetic_skin_is_not_accused(tmp_path, capsys):
+    source = real("eflesh/20250401_014340_probe/states.csv")
+    words = ["import", "csv", str(source), "--time", "0:s", "--stream", "force=4:g", "--missing", "-1"]
+    assert main([*words, "-o", str(tmp_path / "s.h5")]) == 0
+    with open_session(tmp_path / "s.h5") as session:
+        report = check_session(session)
+    capsys.readouterr()
+    raised = [f for f in report.findings if f.severity > Severity.OK]
+    assert report.ok, raised
+    assert all("irregularly" in f.what or "missing" in f.what for f in raised), raised  # both are true
+
+
+@pytest.mark.slow
+def test_an_insole_in_a_chamber_is_accused_of_its_faulty_taxels_only(tmp_path):
+    """Its reference starts under load and is never negative."""
+    found = io.loadmat(real("insole_plenum/calibration_dataset.mat"), squeeze_me=True, struct_as_record=False)[
+        "experiment"
+    ]
+    counts = np.asarray(found.C)[:, 2:]
+    chamber, *_ = aligned(counts, found.P)  # the two were recorded by clocks of their own
+    time = (np.arange(len(counts)) * (SECOND / 48.7)).astype(np.int64)
+    streams = {
+        "pressure": Samples(StreamFacts("counts", units="1", channels=280, rate_hz=48.7), time, counts),
+        "force": Samples(StreamFacts("force", units="N", channels=1, rate_hz=48.7), time, chamber.reshape(-1, 1)),
+    }
+    path = Recording(SessionFacts(epoch=datetime(2023, 1, 1, tzinfo=UTC)), streams, None).write(tmp_path / "s.h5")
+    with open_session(path) as session:
+        report = check_session(session)
+    raised = [f for f in report.findings if f.severity > Severity.OK]
+    assert report.ok, raised
+    assert all("of 280 channels" in f.what or f.where == "/presses" for f in raised), raised
+    assert any("(stuck)" in f.what for f in raised)
+    assert any("(saturated)" in f.what for f in raised)

@@ -1,0 +1,350 @@
+"""Recordings that are well formed and cannot be true: each lie is told, and the words that name it are read."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import jaxeit as je
+from calib.bench import Bench, Timing, simulate
+from calib.check import Severity, check_session, render, transfer_matrix
+from calib.check.reading_order import predict_readings
+from calib.session import StreamFacts, open_session
+
+from .recording import SECOND, Recording, Samples
+
+ERROR, WARNING = Severity.ERROR, Severity.WARNING
+FORCES = np.array([5.0, 10.0, 20.0])
+
+
+@pytest.fixture(scope="module")
+def honest(skin, tmp_path_factory):
+    """Sixteen presses of the testbed with noise, as a file would hold them; nothing tells that they were simulated."""
+    effects = (
+        je.effects.LoadSpreading(),
+        je.effects.CoatingNonUniformity(std=0.15, length=0.03, seed=3),
+        je.effects.ContactPiezoresistance(),
+        je.effects.Noise(std=1e-5),
+        je.effects.Noise(std=5.0, stream=je.effects.StreamKind.PRESSURE),
+        je.effects.Noise(std=0.01, stream=je.effects.StreamKind.FORCE),
+    )
+    # Off the middles of the pads, so that no move of the stage leaves every press on its pad.
+    x, y = np.meshgrid([0.025, 0.065, 0.12, 0.17], [0.03, 0.07, 0.125, 0.165])
+    timing = Timing(rest=0.6, ramp=0.4, hold=1.1, release=0.4, recovery=0.8)
+    bench = Bench(
+        je.Scene(skin, effects), np.stack([x.ravel(), y.ravel()], 1), FORCES, timing=timing, blank=4.0, eit_rate=20.0,
+        pad_rate=100.0, eit_step=3e-6, seed=5, toml="x",
+    )  # fmt: skip
+    path = simulate(bench, tmp_path_factory.mktemp("honest") / "s.h5", fidelity=je.Fidelity.draft())
+    with open_session(path) as session:
+        return Recording.of(session)
+
+
+@pytest.fixture(scope="module")
+def transfer(skin):
+    return transfer_matrix(skin)
+
+
+@pytest.fixture
+def findings(tmp_path, transfer):
+    """Write a recording and check it; the findings above a note."""
+
+    def of(recording):
+        with open_session(recording.write(tmp_path / "s.h5")) as session:
+            report = check_session(session, transfer=transfer)
+        page = render(report)
+        assert max(map(len, page.splitlines())) <= 100
+        return [f for f in report.findings if f.severity > Severity.OK]
+
+    return of
+
+
+def test_an_honest_recording_has_no_finding(honest, findings):
+    assert findings(honest) == []
+
+
+def test_an_honest_recording_without_a_table_has_no_finding(honest, findings):
+    assert findings(stage_for_table(honest)) == []
+
+
+def test_a_recording_that_begins_in_mid_press_is_not_negative(honest, findings):
+    """Without a table, the rests between the presses look like presses of the negated force."""
+    start = honest.presses.t_hold0[0] + SECOND // 2
+    cut = honest
+    for name, s in honest.streams.items():
+        cut = cut.with_stream(name, replace(s, time=s.time[s.time >= start], values=s.values[s.time >= start]))
+    force = cut.values("force")
+    for level in (0.0, force[0]):  # also with a load cell that was tared under load
+        found = findings(stage_for_table(cut.change("force", force - level)))
+        assert not any("negative" in f.what for f in found), found
+
+
+# --- how lies are told ---------------------------------------------------------------------------
+
+
+def stage_for_table(recording, place=lambda p: p):
+    """The places of the presses in a stage stream, and no table of presses."""
+    force, table = recording.streams["force"], recording.presses
+    row = np.clip(np.searchsorted(table.t_press, force.time, side="right") - 1, 0, None)
+    sites = place(np.stack([table.x, table.y], 1))
+    stage = Samples(StreamFacts("position", units="m", channels=2, rate_hz=100.0), force.time, sites[row])
+    return replace(recording.with_stream("stage", stage), presses=None)
+
+
+def scaled(name, factor):
+    return lambda r: r.change(name, factor * r.values(name))
+
+
+def added(name, shift):
+    return lambda r: r.change(name, shift + r.values(name))
+
+
+def columns(name, order):
+    return lambda r: r.change(name, r.values(name)[:, order])
+
+
+def late(name, seconds):
+    return lambda r: r.at(name, r.streams[name].time + int(seconds * SECOND))
+
+
+def moved(x=lambda x, y: x, y=lambda x, y: y):
+    return lambda r: r.pressed(x=x(r.presses.x, r.presses.y), y=y(r.presses.x, r.presses.y))
+
+
+def rows(order):
+    return lambda r: r.pressed(x=order(r.presses.x), y=order(r.presses.y), pad=order(r.presses.pad))
+
+
+def readings(order):
+    return lambda r: r.change("eit", r.values("eit")[:, order(len(r.values("eit")[0]))])
+
+
+def pair_exchanged(r):
+    """The wires of electrodes 3 and 17 are exchanged."""
+    number = np.arange(25)
+    number[[3, 17]] = 17, 3
+    transfer = transfer_matrix(je.load_skin(r.facts.skin_name))
+    own, wrong = (r.facts.current * predict_readings(transfer, p) for p in (r.facts.pattern, number[r.facts.pattern]))
+    return r.change("eit", r.values("eit") - own + wrong)
+
+
+def dead_electrode(value):
+    def tell(r):
+        values = r.values("eit").copy()
+        values[:, (r.facts.pattern == 12).any(1)] = value
+        return r.change("eit", values)
+
+    return tell
+
+
+def frozen(name, first, last):
+    """A stream stands still for a part of the recording."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        a, b = int(first * len(values)), int(last * len(values))
+        values[a:b] = values[a]
+        return r.change(name, values)
+
+    return tell
+
+
+def at_rest(name):
+    """A stream shows its rest for ever, with its noise."""
+
+    def tell(r):
+        values, table, time = r.values(name), r.presses, r.streams[name].time
+        rest = values[time < table.t_press[0] - SECOND]
+        return r.change(name, rest[np.random.default_rng(1).integers(0, len(rest), len(values))])
+
+    return tell
+
+
+def doubled_frames(r):
+    values = r.values("eit").copy()
+    values[1::2] = values[: len(values) - len(values) % 2 : 2]
+    return r.change("eit", values)
+
+
+def pasted_twice(r):
+    """The same recording once more behind itself, with time stamps that go on."""
+    out, span = r, max(s.time[-1] for s in r.streams.values()) + SECOND // 10
+    for name, s in r.streams.items():
+        out = out.with_stream(name, replace(s, time=np.r_[s.time, s.time + span], values=np.r_[s.values, s.values]))
+    table = r.presses
+    twice = {n: np.tile(getattr(table, n), 2) for n in ("x", "y", "tip_diameter", "target_force", "pad", "accepted")}
+    times = {n: np.r_[getattr(table, n), getattr(table, n) + span] for n in table.__dataclass_fields__ if n[:2] == "t_"}
+    return out.pressed(**twice, **times, reason=table.reason * 2)
+
+
+def clipped(r):
+    values = r.values("eit")
+    limit = np.sort(np.abs(values).max(0))[-80]
+    return r.change("eit", np.clip(values, -limit, limit))
+
+
+def slowed(factor):
+    """All time stamps in another unit than they are said to be."""
+
+    def tell(r):
+        for name, s in r.streams.items():
+            r = r.with_stream(
+                name, replace(s.at(s.time * factor), facts=replace(s.facts, rate_hz=s.facts.rate_hz / factor))
+            )
+        return r.pressed(**{n: getattr(r.presses, n) * factor for n in ("t_press", "t_hold0", "t_hold1", "t_release")})
+
+    return tell
+
+
+def unpressed(r):
+    """The force of every other press is cut out."""
+    values, time = r.values("force").copy(), r.streams["force"].time
+    for start, stop in zip(r.presses.t_press[::2], r.presses.t_release[::2], strict=True):
+        values[(time > start - SECOND // 5) & (time < stop + SECOND // 5)] = values[0]
+    return r.change("force", values)
+
+
+def half_listed(r):
+    kept = np.arange(len(r.presses)) % 2 == 0
+    return replace(r, presses=replace(r.presses, **{
+        n: tuple(np.array(v)[kept]) if isinstance(v := getattr(r.presses, n), tuple) else v[kept]
+        for n in r.presses.__dataclass_fields__
+    }))  # fmt: skip
+
+
+def with_temperature(r):
+    time = r.streams["force"].time[::100]
+    values = np.full((len(time), 1), 21.5)
+    return r.with_stream(
+        "temperature", Samples(StreamFacts("temperature", units="K", channels=1, rate_hz=1.0), time, values)
+    )
+
+
+class Lie(NamedTuple):
+    tell: Callable[[Recording], Recording]
+    severity: Severity
+    words: tuple[str, ...]
+
+
+LIES = {
+    # units
+    "force in mN": Lie(scaled("force", 1e3), WARNING, ("/streams/force", "times the target")),
+    "force in kN": Lie(scaled("force", 1e-3), WARNING, ("/streams/force", "times the target")),
+    "force in mN, no target": Lie(
+        lambda r: scaled("force", 1e3)(r).pressed(target_force=np.zeros(16)), WARNING, ("what the pressures", "unit")
+    ),
+    "load in g": Lie(scaled("force", 1 / 9.80665e-3), WARNING, ("/streams/force", "times the target")),
+    "force of a converter's counts": Lie(scaled("force", 1e4), WARNING, ("cannot be true",)),
+    "pressure in kPa": Lie(scaled("pressure", 1e-3), WARNING, ("/streams/pressure", "kPa or bar")),
+    "pressure in mbar": Lie(scaled("pressure", 1e-2), WARNING, ("/streams/force", "a unit of one of the two")),
+    "pressure in mPa": Lie(scaled("pressure", 1e3), WARNING, ("beyond the sensor's span",)),
+    "absolute pressure": Lie(added("pressure", 101325.0), WARNING, ("beyond the sensor's span", "gage")),
+    "voltage in mV": Lie(scaled("eit", 1e3), WARNING, ("/streams/eit", "times the model's")),
+    "voltage in kV": Lie(scaled("eit", 1e-3), WARNING, ("/streams/eit", "times the model's")),
+    "places in mm": Lie(moved(lambda x, y: 1e3 * x, lambda x, y: 1e3 * y), ERROR, ("outside the sheet", "press 0")),
+    "places in um on the stage": Lie(lambda r: stage_for_table(r, lambda p: 1e6 * p), ERROR, ("outside the sheet",)),
+    "places 100 km off": Lie(moved(lambda x, y: x + 1e5), ERROR, ("outside the sheet",)),
+    "tip in mm": Lie(lambda r: r.pressed(tip_diameter=np.full(16, 20.0)), WARNING, ("a tip of 20 m",)),
+    "temperature in degC as K": Lie(with_temperature, WARNING, ("temperature", "21.5 K cannot be true")),
+    "time in ms as s": Lie(slowed(1000), WARNING, ("Hz", "another unit")),
+    # signs
+    "force pulls": Lie(scaled("force", -1), ERROR, ("negative while pressing",)),
+    "force pulls, no table": Lie(
+        lambda r: stage_for_table(scaled("force", -1)(r)), ERROR, ("negative while pressing",)
+    ),
+    "pressure falls on pressing": Lie(scaled("pressure", -1), ERROR, ("falls on pressing", "16 of 16")),
+    "voltages reversed": Lie(scaled("eit", -1), ERROR, ("every sign is reversed",)),
+    "magnitudes": Lie(lambda r: r.change("eit", np.abs(r.values("eit"))), ERROR, ("magnitudes without sign",)),
+    # order
+    "readings in reversed order": Lie(readings(lambda n: np.arange(n)[::-1]), ERROR, ("reversed order",)),
+    "readings rolled": Lie(readings(lambda n: np.roll(np.arange(n), -7)), ERROR, ("starts at reading 7 ",)),
+    "electrode pair exchanged": Lie(pair_exchanged, ERROR, ("electrodes 3 and 17 are exchanged",)),
+    "pressure columns exchanged": Lie(
+        columns("pressure", [1, 0, 2, 3]), ERROR, ("column 1 responds over pad 'lower left'",)
+    ),
+    "pressure columns exchanged, no table": Lie(
+        lambda r: stage_for_table(columns("pressure", [0, 1, 3, 2])(r)),
+        ERROR,
+        ("column 3 responds over pad 'upper left'",),
+    ),
+    "a pressure column too few": Lie(columns("pressure", [0, 1, 2]), ERROR, ("has 3 columns",)),
+    # places
+    "x and y exchanged": Lie(moved(lambda x, y: y, lambda x, y: x), ERROR, ("x and y are exchanged",)),
+    "x mirrored": Lie(moved(lambda x, y: 0.2 - x), ERROR, ("x is mirrored",)),
+    "y mirrored on the stage": Lie(
+        lambda r: stage_for_table(r, lambda p: p * [1, -1] + [0, 0.2]), ERROR, ("y is mirrored",)
+    ),
+    "stage turned": Lie(moved(lambda x, y: 0.2 - x, lambda x, y: 0.2 - y), ERROR, ("turned by 180",)),
+    "table one press late": Lie(rows(lambda c: np.roll(c, 1)), ERROR, ("one press late",)),
+    "table in reversed order": Lie(rows(lambda c: c[::-1]), ERROR, ("/presses", "places look wrong")),
+    "table shuffled": Lie(
+        rows(lambda c: c[np.random.default_rng(8).permutation(16)]), WARNING, ("do not match the readings",)
+    ),
+    "a pad that is not under the tip": Lie(
+        lambda r: r.pressed(pad=np.full(16, 2)), WARNING, ("name a pad that is not under",)
+    ),
+    "a pad that does not exist": Lie(lambda r: r.pressed(pad=np.full(16, 7)), WARNING, ("name a pad",)),
+    "origin of the stage moved": Lie(
+        lambda r: replace(stage_for_table(r, lambda p: np.add(p, (0.012, 0.0))), presses=r.presses),
+        WARNING,
+        ("+12.0 mm in x",),
+    ),
+    "pads never pressed": Lie(
+        lambda r: r.pressed(accepted=(r.presses.y < 0.1) | (r.presses.x < 0.1), reason=("",) * 16),
+        WARNING,
+        ("none of 12 presses lies on 1 pad of 4: upper right",),
+    ),
+    # time
+    "EIT 0.5 s late": Lie(late("eit", 0.5), ERROR, ("/streams/eit", "after the force")),
+    "pressure 0.5 s early": Lie(late("pressure", -0.5), ERROR, ("/streams/pressure", "after the force")),
+    "pressure 7 s late": Lie(late("pressure", 7.0), ERROR, ("/streams/pressure", "+7.0", "when moved")),
+    "EIT 9 s late": Lie(late("eit", 9.0), ERROR, ("/streams/eit", "+9.0", "when moved")),
+    "table of another recording": Lie(
+        lambda r: r.pressed(
+            **{n: getattr(r.presses, n) + 10**12 for n in r.presses.__dataclass_fields__ if n[:2] == "t_"}
+        ),
+        ERROR,
+        ("none of 16 presses can be used",),
+    ),
+    "presses that overlap": Lie(
+        lambda r: r.pressed(t_release=r.presses.t_release + 4 * SECOND), WARNING, ("begin before",)
+    ),
+    # what was never measured
+    "EIT constant": Lie(
+        lambda r: r.change("eit", np.tile(r.values("eit")[:1], (len(r.values("eit")), 1))), ERROR, ("never change",)
+    ),
+    "EIT of the untouched skin": Lie(at_rest("eit"), ERROR, ("no reading changes", "16 of 16")),
+    "EIT frozen": Lie(frozen("eit", 0.5, 0.8), WARNING, ("equal the one before", "the longest for")),
+    "every frame twice": Lie(doubled_frames, WARNING, ("50 % of its frames equal the one before",)),
+    "recording pasted twice": Lie(pasted_twice, WARNING, ("copies of earlier ones",)),
+    "EIT at the converter's end": Lie(clipped, ERROR, ("saturated",)),
+    "an electrode dead": Lie(dead_electrode(0.0), ERROR, ("all of them use electrode 12",)),
+    "pressure frozen": Lie(frozen("pressure", 0.5, 0.8), WARNING, ("no pad feels",)),
+    "pressure of untouched pads": Lie(
+        at_rest("pressure"), WARNING, ("/streams/force", "the pressures of the pads bear")
+    ),
+    "force missing throughout": Lie(
+        lambda r: r.change("force", np.full_like(r.values("force"), np.nan)),
+        ERROR,
+        ("/streams/force", "no finite value"),
+    ),
+    "force missing throughout, no table": Lie(
+        lambda r: replace(r.change("force", np.full_like(r.values("force"), np.nan)), presses=None),
+        ERROR,
+        ("/streams/force", "no finite value"),
+    ),
+    "pressure without force": Lie(unpressed, WARNING, ("without force",)),
+    "force outside the listed presses": Lie(half_listed, WARNING, ("outside the listed presses", "8 contacts")),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_is_named(lie, honest, findings, hard):
+    tell, severity, words = LIES[lie]
+    found = findings(tell(honest))
+    texts = [f"{f.where}: {f.what}; {f.remedy}" for f in found if f.severity is severity and f.remedy]
+    named = [text for text in texts if all(word in text for word in words)]
+    assert named, found
+    hard(f"lie: {lie}", f"`check`: {severity.name.lower()}", beyond=named[0])
