@@ -9,6 +9,8 @@ The names used every day are here; each room holds the rest, such as `jaxeit.eff
 
 from importlib import metadata
 
+from jaxeit_bounds import Budget, BudgetError
+
 from . import (
     accuracy,
     contacts,
@@ -82,6 +84,8 @@ __all__ = [
     "AreaPatch",
     "BackProjection",
     "BoundaryPatch",
+    "Budget",
+    "BudgetError",
     "Bumps",
     "ContactFinder",
     "Contacts",

@@ -11,6 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxeit_bounds import require
+
 from .curve_fit import fit_curves
 from .curves import AbstractCurve
 from .fitted_curve import FittedCurve, predict_pads
@@ -216,7 +218,10 @@ def fit_blend(signals: np.ndarray, force: np.ndarray, stretches: int = 20, folds
 
     The ridge is the one of `RIDGES` with the smallest squared error in cross-validation by stretches of time, dealt
     to the folds in turn. Few long stretches would measure extrapolation to what a stretch alone has seen.
+
+    Raises: `FitError` for more channels than `Budget` allows: memory grows with the fourth power of their number.
     """
+    require("blend_channels", signals.shape[1], "fit_blend", FitError)
     fold = (np.arange(len(force)) * stretches // len(force)) % folds
 
     def held_out(ridge: float) -> float:

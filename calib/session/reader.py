@@ -20,7 +20,6 @@ from .tables import CLOCK_ATTRIBUTES, FORMAT, PRESS_COLUMNS, ClockTable, Events,
 from .units import Unit
 
 MAX_STREAMS = 64
-MAX_TRUTH_BYTES = 1 << 30
 
 
 def open_session(path: str | os.PathLike[str]) -> "Session":
@@ -188,9 +187,8 @@ class _TruthArrays(Mapping[str, np.ndarray]):
             raise KeyError(name)
         node = required(self._node, name, self._node.dataset(name))
         array = GuardedArray(node)
-        if array.nbytes > MAX_TRUTH_BYTES or array.dtype.kind == "S":
-            what = f"holds {array.nbytes:,} bytes of {array.dtype}, not numbers of at most {MAX_TRUTH_BYTES:,} bytes"
-            raise node.error(what, SCHEMA)
+        if array.dtype.kind == "S":
+            raise node.error(f"holds {array.dtype}, not numbers", SCHEMA)
         unit = declared_unit(node, "")
         values = array.read()
         return values if unit == Unit(unit.si) else values * unit.factor + unit.offset

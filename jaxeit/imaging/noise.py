@@ -24,6 +24,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 
+from jaxeit_bounds import require
+
 from .._compile import is_traced, require_known
 from ..effects import AbstractTerminalEffect, chosen
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
@@ -92,6 +94,7 @@ def pairs_of(pattern: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def whitened(pattern: np.ndarray, current: Any, weight: Any, channels: np.ndarray, dtype: np.dtype) -> "Whitened":
     """The pair sums of a protocol, from its pattern (readings, 4); in NumPy unless JAX traces current or weight."""
     electrodes, pairs = pairs_of(pattern)
+    require("array_bytes", 8 * len(electrodes) ** 2, "prepare: covariance of the pairs of electrodes")
     lines, sign = lines_of(pairs, len(electrodes))
     arrays = {
         "pairs": pairs.astype(np.int32),

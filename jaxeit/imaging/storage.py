@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxeit_bounds import open_regular, require
+
 from .._compile import require_known
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem
@@ -264,10 +266,11 @@ _DAMAGE = (
 
 def _read_numbers(path: str | Path) -> dict[str, np.ndarray]:
     """The arrays of a .npz; none is taken to be larger than the file that holds it."""
-    with zipfile.ZipFile(path) as file:
+    with open_regular(path) as raw, zipfile.ZipFile(raw) as file:
         for member in file.infolist():
             if member.compress_type != zipfile.ZIP_STORED:
                 raise StoreError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
+        require("array_bytes", sum(member.file_size for member in file.infolist()), "numbers", StoreError)
         return {m.filename.removesuffix(".npy"): _read_array(file, m) for m in file.infolist()}
 
 

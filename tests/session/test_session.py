@@ -619,7 +619,7 @@ REFUSED_FILES: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "no shape": (link(FORCE, h5py.Empty("f4")), "has no shape or too many dimensions"),
     "chunks of 4 bytes": (replace(FORCE, shape=(1 << 21, 1), dtype="f4", chunks=(1, 1)), "has 2,097,152 chunks"),
     "table of two columns": (replace("presses/x", data=np.zeros((2, 2))), "of shape (2, 2); write shape (rows)"),
-    "truth in words": (replace("truth/site", data=np.full(2, b"x")), "holds 2 bytes of |S1, not numbers"),
+    "truth in words": (replace("truth/site", data=np.full(2, b"x")), "/truth/site: holds |S1, not numbers"),
     "endless texts": (replace("presses/reason", data=np.full(2, b"x" * 100_000)), "holds texts of 100,000 bytes"),
 }
 

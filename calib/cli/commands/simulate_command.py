@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..arguments import prepare_outputs, skin_of
-from ..terminal import progress_bar
+from ..terminal import announce_model, progress_bar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    from ...bench import load_bench, measure_costs, render_costs, simulate
+    from ...bench import SIMULATION, load_bench, measure_costs, render_costs, simulate
 
     if args.data_set:
         return _simulate_data_set(args)
@@ -39,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
     prepare_outputs(args.output)
     if args.serve and Path(args.output).exists():
         return _serve(args.output)
+    announce_model(bench.scene.skin, SIMULATION)
     try:
         simulate(bench, args.output, progress=progress_bar("blocks"))
     except KeyboardInterrupt:
