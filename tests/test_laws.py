@@ -60,6 +60,21 @@ def test_imports_run_down_the_list(package, order):
                 assert order.index(used) < order.index(room), f"{path} imports {used}"
 
 
+def test_both_packages_share_limits_that_import_nothing_heavy():
+    """The recorder and the readers of files start without JAX."""
+    code = "import sys, calib.session, calib.record.recorder; sys.exit(bool({'jax', 'jaxeit'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+    for path in (ROOT / "jaxeit_bounds").rglob("*.py"):
+        assert not re.search(r"import (jaxeit|calib|jax|numpy)\b|from (jaxeit|calib)\b", path.read_text()), path
+
+
+def test_toml_enters_by_one_door():
+    """Parsed without limits, a short text needs time and memory without end."""
+    users = {str(p.relative_to(ROOT)) for n in ("jaxeit", "calib") for p in (ROOT / n).rglob("*.py")
+             if "tomllib" in p.read_text()}  # fmt: skip
+    assert users == {"jaxeit/toml.py"}
+
+
 def test_jaxeit_knows_nothing_of_calib_or_files():
     for path in (ROOT / "jaxeit").rglob("*.py"):
         assert not list(_imports(path, "calib")), path

@@ -94,6 +94,9 @@ class Session:
         for name in ("current", "frequency"):
             if protocol.attribute(name) is not None:
                 setattr(self, name, float(protocol.number(name)))
+        if (self.current is not None and self.current <= 0) or (self.frequency is not None and self.frequency < 0):
+            what = f"current {self.current} A at {self.frequency} Hz cannot be"
+            raise protocol.error(what, "write an amplitude above zero, and a frequency of zero or more")
         offset = protocol.dataset("offset")
         if offset is not None:
             self.offset = small_array(offset, (len(self.pattern),), "f").astype(float)

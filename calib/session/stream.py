@@ -10,6 +10,9 @@ from .guard import Node
 from .members import declared_unit, required
 from .tables import STREAM_EXTRAS
 
+LARGEST_VALUE = 1e18
+"""In SI units. What is larger was not measured; its square would overflow where float32 is computed with."""
+
 TIME_BLOCK = 1 << 20
 """Time stamps that are read and checked at once."""
 
@@ -92,7 +95,7 @@ class Stream:
             raise self._time.node.error(what, "sort the rows and drop equal times")
 
     def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Samples ``start:stop`` as float64 (n, channels) in SI; missing values are NaN."""
+        """Samples ``start:stop`` as float64 (n, channels) in SI; missing values, and those above 1e18, are NaN."""
         rows = len(range(*slice(start, stop).indices(len(self))))
         self._values.node.require("array_bytes", 8 * rows * self.channels)
         raw = self._values.read(start, stop).reshape(-1, self.channels)
@@ -105,7 +108,7 @@ class Stream:
             # In place, and only if necessary, because a long session spends most of its time here.
             values = np.multiply(values, scale, out=values) if scale != 1.0 else values
             values = np.add(values, shift, out=values) if shift != 0.0 else values
-        values[np.isinf(values)] = np.nan
+        values[np.abs(values) > LARGEST_VALUE] = np.nan
         return values
 
     def blocks(self, max_bytes: int = 32 << 20) -> Iterator[tuple[int, int, np.ndarray]]:

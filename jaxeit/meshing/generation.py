@@ -82,9 +82,10 @@ def expected_nodes(
     """About how many nodes `triangulate` will make, within a fifth where electrodes are spread over the domain.
 
     The integral of the nodes per area, ``1 / (sqrt(3)/2 h^2)``, over the sheet. Around a feature of radius r the edges
-    grow as ``h = s + k d`` with the distance d, as far as the next feature.
+    grow as ``h = s + k d`` with the distance d, as far as the next feature. No edge is longer than the sheet is wide.
     """
-    longest, slope = min(edge_length, domain.perimeter / 16), growth - 1
+    width = 2 * domain.area / domain.perimeter
+    longest, slope = min(edge_length, domain.perimeter / 16, width), growth - 1
     shortest = edge_length / 4 if electrode_edge is None else electrode_edge
     own = sum(len(footprint.nodes(domain)) for footprint in footprints)
     features = [feature for footprint in footprints for feature in footprint.features(domain, longest, shortest)]
