@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo
 
-.PHONY: demo test annotations slow lint clean
+.PHONY: demo test slow lint clean
 
 # One stamp per set of extras: pip runs again only when pyproject.toml changes.
 $(VENV)/.report: pyproject.toml
@@ -24,15 +24,8 @@ demo: $(VENV)/.report
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "not slow"
 
-# The rooms that are quick: what their tests run of the packages is checked against its annotations. In one process, since
-# the workers of pytest-xdist load plugins after the packages.
-CHECKED := tests/geometry tests/presses tests/registry tests/session tests/test_fusion.py tests/test_metrics.py
-
-annotations: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 0 -p tests.annotations -m "not slow" $(CHECKED)
-
 slow: $(VENV)/.dev
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest -m slow
+	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -m slow
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -1,9 +1,6 @@
-"""Error against time: linear and quadratic elements, both precisions, three gradings of the mesh, on two sheets.
+"""Error against time: linear and quadratic elements, both precisions, three gradings of the mesh, on two sheets."""
 
-python -m benchmarks.bench_accuracy [--smoke | --draw-only]
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,10 +12,12 @@ import jaxeit as je
 from jaxeit.linalg import NestedDissection
 
 from .clock import Call, Tool, interleaved, seconds, spread, taken
-from .figures import BLUE, GREY, ORANGE, legend, logarithmic, panels
-from .harness import Question, Row, Run
+from .figures import BLUE, GREY, ORANGE, curves, legend, logarithmic, panels
+from .harness import Question, Run
+from .markdown import cell
 from .peers import cholmod, eidors
 from .problems import CONTACT, ELECTRODES, Case, Problem, disc, rectangle
+from .rows import Row, grouped
 from .tools import Entry, forward_of, present
 
 GRADINGS = (1.2, 1.4, 1.7)
@@ -46,8 +45,7 @@ def with_error(case: Case, labels: Row, tool: Tool, elements: int) -> Solve:
     first, (_, found) = seconds(taken, tool, flat)
     error = float(np.linalg.norm(found - case.exact) / np.linalg.norm(case.exact))
     labels = {"sheet": case.name} | labels | {"relative_error": error, "first_call_s": round(first, 3)}
-    where = f"{case.name}, {labels['tool']}, {labels['mesh']}, P{labels['order']}, {labels['dtype']}"
-    print(f"{where}, {labels['unknowns']:,} unknowns: {100 * error:.3g} %", flush=True)
+    print(cell("{sheet}, {tool}, {mesh}, P{order}, {dtype}, {unknowns:,} unknowns: {relative_error:.3g %}", labels))
     return Solve(labels, tool, flat)
 
 
@@ -69,18 +67,14 @@ def regular(case: Case, order: int, cells: int, dtype: str = "float64") -> Solve
     return ours(case, Problem(cells).model(dtype, order), "regular", order, dtype, cells=cells)
 
 
-def peer(case: Case, entry: Entry, order: int, cells: int) -> Solve:
-    problem = Problem(cells)
-    labels = {"tool": entry.name, "mesh": "regular", "order": order, "dtype": "float64", "cells": cells}
-    labels |= {"nodes": (cells + 1) ** 2, "unknowns": (order * cells + 1) ** 2 - 1}
-    return with_error(case, labels, entry.prepare(problem), len(problem.sigma))
-
-
 def peers(case: Case, several: Sequence[tuple[Entry, int, tuple[int, ...]]]) -> Iterator[Solve]:
     """Those that are installed, at each of their sizes."""
     for entry, order, sizes in several:
-        for found in present([entry], sizes[0]):
-            yield from (peer(case, found, order, cells) for cells in sizes)
+        for cells in sizes if present([entry], sizes[0]) else ():
+            problem = Problem(cells)
+            labels = {"tool": entry.name, "mesh": "regular", "order": order, "dtype": "float64", "cells": cells}
+            labels |= {"nodes": (cells + 1) ** 2, "unknowns": (order * cells + 1) ** 2 - 1}
+            yield with_error(case, labels, entry.prepare(problem), len(problem.sigma))
 
 
 def with_precision(sizes: Sequence[Any]) -> list[tuple[Any, str]]:
@@ -95,7 +89,7 @@ def on_sheet(case: Case, smoke: bool) -> Iterator[Solve]:
         yield from peers(case, PEERS)
         for order, sizes in CELLS.items():
             yield from (regular(case, order, cells, dtype) for cells, dtype in with_precision(sizes))
-    edges: Mapping[int, tuple[float, ...]] = {2: (0.2,)} if smoke else EDGES
+    edges: dict[int, tuple[float, ...]] = {2: (0.2,)} if smoke else EDGES
     for growth in GRADINGS[-1:] if smoke else GRADINGS:
         for order, lengths in edges.items():
             yield from (graded(case, order, edge, growth, dtype) for edge, dtype in with_precision(lengths))
@@ -115,12 +109,12 @@ def measure(run: Run) -> Iterator[Row]:
 
 # --- the picture
 
-COLOURS = {1: ORANGE, 2: BLUE}
+COLOURS, ORDERS = {1: ORANGE, 2: BLUE}, {1: "P1, linear", 2: "P2, quadratic"}
 STYLES: dict[str, Any] = {"float64": "-", "float32": (0, (3, 2))}
 MARKERS = dict(zip(("regular", *(f"growth {g}" for g in GRADINGS)), "Do^s", strict=True))
-EIDORS: dict[str, Any] = {"color": "#7b3fa0", "marker": "*", "markersize": 10, "linestyle": "none"}
-TARGET_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.9, "linestyle": ":"}
-CHOLMOD_LINE: dict[str, Any] = {"color": GREY, "linewidth": 1.2, "linestyle": "-."}
+EIDORS: Row = {"color": "#7b3fa0", "marker": "*", "markersize": 10, "linestyle": "none"}
+TARGET_LINE: Row = {"color": GREY, "linewidth": 0.9, "linestyle": ":"}
+CHOLMOD_LINE: Row = {"color": GREY, "linewidth": 1.2, "linestyle": "-."}
 TITLES = {
     "rectangle": "Rectangle, 25 point electrodes",
     "disc": f"Disc, {ELECTRODES} electrodes on the rim, contact z = {CONTACT}",
@@ -130,39 +124,27 @@ TITLES = {
 def picture(data: Row) -> Figure:
     """A panel per sheet, error against time; a curve per order, precision and grading."""
     figure, axes = panels(10.4, 6.0, 1, 2, sharey=True)
+    rows = grouped((row | {"percent": 100 * row["relative_error"]} for row in data["rows"]), "sheet", "tool")
     for panel, (sheet, title) in zip(axes, TITLES.items(), strict=True):
         logarithmic(panel, title, 10.5, "major", xlabel="time of one forward solve, ms")
-        _curves(panel, partial(_of, data["rows"], sheet))
+        panel.axhline(100 * TARGET, **TARGET_LINE)
+        curves(panel, rows[sheet, "jaxeit"], "median_ms", "percent", ("mesh", "order", "dtype"), _look)
+        for row in rows.get((sheet, cholmod.NAME), ()):
+            panel.axvline(row["median_ms"], **CHOLMOD_LINE)
+        curves(panel, rows.get((sheet, eidors.NAME), ()), "median_ms", "percent", ("tool",), lambda tool: EIDORS)
     axes[0].set_ylabel("error of the readings, rms, % of their rms")
-    legend(figure, _entries(partial(_of, data["rows"], "rectangle")), 6)
+    legend(figure, _entries(rows), 6)
     return figure
 
 
-def _of(rows: Sequence[Row], sheet: str, tool: str) -> list[Row]:
-    return [r for r in rows if (r["sheet"], r["tool"]) == (sheet, tool)]
+def _look(mesh: str, order: int, dtype: str) -> Row:
+    look = {"color": COLOURS[order], "linestyle": STYLES[dtype], "marker": MARKERS[mesh], "linewidth": 1.3}
+    return look | {"markersize": 5.5, "markerfacecolor": COLOURS[order] if dtype == "float64" else "white"}
 
 
-def _curves(panel: Any, of: Any) -> None:
-    panel.axhline(100 * TARGET, **TARGET_LINE)
-    curves: dict[tuple, list[Row]] = {}
-    for row in of("jaxeit"):
-        curves.setdefault((row["mesh"], row["order"], row["dtype"]), []).append(row)
-    for (mesh, order, dtype), rows in curves.items():
-        look: Row = {"color": COLOURS[order], "linestyle": STYLES[dtype], "marker": MARKERS[mesh]}
-        face = COLOURS[order] if dtype == "float64" else "white"
-        panel.plot(*_points(rows), **look, linewidth=1.3, markersize=5.5, markerfacecolor=face)
-    for row in of(cholmod.NAME):
-        panel.axvline(row["median_ms"], **CHOLMOD_LINE)
-    panel.plot(*_points(of(eidors.NAME)), **EIDORS)
-
-
-def _points(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
-    return [r["median_ms"] for r in rows], [100 * r["relative_error"] for r in rows]
-
-
-def _entries(of: Any) -> Iterator[Row]:
+def _entries(rows: dict[tuple[str, str], list[Row]]) -> Iterator[Row]:
     """One for each colour, style, marker and reference; in columns of two."""
-    for order, name in {1: "P1, linear", 2: "P2, quadratic"}.items():
+    for order, name in ORDERS.items():
         yield {"color": COLOURS[order], "linewidth": 3, "label": name}
     for dtype, style in STYLES.items():
         face = GREY if dtype == "float64" else "white"
@@ -171,9 +153,9 @@ def _entries(of: Any) -> Iterator[Row]:
         label = "regular mesh" if mesh == "regular" else f"graded, {mesh}"
         yield {"marker": marker, "linestyle": "none", "label": label}
     yield TARGET_LINE | {"label": f"{100 * TARGET:.3g} %"}
-    for row in of(cholmod.NAME):
+    for row in rows.get(("rectangle", cholmod.NAME), ()):
         yield CHOLMOD_LINE | {"label": f"CHOLMOD's time,\nP1, {row['nodes']:,} nodes"}
-    if of(eidors.NAME):
+    if ("rectangle", eidors.NAME) in rows:
         yield EIDORS | {"label": "EIDORS, P2, regular"}
 
 

@@ -1,35 +1,30 @@
-"""Forward solves per second over a data set, and the time that a fresh process needs for its first results.
+"""Forward solves per second over a data set of 1,681 contacts, each tool in a process of its own."""
 
-python -m benchmarks.bench_batch [--smoke]
-"""
-
-import json
 import os
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
 
 from . import problems
-from .clock import Tool, alone, fresh, peak_megabytes, peaks, require_agreement, seconds
-from .harness import Question, Row, Run, set_up
+from .clock import Call, Tool, alone, interleaved, peak_megabytes, peaks, require_agreement, seconds, spread
+from .harness import Question, Run, set_up
 from .peers import cholmod, superlu
 from .problems import Problem
+from .rows import Row
 from .tools import MAX_FLOAT32_DIFFERENCE, as_tool, compiled
 
 SIDE, PITCH, WIDTH, AMPLITUDE = 41, 0.005, 0.012, 0.5
 PIECE = 64  # contacts of a call, a multiple of every batch
-SIZES, STARTUP_SIZES = (30, 60), (30, 120)
+SIZES = (30, 60)
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+ORDER = {"median": "median", "min": "max", "max": "min"}  # the least rate is that of the longest time
 PEERS = {peer.NAME: peer for peer in (superlu, cholmod)}
 
 
@@ -88,11 +83,8 @@ def looped(tool: Tool) -> Tool:
     return lambda sigma: np.stack([tool(row) for row in sigma])
 
 
-# --- what happens in the process of one tool
-
-
 class Work:
-    """One tool and the data set; the clock is read here, and nothing but voltages travels."""
+    """One tool and the data set, in the process of the tool, where the clock is read."""
 
     def __init__(self, way: Way, cells: int) -> None:
         set_up()
@@ -102,12 +94,9 @@ class Work:
         # The contacts that are timed and compared lie all over the sheet.
         self.some = contacts(self.problem, np.linspace(0, SIDE**2 - 1, PIECE).astype(int))
 
-    def first(self) -> tuple[float, np.ndarray]:
-        """Seconds of the first call, compilation included, and its voltages."""
-        return seconds(self.tool, self.some)
-
-    def again(self, turn: int) -> float:
-        return seconds(self.tool, self.some * (1 + 1e-3 * turn))[0]
+    def piece(self, factor: float) -> tuple[float, np.ndarray]:
+        """Seconds of a call with PIECE contacts, whose conductivity is that many times as large, and its voltages."""
+        return seconds(self.tool, self.some * factor)
 
     def whole(self) -> tuple[float, np.ndarray]:
         """The data set: seconds, without those that make the conductivities, and voltages, (1681, readings)."""
@@ -125,9 +114,6 @@ def ask(method: str, way: Way, cells: int, *args: Any) -> Any:
     return getattr(work(way, cells), method)(*args)
 
 
-# --- what happens in the process that compares
-
-
 @contextmanager
 def threads(one: bool) -> Iterator[None]:
     """The environment of processes started meanwhile: BLAS reads it once, when it is loaded."""
@@ -141,97 +127,72 @@ def threads(one: bool) -> Iterator[None]:
             os.environ.update({} if value is None else {name: value})
 
 
-def started(way: Way, cells: int, stack: ExitStack) -> Callable:
-    """``call(method, ...)`` in the process of a tool, which ends with the stack."""
-    pool = stack.enter_context(alone())
-    with threads(way.one_thread):
-        pool.submit(os.getpid)  # starts it
-    return lambda method, *args: pool.submit(ask, method, way, cells, *args).result()
+class Elsewhere:
+    """A tool in a process of its own, which ends with the stack; called with a factor of the conductivities."""
 
+    def __init__(self, way: Way, cells: int, stack: ExitStack) -> None:
+        self.way, self.cells, self.last_seconds = way, cells, float("nan")
+        self.pool = stack.enter_context(alone())
+        with threads(way.one_thread):
+            self.pool.submit(os.getpid)  # starts it
 
-def present(ways: tuple[Way, ...]) -> tuple[Way, ...]:
-    absent = {name: peer.missing() for name, peer in PEERS.items() if peer.missing()}
-    for name, reason in absent.items():
-        print(f"{name} left out: {reason}")
-    return tuple(way for way in ways if way.name not in absent)
+    def ask(self, method: str, *args: Any) -> Any:
+        return self.pool.submit(ask, method, self.way, self.cells, *args).result()
+
+    def __call__(self, factor: np.ndarray) -> np.ndarray:
+        self.last_seconds, voltages = self.ask("piece", factor)
+        return voltages
 
 
 def rates(run: Run) -> Iterator[Row]:
-    """Solves per second of each way, one way after the other in each round."""
-    for cells in (problems.SMOKE,) if run.smoke else SIZES:
+    """Solves per second of each way, the ways in turns."""
+    absent = {name: peer.missing() for name, peer in PEERS.items() if peer.missing()}
+    for name, reason in absent.items():
+        print(f"{name} left out: {reason}")
+    ways = [way for way in run.sizes(WAYS, SMOKE) if way.name not in absent]
+    for cells in run.sizes(SIZES, (problems.SMOKE,)):
         with ExitStack() as stack:
-            tools = {way: started(way, cells, stack) for way in present(SMOKE if run.smoke else WAYS)}
-            print(f"{(cells + 1) ** 2} nodes, {PIECE} contacts; largest difference of the voltages")
-            first = {way: tool("first") for way, tool in tools.items()}
-            loose = {str(way): MAX_FLOAT32_DIFFERENCE for way in tools if way.dtype == "float32"}
-            found = require_agreement({str(way): out for way, (_, out) in first.items()}, str(REFERENCE), loose)
-            times: dict[Way, list[float]] = {way: [] for way in tools}
-            for turn in range(3 if run.smoke else 5):
-                for way, tool in tools.items():
-                    times[way].append(tool("again", turn))
-            rows = {way: rate(times[way]) | tool("memory") for way, tool in tools.items()}
-            for way, row in rows.items():
-                labels = {"tool": str(way), "nodes": (cells + 1) ** 2, "difference": found.get(str(way), 0.0)}
-                rows[way] = labels | {"first_call_s": round(first[way][0], 3)} | row
-            if not run.smoke:
-                best = min((w for w in tools if w.batch and w.dtype == "float64"), key=lambda w: np.median(times[w]))
-                rows[best] |= whole(tools[best], str(best))
-            yield {"rows": list(rows.values())}
+            yield {"rows": rows_of([Elsewhere(way, cells, stack) for way in ways], run.smoke)}
 
 
-def rate(times: list[float]) -> dict[str, float]:
+def rows_of(tools: Sequence[Elsewhere], smoke: bool) -> list[Row]:
+    """A row for each tool at one size; the quickest of ours in float64 solves the whole data set, too."""
+    nodes, unit = (tools[0].cells + 1) ** 2, np.ones(())
+    print(f"{nodes} nodes, {PIECE} contacts; largest difference of the voltages")
+    outputs, first = {}, {}
+    for tool in tools:
+        outputs[str(tool.way)] = tool(unit)
+        first[tool] = tool.last_seconds
+    loose = {str(tool.way): MAX_FLOAT32_DIFFERENCE for tool in tools if tool.way.dtype == "float32"}
+    found = require_agreement(outputs, str(REFERENCE), loose)
+    times = interleaved([Call(tool, unit) for tool in tools], 3 if smoke else 5, np.inf)
+    rows: dict[Elsewhere, Row] = {}
+    for tool, (own, _) in zip(tools, times, strict=True):
+        labels = {"tool": str(tool.way), "nodes": nodes, "difference": found.get(str(tool.way), 0.0)}
+        rows[tool] = labels | {"first_call_s": round(first[tool], 3)} | rate(own) | tool.ask("memory")
+    if not smoke:
+        mine = [tool for tool in tools if tool.way.batch and tool.way.dtype == "float64"]
+        best = max(mine, key=lambda tool: rows[tool]["median_per_s"])
+        rows[best] |= whole(best)
+    return list(rows.values())
+
+
+def rate(times: Sequence[float]) -> dict[str, float]:
     """Solves per second: median, least and most."""
-    found = PIECE / np.array(times)
-    summary = {"median_per_s": np.median(found), "min_per_s": found.min(), "max_per_s": found.max()}
-    return {key: round(float(value), 1) for key, value in summary.items()} | {"repeats": len(times)}
+    ms = spread(times)
+    per_s = {f"{name}_per_s": round(1e3 * PIECE / ms[f"{of}_ms"], 1) for name, of in ORDER.items()}
+    return per_s | {"repeats": len(times)}
 
 
-def whole(tool: Callable, name: str) -> Row:
-    """Time and memory of the whole data set, by our fastest way in double precision."""
-    taken, voltages = tool("whole")
+def whole(tool: Elsewhere) -> Row:
+    """Time and memory of the whole data set."""
+    taken, voltages = tool.ask("whole")
     if not np.isfinite(voltages).all():
-        raise SystemExit(f"{name} gives voltages that are not finite")
-    return {"whole_set_s": round(taken, 2), "whole_set_shape": voltages.shape, **tool("memory")}
+        raise SystemExit(f"{tool.way} gives voltages that are not finite")
+    return {"whole_set_s": round(taken, 2), "whole_set_shape": voltages.shape, **tool.ask("memory")}
 
 
-# --- start-up: a process that knows jaxeit only until it is imported, then gets this work
-
-STARTUP = """
-import time
-import jax, jaxeit as je
-took = {{"import": time.time() - {begin}}}
-jax.config.update("jax_enable_x64", True)
-from benchmarks.bench_batch import print_startup
-print_startup({cells}, took)
-"""
-
-
-def print_startup(cells: int, took: dict[str, float]) -> None:
-    """Seconds of each step in this process; called by STARTUP."""
-    problem = Problem(cells)
-    sigma = jnp.asarray(problem.sigma)
-    took["discretise"], (model, image) = seconds(_discretised, problem)
-    took["forward"], _ = seconds(lambda: jax.block_until_ready(je.forward(model, sigma)))
-    took["jacobian"], _ = seconds(lambda: jax.block_until_ready(je.jacobian(model, sigma, image)))
-    print(json.dumps(took))
-
-
-def _discretised(problem: Problem) -> tuple[je.Model, je.model.BasisMap]:
-    model = problem.model()
-    return model, je.Pixels(30).on(model)
-
-
-def startup(run: Run) -> Iterator[Row]:
-    """Without a cache of compiled programs, with an empty one, and with what that run left there."""
-    for cells in (problems.SMOKE,) if run.smoke else STARTUP_SIZES:
-        with tempfile.TemporaryDirectory() as folder:
-            for name, there in (("no cache", ""), ("fresh cache", folder), ("second process", folder)):
-                done = fresh(STARTUP.format(begin=time.time(), cells=cells), cache=there)[1]
-                took = {step: round(spent, 3) for step, spent in json.loads(done.stdout.splitlines()[-1]).items()}
-                yield {"startup": [{"nodes": (cells + 1) ** 2, "cache": name, **took}]}
-
-
-main = Question("batch", __doc__, {"rows": rates, "startup": startup})
+main = Question("batch", __doc__, {"rows": rates})
 
 if __name__ == "__main__":
     main()

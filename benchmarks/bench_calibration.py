@@ -1,7 +1,5 @@
 """How short may a bench session be?  Presses, and forces at each of them, against the error on presses not fitted.
 
-python -m benchmarks.bench_calibration [--smoke | --draw-only]
-
 The pool is the bundled session testbed_grid.h5: 225 simulated presses to 20 N on a 15 x 15 grid.  Some of them are
 fitted and the others predicted, over their holds and all along their presses; of all 225 each fifth of the places is
 predicted from the rest.  They lie on a grid (nearest to the middles of equal cells), are scattered evenly without one
@@ -28,8 +26,9 @@ from calib.fitting.results import FitResult
 from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
 
-from .figures import logarithmic, panels
-from .harness import ROOT, Question, Row, Run
+from .figures import curves, logarithmic, panels
+from .harness import ROOT, Question, Run
+from .rows import Row, averaged, grouped
 
 SESSIONS = ROOT / "data" / "sessions"
 SIDES = (3, 4, 5, 6, 8, 10, 15)  # of the grid of presses
@@ -37,8 +36,7 @@ LEVELS = (1, 2, 3, 5, None)  # None: the whole press
 DRAWS, FOLDS = 3, 5
 SIDE = 15  # of the pool's grid
 CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib.PowerLaw()}
-FIELDS = {"none": None, "pad edge": calib.PadEdge()}
-RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))
+RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))  # curve, and location field
 SMOKE = calib.Recipe(
     location=calib.Bilinear(nodes=2, shared=True),
     locator=calib.ImageCentroid("half"),
@@ -78,15 +76,11 @@ def pool(smoke: bool) -> Pool:
         seconds = float(np.median(np.diff(found.recordings[0].presses.t_press))) * 1e-9
     with calib.open_session(SESSIONS / "testbed_presses.h5") as session:
         other = pool_presses([session], calibration.skin)
-    places, elsewhere = (_places(calibration, frames) for frames in (found.dv, other.dv))
+    places: Any
+    elsewhere: Any
+    places, elsewhere = (calibration.locate(frames, single=True) for frames in (found.dv, other.dv))  # it has a field
     geometry = geometry_of(calibration.skin, places.position.dtype)
     return Pool(found.data, geometry, places, found.position, seconds, other.data, elsewhere)
-
-
-def _places(calibration: calib.Calibration, frames: np.ndarray) -> Places:
-    found = calibration.locate(frames, single=True)
-    assert found is not None  # it has a field
-    return found
 
 
 # --- what is fitted
@@ -140,14 +134,13 @@ def at_levels(data: PressData, levels: int | None) -> PressData:
 
 def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> Hybrid | None:
     """None where the presses do not determine it."""
-    curve, field = CURVES[recipe[0]], FIELDS[recipe[1]]
-    places = None if field is None else pool.places
+    field, places = (None, None) if recipe[1] == "none" else (calib.PadEdge(), pool.places)
     pressed = pool.position[use]
     data = replace(at_levels(pool.data, levels), reach=np.stack([pressed.min(0), pressed.max(0)]))
     presses = LocatedPresses(data, pool.geometry, places)
-    hybrid = fit_hybrid(curve, field, presses, calib.fitting.SoftL1(), use=use)
-    results = [np.asarray(hybrid.curves.result), *([] if hybrid.field is None else [np.asarray(hybrid.field.result)])]
-    return hybrid if all((found == FitResult.SUCCESS).all() for found in results) else None
+    hybrid = fit_hybrid(CURVES[recipe[0]], field, presses, calib.fitting.SoftL1(), use=use)
+    results = [hybrid.curves.result, *([] if hybrid.field is None else [hybrid.field.result])]
+    return hybrid if all((np.asarray(found) == FitResult.SUCCESS).all() for found in results) else None
 
 
 # --- how well it predicts
@@ -180,82 +173,51 @@ def _rms(parts: Sequence[np.ndarray]) -> float:
     return float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2)))
 
 
-def row(pool: Pool, recipe: tuple[str, str], spread: str, uses: Sequence[np.ndarray], levels: int | None) -> Row:
+def row(pool: Pool, recipe: tuple[str, str], spread: str, uses: Sequence[np.ndarray], levels: int | None = None) -> Row:
     """Means over the draws that determine the fit, and their standard deviations."""
-    tried = [judged(pool, recipe, use, levels) for use in uses]
-    good = [one for one in tried if one]
+    good = [one for one in (judged(pool, recipe, use, levels) for use in uses) if one]
     count = int(uses[0].sum())
     out: Row = {"curve": recipe[0], "location": recipe[1], "spread": spread, "presses": count, "levels": levels}
-    out |= {"minutes": round(count * pool.seconds / 60, 1), "draws": len(tried), "failed": len(tried) - len(good)}
-    for name in good[0] if good else ():
-        values = np.array([one[name] for one in good])
-        out[name] = float(values.mean())
-        if len(values) > 1:
-            out[f"{name}_sd"] = float(values.std(ddof=1))
-    return out
+    out |= {"minutes": round(count * pool.seconds / 60, 1), "draws": len(uses), "failed": len(uses) - len(good)}
+    return out | (averaged(good) if good else {})
 
 
 def by_presses(run: Run) -> Iterator[Row]:
-    found, recipes = pool(run.smoke), RECIPES[1:2] if run.smoke else RECIPES
+    found = pool(run.smoke)
     presses = len(found.data.force)
-    for recipe in recipes:
-        for count in (side**2 for side in ((5, 15) if run.smoke else SIDES)):
-            uses = {"grid": [on_grid(found.position, round(count**0.5))]}
+    for recipe in run.sizes(RECIPES, RECIPES[1:2]):
+        for side in run.sizes(SIDES, (5, 15)):
+            uses, count = {"grid": [on_grid(found.position, side)]}, side**2
             if count < presses:
                 uses["scattered"] = [scattered(found.position, count)]
                 uses["random"] = [drawn(presses, count, seed) for seed in range(1 if run.smoke else DRAWS)]
-            yield {"presses": [row(found, recipe, spread, some, None) for spread, some in uses.items()]}
-    yield {"verdict": verdict(run.data["presses"])}
+            yield {"presses": [row(found, recipe, spread, some) for spread, some in uses.items()]}
 
 
 def by_levels(run: Run) -> Iterator[Row]:
     yield {"levels": []}
-    for curve in () if run.smoke else CURVES:
+    for curve in run.sizes(list(CURVES), ()):
         for count in (36, 100):
             uses = [scattered(pool(False).position, count)]
             rows = [row(pool(False), (curve, "pad edge"), "scattered", uses, levels) for levels in LEVELS]
             yield {"levels": rows}
 
 
-# --- what is said of it
-
-
-def verdict(rows: Sequence[Row]) -> str:
-    """The fewest presses, scattered, whose error is within a quarter of that of all."""
-    said = []
-    for recipe in RECIPES:
-        mine = [r for r in rows if (r["curve"], r["location"]) == recipe and "hold_n" in r]
-        most = max((r["presses"] for r in mine), default=0)
-        mine = [r for r in mine if r["spread"] == "scattered" or r["presses"] == most]
-        mine.sort(key=lambda r: r["presses"])
-        if len(mine) > 1:
-            best = mine[-1]["hold_n"]
-            few = next(r for r in mine if r["hold_n"] <= 1.25 * best)
-            said.append(
-                f"{recipe[0]}, {recipe[1]}: {few['presses']} presses ({few['minutes']:.1f} minutes) come within a "
-                f"quarter of all {most} ({few['hold_n']:.2f} against {best:.2f} N)"
-            )
-    return "\n".join(said)
+# --- the picture
 
 
 def picture(data: Row) -> Figure:
     """Error against presses, and against force levels."""
     figure, (left, right) = panels(10.8, 4.6, 1, 2, sharey=True)
-    for colour, recipe in zip(("C0", "C1", "C2"), RECIPES, strict=True):
-        rows = [r for r in data["presses"] if (r["curve"], r["location"]) == recipe and "hold_n" in r]
-        for spread, line in LINES.items():
-            label = f"{recipe[0]}, place: {recipe[1]}" if spread == "scattered" else None
-            look: Row = {"color": colour, "linestyle": line, "marker": "o" if label else ".", "label": label}
-            points = [(r["presses"], r["hold_n"], r.get("hold_n_sd", 0)) for r in rows if r["spread"] == spread]
-            left.errorbar(*zip(*points, strict=True), **look)
-    for colour, curve in zip(("C0", "C1", "C2"), CURVES, strict=True):
-        curves: dict[int, list[tuple[int, float]]] = {}
-        for r in data["levels"]:
-            if r["curve"] == curve and "press_n" in r:
-                curves.setdefault(r["presses"], []).append((LEVELS.index(r["levels"]), r["press_n"]))
-        for count, points in curves.items():
-            look = {"color": colour, "linestyle": "-" if count == max(curves) else "--", "marker": "o"}
-            right.plot(*zip(*points, strict=True), **look, label=f"{curve}, {count} presses")
+    colours = dict(zip(RECIPES, ("C0", "C1", "C2"), strict=True))
+    for (curve, location, spread), rows in grouped(data["presses"], "curve", "location", "spread").items():
+        points = [(r["presses"], r["hold_n"], r.get("hold_n_sd", 0)) for r in rows if "hold_n" in r]
+        first = spread == "scattered"
+        look: Row = {"marker": "o", "label": f"{curve}, place: {location}"} if first else {"marker": "."}
+        look |= {"color": colours[curve, location], "linestyle": LINES[spread]}
+        left.errorbar(*zip(*points, strict=True), **look)
+    rows = [r | {"step": LEVELS.index(r["levels"])} for r in data["levels"]]
+    curves(right, rows, "step", "press_n", ("curve", "presses"), _look)
     labels: Any = {"xlabel": "presses fitted", "ylabel": "RMS error of held-out forces, N"}
     logarithmic(left, "over the holds; scattered (lines), grid (dashed), random (dotted, ± sd)", **labels)
     left.set_xticks([s**2 for s in SIDES], labels=[str(s**2) for s in SIDES])
@@ -267,6 +229,11 @@ def picture(data: Row) -> Figure:
     for axes in (left, right):
         axes.legend(fontsize=8, frameon=False)
     return figure
+
+
+def _look(curve: str, count: int) -> Row:
+    line, colour = "-" if count == 100 else "--", f"C{list(CURVES).index(curve)}"
+    return {"color": colour, "linestyle": line, "label": f"{curve}, {count} presses"}
 
 
 PARTS = {"presses": by_presses, "levels": by_levels}

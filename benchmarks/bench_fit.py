@@ -1,7 +1,5 @@
 """What calibrating costs: a session of 225 presses end to end, many sessions by workers, and the fits alone.
 
-python -m benchmarks.bench_fit [--sessions 24] [--workers 1 2] [--smoke]
-
 end to end: the bundled session, whose streams are slow, and one with all the frames that a bench records in 25 minutes
 (scene paper_bench, simulated first), without and with a correction by location. Each stage apart, in the first call,
 which compiles (or reads the cache of compiled programs), and in the second.
@@ -17,6 +15,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,14 +26,14 @@ from scipy.optimize import least_squares
 
 import calib
 import jaxeit as je
-from calib.batch.sessions import Outcome
 from calib.bench import load_bench, simulate
-from calib.fitting.curve_fit import fit_curves
+from calib.fitting.curves import fit_curves
 from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
 
-from .clock import in_turns, seconds, spread
-from .harness import ROOT, Question, Row, Run
+from .clock import in_turns, require_agreement, seconds, spread
+from .harness import ROOT, Question, Run
+from .rows import Row
 
 SESSION = ROOT / "data" / "sessions" / "testbed_grid.h5"
 WIDTH = 1.287  # of the robust loss, in units of the residuals' scale
@@ -68,43 +67,36 @@ def end_to_end(run: Run) -> Iterator[Row]:
 
 def stages(path: Path, recipe: calib.Recipe, out: Path) -> dict[str, float]:
     """Seconds of each stage of one calibration, saving included."""
-    began: list[tuple[str, float]] = []
-
-    def begin(stage: str) -> None:
-        began.append((stage, time.perf_counter()))
-
-    begin("opening")
+    began = [("opening", time.perf_counter())]
     with calib.open_session(path) as session:
-        calibration = calib.calibrate([session], recipe=recipe, progress=begin)
-        begin("saving")
+        calibration = calib.calibrate(
+            [session], recipe=recipe, progress=lambda stage: began.append((stage, time.perf_counter()))
+        )
+        began.append(("saving", time.perf_counter()))
         calibration.save(out)
-        begin("")
-    spent = {name: after - at for (name, at), (_, after) in pairwise(began)}
-    return {name: round(s, 3) for name, s in spent.items()} | {"all": round(began[-1][1] - began[0][1], 3)}
+    began.append(("", time.perf_counter()))
+    spent = {name: round(after - at, 3) for (name, at), (_, after) in pairwise(began)}
+    return spent | {"all": round(began[-1][1] - began[0][1], 3)}
 
 
 # --- many
 
 
 def many(run: Run) -> Iterator[Row]:
-    sessions, several = (2, [1]) if run.smoke else (run.args.sessions, run.args.workers)
-    for workers in several:
+    sessions = 2 if run.smoke else run.args.sessions
+    for workers in run.sizes(run.args.workers, (1,)):
         yield {"many": [batch(sessions, workers, recipe_of(run))]}
 
 
 def batch(sessions: int, workers: int, recipe: calib.Recipe) -> Row:
     """Sessions per minute, all in all and once every worker is warm, and what it comes to per session and worker."""
     ended: list[float] = []
-
-    def tell(outcome: Outcome) -> None:
-        ended.append(time.perf_counter())
-
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"s{i:04d}.h5" for i in range(sessions)]
         for path in paths:
             shutil.copy(SESSION, path)
-        out = Path(folder) / "out"
-        spent, outcomes = seconds(lambda: calib.calibrate_many(paths, out, jobs=workers, tell=tell, recipe=recipe))
+        how = {"jobs": workers, "recipe": recipe, "tell": lambda outcome: ended.append(time.perf_counter())}
+        spent, outcomes = seconds(lambda: calib.calibrate_many(paths, Path(folder) / "out", **how))
     failed = [outcome.reason for outcome in outcomes if outcome.reason]
     if failed:
         raise SystemExit(f"{len(failed)} sessions failed: {failed[0]}")
@@ -127,19 +119,17 @@ def fits(run: Run) -> Iterator[Row]:
         data = pool_presses([session], je.load_skin("testbed")).data
     first, found = seconds(_ours, data, calib.PowerLaw())
     reference = float(np.asarray(found.curve.reference)[0])
-    curve = calib.PowerLaw(reference)
-    found = _ours(data, curve)
+    ours = partial(_ours, data, calib.PowerLaw(reference))
+    found = ours()
     scales = np.asarray(found.scale, float)
 
     def theirs() -> np.ndarray:
         return np.stack([_theirs(data, pad, reference, scale) for pad, scale in enumerate(scales)])
 
-    difference = float(np.abs(theirs() / np.asarray(found.parameters) - 1).max())
-    if difference > MAX_DIFFERENCE:
-        raise SystemExit(f"scipy's parameters differ by {difference:.1e}: nothing is timed")
-    calls = {"calib.fit_curves": lambda: jax.block_until_ready(_ours(data, curve).parameters)}
-    calls["scipy.optimize.least_squares"] = theirs
-    about = {"samples": int(data.mask.sum()), "pads": len(scales), "difference": difference}
+    outputs = {"scipy.optimize.least_squares": theirs() / np.asarray(found.parameters), "calib.fit_curves": np.ones(2)}
+    difference = require_agreement(outputs, "calib.fit_curves", {"scipy.optimize.least_squares": MAX_DIFFERENCE})
+    calls = {"calib.fit_curves": lambda: jax.block_until_ready(ours().parameters), next(iter(difference)): theirs}
+    about = {"samples": int(data.mask.sum()), "pads": len(scales), "difference": next(iter(difference.values()))}
     times = {name: spread(taken) for name, taken in in_turns(calls, 3 if run.smoke else 20).items()}
     yield {"fits": about | {"first_call_s": round(first, 3), **times, "remark": REMARK}}
 
@@ -150,7 +140,7 @@ def _ours(data: PressData, curve: calib.PowerLaw) -> Any:
 
 
 def _theirs(data: PressData, pad: int, reference: float, scale: float) -> np.ndarray:
-    """Secant and exponent of one pad."""
+    """Secant and exponent of one pad, as exponents of e in the fit."""
     p, f = data.sample_pressure[pad, data.mask[pad]], data.sample_force[data.mask[pad]]
     loaded = p > 0
     z, log_z = np.where(loaded, p / reference, 0.0), np.log(np.where(loaded, p / reference, 1.0))
@@ -159,15 +149,12 @@ def _theirs(data: PressData, pad: int, reference: float, scale: float) -> np.nda
     def force(x):
         return np.where(loaded, np.exp(x[0]) * size * reference * z ** np.exp(x[1]), 0.0)
 
-    def residual(x):
-        return (f - force(x)) / scale
-
     def slope(x):
         h = force(x)
         return -np.stack([h, h * log_z * np.exp(x[1])], 1) / scale
 
-    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-9)
-    found = least_squares(residual, [0.0, 0.0], jac=slope, loss="soft_l1", f_scale=WIDTH, **tolerances)
+    how = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-9) | {"loss": "soft_l1", "f_scale": WIDTH}
+    found = least_squares(lambda x: (f - force(x)) / scale, [0.0, 0.0], jac=slope, **how)
     return np.array([np.exp(found.x[0]) * size, np.exp(found.x[1])])
 
 

@@ -1,14 +1,11 @@
-"""Forward solves of every tool on the same work, in one run.
+"""Forward solves of every tool on the same work, in one run."""
 
-python -m benchmarks.bench_forward [--smoke] [--no-memory]
-"""
-
-from .comparison import OPTIONS, Comparison, factorisation
+from .comparison import Comparison, factorisation
 from .harness import Question
 from .peers import superlu
 
 FORWARDS = Comparison("forward", superlu.NAME, "voltages", factorisation, repeats=15)
-main = Question("forward", __doc__, {"rows": FORWARDS}, OPTIONS)
+main = Question("forward", __doc__, {"rows": FORWARDS})
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,5 @@
 """How time and memory grow: with nodes, electrodes, readings, pixels, frames of a batch, and pads.
 
-python -m benchmarks.bench_growth [--smoke]
-
 One size varies at a time, on the square of the other benchmarks.  The exponents are the slopes of a line through the
 logarithms, over all sizes and from the last but one to the last; beside them what the theory expects for large sizes.
 Memory is what XLA states for the compiled program: arguments, results and temporaries.
@@ -19,8 +17,9 @@ import jaxeit as je
 from jaxeit.linalg import NestedDissection
 
 from .clock import in_turns, program, spread
-from .harness import Question, Row, Run
+from .harness import Question, Run
 from .problems import SIDE, square
+from .rows import Row
 
 PIXELS, BASE_CELLS, BASE_GRID = 30, 60, 5
 REPEATS, BUDGET = 15, 1.0  # calls of each that are timed, and s for a slow one
@@ -53,15 +52,11 @@ def model(cells: int = BASE_CELLS, grid: int = BASE_GRID, readings: int | None =
     return je.discretise(je.Scene(skin(grid, readings)), je.Fidelity(solver=NestedDissection()), mesh=mesh)
 
 
-def forward(of: str, size: int) -> Work:
+def solve(function: Callable, of: str, size: int) -> Work:
+    """`forward`, or `jacobian` onto pixels, with so many cells a side or electrodes a side of their grid."""
     found = model(**{of: size})
-    return je.forward, (found, found.background), len(found.nodes) if of == "cells" else size**2
-
-
-def jacobian(of: str, size: int) -> Work:
-    found = model(**{of: size})
-    arguments = (found, found.background, je.Pixels(PIXELS).on(found))
-    return je.jacobian, arguments, len(found.nodes) if of == "cells" else size**2
+    image = (je.Pixels(PIXELS).on(found),) if function is je.jacobian else ()
+    return function, (found, found.background, *image), len(found.nodes) if of == "cells" else size**2
 
 
 def images(recon: je.Reconstructor, count: int, *shape: int) -> Work:
@@ -92,6 +87,7 @@ def series() -> tuple[Series, ...]:
     """Those that share a reconstructor or a model make it once."""
     recon, draft = reconstructor(), model(30)
     factor, cells, grids = "1 to 1.5: fronts, then their factorisation", (30, 60, 120, 240), (3, 5, 6, 10)
+    forward, jacobian = (partial(solve, function) for function in (je.forward, je.jacobian))
     return (
         Series("forward", "nodes", cells, factor, "1, and a logarithm", partial(forward, "cells")),
         Series("Jacobian", "nodes", cells, factor, "1, and a logarithm", partial(jacobian, "cells")),

@@ -1,7 +1,5 @@
 """Localisation with every imaging method: the testbed of the paper, simulated on another mesh, six seeds.
 
-python -m benchmarks.bench_images [--smoke] [--seeds 6] [--methods TEXT]
-
 For each seed the sheet is coated anew (CoatingNonUniformity 0.15, ContactGain 0.12), pressed to 20 N by a 20 mm tip
 on the 15 x 15 grid, and pressed at two places at once; noise is 60 dB below the readings. Columns: localisation by
 each estimator and inward bias (mean over the grid, mm; the uneven contact gain alone moves the centre of a press by
@@ -14,9 +12,9 @@ same noise; otherwise at an even sheet. Iterative methods have 24 x 24 pixels, t
 uses the first two seeds.
 """
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import jax
@@ -24,9 +22,10 @@ import numpy as np
 
 import jaxeit as je
 
-from .clock import seconds
-from .harness import Question, Row, Run, stored
-from .problems import noise_of, readings_of_presses
+from .clock import in_turns, seconds, spread
+from .harness import Question, Run, stored
+from .problems import pressed
+from .rows import Row, averaged
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.02, 0.03, 0.04, 0.06), (1.0, 1 / 3)
@@ -67,13 +66,6 @@ class Simulated:
     """
 
     def __init__(self, seed: int, grid: int, pairs: int) -> None:
-        effects = (
-            je.effects.LoadSpreading(0.012),
-            je.effects.CoatingNonUniformity(0.15, 0.03, seed=2 * seed),
-            je.effects.ContactGain(0.12, 0.015, seed=2 * seed + 1),
-            je.effects.ContactPiezoresistance(1.0, 20e3, 1.0),
-        )
-        model = je.discretise(je.Scene(je.load_skin("testbed"), effects), je.Fidelity.standard(edge_length=0.026))
         rng = np.random.default_rng(seed)
         line = np.linspace(0.01, 0.19, grid)
         self.sites = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
@@ -81,11 +73,11 @@ class Simulated:
         along = np.stack([np.cos(angle), np.sin(angle)], -1) / 2
         far = np.array(DISTANCES)[:, None, None]
         self.pairs = np.stack([centre - far * along, centre + far * along], -2)
-        v0 = np.asarray(je.forward(model))
-        self.noise = np.full(v0.size, noise_of(v0))
-        self.blank = v0 + self.noise / np.sqrt(BLANKS) * rng.normal(size=v0.size)
-        frames = readings_of_presses(model, *self._presses())
-        self.frames = frames - v0 + self.noise * rng.normal(size=frames.shape)
+        uneven = je.effects.CoatingNonUniformity(0.15, 0.03, seed=2 * seed)
+        found = pressed((uneven, je.effects.ContactGain(0.12, 0.015, seed=2 * seed + 1)), *self._presses())
+        self.noise = np.full(found.untouched.size, found.noise)
+        self.blank = found.untouched + self.noise / np.sqrt(BLANKS) * rng.normal(size=found.untouched.size)
+        self.frames = found.change + self.noise * rng.normal(size=found.change.shape)
 
     def _presses(self) -> tuple[np.ndarray, np.ndarray]:
         """Two places of each press, and the loads there; the second of a single is not loaded."""
@@ -157,27 +149,21 @@ def by_fit(finder: je.ContactFinder, one: Simulated) -> Seen:
 
 def measured(name: str, model: je.Model, simulated: Sequence[Simulated]) -> Row:
     """The row of a method; its preparation is timed once all is compiled."""
-    settings: Row = dict((FITS | METHODS)[name])
+    fit = name in FITS
+    settings: Row = ({} if fit else USUAL) | (FITS | METHODS)[name]
     simulated, sheet_known = simulated[: settings.pop("seeds", None)], settings.pop("sheet_known", False)
-    usual: Row = {} if name in FITS else USUAL
-    settings = usual | settings | {"noise": simulated[0].noise}
     if "basis" in settings:
         settings["basis"] = settings["basis"].on(model)
-    prepare = partial(je.prepare_contacts if name in FITS else je.prepare, model, **settings)
-    coats = [je.fit_background(model, one.blank) if sheet_known else None for one in simulated]
+    prepare = partial(je.prepare_contacts if fit else je.prepare, model, noise=simulated[0].noise, **settings)
+    coats = [je.fit_background(model, one.blank) for one in simulated] if sheet_known else [None]
     prepare(sigma=coats[0])
     spent, first = seconds(lambda: prepare(sigma=coats[0]))
-    ready = [first, *(prepare(sigma=coat) if sheet_known else first for coat in coats[1:])]
-    if name in FITS:
-        see, about = by_fit, {"prepare_ms": 1e3 * spent}
-    else:
-        level = chosen_level(first, np.asarray(first(simulated[0].singles)))
-        see, about = partial(by_image, level=level), {"level": level, "prepare_ms": 1e3 * spent}
+    ready = [first, *(prepare(sigma=coat) for coat in coats[1:])] if sheet_known else [first] * len(simulated)
+    about = {} if fit else {"level": chosen_level(first, np.asarray(first(simulated[0].singles)))}
+    see: Callable[[Any, Simulated], Seen] = by_fit if fit else partial(by_image, **about)
     found = [dict(scores(one, see(method, one))) for method, one in zip(ready, simulated, strict=True)]
-    mean = {name: float(np.nanmean([seed[name] for seed in found])) for name in found[0]}
-    if len(found) > 1:
-        mean |= {f"{name}_sd": float(np.nanstd([seed[name] for seed in found], ddof=1)) for name in found[0]}
-    return mean | {"seeds": len(found), "frame_ms": frame_time(first, simulated[0].singles)} | about
+    times = {"frame_ms": frame_time(first, simulated[0].singles), "prepare_ms": 1e3 * spent}
+    return averaged(found) | {"seeds": len(found)} | times | about
 
 
 def scores(one: Simulated, seen: Seen) -> Iterator[tuple[str, float]]:
@@ -191,34 +177,29 @@ def scores(one: Simulated, seen: Seen) -> Iterator[tuple[str, float]]:
         yield name, float(matched(found, pairs).mean())
 
 
-def frame_time(apply: Callable, frames: np.ndarray, budget: float = 1.0) -> float:
+def frame_time(apply: Callable, frames: np.ndarray) -> float:
     """Median time of one frame, ms; images are computed in NumPy, which takes less time than a call of JAX."""
     apply = apply.on_host() if isinstance(apply, je.Reconstructor) else apply
-    jax.block_until_ready(apply(frames[0]))
-    times: list[float] = []
-    start = time.perf_counter()
-    while len(times) < 5 or (time.perf_counter() - start < budget and len(times) < 200):
-        times.append(seconds(lambda k: jax.block_until_ready(apply(frames[k % len(frames)])), len(times))[0])
-    return 1e3 * float(np.median(times))
+    turns = cycle(frames)
+    jax.block_until_ready(apply(next(turns)))
+    times = in_turns({"frame": lambda: jax.block_until_ready(apply(next(turns)))}, 200, budget=1.0)["frame"]
+    return spread(times)["median_ms"]
 
 
 def measure(run: Run) -> Iterator[Row]:
     """A row for each method; with `--methods` those not named stay as stored."""
-    seeds, grid, pairs = (1, 4, 4) if run.smoke else (run.args.seeds, 15, 24)
+    seeds, grid, pairs = run.sizes((6, 15, 24), (1, 4, 4))
     model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
     simulated = [Simulated(seed, grid, pairs) for seed in range(seeds)]
     before = {row["method"]: row for row in stored(run.args.section)["rows"]} if run.args.methods else {}
     rows = []
-    for name in SMOKE if run.smoke else (*FITS, *METHODS):
+    for name in run.sizes((*FITS, *METHODS), SMOKE):
         rows.append({"method": name} | measured(name, model, simulated) if run.args.methods in name else before[name])
         print(name, flush=True)
     yield {"seeds": seeds, "rows": rows}
 
 
-OPTIONS: Row = {
-    "--seeds": {"type": int, "default": 6},
-    "--methods": {"default": "", "metavar": "TEXT", "help": "measure methods whose name contains TEXT"},
-}
+OPTIONS: Row = {"--methods": {"default": "", "metavar": "TEXT", "help": "measure methods whose name contains TEXT"}}
 main = Question("images", __doc__, {"rows": measure}, OPTIONS)
 
 if __name__ == "__main__":

@@ -1,7 +1,4 @@
-"""One-step reconstruction (NOSER) of every tool on the same work, in one run: preparation and application.
-
-python -m benchmarks.bench_inverse [--smoke] [--no-memory] [--only application]
-"""
+"""One-step reconstruction (NOSER) of every tool on the same work, in one run: preparation and application."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,15 +14,13 @@ import scipy.sparse as sp
 import jaxeit as je
 
 from .clock import limits, require_agreement, seconds
-from .comparison import OPTIONS, Comparison, inverse_work
-from .harness import Question, Row, Run
-from .peers import eidors
+from .comparison import Comparison, inverse_work
+from .harness import Question, Run
 from .problems import SMOKE, Problem
-from .tools import IN_DATA, PIXELS, Reconstruction
+from .rows import Row
+from .tools import IN_DATA, Reconstruction
 
-MAX_FLOAT32_DIFFERENCE = (
-    1e-4  # of float32 images by matrices built in float64; built in float32 they are 2 % off: not timed
-)
+MAX_FLOAT32_DIFFERENCE = 1e-4  # of float32 images by matrices built in float64; those built in float32 are 2 % off
 CALLS, BLOCK, BUDGET = 2000, 100, 12.0  # calls whose times are taken, in turns of a block; s for a slow one
 SINGLE, STREAM, AFTER_WORK, BATCH = "single", "stream", "single, after other work", "batch"
 STREAMED = 100_000  # frames, of which few enough are slow that they need so many to be counted
@@ -36,7 +31,7 @@ ASKED = 100  # readings of a frame of the event-driven scan
 STILL = "as much time in the first cache"
 ELSEWHERE = np.zeros(1 << 25, np.uint8)  # bytes that other work touches: sixteen times what a core keeps to itself
 TOGETHER, LOOP = 1000, 100
-GOAL_MS, GOAL_TIMES = 0.1, 10
+LATE_MS = 0.1
 STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
     "p50": np.median,
     "p99": lambda times: np.quantile(times, 0.99),
@@ -216,7 +211,7 @@ def application_rows(ways: Ways, times: Mapping[str, np.ndarray], byte_per_s: fl
         ms, per_frame = 1e3 * times[name], 1e3 * way.passes / way.frames
         found = {f"{key}_ms": round(float(f(ms)), 5) for key, f in STATISTICS.items()}
         row: Row = {"way": name, "frames": way.frames, "calls": len(ms)} | found
-        row |= {"above": int(np.sum(ms > GOAL_MS)), "frames_per_s": round(1e3 / float(np.median(ms)), 1)}
+        row |= {"above": int(np.sum(ms > LATE_MS)), "frames_per_s": round(1e3 / float(np.median(ms)), 1)}
         row |= {"bytes": way.bytes, "least_ms": round(per_frame * way.bytes / byte_per_s, 5)}
         rows.append(row | {"least_cached_ms": round(per_frame * copy_seconds(way.bytes), 5)})
     return rows
@@ -247,35 +242,10 @@ def application(run: Run) -> Iterator[Row]:
         times = latencies(ways, calls, block, 1.0 if smoke else BUDGET, between)
         out[kind] = [row | {"difference": found[row["way"]]} for row in application_rows(ways, times, byte_per_s)]
     yield {"application": out}
-    yield {"verdict": verdict(run.data)}
-
-
-def verdict(data: Row) -> list[str]:
-    """The goals, and what was measured."""
-    rows, lines = sorted(data.get("rows", ()), key=lambda row: row["nodes"]), []
-    ours = {row["nodes"]: row["median_ms"] for row in rows if row["tool"] == "jaxeit float64, pixels"}
-    for row in rows:
-        if row["tool"] == f"{eidors.NAME}, pixels" and row["nodes"] in ours:
-            times = row["median_ms"] / ours[row["nodes"]]
-            said = f"{row['nodes']:,} nodes onto {PIXELS**2} pixels: {times:.1f} times as fast as EIDORS"
-            lines.append(f"{said} (goal {GOAL_TIMES}: {_met(times >= GOAL_TIMES)})")
-    for kind in (SINGLE, STREAM, AFTER_WORK):
-        for row in data["application"][kind]:
-            said = f"{kind}, {row['way']}: " + ", ".join(f"{key} {row[f'{key}_ms']:.3f}" for key in STATISTICS) + " ms"
-            if kind == STREAM:
-                lines.append(f"{said} ({row['above']:,} of {row['calls']:,} calls above {GOAL_MS})")
-            elif row["way"].startswith("jaxeit"):
-                goal = f"goal {GOAL_MS}: {_met(row['max_ms'] <= GOAL_MS)}"
-                lines.append(f"{said} ({goal}; {row['p50_ms'] / row['least_ms']:.1f} times the limit)")
-    return lines
-
-
-def _met(goal: bool) -> str:
-    return "met" if goal else "missed"
 
 
 PREPARATION = Comparison("inverse", IN_DATA, "reconstruction matrices", inverse_work, 7, ("pixels", "elements"))
-main = Question("inverse", __doc__, {"preparation": PREPARATION, "application": application}, OPTIONS)
+main = Question("inverse", __doc__, {"preparation": PREPARATION, "application": application})
 
 if __name__ == "__main__":
     main()

@@ -1,14 +1,14 @@
 """Kuopio Tomography Challenge 2023: untrained methods on its four training frames, with electrodes taken away.
 
-python -m benchmarks.bench_ktc --data FOLDER     # --smoke: one frame at two levels, nothing written
-
 A water tank of 0.115 m radius with 32 electrodes around it, plastic and metal pieces in it (Räsänen et al. 2023). The
 challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, with every reading that uses one. Its
 evaluation frames are not used here; the levels are made by leaving those readings of the training frames out.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +28,9 @@ from calib.report.figures import write_figure
 
 from .clock import seconds
 from .figures import panels
-from .harness import ROOT, Question, Row, Run
-from .tables import crossed
+from .harness import ROOT, Question, Run
+from .markdown import crossed
+from .rows import Row, grouped
 
 PICTURE = ROOT / "docs" / "ktc.png"
 RADIUS, ELECTRODES, GRID = 0.115, 32, 256
@@ -62,7 +63,7 @@ def otsu_labels(image: np.ndarray) -> np.ndarray:
     return np.where(classes < water, RESISTIVE, np.where(classes > water, CONDUCTIVE, WATER))
 
 
-# --- the challenge ---------------------------------------------------------------------------------------------------
+# --- the challenge
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,61 +199,35 @@ def on_grid(values: np.ndarray, picture: Any) -> np.ndarray:
     return np.where(np.hypot(x, y) <= RADIUS, map_coordinates(filled, places, order=1, mode="nearest"), 0.0)
 
 
-Method = Callable[[Data], list[tuple[np.ndarray, np.ndarray]]]  # frames to (image, labels) of each
+Method = Callable[[Data], list[np.ndarray]]  # frames to the labels of each
+FLOOR, LEAST = 0.5, 150  # of a region: change of log conductivity, and pixels
+RELATIVE, ABSOLUTE = 0.05, 0.01  # share of a change, and of the largest, that the model misses
 
 
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """The recipe of old: one step from even water with `Noser`, then Otsu."""
-
-    model: je.Model
-    image: je.model.BasisMap
-    water: Water
-    hyperparameter: float = 0.1
-
-    def __call__(self, data: Data) -> list[tuple[np.ndarray, np.ndarray]]:
-        sigma = jnp.full_like(self.model.background, self.water.sigma)
-        used = np.isfinite(data.reference)
-        recon = je.prepare(
-            self.model, basis=self.image, hyperparameter=self.hyperparameter, sigma=sigma, channels=jnp.asarray(used)
-        )
-        images = np.asarray(recon(jnp.asarray(data.frames - data.reference)))
-        pictures = [on_grid(image, recon) for image in images]
-        return [(picture, otsu_labels(picture)) for picture in pictures]
+def linear(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) -> list[np.ndarray]:
+    """The recipe of the challenge: one step from even water with `Noser`, then Otsu."""
+    sigma, used = jnp.full_like(model.background, water.sigma), jnp.asarray(np.isfinite(data.reference))
+    recon = je.prepare(model, basis=image, hyperparameter=0.1, sigma=sigma, channels=used)
+    images = np.asarray(recon(jnp.asarray(data.frames - data.reference)))
+    return [otsu_labels(on_grid(image, recon)) for image in images]
 
 
-@dataclass(frozen=True, eq=False)
-class Variation:
+def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) -> list[np.ndarray]:
     """Gauss-Newton on log conductivity with total variation, each region cut at half its height.
 
-    The model is asked for the change only: ``voltages(0) + frame - reference``. It misses the change by ``relative`` of
-    it, ``absolute`` of the largest, and in the measure in which it missed the reference.
+    The model is asked for the change only: ``voltages(0) + frame - reference``. It misses the change by RELATIVE of it,
+    ABSOLUTE of the largest, and in the measure in which it missed the reference.
     """
-
-    model: je.Model
-    image: je.model.BasisMap
-    water: Water
-    prior: je.imaging.IsotropicVariation = field(default_factory=je.imaging.IsotropicVariation)
-    relative: float = 0.05
-    absolute: float = 0.01
-    floor: float = 0.5
-    least: int = 150
-
-    def __call__(self, data: Data) -> list[tuple[np.ndarray, np.ndarray]]:
-        contact = jnp.full_like(self.model.contact, 1 / self.water.contact)
-        model = eqx.tree_at(lambda m: m.contact, self.model, contact)
-        physics = je.imaging.LogConductivity(model, self.image, jnp.asarray(self.water.sigma))
-        rest = np.asarray(_rest(physics))
-        pictures = [self._picture(physics, rest, frame, data.reference) for frame in data.frames]
-        return [(picture, half_height(picture, self.floor, self.least)) for picture in pictures]
-
-    def _picture(self, physics, rest, frame, reference):
-        change = frame - reference
-        share = np.sqrt(np.nansum(change**2) / np.nansum(reference**2))
-        largest = np.nanmax(np.abs(change))
-        std = self.relative * np.abs(change) + self.absolute * largest + share * np.abs(self.water.missed)
-        found = je.gauss_newton(physics, self.prior, jnp.asarray(rest + change), jnp.asarray(std))
-        return on_grid(np.asarray(found), self.image.picture)
+    model = eqx.tree_at(lambda m: m.contact, model, jnp.full_like(model.contact, 1 / water.contact))
+    physics = je.imaging.LogConductivity(model, image, jnp.asarray(water.sigma))
+    rest, labels = np.asarray(_rest(physics)), []
+    for change in data.frames - data.reference:
+        share = np.sqrt(np.nansum(change**2) / np.nansum(data.reference**2))
+        std = RELATIVE * np.abs(change) + ABSOLUTE * np.nanmax(np.abs(change)) + share * np.abs(water.missed)
+        prior = je.imaging.IsotropicVariation()
+        found = je.gauss_newton(physics, prior, jnp.asarray(rest + change), jnp.asarray(std))
+        labels.append(half_height(on_grid(np.asarray(found), image.picture), FLOOR, LEAST))
+    return labels
 
 
 @eqx.filter_jit
@@ -262,7 +237,7 @@ def _rest(physics):
 
 def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method]:
     image = je.Pixels(pixels).on(model)
-    return {"linear": Linear(model, image, water), "variation": Variation(model, image, water)}
+    return {way.__name__: partial(way, model, image, water) for way in (linear, variation)}
 
 
 # --- results
@@ -273,31 +248,30 @@ def measure(
 ) -> tuple[list[Row], dict[tuple[int, str], list[np.ndarray]]]:
     """Scores of every method at every level, and the labels behind them."""
     rows, found = [], {}
-    for level in levels:
-        for name, way in ways.items():
-            spent, out = seconds(way, with_level(data, level, first))
-            found[level, name] = [labels for _, labels in out]
-            scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(found[level, name], data.truth, strict=True)]
-            row = {"level": level, "first": first, "method": name, "seconds": round(spent, 2)}
-            rows.append(row | {"scores": [round(s, 3) for s in scores], "mean": round(float(np.mean(scores)), 3)})
-            print(rows[-1], flush=True)
+    for level, (name, way) in product(levels, ways.items()):
+        spent, found[level, name] = seconds(way, with_level(data, level, first))
+        scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(found[level, name], data.truth, strict=True)]
+        row = {"level": level, "first": first, "method": name, "seconds": round(spent, 2)}
+        rows.append(row | {"scores": [round(s, 3) for s in scores], "mean": round(float(np.mean(scores)), 3)})
+        print(rows[-1], flush=True)
     return rows, found
+
+
+def _mean(rows: list[Row]) -> float:
+    return float(np.mean([row["mean"] for row in rows]))
 
 
 def totals(rows: list[Row]) -> dict[str, float]:
     """Mean over levels, of the 21 points of the challenge (three frames at each of seven levels)."""
-    names = dict.fromkeys(row["method"] for row in rows)
-    return {name: round(21 * float(np.mean([r["mean"] for r in rows if r["method"] == name])), 2) for name in names}
+    return {name: round(21 * _mean(mine), 2) for name, mine in grouped(rows, "method").items()}
 
 
 def means(rows: list[Row]) -> dict[str, dict[str, float]]:
     """Mean score by level and method."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for row in rows:
-        found.setdefault(row["method"], {}).setdefault(f"level {row['level']}", []).append(row["mean"])
+    by_method = {name: grouped(mine, "level") for name, mine in grouped(rows, "method").items()}
     return {
-        name: {level: round(float(np.mean(scores)), 3) for level, scores in by_level.items()}
-        for name, by_level in found.items()
+        name: {f"level {level}": round(_mean(mine), 3) for level, mine in by_level.items()}
+        for name, by_level in by_method.items()
     }
 
 
@@ -358,7 +332,7 @@ def challenge(run: Run) -> Iterator[Row]:
     ways = methods(model, water["equal currents, offsets"])
     if run.smoke:
         data = replace(data, frames=data.frames[:1], truth=data.truth[:1])
-    rows, found = measure(data, ways, SMOKE_LEVELS if run.smoke else LEVELS)
+    rows, found = measure(data, ways, run.sizes(LEVELS, SMOKE_LEVELS))
     print(table(rows), flush=True)
     yield {"published_of_21": PUBLISHED, "of_21": totals(rows), "rows": rows}
     if not run.smoke:

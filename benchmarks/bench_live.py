@@ -5,8 +5,6 @@ First a soak, which is recorded as well, and another at real-time priority where
 many frames in a tenth of the time; then the highest rate of frames that is sustained, by doubling and bisection. A rate
 at which frames are dropped is tried once more: a machine that stands still for a moment drops them at any rate.
 
-python -m benchmarks.bench_live [--smoke] [--minutes 10] [--calibration CALIBRATION.h5 --section NAME] [--only rates]
-
 Latency counts from when the bytes that end a frame were read; `since_due` from when the simulated device should have
 sent it: the device's own lateness, and what the bytes waited to be read, are in it. `woken` is how late a process wakes
 that does nothing but sleep from one hundredth of a second to the next, at the same time: no program on this machine can
@@ -20,7 +18,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import count
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
@@ -41,11 +39,12 @@ from calib.record.priority import real_time, refusal
 from calib.record.recorder import record_session, session_journal
 from calib.runtime import set_up_live
 
-from .harness import Question, Row, Run
+from .harness import Question, Run
 from .memory import growth, resident
+from .rows import Row
 
 RATE, PRESSURE_RATE = 100, 1000
-REST = 1.0
+REST = 0.5  # s; much shorter than a pause of the simulated skin
 LOST = 1e-3  # of the frames may be dropped at a rate that is sustained
 FASTEST = 6400  # Hz
 CLOSE = 1.1  # the rate that is sustained and the one that is not are not farther apart
@@ -118,12 +117,12 @@ def skin_process(rates: tuple[int, int], channels: tuple[int, int], told: Any, s
 
 
 def frames(number: int, rate: int, channels: int) -> Packets:
-    """Noise; on the pads a press of 2 kPa, half of the time, from two seconds on."""
+    """Noise; on the pads a press of 2 kPa, two seconds of every four: rest levels can be found in each pause."""
     rng = np.random.default_rng(number)
     pool = rng.normal(0, 1e-6, (64, channels)).astype("f4")
     pressed = pool + np.float32(2e-4 * rng.normal() if number == 1 else 2000.0)
     times = (n * 1_000_000_000 // rate for n in count())
-    choice = ((pressed if n > 2 * rate and n // rate % 2 else pool)[n % 64] for n in count())
+    choice = ((pressed if n // (2 * rate) % 2 else pool)[n % 64] for n in count())
     return frame_packets(number, times, choice)
 
 
@@ -157,38 +156,23 @@ class Received:
         return self._due.get(host)
 
 
-class Watch:
-    """Latencies, s, and the memory of this process once a second; all room is taken at the beginning."""
+class Memory:
+    """Samples of the time, s, and the memory of this process, MB; all room is taken at the beginning."""
 
-    def __init__(self, rate: int, seconds: float, begin: int, received: Received):
-        most = int(1.5 * rate * seconds) + 1000
-        self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
-        self._memory, self._used = np.full((int(seconds) + 60, 2), np.nan), 0
-        self._rate, self._begin, self._received = rate, begin, received
-        self.last: FrameResult | None = None
+    def __init__(self, most: int):
+        self._samples, self._used = np.full((most, 2), np.nan), 0
 
-    def __call__(self, result: FrameResult) -> None:
-        now, row = time.monotonic_ns(), result.number - 1
-        self.last = result
-        self._latency[row] = result.latency
-        due = self._received.due(result.host)
-        if due is not None:
-            self._since_due[row] = ((now - self._begin) // 1000 - due) % 2**32 / 1e6
-        if not self._used or now / 1e9 - self._memory[self._used - 1, 0] >= 1.0:
-            self._memory[self._used] = now / 1e9, resident()
+    @property
+    def samples(self) -> np.ndarray:
+        """(n, 2)."""
+        return self._samples[: self._used]
+
+    def note(self, at_least: float = 0.0) -> None:
+        """Take a sample, unless the last is younger than that many seconds."""
+        now = time.monotonic()
+        if not self._used or now - self._samples[self._used - 1, 0] >= at_least:
+            self._samples[self._used] = now, resident()
             self._used += 1
-
-    def found(self) -> Row:
-        """In ms, and MB."""
-        out = spread("latency", self._latency) | spread("since_due", self._since_due)
-        memory = self._memory[: self._used]
-        return out | {"memory_mb": round(memory[-1, 1])} | grown(memory, self._rate)
-
-
-def spread(name: str, seconds: np.ndarray) -> dict[str, float]:
-    """Percentiles, ms."""
-    values = 1e3 * np.nanpercentile(seconds, [50, 99, 100])
-    return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
 
 
 def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
@@ -200,9 +184,39 @@ def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
     if not np.isfinite(found.error):
         return {}
     return {
-        "memory_mb_per_hour": round(found.slope * share, 2),
-        "memory_mb_per_hour_error": round(found.error * share, 2),
+        f"memory_mb_per_hour{end}": round(mb * share, 2) for end, mb in (("", found.slope), ("_error", found.error))
     }
+
+
+class Watch:
+    """Latencies, s, and the memory of this process once a second; all room is taken at the beginning."""
+
+    def __init__(self, rate: int, seconds: float, begin: int, received: Received):
+        most = int(1.5 * rate * seconds) + 1000
+        self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
+        self._rate, self._begin, self._received, self._memory = rate, begin, received, Memory(int(seconds) + 60)
+        self.last: FrameResult | None = None
+
+    def __call__(self, result: FrameResult) -> None:
+        now, row = time.monotonic_ns(), result.number - 1
+        self.last = result
+        self._latency[row] = result.latency
+        due = self._received.due(result.host)
+        if due is not None:
+            self._since_due[row] = ((now - self._begin) // 1000 - due) % 2**32 / 1e6
+        self._memory.note(at_least=1.0)
+
+    def found(self) -> Row:
+        """In ms, and MB."""
+        times = percentiles("latency", self._latency) | percentiles("since_due", self._since_due)
+        memory = self._memory.samples
+        return times | {"memory_mb": round(memory[-1, 1])} | grown(memory, self._rate)
+
+
+def percentiles(name: str, seconds: np.ndarray) -> dict[str, float]:
+    """Median, 99th percentile and most, ms."""
+    values = 1e3 * np.nanpercentile(seconds, [50, 99, 100])
+    return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
 
 
 @contextmanager
@@ -237,7 +251,7 @@ def metronome(realtime: bool) -> Iterator[dict[str, float]]:
             yield found
         finally:
             stop.set()
-            found |= spread("woken", told.get(timeout=10))
+            found |= percentiles("woken", told.get(timeout=10))
 
 
 def sleeping(realtime: bool, told: Any, stop: Event) -> None:
@@ -254,24 +268,18 @@ def sleeping(realtime: bool, told: Any, stop: Event) -> None:
 
 def tenfold(calibration: calib.Calibration, seconds: float) -> Row:
     """A recording at ten times the rate of the paper: frames, those lost, and what memory did."""
-    rates, memory = (10 * RATE, 10 * PRESSURE_RATE), np.full((int(10 * seconds) + 1000, 2), np.nan)
-    used = count()
-
-    def note(line: str) -> None:
-        row = next(used)
-        memory[row] = time.monotonic(), resident()
-
+    rates, memory = (10 * RATE, 10 * PRESSURE_RATE), Memory(int(10 * seconds) + 1000)
     with device(calibration, rates) as (_, (eit, pressure)), tempfile.TemporaryDirectory() as folder:
         plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
-        summary = record_session(plan, sources, Path(folder) / "session.h5", seconds=seconds, progress=note)
-    recorded = memory[: next(used) - 1]  # the last is told when the session is written
+        path = Path(folder) / "session.h5"
+        summary = record_session(plan, sources, path, seconds=seconds, progress=lambda line: memory.note())
     return {
         "rate_hz": rates[0],
         "seconds": seconds,
         "recorded": [stream.frames for stream in summary.streams],
         "lost": [stream.lost for stream in summary.streams],
         "complete": summary.complete,
-        **grown(recorded, rates[0]),
+        **grown(memory.samples[:-1], rates[0]),  # the last is told when the session is written
     }
 
 
@@ -292,17 +300,13 @@ def watched(
     calibration: calib.Calibration, rate: int, seconds: float, output: Path | None = None, realtime: bool = False
 ) -> Row:
     """One run: frames and what became of them, the latencies in ms, and what memory did."""
+    show, settings = LiveControl(), LiveSettings(REST, realtime=realtime)
     with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
-        with ExitStack() as stack:
-            show, received = (
-                LiveControl(),
-                Received(stack.enter_context(session_journal(output)) if output is not None else NullSink()),
-            )
-            watch, woken = Watch(rate, seconds, begin, received), stack.enter_context(metronome(realtime))
-            timer = threading.Timer(seconds, show.stop.set)
+        with session_journal(output) if output else nullcontext(NullSink()) as sink, metronome(realtime) as woken:
+            received = Received(sink)
+            watch, timer = Watch(rate, seconds, begin, received), threading.Timer(seconds, show.stop.set)
             plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
-            how: Any = {"log": received, "begun": timer.start}
-            run_live(calibration, plan, sources, [watch], show, LiveSettings(REST, realtime=realtime), **how)
+            run_live(calibration, plan, sources, [watch], show, settings, log=received, begun=timer.start)
             timer.cancel()
             ended = time.monotonic()
         finishing = time.monotonic() - ended

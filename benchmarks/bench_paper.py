@@ -1,7 +1,5 @@
 """The shipped scene `paper_bench` against the paper, over seeds; and the same at fixed force for other load spreading.
 
-python -m benchmarks.bench_paper [--seeds 6] [--smoke]
-
 Each seed has a sheet, a protrusion layer, noise and drift of its own.  Localisation by centroids of the image and by
 the fit of contacts; coefficients of variation of the EIT sum, of the hybrid (the paper's recipe) and of that corrected
 for the contact's place, predicted by fits that have not seen the place, as `jaxeit calibrate --location edge` prints
@@ -24,20 +22,21 @@ import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.runtime import set_up
 
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 from .tables import PAPER_BENCH
 
 SCENE = 0.01  # m, the spreading of the shipped scene
 WIDTHS = (0.006, 0.008, SCENE, 0.012, 0.016, 0.020)
-EIT_RATE, SCANS = 10.0, 18
+EIT_RATE, SCANS, SEEDS = 10.0, 18, 6
 PAPER = {"localisation_quarter_mean": "6.9", "cv_eit_ddof1": "0.31", "cv_hybrid_ddof1": "0.14"}
 
 
 def measure(run: Run) -> Iterator[Row]:
     """A row for each load spreading: mean and standard deviation over the seeds."""
-    seeds = 1 if run.smoke else run.args.seeds
+    seeds = 1 if run.smoke else SEEDS
     yield {"seeds": seeds, "paper": PAPER}
-    for width in (SCENE,) if run.smoke else WIDTHS:
+    for width in run.sizes(WIDTHS, (SCENE,)):
         found = [figures(seed, width, run.smoke) for seed in range(seeds if width == SCENE else 1)]
         row: Row = {"spreading_mm": 1e3 * width, "seeds": len(found)}
         for name in PAPER_BENCH:
@@ -77,7 +76,7 @@ def figures(seed: int, width: float, smoke: bool) -> dict[str, float]:
     return {name: float(found[name]) for name in PAPER_BENCH}
 
 
-main = Question("paper", __doc__, {"rows": measure}, {"--seeds": {"type": int, "default": 6}}, prepare=set_up)
+main = Question("paper", __doc__, {"rows": measure}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

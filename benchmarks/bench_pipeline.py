@@ -1,7 +1,5 @@
 """From the mesh to images of 100 frames with every tool, and the time that each tool needs to reach an accuracy.
 
-python -m benchmarks.bench_pipeline [--smoke] [--no-memory] [--largest CELLS] [--only accuracy]
-
 Pipeline: nodes, triangles, electrodes, pairs and 100 frames are given as arrays; the result is the images by one-step
 NOSER, linearised at a conductivity that varies. Every tool repeats in each call what depends on the mesh; ours is
 timed with its programs compiled (`first_call_s` holds the compilation). Tools without pixels are given the
@@ -18,10 +16,11 @@ from typing import Any
 
 from .bench_accuracy import Solve, graded, peers, regular, timed
 from .clock import require_agreement
-from .comparison import OPTIONS, Comparison, inverse_work
-from .harness import Question, Row, Run
+from .comparison import Comparison, inverse_work
+from .harness import Question, Run
 from .peers import cholmod, eidors, pyeit, superlu
 from .problems import Problem, rectangle
+from .rows import Row
 from .tools import IN_IMAGE, Entry, forward, present
 
 TARGETS = (1e-2, 1e-3, 2e-4)
@@ -86,7 +85,7 @@ def accuracy(run: Run) -> Iterator[Row]:
 PIPELINES = Comparison(
     "pipeline", IN_IMAGE, "images", inverse_work, 5, ("pixels", "elements"), "voltage_difference", voltages
 )
-main = Question("pipeline", __doc__, {"rows": PIPELINES, "accuracy": accuracy}, OPTIONS)
+main = Question("pipeline", __doc__, {"rows": PIPELINES, "accuracy": accuracy})
 
 if __name__ == "__main__":
     main()

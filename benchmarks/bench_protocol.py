@@ -1,7 +1,5 @@
 """Accuracy and frame rate against the number of readings in a frame.
 
-python -m benchmarks.bench_protocol [--smoke | --draw-only]
-
 Single presses of 8 N by a 20 mm tip at places all over the testbed, which has an even coating, simulated on another
 mesh than the one they are found on; the noise of a reading is 60 dB below the rms of the readings. Each way to choose
 readings is asked for more and more of the 550 readings of a scan; the others are NaN, which image and fit leave out
@@ -23,9 +21,10 @@ from matplotlib.figure import Figure
 
 import jaxeit as je
 
-from .figures import logarithmic, panels
-from .harness import Question, Row, Run
-from .problems import noise_of, readings_of_presses
+from .figures import curves, logarithmic, panels
+from .harness import Question, Run
+from .problems import pressed
+from .rows import Row, averaged
 
 COUNTS = (10, 20, 40, 80, 160, 275, 550)
 INDEPENDENT = 160  # the most that volume is asked for: more readings span no more, but for rounding
@@ -58,23 +57,17 @@ class Bench:
 
     def __init__(self, smoke: bool) -> None:
         self.skin = je.load_skin("testbed")
-        self.sites, self.frames, noise = self._simulated(4 if smoke else PRESSES, 0.06 if smoke else 0.026)
+        rng, presses = np.random.default_rng(0), 4 if smoke else PRESSES
+        low, high = self.skin.domain.bounds
+        self.sites = rng.uniform(np.add(low, MARGIN), np.subtract(high, MARGIN), (presses, 2))
+        found = pressed((), self.sites[:, None], np.full((presses, 1), LOAD), 0.06 if smoke else 0.026)
+        self.frames = found.change + found.noise * rng.normal(size=found.change.shape)
         self.model = je.discretise(je.Scene(self.skin), je.Fidelity.draft())
-        std = np.full(self.skin.protocol.readings, noise)
-        self.fit = je.prepare_contacts(self.model, noise=std, most=2, columns=21 if smoke else 41)
+        std = np.full(self.skin.protocol.readings, found.noise)
+        settings = je.contacts.ContactSettings(most=2, columns=21 if smoke else 41)
+        self.fit = je.prepare_contacts(self.model, settings, noise=std)
         self.image = je.prepare(self.model, noise=std)
         self.basis = je.Pixels(20).on(self.model)
-
-    def _simulated(self, presses: int, edge_length: float) -> tuple[np.ndarray, np.ndarray, float]:
-        effects = (je.effects.LoadSpreading(0.012), je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
-        model = je.discretise(je.Scene(self.skin, effects), je.Fidelity.standard(edge_length=edge_length))
-        rng = np.random.default_rng(0)
-        low, high = self.skin.domain.bounds
-        sites = rng.uniform(np.add(low, MARGIN), np.subtract(high, MARGIN), (presses, 2))
-        touched = readings_of_presses(model, sites[:, None], np.full((presses, 1), LOAD))
-        v0 = np.asarray(je.forward(model))
-        noise = noise_of(v0)
-        return sites, touched - v0 + noise * rng.normal(size=touched.shape), noise
 
     def pads_at(self, places: np.ndarray) -> np.ndarray:
         """The pad of the pixel that is nearest to each place."""
@@ -117,8 +110,8 @@ class Bench:
     def row(self, name: str, count: int, orders: Orders) -> Row:
         rows = [np.sort(order[:count]) for order in orders]
         frames = np.full(self.frames.shape, np.nan)
-        for frame, seen, kept in zip(frames, self.frames, rows, strict=True):
-            frame[kept] = seen[kept]
+        for number, kept in enumerate(rows):
+            frames[number, kept] = self.frames[number, kept]
         fitted = np.asarray(je.localisation_error(je.contacts.strongest(self.fit(frames)), self.sites))
         pictured = np.asarray(je.localisation_error(ESTIMATOR(self.image(frames), self.image), self.sites))
         return {
@@ -147,51 +140,37 @@ def measure(run: Run) -> Iterator[Row]:
     bench = Bench(run.smoke)
     ways = bench.ways()
     yield {"presses": len(bench.sites), "rows": []}
-    for count in (40,) if run.smoke else COUNTS:
+    for count in run.sizes(COUNTS, (40,)):
         rows = [bench.row(name, count, way) for name, way in ways.items() if len(way[0]) >= count]
         drawn = [bench.row("at random", count, bench.at_random(k)) for k in range(1 if run.smoke else DRAWS)]
-        yield {"rows": [*rows, mean(drawn)]}
+        yield {"rows": [*rows, averaged(drawn, sd_of="_mm")]}
     yield {"events": events(bench, 24, 80)}
-
-
-def mean(rows: Sequence[Row]) -> Row:
-    """The mean over draws, and the standard deviation of the errors."""
-    out: Row = {}
-    for name, first in rows[0].items():
-        values = [row[name] for row in rows if row[name] is not None]
-        number = isinstance(first, float) or first is None
-        out[name] = (float(np.mean(values)) if values else None) if number else first
-        if name.endswith("_mm") and len(values) > 1:
-            out[f"{name}_sd"] = float(np.std(values, ddof=1))
-    return out
 
 
 def events(bench: Bench, idle: int, local: int) -> Row:
     """Readings and errors by frame: at rest, for the pad that is pressed, then around the contact found."""
-    scan = je.prepare_event_scan(
-        bench.model, bench.skin, je.scan.EventScanSettings(onset=500.0, idle=idle, local=local)
-    )
+    settings = je.scan.EventScanSettings(onset=500.0, idle=idle, local=local)
+    scan = je.prepare_event_scan(bench.model, bench.skin, settings)
     step = eqx.filter_jit(lambda state, pressure, places: scan.step(state, pressure, places))
-    found: dict[str, list] = {"rest": [], "first": [], "next": []}
+    masks: dict[str, list] = {"rest": [], "first": [], "next": []}
     errors: dict[str, list[float]] = {"first": [], "next": []}
-    for site, seen, pressed in zip(bench.sites, bench.frames, bench.pads_at(bench.sites), strict=True):
-        pressure, nowhere = np.zeros(len(bench.skin.pads)), np.full((bench.fit.most, 2), np.nan)
-        state, _ = step(scan.start(), pressure, nowhere)  # the whole scan
-        state, mask = step(state, pressure, nowhere)
-        found["rest"].append(mask)
-        pressure[pressed], places = 5e3, nowhere
-        for name in ("first", "next"):
+    for site, seen, pad in zip(bench.sites, bench.frames, bench.pads_at(bench.sites), strict=True):
+        pressure, places = np.zeros(len(bench.skin.pads)), jnp.full((bench.fit.most, 2), jnp.nan)
+        state, _ = step(scan.start(), pressure, places)  # the whole scan
+        state, mask = step(state, pressure, places)
+        masks["rest"].append(mask)
+        pressure[pad] = 5e3
+        for name, apart in errors.items():
             state, mask = step(state, pressure, places)
             contacts = bench.fit(jnp.where(mask, seen, jnp.nan))
             places = jnp.where(contacts.present[:, None], contacts.position, jnp.nan)
-            found[name].append(mask)
-            errors[name].append(float(je.localisation_error(je.contacts.strongest(contacts), site)))
+            masks[name].append(mask)
+            apart.append(float(je.localisation_error(je.contacts.strongest(contacts), site)))
     out: Row = {"idle": idle, "local": local}
-    for name, masks in found.items():
-        out[name] = {"readings": float(np.mean([int(m.sum()) for m in masks]))} | bench.rates(masks)
-        if name in errors:
-            apart = np.array(errors[name])
-            out[name] |= {"fit_mm": _mm(apart, np.nanmean), "lost": float(np.isnan(apart).mean())}
+    for name, mine in masks.items():
+        out[name] = {"readings": float(np.mean([int(m.sum()) for m in mine]))} | bench.rates(mine)
+    for name, apart in errors.items():
+        out[name] |= {"fit_mm": _mm(np.array(apart), np.nanmean), "lost": float(np.isnan(apart).mean())}
     return out
 
 
@@ -206,13 +185,15 @@ def picture(data: Row) -> Figure:
     """Error against readings, by the fit and by the image, and against frames per second."""
     figure, axes = panels(12, 4.3, 1, 3)
     for panel, (x, y, label, title) in zip(axes, PANELS, strict=True):
-        for way, colour in WAYS.items():
-            points = sorted((r[x], r[y]) for r in data["rows"] if r["way"] == way and r[y] is not None)
-            line = ":" if way == "at random" else "-"
-            panel.plot(*zip(*points, strict=True), line, marker="o", color=colour, label=way)
+        rows = sorted(data["rows"], key=lambda row: (list(WAYS).index(row["way"]), row[x]))
+        curves(panel, rows, x, y, ("way",), _look)
         logarithmic(panel, title, xlabel=label, ylabel="mean error of place, mm")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
     return figure
+
+
+def _look(way: str) -> Row:
+    return {"linestyle": ":" if way == "at random" else "-", "color": WAYS[way], "label": way}
 
 
 main = Question("protocol_cost", __doc__, {"rows": measure}, picture=picture, file="measurement-cost.png")

@@ -1,7 +1,5 @@
 """Recordings of others on real hardware, which are not part of this project: what the fits make of them.
 
-python -m benchmarks.bench_real FOLDER [--only NAME] [--smoke]
-
 FOLDER holds the public recordings eflesh, pneumatic_actuator and insole_plenum (benchmarks/README.md says whose they
 are).
 
@@ -20,6 +18,7 @@ follows the one branch where the other was held out; stretches a tenth as long a
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -28,15 +27,15 @@ from scipy import io, ndimage
 
 import calib
 from calib.fitting.channel_faults import faults
-from calib.fitting.curve_fit import fit_curves
-from calib.fitting.curves import CURVES, AbstractCurve
-from calib.fitting.fitted_curve import predict_pads
-from calib.fitting.gaussian_process import SmoothChannels
+from calib.fitting.curves import CURVES, AbstractCurve, fit_curves
+from calib.fitting.curves.fitted import predict_pads
+from calib.fitting.logs import SmoothChannels, fit_log
 from calib.fitting.results import FitResult
-from calib.fitting.validation import fit_log, rmse
+from calib.fitting.validation import rmse
 from calib.runtime import set_up
 
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 
 GRAM = 9.80665e-3  # N
 EFLESH = "eflesh/20250401_014340_probe"
@@ -56,7 +55,7 @@ def _row(of: str, law: str, train: float, test: float, unit: str, **more: object
     return {"recording": of, "law": law, "fitted": round(train, 4), "predicted": round(test, 4), "unit": unit} | more
 
 
-# --- pressure against force -----------------------------------------------------------------------
+# --- pressure against force
 
 
 def _actuators(folder: Path, smoke: bool) -> Iterator[Row]:
@@ -68,7 +67,7 @@ def _actuators(folder: Path, smoke: bool) -> Iterator[Row]:
             yield _row(name, CURVES.name_of(law), fit.train.rmse, fit.held_out.rmse, "N")
 
 
-# --- channels against a scale -----------------------------------------------------------------------
+# --- channels against a scale
 
 
 def _eflesh(folder: Path, smoke: bool) -> Iterator[Row]:
@@ -88,25 +87,19 @@ def _eflesh(folder: Path, smoke: bool) -> Iterator[Row]:
         yield _row("eflesh", way, fit.train.rmse / GRAM, fit.held_out.rmse / GRAM, "g", source=fit.source)
 
 
-# --- taxels against a chamber's pressure --------------------------------------------------------------
+# --- taxels against a chamber's pressure
 
 
 def _insole(folder: Path, smoke: bool) -> Iterator[Row]:
-    found = io.loadmat(folder / "insole_plenum" / "calibration_dataset.mat", squeeze_me=True, struct_as_record=False)[
-        "experiment"
-    ]
+    path = folder / "insole_plenum" / "calibration_dataset.mat"
+    found = io.loadmat(path, squeeze_me=True, struct_as_record=False)["experiment"]
     counts = found.C[:, 2:]
     pressure, rate, lag = aligned(counts, found.P)
     told = faults(counts, pressure)
     sound = ~told.any
-    yield {
-        "recording": "insole",
-        "taxels": counts.shape[1],
-        **{name: np.flatnonzero(flags).tolist() for name, flags in told._asdict().items()},
-        "sound": int(sound.sum()),
-        "rate": round(rate, 4),
-        "lag_samples": round(lag, 1),
-    }
+    faulty = {name: np.flatnonzero(flags).tolist() for name, flags in told._asdict().items()}
+    about: Row = {"recording": "insole", "taxels": counts.shape[1]} | faulty
+    yield about | {"sound": int(sound.sum()), "rate": round(rate, 4), "lag_samples": round(lag, 1)}
     rows = slice(None, None, 100 if smoke else THIN)
     rest, gauge = np.median(counts[:REST], 0), np.median(pressure[:REST])  # the gauge's own zero is at 0.056 bar
     press = ndimage.median_filter(rest - counts, (9, 1))[rows][:, sound].T
@@ -120,16 +113,10 @@ def aligned(counts: np.ndarray, pressure: np.ndarray) -> tuple[np.ndarray, float
     def alike(rate: float, lag: float) -> float:
         return float(np.corrcoef(np.interp(index * rate + lag, np.arange(len(pressure)), pressure), middle)[0, 1])
 
-    tried = [(alike(r, k), r, k) for r in np.linspace(0.98, 1.02, 21) for k in np.linspace(-200, 200, 41)]
-    for step in (0.001, 0.0002):
-        _, rate, lag = max(tried)
-        around = np.linspace(-2, 2, 9)
-        tried = [
-            (alike(rate + a * step, lag + b * 2e4 * step), rate + a * step, lag + b * 2e4 * step)
-            for a in around
-            for b in around
-        ]
-    _, rate, lag = max(tried)
+    rate, lag, grid = 1.0, 0.0, partial(np.linspace, -1, 1)
+    finer = ((0.02 * grid(21), 200 * grid(41)), (0.002 * grid(9), 40 * grid(9)), (4e-4 * grid(9), 8 * grid(9)))
+    for rates, lags in finer:
+        rate, lag = max(product(rate + rates, lag + lags), key=lambda one: alike(*one))
     return np.interp(index * rate + lag, np.arange(len(pressure)), pressure), rate, lag
 
 

@@ -1,7 +1,5 @@
 """The cost of a scene's effects; an effect that is not listed costs nothing.
 
-python -m benchmarks.bench_scene [--smoke] [--only sessions] [--presets NAME ...]
-
 The first table has the program of one frame of a touch on the testbed (load, sheet, electrodes, voltages) and the
 program of a block of 1,024 frames (histories and readout), as effects are added one by one in the order of the
 stages: compile time, operations of the optimised program, floating-point operations by XLA's count, run time. The
@@ -12,6 +10,7 @@ listed apart.
 
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +25,11 @@ from calib.bench import load_bench, presets, simulate
 from jaxeit import effects as fx
 
 from .clock import in_turns, program, seconds
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 
 ROWS = 1024
-LEFT_OUT = (
-    je.effects.IndentationSpreading,
-    je.effects.HomogenisedIslands,
-    je.effects.ContinuousCoating,
-)  # others say the same
+LEFT_OUT = (fx.IndentationSpreading, fx.HomogenisedIslands, fx.ContinuousCoating)  # others say the same
 STAGES = ("mechanics", "material", "electrical", "pneumatics", "readout")
 
 
@@ -111,7 +107,7 @@ def histories(effects, block, pads, load, pattern):
 
 
 def sessions(run: Run) -> Iterator[Row]:
-    for name in ["ideal"] if run.smoke else run.args.presets:
+    for name in run.sizes(list(presets()), ["ideal"]):
         yield {"sessions": [simulated(name, fidelity(run))]}
 
 
@@ -119,25 +115,15 @@ def simulated(name: str, fidelity: je.Fidelity) -> Row:
     """A shipped scene to a file, twice: the first run compiles what the second finds in memory."""
     bench = load_bench(name)
     with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{number}.h5" for number in range(2)]
-        first, second = (
-            seconds(lambda path: simulate(bench, path, fidelity=fidelity, progress=lambda work: work), path)[0]
-            for path in paths
-        )
-        size = paths[-1].stat().st_size
-    return {
-        "scene": name,
-        "recording_s": bench.duration,
-        "frames": int(bench.duration * bench.eit_rate),
-        "first_s": first,
-        "second_s": second,
-        "times_real_time": bench.duration / second,
-        "file_mb": size / 1e6,
-    }
+        path = Path(folder) / "session.h5"
+        runs = {"first_s": path, "second_s": path.with_name("again.h5")}
+        times = {key: seconds(partial(simulate, bench, out, fidelity=fidelity))[0] for key, out in runs.items()}
+        size = path.stat().st_size
+    about = {"scene": name, "recording_s": bench.duration, "frames": int(bench.duration * bench.eit_rate)}
+    return about | times | {"times_real_time": bench.duration / times["second_s"], "file_mb": size / 1e6}
 
 
-PRESETS: Row = {"nargs": "*", "default": list(presets()), "metavar": "NAME", "help": "scenes to simulate"}
-main = Question("scene", __doc__, {"programs": programs, "sessions": sessions}, {"--presets": PRESETS}, prepare=set_up)
+main = Question("scene", __doc__, {"programs": programs, "sessions": sessions}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

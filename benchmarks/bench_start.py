@@ -1,7 +1,5 @@
 """Start-up times of fresh processes: imports, help, and the README's first program.
 
-python -m benchmarks.bench_start [--smoke]
-
 Times are from the start of a process to its end.  The program runs without a cache of compiled programs, with an empty
 cache, and with the cache that this run filled.  The times of imports, by package, are those of `python -X importtime`.
 """
@@ -13,7 +11,8 @@ from collections.abc import Iterator
 from functools import partial
 
 from .clock import fresh, in_turns, spread
-from .harness import ROOT, Question, Row, Run
+from .harness import ROOT, Question, Run
+from .rows import Row
 
 COMMANDS = {
     "python": "pass",

@@ -18,9 +18,7 @@ import numpy as np
 
 import jaxeit as je
 
-MAX_DIFFERENCE = (
-    1e-9  # largest difference of results, relative to the largest value, up to which tools do the same work
-)
+MAX_DIFFERENCE = 1e-9  # of results of tools that do the same work, relative to the largest value
 TURN_SECONDS = 0.1  # s
 MIN_TURNS = 5  # turns: the least and most of fewer times say little about their spread
 
@@ -84,11 +82,11 @@ def a_turn(tool: Tool, sigma: np.ndarray) -> tuple[float, float]:
 
 
 def in_turns(calls: Mapping[Any, Callable], repeats: int, budget: float = np.inf) -> dict[Any, list[float]]:
-    """Seconds of each of several calls, one call a round; a call that has taken ``budget`` seconds stops early."""
+    """Seconds of several calls, each once a round; a slow one stops after ``budget`` seconds and `MIN_TURNS` rounds."""
     times: dict[Any, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
-            if sum(times[name]) < budget:
+            if len(times[name]) < MIN_TURNS or sum(times[name]) < budget:
                 times[name].append(seconds(call)[0])
     return times
 

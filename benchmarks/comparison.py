@@ -9,14 +9,10 @@ import numpy as np
 import jaxeit as je
 
 from .clock import Call, alone, interleaved, limits, peak_megabytes, peaks, require_agreement, seconds, spread, taken
-from .harness import Row, Run, set_up
+from .harness import Run, set_up
 from .problems import SIZES, SMOKE, Problem
+from .rows import Row
 from .tools import PIXELS, TOOLS, basis_of, present
-
-OPTIONS: dict[str, dict[str, Any]] = {
-    "--no-memory": {"action": "store_true", "help": "skip each tool's peak memory at the largest size"},
-    "--largest": {"type": int, "default": SIZES[-1], "metavar": "CELLS", "help": "most cells a side"},
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +37,7 @@ class Comparison:
         """Rows and work of all sizes, then the peak memory of each tool at the largest."""
         machine = limits()
         yield {"limits": machine, "rows": [], "work": []}
-        sizes = (SMOKE,) if run.smoke else tuple(s for s in SIZES if s <= run.args.largest)
-        for cells in sizes:
+        for cells in run.sizes(SIZES, (SMOKE,)):
             before, problem = self.before(cells), Problem(cells)
             for image in self.images:
                 rows = self.rows(problem, image, 3 if run.smoke else self.repeats)
@@ -50,8 +45,8 @@ class Comparison:
                     for row in rows if self.checked else ():
                         row[self.checked] = before.get(row["tool"].split(",")[0])
                     yield {"rows": rows, "work": [with_limits(rows, machine, self.work(problem, image))]}
-        if not (run.smoke or run.args.no_memory):
-            self._add_peaks(run.data["rows"], sizes[-1])
+        if not run.smoke:
+            self._add_peaks(run.data["rows"], SIZES[-1])
             yield {}
 
     def rows(self, problem: Problem, image: str, repeats: int, budget: float = 8.0) -> list[Row]:

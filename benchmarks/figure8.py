@@ -1,7 +1,5 @@
 """Two contacts that come and go one by one, as in the paper's figure 8: force over time, its error, and interference.
 
-python -m benchmarks.figure8 [--smoke]
-
 The shipped scene `two_contacts` (SIMULATED): press 1, press 2, release 1, release 2, three times with both tips on one
 pad and on neighbouring ones otherwise.  The calibration is of single presses on a grid over the same sheet, as a bench
 makes them: it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump, and
@@ -11,10 +9,8 @@ spreads to its neighbours counts as interference; it means nothing for tips that
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +22,8 @@ from calib.report.figures import write_figure
 from calib.report.force_series import ForceSeries, force_series_figure
 from calib.runtime import set_up
 
-from .harness import ROOT, Question, Row, Run
+from .harness import ROOT, Question, Run
+from .rows import Row, grouped
 
 PICTURE = ROOT / "docs" / "figure-8.png"
 SIDE = 9  # of the grid of presses that are calibrated on
@@ -62,60 +59,31 @@ def force_map(bench: Bench, smoke: bool) -> dict[str, np.ndarray]:
         return dict(calib.session.read_archive(folder / "map.h5", "skin-forcemap").arrays)
 
 
-@dataclass(frozen=True, eq=False)
 class Press:
-    """One press of both tips: what they did, and what the force map says of that time."""
+    """One press of both tips: what they did, and what the force map says of that time.
 
-    bench: Bench
-    forces: dict[str, np.ndarray]
-    number: int
+    | meaning                                                          | shape         | unit |
+    |------------------------------------------------------------------|---------------|------|
+    | time; rows: of the force map                                     | (n,)          | s    |
+    | tips                                                             | (contacts, 2) | m    |
+    | contacts: true forces; by_fit: of the contacts that were fitted; | (n, contacts) | N    |
+    | by_map: of the pixels of the force map                           | (n, contacts) | N    |
+    | under: pad under each tip                                        | (contacts,)   |      |
+    | pads: true forces; found: those of the force map                 | (n, pads)     | N    |
+    """
 
-    @property
-    def start(self) -> float:
-        return self.bench.blank + self.number * self.bench.period
-
-    @cached_property
-    def rows(self) -> np.ndarray:
-        time = self.forces["time"] / 1e9
-        return (time >= self.start + 0.5) & (time < self.start + self.bench.period - 0.2)
-
-    @cached_property
-    def time(self) -> np.ndarray:
-        """(n,) s."""
-        return self.forces["time"][self.rows] / 1e9
-
-    @property
-    def tips(self) -> np.ndarray:
-        """(contacts, 2) m."""
-        return planned_motion(self.bench).places[self.number]
-
-    @cached_property
-    def contacts(self) -> np.ndarray:
-        """(n, contacts) N, the true forces."""
-        return loads_at(planned_motion(self.bench), self.time).load
-
-    @property
-    def under(self) -> np.ndarray:
-        """Pad under each tip."""
-        return np.argmax([je.Polygon(pad.outline).contains(self.tips) for pad in self.bench.scene.skin.pads], 0)
-
-    @property
-    def pads(self) -> np.ndarray:
-        """(n, pads) N, the true forces."""
-        true = np.zeros((len(self.time), len(self.bench.scene.skin.pads)))
-        np.add.at(true.T, self.under, self.contacts.T)
-        return true
-
-    @property
-    def by_fit(self) -> np.ndarray:
-        """(n, contacts) N, of the contacts that were fitted."""
-        return self._to_tips(self.forces["contact_position"][self.rows], self.forces["contact_force"][self.rows])
-
-    @property
-    def by_map(self) -> np.ndarray:
-        """(n, contacts) N, of the pixels of the force map."""
-        force = self.forces["force"][self.rows]
-        return self._to_tips(np.broadcast_to(self.forces["centres"], (*force.shape, 2)), force)
+    def __init__(self, bench: Bench, forces: dict[str, np.ndarray], number: int) -> None:
+        self.bench, self.number, self.start = bench, number, bench.blank + number * bench.period
+        every, motion = forces["time"] / 1e9, planned_motion(bench)
+        rows = (every >= self.start + 0.5) & (every < self.start + bench.period - 0.2)
+        self.time, self.found, force = every[rows], forces["pad_force"][rows], forces["force"][rows]
+        self.tips, self.contacts = motion.places[number], loads_at(motion, every[rows]).load
+        self.outlines = [je.Polygon(pad.outline) for pad in bench.scene.skin.pads]
+        self.under = np.argmax([outline.contains(self.tips) for outline in self.outlines], 0)
+        self.pads = np.zeros(self.found.shape)
+        np.add.at(self.pads.T, self.under, self.contacts.T)
+        self.by_fit = self._to_tips(forces["contact_position"][rows], forces["contact_force"][rows])
+        self.by_map = self._to_tips(np.broadcast_to(forces["centres"], (*force.shape, 2)), force)
 
     def _to_tips(self, place: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Forces (n, k) at places (n, k, 2), each given to the nearest tip, (n, contacts); NaN is nowhere."""
@@ -127,34 +95,31 @@ class Press:
     @property
     def kind(self) -> str:
         """One of `KINDS`; a tip on a border rests on pads beside the one that its centre is on."""
-        pads, under = self.bench.scene.skin.pads, self.under
-        outlines = [je.Polygon(pads[k].outline) for k in under]
-        away = [one.boundary_distance(tip[None])[0] for one, tip in zip(outlines, self.tips, strict=True)]
-        return KINDS[2] if min(away) < 1e-6 else KINDS[len(set(under.tolist())) - 1]
+        pressed = zip(self.under, self.tips, strict=True)
+        away = [self.outlines[pad].boundary_distance(tip[None])[0] for pad, tip in pressed]
+        return KINDS[2] if min(away) < 1e-6 else KINDS[len(set(self.under.tolist())) - 1]
 
     def row(self) -> Row:
-        true, found, contacts = self.pads, self.forces["pad_force"][self.rows], self.contacts
-        idle, both = ~true.any(0), (contacts > 0.9 * contacts.max(0)).all(1)
-        off, hold = found.sum(1) - true.sum(1), true.sum(1)[both].mean()
+        idle, both = ~self.pads.any(0), (self.contacts > 0.9 * self.contacts.max(0)).all(1)
+        off, hold = self.found.sum(1) - self.pads.sum(1), self.pads.sum(1)[both].mean()
         return {
             "press": self.number,
             "tips_on": self.kind,
-            "pad_rmse_N": _rms((found - true)[:, ~idle]),
-            "contact_rmse_N": _rms(self.by_fit - contacts),
-            "map_contact_rmse_N": _rms(self.by_map - contacts),
+            "pad_rmse_N": _rms((self.found - self.pads)[:, ~idle]),
+            "contact_rmse_N": _rms(self.by_fit - self.contacts),
+            "map_contact_rmse_N": _rms(self.by_map - self.contacts),
             "total_rmse_N": _rms(off),
             "total_error_of_hold_percent": float(100 * np.abs(off[both]).mean() / hold),
-            "interference_percent": float(100 * np.abs(found[both][:, idle]).max(0).max() / hold),
+            "interference_percent": float(100 * np.abs(self.found[both][:, idle]).max(0).max() / hold),
         }
 
     def series(self, title: str) -> ForceSeries:
-        idle = sorted(set(range(len(self.bench.scene.skin.pads))) - set(self.under.tolist()))
-        others = self.forces["pad_force"][self.rows][:, idle].sum(1, keepdims=True)
+        others = np.delete(self.found, self.under, 1).sum(1)
         timing, late = self.bench.timing, self.bench.companions[0].delay
         down = timing.rest + timing.ramp + timing.hold
         events = dict(zip(EVENTS, (timing.rest, timing.rest + late, down, down + late), strict=True))
         names = ("contact 1", "contact 2", "pads not touched, together")
-        true, found = np.column_stack([self.contacts, np.zeros(len(self.time))]), np.column_stack([self.by_fit, others])
+        true, found = (np.column_stack(parts) for parts in ((self.contacts, 0 * others), (self.by_fit, others)))
         return ForceSeries(title, names, self.time - self.start, true, found, events)
 
 
@@ -162,13 +127,13 @@ def _rms(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def summary(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+def summary(rows: Sequence[Row]) -> dict[str, Row]:
     """Means by kind."""
-    found: dict[str, Any] = {kind: [row for row in rows if row["tips_on"] == kind] for kind in KINDS}
+    by_kind = grouped(rows, "tips_on")
     return {
-        kind: {key: round(float(np.mean([row[key] for row in mine])), 3) for key in list(mine[0])[2:]}
-        for kind, mine in found.items()
-        if mine
+        kind: {key: round(float(np.mean([row[key] for row in by_kind[kind]])), 3) for key in list(rows[0])[2:]}
+        for kind in KINDS
+        if kind in by_kind
     }
 
 

@@ -4,7 +4,8 @@ import argparse
 import json
 import os
 import platform
-from collections.abc import Callable, Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -19,11 +20,10 @@ from calib.session import replacing
 
 from . import tables
 from .peers import eidors
+from .rows import Row
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
-
-Row = dict[str, Any]
 
 
 def set_up() -> None:
@@ -46,6 +46,10 @@ class Run:
     def smoke(self) -> bool:
         """Whether the smallest sizes are wanted, with nothing written."""
         return self.args.smoke
+
+    def sizes(self, full: Sequence[Any], smoke: Sequence[Any]) -> Sequence[Any]:
+        """Those of a smoke run or the full ones."""
+        return smoke if self.smoke else full
 
 
 Part = Callable[[Run], Iterable[Row]]
@@ -106,7 +110,7 @@ class Question:
         parser = argparse.ArgumentParser(
             description=self.about,
             formatter_class=argparse.RawDescriptionHelpFormatter,
-            prog=f"benchmarks {self.section}",
+            prog=f"python -m benchmarks.{Path(sys.argv[0]).stem}",
         )
         parser.add_argument("--smoke", action="store_true", help="the smallest sizes, few repeats, nothing written")
         parser.add_argument("--section", default=self.section, help="name of this run among the results")

@@ -1,7 +1,4 @@
-"""What accuracy costs in time on the shipped skins: `jaxeit bench` for both, kept and drawn.
-
-python -m benchmarks.ladder [--smoke | --draw-only]
-"""
+"""What accuracy costs in time on the shipped skins: `jaxeit bench` for both, kept and drawn."""
 
 from collections.abc import Iterator, Mapping
 
@@ -13,7 +10,8 @@ from jaxeit.linalg import NestedDissection
 
 from .clock import limits
 from .comparison import factorisation_of, least_ms
-from .harness import Question, Row, Run
+from .harness import Question, Run
+from .rows import Row
 
 SKINS = ("testbed", "chest")
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -138,9 +138,23 @@ def exact_disc(pattern: np.ndarray) -> np.ndarray:
 # --- presses
 
 
-def readings_of_presses(model: je.Model, places: np.ndarray, loads: np.ndarray) -> np.ndarray:
-    """(n, readings) V of presses at (n, k, 2) places at once with (n, k) N, by tips of 20 mm."""
-    return np.asarray(_pressed(model, jnp.asarray(places), jnp.asarray(loads)))
+class Pressed(NamedTuple):
+    """Readings (readings,) V of the untouched testbed, their change (presses, readings) V, and the noise of one,
+    60 dB below their rms, V."""
+
+    untouched: np.ndarray
+    change: np.ndarray
+    noise: float
+
+
+def pressed(effects: tuple, places: np.ndarray, loads: np.ndarray, edge_length: float = 0.026) -> Pressed:
+    """The testbed pressed by tips of 20 mm at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own."""
+    effects = (je.effects.LoadSpreading(0.012), *effects, je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
+    scene = je.Scene(je.load_skin("testbed"), effects)
+    model = je.discretise(scene, je.Fidelity.standard(edge_length=edge_length))
+    untouched = np.asarray(je.forward(model))
+    touched = np.asarray(_touched(model, jnp.asarray(places), jnp.asarray(loads)))
+    return Pressed(untouched, touched - untouched, 1e-3 * float(np.sqrt(np.mean(untouched**2))))
 
 
 def _forwards(model: je.Model, places: jax.Array, loads: jax.Array) -> jax.Array:
@@ -152,9 +166,4 @@ def _forwards(model: je.Model, places: jax.Array, loads: jax.Array) -> jax.Array
 
 
 _jit: Any = eqx.filter_jit  # its type leaves out what it hands on to jax.jit
-_pressed = _jit(_forwards, compiler_options=je.compiler_options())  # compiled once for all seeds
-
-
-def noise_of(v0: np.ndarray) -> float:
-    """Noise of a reading, V: 60 dB below the readings' rms."""
-    return 1e-3 * float(np.sqrt(np.mean(v0**2)))
+_touched = _jit(_forwards, compiler_options=je.compiler_options())  # compiled once for all seeds

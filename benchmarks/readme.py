@@ -11,7 +11,8 @@ from calib.report.figures import sensitivity_figure, write_figure
 from calib.runtime import set_up
 from calib.session import replacing
 
-from .tables import evaluation, filled, replaced
+from .markdown import replaced
+from .tables import evaluation, filled
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

@@ -1,7 +1,4 @@
-"""Numerical limits: error against severity on nine hard axes, in both precisions and in a textbook form.
-
-python -m benchmarks.stability [--smoke | --draw-only]
-"""
+"""Numerical limits: error against severity on nine hard axes, in both precisions and in a textbook form."""
 
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
@@ -18,8 +15,9 @@ from tests import hard_strip as strip
 from tests.oracles.rational import inverse_corner
 
 from .figures import BLUE, GREY, ORANGE, legend, panels
-from .harness import Question, Row, Run
+from .harness import Question, Run
 from .problems import square
+from .rows import Row, grouped
 
 FORMS = ("float64", "float32", "naive")
 SOLVER = je.linalg.NestedDissection()
@@ -71,38 +69,22 @@ def _power(value: float) -> float:
     return float(2.0 ** np.round(np.log2(value)))
 
 
-def contact(z: float) -> Errors:
-    return read(FLAT, (z,) * 4)
-
-
-def contrast(ratio: float) -> Errors:
-    """Each element between 1 / root(ratio) and root(ratio)."""
+def _drawn(ratio: float) -> np.ndarray:
+    """Conductivities between 1 / root(ratio) and root(ratio), each element its own."""
     decades = np.random.default_rng(1).uniform(-0.5, 0.5, len(X)) * np.log2(ratio)
-    return read(2.0 ** np.round(decades))
+    return 2.0 ** np.round(decades)
 
 
-def wave(ratio: float) -> Errors:
-    return read(2.0 ** np.round(0.5 * np.log2(ratio) * np.sin(2 * np.pi * X / 8) * np.cos(np.pi * Y / 4)))
+def _wave(ratio: float) -> np.ndarray:
+    return 2.0 ** np.round(0.5 * np.log2(ratio) * np.sin(2 * np.pi * X / 8) * np.cos(np.pi * Y / 4))
 
 
-def tear(left: float) -> Errors:
-    return read(np.where((X > 3) & (X < 5) & (Y < 3), _power(left), 1.0) * FLAT, ground=(4.0, 2.0))
+def _torn(left: float, depth: float) -> np.ndarray:
+    """A gap in the middle, as deep as that, where so much of the conductivity is left."""
+    return np.where((X > 3) & (X < 5) & (depth > Y), _power(left), 1.0) * FLAT
 
 
-def gap(left: float) -> Errors:
-    return read(np.where((X > 3) & (X < 5), _power(left), 1.0) * FLAT)
-
-
-# The strip that reads the same on any mesh.
-
-
-def grading(ratio: float) -> Errors:
-    return _on_the_strip(strip.graded(0.02 / ratio))
-
-
-def sliver(angle: float) -> Errors:
-    """Let through past the check, which refuses below 20 degrees."""
-    return _on_the_strip(strip.capped(np.tan(np.radians(angle)) / 2**0.5))
+# The strip that reads the same on any mesh; slivers pass here although the check of meshes refuses below 20 degrees.
 
 
 def _on_the_strip(mesh: je.meshing.Mesh) -> Errors:
@@ -199,17 +181,25 @@ READING = "error of the worst reading"
 SCHUR = "pseudo-inverse of Y"
 GEOMETRY = "nodes in float32"
 TOO_MUCH = "force too much"
+SMALLEST, LEFT = "largest over smallest", "conductivity left"
 AXES = [
-    Axis("Contact resistance", "specific resistance, Ω m² or Ω m", SCHUR, READING, contact, _decades(-12, 8, 1)),
-    Axis("Contrast, each element its own", "largest over smallest", SCHUR, READING, contrast, _decades(0, 12, 1)),
-    Axis("Contrast, smooth", "largest over smallest", SCHUR, READING, wave, _decades(0, 12, 1)),
-    Axis("A tear amid the sheet", "conductivity left", "ground in the tear", READING, tear, _decades(0, -18, 1)),
-    Axis("A tear across the sheet", "conductivity left", SCHUR, READING, gap, _decades(0, -18, 1)),
-    Axis("Graded mesh", "longest over shortest edge", GEOMETRY, READING, grading, _decades(1, 6, 1)),
-    Axis("Slivers, unchecked", "smallest angle, degrees", GEOMETRY, READING, sliver, _decades(1, -7, 1)),
+    Axis("Contact resistance", "specific resistance, Ω m² or Ω m", SCHUR, READING,
+         lambda z: read(FLAT, (z,) * 4), _decades(-12, 8, 1)),
+    Axis("Contrast, each element its own", SMALLEST, SCHUR, READING,
+         lambda ratio: read(_drawn(ratio)), _decades(0, 12, 1)),
+    Axis("Contrast, smooth", SMALLEST, SCHUR, READING,
+         lambda ratio: read(_wave(ratio)), _decades(0, 12, 1)),
+    Axis("A tear amid the sheet", LEFT, "ground in the tear", READING,
+         lambda left: read(_torn(left, 3), ground=(4.0, 2.0)), _decades(0, -18, 1)),
+    Axis("A tear across the sheet", LEFT, SCHUR, READING,
+         lambda left: read(_torn(left, np.inf)), _decades(0, -18, 1)),
+    Axis("Graded mesh", "longest over shortest edge", GEOMETRY, READING,
+         lambda ratio: _on_the_strip(strip.graded(0.02 / ratio)), _decades(1, 6, 1)),
+    Axis("Slivers, unchecked", "smallest angle, degrees", GEOMETRY, READING,
+         lambda angle: _on_the_strip(strip.capped(np.tan(np.radians(angle)) / 2**0.5)), _decades(1, -7, 1)),
     Axis("Regularisation", "λ", "inverse of JᵀJ + λ²R", "error of the image", regularisation, _decades(2, -10, 1)),
     Axis("Light touch", "peak over noise", "equation 4 as printed", TOO_MUCH, light_touch, _decades(2, -2, 0.25)),
-]
+]  # fmt: skip
 
 
 def measure(axes: Sequence[Axis], per_axis: int | None = None) -> list[Row]:
@@ -223,23 +213,23 @@ def measure(axes: Sequence[Axis], per_axis: int | None = None) -> list[Row]:
     return rows
 
 
-COLOURS = {"float64": BLUE, "float32": ORANGE, "naive": "#9a9a9a"}
-MARKERS = {"float64": "o", "float32": "s", "naive": "D"}
-NAMES = ("jaxeit, float64", "jaxeit, float32", "naive, float64 (as each panel says)")
+LOOKS: dict[str, Row] = {
+    "float64": {"color": BLUE, "marker": "o", "label": "jaxeit, float64"},
+    "float32": {"color": ORANGE, "marker": "s", "label": "jaxeit, float32"},
+    "naive": {"color": "#9a9a9a", "marker": "D", "label": "naive, float64 (as each panel says)"},
+}
+LOST: Row = {"marker": "x", "linestyle": "none"}
 LOWEST, HIGHEST = 1e-17, 1e3
 
 
 def picture(data: Row) -> Figure:
     """A panel per axis; what is not finite at the upper edge."""
     figure, axes = panels(11.0, 9.6, 3, 3, sharey=True)
+    rows = grouped(data["rows"], "axis")
     for panel, axis in zip(axes, AXES, strict=True):
-        _panel(panel, axis, [row for row in data["rows"] if row["axis"] == axis.title])
-    looks = zip(FORMS, NAMES, strict=True)
-    entries: list[Row] = [
-        {"color": COLOURS[form], "marker": MARKERS[form], "markersize": 4, "label": name} for form, name in looks
-    ]
-    lost = {"color": GREY, "marker": "x", "linestyle": "none", "label": "not finite, or refused"}
-    legend(figure, [*entries, lost], 4, size=9)
+        _panel(panel, axis, rows.get(axis.title, []))
+    entries = [look | {"markersize": 4} for look in LOOKS.values()]
+    legend(figure, [*entries, LOST | {"color": GREY, "label": "not finite, or refused"}], 4, size=9)
     return figure
 
 
@@ -250,12 +240,11 @@ def _panel(panel: Any, axis: Axis, rows: list[Row]) -> None:
     panel.minorticks_off()
     panel.grid(True, which="major", color="#e8e8e8", linewidth=0.8)
     panel.axhspan(1, 10 * HIGHEST, color="#f6eded", zorder=0)
-    for form in FORMS[::-1]:
-        look: Row = {"color": COLOURS[form], "marker": MARKERS[form], "markersize": 3.6, "linewidth": 1.3}
-        finite = (np.nan if row[form] is None else np.clip(row[form], LOWEST * 1.6, HIGHEST) for row in rows)
-        panel.plot([row["severity"] for row in rows], list(finite), **look)
+    for form, look in reversed(LOOKS.items()):
+        finite = [np.nan if row[form] is None else np.clip(row[form], LOWEST * 1.6, HIGHEST) for row in rows]
+        panel.plot([row["severity"] for row in rows], finite, **look, markersize=3.6, linewidth=1.3)
         lost = [row["severity"] for row in rows if row[form] is None]
-        panel.plot(lost, [3 * HIGHEST] * len(lost), color=COLOURS[form], marker="x", linestyle="none", markersize=5)
+        panel.plot(lost, [3 * HIGHEST] * len(lost), **LOST, color=look["color"], markersize=5)
     if axis.severities[0] > axis.severities[-1]:
         panel.invert_xaxis()
     if panel.get_subplotspec().is_first_col() or axis.error != READING:

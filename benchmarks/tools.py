@@ -87,8 +87,7 @@ def forward_inside(problem: Problem) -> Tool:
 
 def forward_called(problem: Problem) -> Tool:
     """As users call it: `je.forward(model, sigma)`."""
-    model = problem.model()
-    return lambda sigma: np.asarray(je.forward(model, sigma))
+    return as_tool(partial(je.forward, problem.model()))
 
 
 FORWARD = (
@@ -138,20 +137,18 @@ def by_eidors(problem: Problem, pixels: bool, verb: str) -> eidors.Eidors:
     return eidors.Eidors(problem, verb, pixels=projection(problem, pixels), **extra)
 
 
-def onto(image: str, name: str, prepare: Callable[..., Tool], *rest: Any, **more: Any) -> Entry:
-    """A tool onto "pixels" or "elements", which its name says."""
-    return Entry(f"{name}, {image}", partial(prepare, pixels=image == "pixels"), *rest, **more)
+def onto(name: str, prepare: Callable[..., Tool], *rest: Any, elements: int = 240, **more: Any) -> tuple[Entry, Entry]:
+    """A tool onto pixels and onto elements, up to so many cells a side; the names say which."""
+    pixels = Entry(f"{name}, pixels", partial(prepare, pixels=True), *rest, **more)
+    return pixels, Entry(f"{name}, elements", partial(prepare, pixels=False), *rest, largest=elements, **more)
 
 
 JACOBIAN = (
-    onto("pixels", "jaxeit float64", jacobian),
-    onto("pixels", "jaxeit float32", partial(jacobian, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
-    onto("pixels", adjoint.NAME, jacobian_by_hand),
-    onto("elements", "jaxeit float64", jacobian, largest=120),  # beyond, the matrix alone takes 1.3 GB
-    onto("elements", adjoint.NAME, jacobian_by_hand, largest=120),
+    *onto("jaxeit float64", jacobian, elements=120),  # beyond, the matrix alone takes 1.3 GB
+    onto("jaxeit float32", partial(jacobian, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE)[0],
+    *onto(adjoint.NAME, jacobian_by_hand, elements=120),
     Entry(f"{pyeit.NAME}, elements", pyeit.prepare_jacobian, pyeit, 30),  # it inverts a dense matrix
-    onto("pixels", eidors.NAME, partial(by_eidors, verb="jacobian"), eidors),
-    onto("elements", eidors.NAME, partial(by_eidors, verb="jacobian"), eidors, 120),
+    *onto(eidors.NAME, partial(by_eidors, verb="jacobian"), eidors, elements=120),
 )
 
 
@@ -219,19 +216,14 @@ def inverse_by_pyeit(problem: Problem) -> Tool:
     return pyeit.prepare_inverse(problem, strength(problem))
 
 
-DENSE: dict[str, Any] = {
-    "largest": 60,
-    "loose": MAX_IMAGE_DIFFERENCE,
-}  # a dense system elements x elements takes minutes
+LOOSE: dict[str, Any] = {"loose": MAX_IMAGE_DIFFERENCE}
+DENSE = LOOSE | {"elements": 60}  # a dense system elements x elements takes minutes
 INVERSE = (
-    onto("pixels", "jaxeit float64", Reconstruction, loose=MAX_IMAGE_DIFFERENCE),
-    onto("pixels", IN_DATA, inverse_by_hand, loose=MAX_IMAGE_DIFFERENCE),
-    onto("pixels", IN_IMAGE, partial(inverse_by_hand, solve=in_image_space), loose=MAX_IMAGE_DIFFERENCE),
-    onto("pixels", eidors.NAME, partial(by_eidors, verb="inverse"), eidors, loose=MAX_IMAGE_DIFFERENCE),
-    onto("elements", "jaxeit float64", Reconstruction, **DENSE),
-    onto("elements", IN_DATA, inverse_by_hand, **DENSE),
-    onto("elements", eidors.NAME, partial(by_eidors, verb="inverse"), eidors, **DENSE),
-    Entry(f"{pyeit.NAME}, elements", inverse_by_pyeit, pyeit, **DENSE),
+    *onto("jaxeit float64", Reconstruction, **DENSE),
+    *onto(IN_DATA, inverse_by_hand, **DENSE),
+    onto(IN_IMAGE, partial(inverse_by_hand, solve=in_image_space), **LOOSE)[0],
+    *onto(eidors.NAME, partial(by_eidors, verb="inverse"), eidors, **DENSE),
+    Entry(f"{pyeit.NAME}, elements", inverse_by_pyeit, pyeit, largest=60, **LOOSE),
 )
 
 
@@ -265,15 +257,12 @@ def pipeline_by_pyeit(problem: Problem) -> Tool:
     return pyeit.prepare_pipeline(problem, strength(problem), frames(len(problem.pattern)))
 
 
-SLOW = DENSE | {"largest": 30}
+SLOW = LOOSE | {"elements": 30}
 PIPELINE = (
-    onto("pixels", "jaxeit float64", pipeline, loose=MAX_IMAGE_DIFFERENCE),
-    onto("pixels", IN_IMAGE, pipeline_by_hand, loose=MAX_IMAGE_DIFFERENCE),
-    onto("pixels", eidors.NAME, partial(by_eidors, verb="pipeline"), eidors, loose=MAX_IMAGE_DIFFERENCE),
-    onto("elements", "jaxeit float64", pipeline, **SLOW),
-    onto("elements", IN_IMAGE, pipeline_by_hand, **SLOW),
-    onto("elements", eidors.NAME, partial(by_eidors, verb="pipeline"), eidors, **SLOW),
-    Entry(f"{pyeit.NAME}, elements", pipeline_by_pyeit, pyeit, **SLOW),
+    *onto("jaxeit float64", pipeline, **SLOW),
+    *onto(IN_IMAGE, pipeline_by_hand, **SLOW),
+    *onto(eidors.NAME, partial(by_eidors, verb="pipeline"), eidors, **SLOW),
+    Entry(f"{pyeit.NAME}, elements", pipeline_by_pyeit, pyeit, largest=30, **LOOSE),
 )
 
 TOOLS = {"forward": FORWARD, "jacobian": JACOBIAN, "inverse": INVERSE, "pipeline": PIPELINE}

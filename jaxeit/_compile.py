@@ -4,7 +4,7 @@ import ctypes
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial, wraps
-from itertools import chain, pairwise
+from itertools import chain
 from math import prod
 from typing import Any, TypeVar
 
@@ -15,28 +15,23 @@ import numpy as np
 from jax.core import Tracer, eval_context
 from jax.custom_batching import custom_vmap
 from jax.extend.core import get_opaque_trace_state
-from jaxtyping import Array, Float
-
-# Products that `stacked_product` sums in one loop, as XLA unrolls so many, and multiplications from which on loops pay:
-# below, threads wait for each other for longer.
-_SUMMED = 16
-_LOOPED = 500_000
+from jaxtyping import Array
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
-# Numbers of an array that `bind` copies into one with others: to look at an argument takes a call half a microsecond,
-# and its first touch more.
-_SMALL = 1 << 16
+# Largest size of an array that `bind` packs with others. Each argument costs a call half a microsecond, and more at its
+# first use; packing copies the array, which for larger arrays costs more memory than the microsecond is worth.
+MAX_PACKED_SIZE = 1 << 16
 
 
 def verb(function: F) -> F:
-    """Compile ``function`` when it is called; inside another compiled function it is part of that.
+    """Compile ``function`` when it is called; inside another compiled function it becomes part of that function.
 
-    A decorator, for functions of yours too: like `equinox.filter_jit`, arrays are traced and the rest is static.
+    A decorator, also for functions of your own: as with `equinox.filter_jit`, arrays are traced and the rest is static.
 
-    By itself it gets the compiler options that suit its gathers best (`compiler_options`), which
-    JAX takes for whole programs only.
+    A call outside other compiled functions uses the compiler options that suit its gathers best (`compiler_options`);
+    JAX accepts options for whole programs only.
     """
     inner = eqx.filter_jit(function)
 
@@ -55,9 +50,9 @@ def verb(function: F) -> F:
 def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | None = None) -> Callable[..., T]:
     """``function(*first, ...)`` as one compiled function of the rest, which must be arrays or pytrees of them.
 
-    For calls from a loop in Python: a model is many arrays, and looking through them anew takes longer than the forward
-    solution of a small one. Small arrays are copied into one of each type. What of ``first`` is no array is static, as
-    for `verb`. ::
+    For calls from a loop in Python: a model is many arrays, and checking all of them at each call takes longer than the
+    forward solution of a small model. Small arrays are packed into one array of each type. Parts of ``first`` that are
+    no arrays are static, as for `verb`. ::
 
         voltages = je.bind(je.forward, model)
         voltages(sigma)
@@ -67,39 +62,41 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     """
     leaves, static = eqx.partition(first, eqx.is_array)
     flat, structure = jax.tree.flatten(leaves)
-    packed, unpacked = _packed(flat)
+    packs, unpack = _pack_by_type(flat)
 
     @partial(jax.jit, compiler_options=compiler_options() if options is None else dict(options))
-    def program(packed: list[Array], rest: tuple[Any, ...]) -> T:
-        return function(*eqx.combine(jax.tree.unflatten(structure, unpacked(packed)), static), *rest)
+    def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
+        return function(*eqx.combine(jax.tree.unflatten(structure, unpack(packs)), static), *rest)
 
-    return lambda *rest: program(packed, rest)
+    return lambda *rest: program(packs, rest)
 
 
-def _packed(arrays: list[Array]) -> tuple[list[Array], Callable[[list[Array]], list[Array]]]:
-    """The arrays, of which the small ones of a type are one, and the function that takes that apart again."""
+def _pack_by_type(arrays: list[Array]) -> tuple[list[Array], Callable[[list[Array]], list[Array]]]:
+    """Small arrays packed into one array of each type, large ones as they are; and the function that unpacks them."""
     groups: dict[Any, list[int]] = {}
     for place, array in enumerate(arrays):
-        small = array.size <= _SMALL and isinstance(array.dtype, np.dtype)  # and no random key
+        small = array.size <= MAX_PACKED_SIZE and isinstance(array.dtype, np.dtype)  # and no random key
         groups.setdefault(array.dtype if small else place, []).append(place)
     order = np.argsort(list(chain(*groups.values())))
     shapes = [[arrays[place].shape for place in group] for group in groups.values()]
 
-    def unpacked(packs: list[Array]) -> list[Array]:
-        pieces = list(chain(*map(_cut, packs, shapes)))
+    def unpack(packs: list[Array]) -> list[Array]:
+        pieces = list(chain(*map(_split_pack, packs, shapes)))
         return [pieces[place] for place in order]
 
-    return [_joined([arrays[place] for place in group]) for group in groups.values()], unpacked
+    return [_concatenated([arrays[place] for place in group]) for group in groups.values()], unpack
 
 
-def _joined(arrays: list[Array]) -> Array:
+def _concatenated(arrays: list[Array]) -> Array:
+    """One flat array of several; a single array keeps its shape."""
     if len(arrays) == 1:
         return arrays[0]
-    joined: Array = jax.device_put(np.concatenate([np.asarray(array).ravel() for array in arrays]))
-    return joined
+    flat: Array = jax.device_put(np.concatenate([np.asarray(array).ravel() for array in arrays]))
+    return flat
 
 
-def _cut(pack: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
+def _split_pack(pack: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
+    """The reverse of `_concatenated`."""
     if len(shapes) == 1:
         return [pack]
     pieces = jnp.split(pack, np.cumsum([prod(shape) for shape in shapes[:-1]]))
@@ -107,13 +104,13 @@ def _cut(pack: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
 
 
 def is_traced(*values: Any) -> bool:
-    """Whether jit, grad or vmap hides the numbers in any of these values, so that no check can look at them."""
+    """Whether jit, grad or vmap hides the numbers in any of these values, so that they cannot be checked."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def require_known(name: str, error: type[Exception], *values: Any) -> None:
-    """Refuse values that jit, grad or vmap hides, on behalf of a function that decides by looking at them."""
-    if is_traced(*values, jnp.zeros(())):  # the last: inside jit all that is computed is hidden
+    """Refuse values that jit, grad or vmap hides, for a function ``name`` that decides by looking at them."""
+    if is_traced(*values, jnp.zeros(())):  # the zeros: inside jit every computed array is hidden
         raise error(
             f"{name} decides by looking at values, which jit, grad or vmap hides; call it outside the transformed "
             "function and pass the result in"
@@ -121,7 +118,7 @@ def require_known(name: str, error: type[Exception], *values: Any) -> None:
 
 
 def _is_transformed(*values: Any) -> bool:
-    """Whether another transformation is at work: on these values, or on whatever is computed now."""
+    """Whether a transformation of JAX is active: on these values, or on everything that is computed now."""
     return is_traced(*values) or get_opaque_trace_state() != _untransformed_state()
 
 
@@ -134,8 +131,8 @@ def _untransformed_state() -> Any:
 
 @cache
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` under which the sparse solver runs up to twice as fast on a CPU, and
-    compiles in half the time; those that this version of XLA knows.
+    """Options for `jax.jit` with which the sparse solver runs up to twice as fast on a CPU and compiles in half the
+    time; options that this version of XLA does not know are left out.
 
     Pass them to your own ``jax.jit(..., compiler_options=je.compiler_options())``.
     """
@@ -147,21 +144,21 @@ def compiler_options() -> dict[str, Any]:
     return {name: value for name, value in options.items() if _is_known({name: value})}
 
 
-# What glibc's mallopt calls them, and the most that its int takes.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX, _LARGE = -1, -3, -8, 2**31 - 1
+# Parameter numbers of glibc's mallopt, and the largest value that its int holds: thresholds that no block reaches.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX, _INT_MAX = -1, -3, -8, 2**31 - 1
 
 
 def reuse_memory() -> bool:
-    """Have this process keep the memory that it frees; returns whether the system's C library can.
+    """Let this process keep the memory that it frees; returns whether the system's C library can do so.
 
-    glibc returns a block of over 32 MB to the system once it is freed. A program of XLA takes and frees its working
-    memory at every call, so that with meshes of some 30,000 nodes or more it gets a new block each time, which the
-    system clears page by page: a fifth of the time of a Jacobian. After this call the process keeps what it once
-    needed, in one store for all threads, as one of a thread's own holds no block of over 64 MB. The commands do this;
-    in a program of yours call it once, before the first computation.
+    glibc returns a block of over 32 MB to the system once the block is freed. A program of XLA takes and frees its
+    working memory at every call, so that with meshes of some 30,000 nodes or more it gets a new block each time, which
+    the system clears page by page: a fifth of the time of a Jacobian. After this call the process keeps the memory that
+    it once needed, in one arena for all threads, because the arena of a single thread holds no block of over 64 MB. The
+    commands do this; in a program of yours call it once, before the first computation.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    settings = {_MMAP_THRESHOLD: _LARGE, _TRIM_THRESHOLD: _LARGE, _ARENA_MAX: 1}
+    settings = {_MMAP_THRESHOLD: _INT_MAX, _TRIM_THRESHOLD: _INT_MAX, _ARENA_MAX: 1}
     return mallopt is not None and all(mallopt(name, value) for name, value in settings.items())
 
 
@@ -174,46 +171,29 @@ def _is_known(options: dict[str, Any]) -> bool:
     return True
 
 
-def one_by_one(function: Callable[..., T]) -> Callable[..., T]:
-    """``function``, which `jax.vmap` does one by one on a processor, so that each takes only its own way.
+def sequential_on_cpu(function: Callable[..., T]) -> Callable[..., T]:
+    """``function``, whose `jax.vmap` on a CPU is a loop over the batch, as `jax.custom_batching.sequential_vmap` makes.
 
-    In a batch a loop goes on for as long as one needs it, and both sides of a condition are computed: so on other
-    devices, and where it is differentiated. Arguments and results are pytrees of arrays.
+    In a batched program a loop runs until its slowest sample ends, and both branches of a condition are computed; here
+    each sample does only its own work. Other devices, and derivatives, use the batched program. Arguments and results
+    are pytrees of arrays.
     """
-    one = custom_vmap(function)
+    single = custom_vmap(function)
 
-    @one.def_vmap
+    @single.def_vmap
     def _(size: int, batched: Sequence[Any], *args: Any) -> tuple[T, Any]:
-        moving, still = eqx.partition(args, tuple(batched))
+        mapped, shared = eqx.partition(args, tuple(batched))
         out = jax.lax.platform_dependent(
-            moving,
-            cpu=lambda moving: jax.lax.map(lambda each: one(*eqx.combine(each, still)), moving),
-            default=jax.vmap(lambda each: function(*eqx.combine(each, still))),
+            mapped,
+            cpu=lambda mapped: jax.lax.map(lambda sample: single(*eqx.combine(sample, shared)), mapped),
+            default=jax.vmap(lambda sample: function(*eqx.combine(sample, shared))),
         )
         return out, jax.tree.map(lambda _: True, out)
 
     @eqx.filter_custom_jvp
     def call(*args: Any) -> T:
-        result: T = one(*args)
+        result: T = single(*args)
         return result
 
     call.def_jvp(lambda primals, tangents: eqx.filter_jvp(function, primals, tangents))
     return call
-
-
-def stacked_product(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
-    """``left^T right`` of every pair of many small matrices."""
-    by_library = partial(jnp.einsum, "mki,mkj->mij")
-    unfused = jax.config.read("jax_disable_most_optimizations")  # every single product would be stored
-    if unfused or left.size * right.shape[2] < _LOOPED:
-        return by_library(left, right)
-    product: Array = jax.lax.platform_dependent(left, right, cpu=_in_loops, default=by_library)
-    return product
-
-
-def _in_loops(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -> Float[Array, "m i j"]:
-    """On processors jaxlib calls Eigen for each pair in turn, on one core and with the instructions of old machines.
-    Loops that XLA compiles for this one take a third of the time, and for larger matrices no more."""
-    cuts = np.linspace(0, left.shape[1], -(-left.shape[1] // _SUMMED) + 1).astype(int)
-    sums = (jnp.sum(left[:, i:j, :, None] * right[:, i:j, None, :], 1) for i, j in pairwise(cuts))
-    return sum(sums, start=jnp.zeros((), left.dtype))

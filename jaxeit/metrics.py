@@ -65,14 +65,14 @@ class AbstractEstimator(eqx.Module):
     """An estimator of the contact's position from an image."""
 
     @abstractmethod
-    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
+    def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         """Position, (..., 2) m; NaN where the image is nowhere positive."""
 
 
 class Peak(AbstractEstimator):
     """The pixel with the largest value."""
 
-    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
+    def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         found = recon.centres[jnp.argmax(image, -1)]
         return jnp.where(jnp.max(image, -1, keepdims=True) > 0, found, jnp.nan)
 
@@ -86,7 +86,7 @@ class LevelCentroid(AbstractEstimator):
 
     level: float = 0.25
 
-    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
+    def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         top = jnp.max(image, -1, keepdims=True)
         inside = jnp.where((image >= self.level * top) & (top > 0), recon.areas, 0)
         return _centroid(inside, recon)
@@ -95,7 +95,7 @@ class LevelCentroid(AbstractEstimator):
 class PositiveCentroid(AbstractEstimator):
     """The centroid of the positive part, weighted by its value."""
 
-    def __call__(self, image: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
+    def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         return _centroid(jnp.maximum(image, 0) * recon.areas, recon)
 
 

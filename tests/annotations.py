@@ -1,7 +1,4 @@
-"""Check annotations while tests run, by jaxtyping's import hook with beartype.
-
-A plugin, to be loaded before the packages: ``python -m pytest -n 0 -p tests.annotations tests/fitting``;
-workers of pytest-xdist would load it too late.
+"""Check annotations while tests run, by jaxtyping's import hook with beartype. ``JAXTYPING_DISABLE=1`` leaves it out.
 
 jaxtyping checks every function twice: its parameters before a call, and its parameters and result after the call. The
 first check is left out here, so that a function may refuse what its annotations exclude with an error of its own: an
@@ -9,12 +6,15 @@ annotation is false if the function accepts more than the annotation says.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass
+from functools import partial, wraps
+from inspect import isclass
 from typing import Any, Self, get_args, get_origin
 
+import jaxtyping
 import numpy as np
 from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.roar import BeartypeDecorHintPepUnsupportedException
-from jaxtyping import install_import_hook
 from numpy.typing import ArrayLike
 
 _AS = {
@@ -29,28 +29,51 @@ _AS = {
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict(_AS)))
 
 
-def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """beartype on first use, since most of the functions that a test file imports are not called.
+_check_now = jaxtyping.jaxtyped
 
-    Functions inside functions are left out: they would be compiled at every call of the outer one.
+
+def install() -> None:
+    """Check the functions and dataclasses of the packages; to be called before the packages are imported.
+
+    A conftest does that. Workers of pytest-xdist import the plugins named by ``-p`` after the conftest.
     """
-    if "<locals>" in function.__qualname__ or not _has_result(function):
+    if not jaxtyping.config.jaxtyping_disable:
+        jaxtyping.jaxtyped = checked_when_called
+        jaxtyping.install_import_hook(["jaxeit", "calib"], "tests.annotations.after_the_call")
+
+
+def checked_when_called(item: Any = None, *, typechecker: Callable[..., Any]) -> Any:
+    """jaxtyping's decorator, applied at the first call, since a test calls few of the functions that it imports.
+
+    Functions inside functions are left out: their checks would be compiled at every call of the outer one.
+    """
+    if item is None:
+        return partial(checked_when_called, typechecker=typechecker)
+    if "<locals>" in item.__qualname__:
+        return item
+    if isclass(item):
+        if is_dataclass(item) and not hasattr(item.__init__, "__wrapped__"):
+            item.__init__ = checked_when_called(item.__init__, typechecker=typechecker)
+        return item
+    checked: list[Callable[..., Any]] = []
+
+    @wraps(item)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
+        if not checked:
+            checked.append(_check_now(item, typechecker=typechecker))
+        return checked[0](*args, **kwargs)
+
+    return call
+
+
+def after_the_call(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with beartype's check, if jaxtyping made the function for the check after a call."""
+    if not _has_result(function):
         return function
-    compiled: list[Callable[..., Any]] = []
-
-    def check(*args: Any, **kwargs: Any) -> Any:
-        if not compiled:
-            compiled.append(_compiled(function))
-        return compiled[0](*args, **kwargs)
-
-    return check
-
-
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with its check; without one where beartype knows no check, such as for a generic named tuple."""
     try:
         return _beartype(function)
-    except BeartypeDecorHintPepUnsupportedException:
+    except BeartypeDecorHintPepUnsupportedException:  # such as a generic named tuple, for which beartype has no check
         return function
 
 
@@ -58,6 +81,3 @@ def _has_result(function: Callable[..., Any]) -> bool:
     """Whether jaxtyping made this function for the check after a call: the result is its last keyword."""
     code = function.__code__
     return any(name.startswith("ret") for name in code.co_varnames[code.co_argcount :][: code.co_kwonlyargcount])
-
-
-install_import_hook(["jaxeit", "calib"], "tests.annotations.checked")

@@ -11,6 +11,11 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # There is a worker a core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import tests.annotations
+
+# Before the packages are imported. `make slow` leaves the check out.
+tests.annotations.install()
+
 import jax
 import pytest
 

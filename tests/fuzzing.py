@@ -34,8 +34,7 @@ from calib.bench import load_bench
 from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.cli import main as command
-from calib.fitting.curve_fit import FittedCurve
-from calib.fitting.curves import PowerLaw
+from calib.fitting.curves import FittedCurve, PowerLaw
 from calib.record.journal.conversion import convert_journal
 from calib.record.journal.file import Journal, JournalError, JournalReader
 from calib.record.journal.records import END, EVENT, PLAN, PONG, EventCode, pack_event, pack_pong
@@ -484,8 +483,8 @@ READERS = {
     "hostile session": Reader(session, rewritten, lambda path, _: everything(path), FILES, False),
     "calibration": Reader(calibration, damaged, read_calibration, FILES),
     "hostile calibration": Reader(calibration, rewritten, read_calibration, FILES, False),
-    "reconstructor": Reader(reconstructor, damaged, read_reconstructor, (je.imaging.StoreError,)),
-    "hostile reconstructor": Reader(reconstructor, repacked, read_reconstructor, (je.imaging.StoreError,), False),
+    "reconstructor": Reader(reconstructor, damaged, read_reconstructor, (je.imaging.StorageError,)),
+    "hostile reconstructor": Reader(reconstructor, repacked, read_reconstructor, (je.imaging.StorageError,), False),
     "skin": Reader(skin_text, edited, read_skin, (je.toml.TomlError,), False),
     "scene": Reader(bench_texts, edited, read_bench, (ValueError,), False),
     "table": Reader(table, cells, read_table, (SessionError,), False),

@@ -16,6 +16,7 @@ from benchmarks import (
     bench_pipeline,
     bench_protocol,
     bench_start,
+    figures,
     harness,
     problems,
     repeat,
@@ -24,8 +25,10 @@ from benchmarks import (
 )
 from benchmarks.__main__ import questions
 from benchmarks.clock import difference
+from benchmarks.markdown import cell
 from benchmarks.memory import growth
 from benchmarks.peers import eidors, pyeit
+from benchmarks.rows import averaged, grouped
 from calib.presses import PressData
 
 pytestmark = pytest.mark.filterwarnings("default")  # peers' own warnings are theirs
@@ -100,7 +103,7 @@ def test_the_quickest_mesh_that_reaches_the_accuracy():
     found = {(r["kind"], r["target"]): r["best"] for r in bench_pipeline.to_accuracy(rows)}
     assert [found["jaxeit P2, graded", t]["median_ms"] for t in bench_pipeline.TARGETS] == [4.0, 4.0, 9.0]
     assert found["EIDORS first order", 1e-3] is None
-    page = tables.TABLES["to-accuracy"][1]({"to_accuracy": bench_pipeline.to_accuracy(rows)})
+    page = tables.TABLES["to-accuracy"].text({"to_accuracy": bench_pipeline.to_accuracy(rows)})
     assert "| jaxeit P1, regular | 1 (9) | not reached | not reached |" in page
 
 
@@ -149,9 +152,35 @@ def test_the_page_says_how_far_the_ratios_it_quotes_moved():
         for times in ((1, 1, 9, 9), (1, 1, 10, 90))
     )
     runs = [{"rows": rows} for rows in (_run(1, 10, 100), jacobian, _run(2, 21, 300), again)]
-    said = tables.TABLES["repeat"][1](*runs)
+    said = tables.TABLES["repeat"].text(*runs)
     assert "2 of the 3 ratios" in said
     assert "50 %" in said
+
+
+def test_rows_are_grouped_and_averaged():
+    """Labels and whole numbers stay; None and NaN are no values; one value has no standard deviation."""
+    errors = [(1.0, None), (3.0, float("nan")), (5.0, 4.0)]
+    rows = [{"way": "a", "k": 7, "fit_mm": fit, "image_mm": image, "rate": fit} for fit, image in errors]
+    mean = averaged(rows, sd_of="_mm")
+    assert mean == {"way": "a", "k": 7, "fit_mm": 3.0, "fit_mm_sd": 2.0, "image_mm": 4.0, "rate": 3.0}
+    assert averaged(rows[:1])["image_mm"] is None
+    assert grouped(rows, "way") == {"a": rows}
+    assert list(grouped(rows, "way", "fit_mm")) == [("a", 1.0), ("a", 3.0), ("a", 5.0)]
+
+
+@pytest.mark.parametrize(
+    ("template", "text"),
+    [("{x:ms}", "123"), ("{x:.2f kilo}", "0.12"), ("{x:.1f %}", "12345.6 %"), ("{y:ms milli}", "1.23"), ("{z}", "")],
+)
+def test_a_cell_scales_its_number(template, text):
+    assert cell(template, {"x": 123.456, "y": 1.234e-3}) == text
+
+
+def test_curves_leave_out_rows_without_a_number():
+    rows = [{"tool": tool, "x": x, "y": y} for tool, x, y in (("a", 1, 2.0), ("b", 1, None), ("a", 2, 3.0))]
+    _, (axes,) = figures.panels(2, 2, 1, 1)
+    figures.curves(axes, rows, "x", "y", ("tool",), lambda tool: {"label": tool})
+    assert [(line.get_label(), line.get_xydata().tolist()) for line in axes.lines] == [("a", [[1, 2], [2, 3]])]
 
 
 def test_two_files_or_two_sections_are_compared(tmp_path, capsys):

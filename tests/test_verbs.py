@@ -62,7 +62,7 @@ def test_a_bound_function_is_that_of_what_is_left(model):
 
 def test_bound_arrays_keep_their_values_types_and_shapes():
     key = jax.random.key(3)
-    large = np.arange(verbs._SMALL + 1)
+    large = np.arange(verbs.MAX_PACKED_SIZE + 1)
     more = [jnp.float32(2), key, jax.random.split(key), large]
     given = {"floats": [np.arange(3.0), np.float64(7), np.zeros((0, 2))], "more": more, "no": 5}
     given = jax.tree.map(lambda v: jnp.asarray(v) if isinstance(v, np.ndarray | np.generic) else v, given)
@@ -124,7 +124,7 @@ def test_each_takes_only_its_own_way():
     ours, theirs = [], []
     mapped = [
         jax.jit(jax.vmap(jax.vmap(function, (None, 0)), (None, 0)))(1.0, x)
-        for function in (verbs.one_by_one(_halved(ours)), _halved(theirs))
+        for function in (verbs.sequential_on_cpu(_halved(ours)), _halved(theirs))
     ]
     jax.effects_barrier()
     np.testing.assert_array_equal(mapped[0][0], mapped[1][0])
@@ -135,7 +135,7 @@ def test_each_takes_only_its_own_way():
 
 
 def test_what_is_done_one_by_one_has_derivatives():
-    one, x = verbs.one_by_one(_halved([])), jnp.array([9.0, 0.5, 1.5])
+    one, x = verbs.sequential_on_cpu(_halved([])), jnp.array([9.0, 0.5, 1.5])
     slopes = [0.5**4, np.cos(0.5), 0.5]
     for many in (
         jax.vmap(jax.grad(lambda x: one(1.0, x)[0])),

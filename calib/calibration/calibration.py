@@ -9,8 +9,8 @@ from jaxtyping import Array
 
 import jaxeit as je
 
+from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
-from ..fitting.fitted_curve import FittedCurve
 from ..fitting.pads import Hybrid
 from ..fitting.selection import Candidate
 from ..presses.table import Processing
@@ -122,7 +122,7 @@ def load_calibration(path: str | Path) -> Calibration:
         raise SessionError(
             f"{Path(path).name}: {error.args[0]}: missing from the calibration; calibrate again"
         ) from None
-    except je.imaging.StoreError as error:
+    except je.imaging.StorageError as error:
         raise SessionError(f"{Path(path).name}: image/{error}; calibrate again") from None
     except (je.registry.RegistryError, je.toml.TomlError) as error:  # a class or a text that cannot be used
         raise SessionError(f"{Path(path).name}: {' '.join(str(error).split())}") from None

@@ -12,10 +12,11 @@ from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 
+from ..fitting.curves import FittedCurve
+from ..fitting.curves.samples import bucket
 from ..fitting.fields import FittedField, Places
-from ..fitting.fitted_curve import FittedCurve
-from ..fitting.pads import nowhere, pad_forces
-from ..fitting.samples import bucket
+from ..fitting.fields.places import nowhere
+from ..fitting.pads import pad_forces
 from ..presses.corrections import AbstractCorrection, correct
 from ..presses.streams import resample
 from ..presses.table import Processing, resting_levels

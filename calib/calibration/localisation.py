@@ -131,9 +131,8 @@ class FittedContact(AbstractLocatorChoice):
     def prepare(
         self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
     ) -> ContactLocator:
-        finder = je.prepare_contacts(
-            model, noise=noise, most=self.most, columns=self.columns, widths=self.widths, channels=channels, sigma=sigma
-        )
+        settings = je.contacts.ContactSettings(most=self.most, widths=self.widths, columns=self.columns)
+        finder = je.prepare_contacts(model, settings, noise=noise, sigma=sigma, channels=channels)
         return ContactLocator(jax.tree.map(_rounded, finder))
 
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ..fitting.curves import CURVES, AbstractCurve, Linear
-from ..fitting.gaussian_process import SmoothChannels
+from ..fitting.logs import BlendChannels, LogFit, SmoothChannels, fit_log, time_split
 from ..fitting.losses import AbstractLoss, SoftL1
 from ..fitting.results import FitError
 from ..fitting.selection import Tried, simplest
-from ..fitting.validation import BlendChannels, LogFit, fit_log, time_split
 from ..presses.streams import resample
 from ..session import Session, Stream, write_archive
 

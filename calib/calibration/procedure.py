@@ -11,13 +11,7 @@ import jaxeit as je
 
 from ..fitting.fields import single_places
 from ..fitting.pads import Hybrid
-from ..fitting.response import (
-    PadResponse,
-    fit_response,
-    fitting_problem,
-    hold_out_response,
-    require_every_pad_pressed,
-)
+from ..fitting.response import PadResponse, fit_response, fitting_problem, hold_out_response, require_every_pad_pressed
 from ..presses.pooled import pool_presses
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError

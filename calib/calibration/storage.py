@@ -12,9 +12,9 @@ import numpy as np
 import jaxeit as je
 from jaxeit.toml import TomlTable, parse_toml
 
-from ..fitting.curves import CURVES, AbstractCurve, Linear
-from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry, restored
-from ..fitting.fitted_curve import FittedCurve
+from ..fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
+from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry
+from ..fitting.fields.base import restored
 from ..fitting.selection import Candidate, Choice
 from ..presses.table import Processing
 from ..session import Archive
@@ -146,7 +146,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     """The fields of the calibration that `to_archive` described.
 
     Raises:
-        KeyError, ValueError: for what is missing, or does not fit; `StoreError` for the image's numbers.
+        KeyError, ValueError: for what is missing, or does not fit; `StorageError` for the image's numbers.
     """
     attrs, arrays = archive.attrs, archive.arrays
     skin = je.skin.parse_skin(str(attrs["skin_toml"]), "calibration: skin_toml")

@@ -6,6 +6,7 @@ import numpy as np
 
 import jaxeit as je
 
+from ..record.journal.records import EventCode
 from ..session import Session
 from .eit import check_eit
 from .pads import check_pads
@@ -67,7 +68,17 @@ def _session_findings(session: Session) -> Iterator[Finding]:
             "the recording was interrupted (complete = 0)",
             "check its end; `jaxeit recover` finishes what a crash left",
         )
+    yield from _recorded_faults(session)
     missing = [n for n in ("eit", "pressure", "force") if n not in session.streams]
     if missing:
         what = f"no stream named {' or '.join(missing)}: checks that need it are left out"
         yield Finding(Severity.OK, "/streams", what, "a force map is calibrated from eit, pressure and force")
+
+
+def _recorded_faults(session: Session) -> Iterator[Finding]:
+    """What the recorder found wrong with the devices."""
+    events = session.events
+    if events is not None:
+        for code, label in zip(events.code, events.label, strict=True):
+            if code == EventCode.FAULT:
+                yield Finding(Severity.WARNING, "/events", str(label), "mend the device and record again")

@@ -1,5 +1,7 @@
-"""Signals that end a recording or a live show."""
+"""Signals that end a command: its temporary files are removed, and a recording is finished."""
 
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -9,10 +11,44 @@ if TYPE_CHECKING:
     from ..record.recorder import StopRequest
 
 
+ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class Terminated(KeyboardInterrupt):
+    """A signal asked the program to end; handled like Ctrl-C, so that nothing half-written stays."""
+
+    def __init__(self, number: int):
+        super().__init__(f"ended by {signal.Signals(number).name}")
+        self.status = 128 + number
+
+
+def interruption_status(interrupt: KeyboardInterrupt) -> int:
+    """Exit status of a command that was interrupted, as a shell reports it."""
+    return interrupt.status if isinstance(interrupt, Terminated) else 128 + signal.SIGINT
+
+
+@contextmanager
+def termination_raised() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise `Terminated` meanwhile, unless they are ignored; in the main thread only."""
+
+    def terminate(number: int, _frame: FrameType | None) -> None:
+        raise Terminated(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # as nohup has it
+    before = {number: signal.signal(number, terminate) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 @contextmanager
 def orderly_end(orders: "StopRequest", planned: bool) -> Iterator[None]:
     """The first signal ends a recording in order, a second one at once; Ctrl-C is how one without end is ended."""
-    import signal
 
     def tell(number: int, _frame: FrameType | None) -> None:
         if orders.stop.is_set():
@@ -22,8 +58,7 @@ def orderly_end(orders: "StopRequest", planned: bool) -> Iterator[None]:
             "" if expected else f"stopped by {signal.Signals(number).name}", 0 if expected else 128 + number
         )
 
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    numbers = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]  # as nohup has it
+    numbers = [n for n in (signal.SIGINT, *ENDING_SIGNALS) if signal.getsignal(n) != signal.SIG_IGN]  # as nohup has it
     before = {number: signal.signal(number, tell) for number in numbers}
     try:
         yield

@@ -1,17 +1,23 @@
-"""From a table of presses to fitted curves and fields of gain, with their validation and selection."""
+"""From a table of presses to fitted curves and fields of gain, with their validation and selection.
 
-from .curve_fit import fit_curve, fit_curves
+`curves` are functions of the pressure of a pad, `fields` gains over the place of the contact, `logs` fits without
+presses. `pads` fits curves and field together, and `response` chooses among them.
+"""
+
 from .curves import (
     CURVES,
     AbstractCurve,
     Affine,
     AffinePlay,
+    FittedCurve,
     Linear,
     MonotonePolynomial,
     MonotoneSpline,
     Play,
     PlaySpline,
     PowerLaw,
+    fit_curve,
+    fit_curves,
 )
 from .fields import (
     FIELDS,
@@ -29,13 +35,13 @@ from .fields import (
     fit_field,
     single_places,
 )
-from .fitted_curve import FittedCurve
+from .logs import fit_log
 from .losses import LOSSES, AbstractLoss, Cauchy, Huber, SoftL1, Squared
 from .pads import Hybrid
 from .recursive import RecursiveLeastSquares, SensitivityTracker, Touched, follow, follow_frames
 from .results import FitError, FitResult
 from .selection import Candidate
-from .validation import cross_validate, fit_log
+from .validation import cross_validate
 
 __all__ = [
     "CURVES",

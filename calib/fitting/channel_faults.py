@@ -8,7 +8,7 @@ from scipy import ndimage, stats
 
 from ..presses.corrections import bridge
 
-MIN_ARRAY_CHANNELS = 8  # fewer are single sensors, which a person looks at one by one
+MIN_ARRAY_CHANNELS = 8  # with fewer channels, a user inspects each one by itself
 STUCK_FRACTION = 0.99  # of the samples at one value
 MIN_RANK_CORRELATION = 0.5  # with the reference; a channel below it does not follow the reference
 SATURATED_FRACTION = 0.01  # of the samples at an end of the converter

@@ -1,8 +1,8 @@
-"""Forces predicted by fits that never saw the press: a place, a pad, an indenter or a session left out at a time.
+"""Forces predicted by fits that did not use the press: one place, pad, indenter or session is left out at a time.
 
-Cross-validation over places says how well presses between known ones are told.  These say what happens beyond: at a
-place far from all others, on a pad that was never pressed, under another tip, on another day.  Intervals are of a
-bootstrap over places: all presses of a place are drawn together, as they share what is peculiar to it.
+Cross-validation over places gives the error of presses between known places. The other splits give the error of
+extrapolation: to a pad that was never pressed, another tip, another day. Intervals come from a bootstrap over places:
+all presses of a place are drawn together, because they share the error of the place.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,29 +15,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .curve_fit import fit_curves
-from .curves import AbstractCurve
-from .fields import AbstractField, FittedField
+from .curves.base import AbstractCurve
+from .curves.fit import fit_curves
+from .fields.base import AbstractField
+from .fields.fitted import FittedField
 from .losses import AbstractLoss
 from .pads import Hybrid, LocatedPresses, fit_hybrid
 from .results import FitResult
 from .validation import assign_folds
 
-DRAWS = 2000  # of the bootstrap: the ends of an interval are then known to about 2 % of its length
-COVERAGE = 0.9  # of the intervals
+DRAWS = 2000  # draws of the bootstrap; the ends of an interval then vary by about 2 % of its length
+COVERAGE = 0.9  # probability that an interval covers the true value
 
 
 class Split(NamedTuple):
-    """Errors of the total force over the holds, each part predicted from the others.
+    """Errors of the total force over the holds, each part predicted by a fit to the others.
 
     | meaning                                                             | unit |
     |---------------------------------------------------------------------|------|
-    | by: what was left out, in the singular, as "pad"                    |      |
-    | parts: how many there are                                           |      |
-    | presses that were predicted                                         |      |
-    | rmse, and the ends of its 90 % interval over places                 | N    |
+    | by: kind of part left out, in the singular, such as "pad"           |      |
+    | parts: number of parts                                              |      |
+    | presses: number of presses that were predicted                      |      |
+    | rmse: root mean square error of all presses                         | N    |
+    | low, high: ends of the 90 % interval of rmse over places            | N    |
     | worst: root mean square error of the worst part                     | N    |
-    | note: why there is nothing to tell; empty where there is            |      |
+    | note: why there are no errors; empty if there are                   |      |
     """
 
     by: str
@@ -51,29 +53,29 @@ class Split(NamedTuple):
 
 
 def place_draws(place: np.ndarray) -> np.ndarray:
-    """(draws, presses) how often each press is drawn when places are, with replacement; the same every time."""
+    """How often each press is drawn, (draws, presses), when places are drawn with replacement. Fixed seed."""
     _, first, index = np.unique(place, return_index=True, return_inverse=True)
-    number = np.argsort(np.argsort(first))[index.ravel()]  # in the order of appearance
+    number = np.argsort(np.argsort(first))[index.ravel()]  # of each place, in the order of appearance
     count = len(first)
     drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
     return np.stack([np.bincount(draw, minlength=count) for draw in drawn])[:, number]
 
 
 def interval(draws: np.ndarray) -> tuple[float, float]:
-    """Ends of the 90 % interval of a statistic's draws."""
+    """Ends of the 90 % interval of the draws of a statistic."""
     low, high = np.quantile(draws, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
     return float(low), float(high)
 
 
 def folds_by_place(place: np.ndarray, folds: int) -> np.ndarray:
-    """(presses,) fold of each press; presses at one place stay together."""
+    """Fold of each press, (presses,); all presses at one place have the same fold."""
     return assign_folds(place, min(folds, len(np.unique(place))))
 
 
 def hold_out(
     curve: AbstractCurve, field: AbstractField | None, presses: LocatedPresses, loss: AbstractLoss, fold: np.ndarray
 ) -> np.ndarray:
-    """Pad forces over the hold of every press, (presses, pads) N, by fits that never saw its fold (presses,)."""
+    """Pad forces over the hold of every press, (presses, pads) N, by fits without the press's fold (presses,)."""
     pressure = presses.data.pressure
     out = np.full(pressure.shape, np.nan)
     for k in np.unique(fold):
@@ -86,7 +88,7 @@ def hold_out(
 
 
 def hold_out_image(image_sum: np.ndarray, force: np.ndarray, fold: np.ndarray) -> np.ndarray:
-    """Total force by the image alone, (presses,) N: its integral (presses,) S m^2 times one number, found likewise."""
+    """Total force by the image alone, (presses,) N: integral (presses,) S m^2 times a gain fitted without the fold."""
     out = np.empty(len(image_sum))
     for k in np.unique(fold):
         held = fold == k
@@ -105,8 +107,8 @@ def leave_out(
     """A `Split` for every grouping of the presses.
 
     Args:
-        groups: number of each press's part, (presses,), by what the parts are; -1: in none, and always fitted from.
-            "pad" predicts a pad by the curve of all others together, and by what its field shares with theirs.
+        groups: number of each press's part, (presses,), for each kind of part; -1: in none, and never left out.
+            A left-out "pad" is predicted by one curve of all other pads, and by the field that it shares with them.
     """
     return tuple(
         _split(by, part, presses, partial(_by_other_pads if by == "pad" else fit_hybrid, curve, field, presses, loss))
@@ -117,7 +119,7 @@ def leave_out(
 def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., Hybrid]) -> Split:
     data, parts = presses.data, np.unique(part[part >= 0])
     if len(parts) < 2:
-        return Split(by, len(parts), note=f"the presses are of one {by} only: what another would do is not known")
+        return Split(by, len(parts), note=f"the presses are of one {by} only: record presses of another too")
     error = np.full(len(data.force), np.nan)
     for k in parts:
         held = part == k
@@ -125,10 +127,10 @@ def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[...
         error[held] = (force.sum(1) - data.force)[held]
     if not np.isfinite(error[part >= 0]).all():
         return Split(by, len(parts), note=f"without one {by} the rest does not determine the fit: record more presses")
-    return _judged(by, error, part, data.place)
+    return _errors(by, error, part, data.place)
 
 
-def _judged(by: str, error: np.ndarray, part: np.ndarray, place: np.ndarray) -> Split:
+def _errors(by: str, error: np.ndarray, part: np.ndarray, place: np.ndarray) -> Split:
     seen = part >= 0
     square, part = error[seen] ** 2, part[seen]
     weight = place_draws(place[seen])
@@ -145,7 +147,7 @@ def _by_other_pads(
     *,
     use: np.ndarray,
 ) -> Hybrid:
-    """As `fit_hybrid`; a pad that no press used rests on gets the curve of all other pads' samples together."""
+    """As `fit_hybrid`; a pad without presses in `use` gets one curve fitted to the samples of all other pads."""
     found = fit_hybrid(curve, field, presses, loss, use=use)
     data, places = presses.data, presses.places
     mine = data.mask & use[data.sample_press]
@@ -166,7 +168,7 @@ def _by_other_pads(
 
 
 def _levelled(field: FittedField | None, empty: np.ndarray) -> FittedField | None:
-    """A field whose mean on the `empty` pads is taken to be over such places as were pressed on the others."""
+    """The field, with the mean features of the other pads taken for the `empty` pads, which have no presses."""
     if field is None:
         return None
     centre = field.centre.at[empty].set(jnp.mean(jnp.delete(field.centre, empty, axis=0), 0))

@@ -1,8 +1,8 @@
-"""Robust losses: what a residual costs, and how much influence it has.
+"""Robust losses, which limit the influence of outliers on a fit.
 
-A loss goes to a least-squares solver as transformed residuals sign(r) w sqrt(rho(r^2 / w^2)), whose squares are the
-loss, so that no reweighting loop is needed. `AbstractLoss.curvature` tells the solver how much of Gauss and Newton's
-curvature the loss leaves to each residual.
+A least-squares solver gets the residuals transformed to sign(r) w sqrt(rho(r^2 / w^2)), whose squares are the loss, so
+that no reweighting loop is needed. `AbstractLoss.curvature` gives the solver the second derivative of the loss for each
+residual, relative to that of Gauss and Newton.
 """
 
 import abc
@@ -25,7 +25,7 @@ class AbstractLoss(eqx.Module):
         """rho(s) / s for s >= 0, smooth at zero."""
 
     def transform(self, r: Array) -> Array:
-        """sign(r) w sqrt(rho(r^2/w^2)): its square is the loss."""
+        """Transformed residuals sign(r) w sqrt(rho(r^2/w^2)); their squares are the loss."""
         w = self.width.astype(r.dtype)
         return r * jnp.sqrt(self.ratio(jnp.minimum((r / w) ** 2, 0.1 * jnp.finfo(r.dtype).max)))
 
@@ -40,12 +40,12 @@ class AbstractLoss(eqx.Module):
         return found
 
     def curvature(self, t: Array) -> Array:
-        """`dpsi` over the square of the derivative of t = `transform`(r): Newton's share of Gauss and Newton's."""
+        """`dpsi` over the square of the derivative of t = `transform`(r): Newton's curvature over Gauss-Newton's."""
         return jnp.ones_like(t)
 
 
 class Squared(AbstractLoss):
-    """rho(s) = s: ordinary least squares; one outlier moves it without bound."""
+    """rho(s) = s: ordinary least squares, on which one outlier has unbounded influence."""
 
     width: Array = eqx.field(converter=jnp.asarray, default=1.0)
 

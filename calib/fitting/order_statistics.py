@@ -1,4 +1,4 @@
-"""Quantiles of the samples that are valid, and the robust scale of residuals that is made of them."""
+"""Quantiles of the valid samples, in a form that compiles and differentiates."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ def quantiles(
     """Quantiles of the valid values, linear between neighbours; NaN where no value is valid.
 
     Args:
-        parts: of the values that lie below each quantile, 0 to 1.
+        parts: fraction of the values below each quantile, 0 to 1.
     """
     ordered, count = _ascending(jnp.where(valid, values, jnp.inf)), jnp.sum(valid)
     place = jnp.asarray(parts, ordered.dtype) * jnp.maximum(count - 1, 0)
@@ -28,13 +28,13 @@ def quantiles(
 
 
 def median(values: Float[Array, " n"], valid: Bool[Array, " n"]) -> Float[Array, ""]:
-    """The middle one of the valid values; NaN where no value is valid."""
+    """Median of the valid values; NaN where no value is valid."""
     return quantiles(values, valid, (0.5,))[0]
 
 
 @jax.custom_jvp
 def _ascending(values: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Sorted by bit patterns: on a CPU, XLA sorts integers four times as fast as floating-point numbers."""
+    """Sorted values; sorted as bit patterns, because XLA on a CPU sorts integers four times as fast as floats."""
     return _number(jax.lax.sort(_pattern(values), is_stable=False), values.dtype)
 
 
@@ -45,7 +45,7 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
 
 
 def _pattern(values: Float[Array, " n"]) -> Int[Array, " n"]:
-    """Integers in the order of the numbers."""
+    """Bit patterns as integers that have the order of the numbers."""
     integer = jnp.dtype(f"int{8 * values.dtype.itemsize}")
     bits = jax.lax.bitcast_convert_type(values, integer)
     return jnp.where(bits < 0, bits ^ np.iinfo(integer).max, bits)

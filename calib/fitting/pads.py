@@ -1,10 +1,10 @@
-"""The response of all pads together: a curve for each, times a field of gain over the place pressed.
+"""The response of all pads together: a curve for each pad, times a field of gain over the place pressed.
 
-The two are fitted in turn. Given the field, each curve is the robust fit of `fit_curves`, untouched, to forces over
-gains; given the curves, the field is a linear fit in log force with evidence and covariance in closed form
-(`fit_field`). As the field's mean over the presses of a pad is zero, neither moves the other's level: the covariances
-of the two are each complete, and a few turns agree to well within the noise. One joint least-squares problem would
-give the same numbers but neither the evidence nor the sandwich over places.
+Curves and field are fitted in turn. Given the field, `fit_curves` fits each curve to forces over gains. Given the
+curves, `fit_field` is a linear fit in log force, with evidence and covariance in closed form. The mean of the field
+over the presses of a pad is zero, so that neither changes the level of the other: the covariance of each is complete,
+and a few alternations agree to well within the noise. One joint least-squares problem would give the same numbers, but
+neither the evidence nor the sandwich covariance over places.
 """
 
 from dataclasses import dataclass
@@ -20,26 +20,31 @@ from jaxtyping import Array, Float
 import jaxeit as je
 
 from ..presses.pooled import PressData
-from .curve_fit import fit_curves
-from .curves import AbstractCurve
-from .fields import AbstractField, FittedField, Geometry, Places, fit_field, log_gain
-from .fitted_curve import FittedCurve, Prediction, predict_pads
+from .curves.base import AbstractCurve
+from .curves.fit import fit_curves
+from .curves.fitted import FittedCurve, Prediction, predict_pads
+from .curves.samples import bucket
+from .fields.base import AbstractField
+from .fields.fit import fit_field
+from .fields.fitted import FittedField, log_gain
+from .fields.geometry import Geometry
+from .fields.places import Places, nowhere
 from .losses import AbstractLoss
 from .results import FitResult
-from .samples import bucket
 
-ALTERNATIONS = 2  # of fitting the field and the curves: more agree to well within the noise
-FAINT_FORCE = 0.05  # of the largest: presses below weigh less, as their noise is not proportional to the force
+ALTERNATIONS = 2  # fits of the field, then of the curves; more change the result by far less than the noise
+# Fraction of the largest force below which presses weigh less: their noise is constant, not proportional to the force.
+FAINT_FORCE = 0.05
 
 
 class LocatedPresses(NamedTuple):
-    """Presses and where they were found.
+    """Presses with their places.
 
     | field    | meaning                                                    |
     |----------|------------------------------------------------------------|
     | data     | pressures and forces of the presses                        |
     | geometry | outlines of the pads and of the sheet                      |
-    | places   | of each press, as its image tells; None: not looked for     |
+    | places   | place of each press by its image; None: not estimated      |
     """
 
     data: PressData
@@ -49,7 +54,7 @@ class LocatedPresses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hybrid:
-    """The fitted curves, and the field they are multiplied with (None: no correction by location)."""
+    """The fitted curves, and the field of gain that multiplies them (None: no correction by location)."""
 
     curves: FittedCurve
     field: FittedField | None = None
@@ -59,21 +64,21 @@ class Hybrid:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Force on each pad, its standard error (N) and validity, (n, pads), from pressures (n, pads) Pa.
 
-        Without places, a field says nothing but how uncertain that leaves the force. Not valid: beyond the pressures
-        fitted, or a pad whose fit failed.
+        Without places, the gain is one, and the standard error includes its variation over the pad. A force is not
+        valid outside the fitted pressures, or where the fit of the pad failed.
         """
         p = jnp.asarray(pressures, self.curves.parameters.dtype)
         found = pad_forces(self.curves, self.field, p, places)
         return tuple(map(np.asarray, found))  # type: ignore[return-value]
 
     def log_gains(self, places: Places) -> np.ndarray:
-        """Log of the gain of each pad at places, (n, pads)."""
+        """Log of the gain of each pad at places, (n, pads). The response must have a field."""
         assert self.field is not None
         return np.asarray(log_gain(self.field, places).mean)
 
     @property
     def scatter(self) -> np.ndarray:
-        """Root mean square distance of single samples from each pad's response, (pads,) N."""
+        """Root mean square residual of the samples of each pad, (pads,) N."""
         return np.asarray(self.curves.residual_rms)
 
 
@@ -91,14 +96,6 @@ def pad_forces(
     return Prediction(force * factor, factor * jnp.sqrt(error**2 + force**2 * gain.variance), valid)
 
 
-def nowhere(pressures: Float[Array, "n pads"], contacts: int = 1) -> Places:
-    """Places of which nothing is known."""
-    n, pads = pressures.shape
-    position = jnp.full((n, contacts, 2), jnp.nan, pressures.dtype)
-    weight, none = (jnp.zeros((n, contacts, *more), pressures.dtype) for more in ((pads,), ()))
-    return Places(position, weight, none + jnp.nan, none)
-
-
 def fit_hybrid(
     curve: AbstractCurve,
     field: AbstractField | None,
@@ -107,9 +104,9 @@ def fit_hybrid(
     *,
     use: np.ndarray | None = None,
 ) -> Hybrid:
-    """Curves and field from the presses that `use` (presses,) marks; all by default.
+    """Fit curves and field to the presses flagged in `use` (presses,), by default all.
 
-    Look at `curves.result` and `field.result`: nothing is raised for samples that do not determine them.
+    Check `curves.result` and `field.result`: no error is raised for samples that do not determine a fit.
     """
     data, places = presses.data, presses.places
     use = np.ones(len(data.force), bool) if use is None else use
@@ -127,7 +124,7 @@ def fit_hybrid(
 def _curves(
     curve: AbstractCurve, data: PressData, gain: np.ndarray, use: np.ndarray, loss: AbstractLoss
 ) -> FittedCurve:
-    """Each pad's curve through forces over gains, each with the noise that the division left it."""
+    """Each pad's curve, fitted to forces over gains; the noise is divided by the gain too."""
     own = data.pad_samples(with_history=curve.path)
     less = np.exp(-np.take_along_axis(gain, own.rows, 1))
     mask = own.mask & use[data.sample_press][own.rows]
@@ -140,7 +137,7 @@ _fit_field = je.verb(fit_field)
 def _field(
     field: AbstractField, curves: FittedCurve, gain: np.ndarray, presses: LocatedPresses, use: np.ndarray
 ) -> FittedField:
-    """The field that is left of the presses' log forces by the curves; `gain` is the one they were fitted with."""
+    """The field fitted to log forces over those of the curves, which were fitted with the log-gain `gain`."""
     data = presses.data
     force = np.asarray(predict_pads(curves, jnp.asarray(data.pressure.T)).force).T * np.exp(gain)
     part = np.maximum(np.nan_to_num(force), 0)
@@ -157,14 +154,14 @@ def _field(
 
 
 def _weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Places count once however often they are pressed, faint presses less."""
+    """Weights of the presses, (presses,): those at one place sum to one at most, faint presses weigh less."""
     faint = FAINT_FORCE * force[use].max(initial=0)
     weight = force**2 / (force**2 + faint**2)
     return np.asarray(weight / np.maximum(np.bincount(place, use)[place], 1))
 
 
 def sample_forces(hybrid: Hybrid, presses: LocatedPresses) -> np.ndarray:
-    """Pad forces along the presses, (pads, n) N; NaN from pads whose fit failed."""
+    """Pad forces at all samples of the presses, (pads, n) N; NaN for pads whose fit failed."""
     data = presses.data
     force = np.asarray(_curve_forces(hybrid.curves, jnp.asarray(data.sample_pressure)))
     force = np.where((np.asarray(hybrid.curves.result) == FitResult.SUCCESS)[:, None], force, np.nan)

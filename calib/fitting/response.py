@@ -1,4 +1,4 @@
-"""A skin's response to presses: curves and field chosen and fitted, and what they predict of presses held out."""
+"""The response of a skin to presses: choice and fit of curves and field, and their predictions of held-out presses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,9 +9,12 @@ import numpy as np
 import jaxeit as je
 
 from ..presses.pooled import PressData
-from .curves import AbstractCurve, Linear
-from .fields import AbstractField, Places, geometry_of, single_places
-from .fitted_curve import FittedCurve
+from .curves.base import AbstractCurve
+from .curves.elementary import Linear
+from .curves.fitted import FittedCurve
+from .fields.base import AbstractField
+from .fields.geometry import geometry_of
+from .fields.places import Places, single_places
 from .held_out import Split, folds_by_place, hold_out, hold_out_image, leave_out
 from .losses import AbstractLoss
 from .pads import Hybrid, LocatedPresses, fit_hybrid
@@ -20,13 +23,13 @@ from .selection import Choice, choose
 
 
 class FittingProblem(NamedTuple):
-    """What curves and fields are fitted to, and how.
+    """The presses to fit, and how to fit and divide them.
 
     | meaning                                                     | shape      |
     |-------------------------------------------------------------|------------|
-    | presses, with the places where they were found              |            |
-    | loss of the curve fits                                      |            |
-    | fold of each press; presses at one place share it           | (presses,) |
+    | presses: the presses with their places                      |            |
+    | loss: robust loss of the curve fits                         |            |
+    | fold: fold of each press, the same for all at one place     | (presses,) |
     """
 
     presses: LocatedPresses
@@ -47,12 +50,12 @@ class PadResponse:
 
 
 class HeldOutForces(NamedTuple):
-    """Forces over the holds, predicted by fits that never saw the press's place.
+    """Forces over the holds, predicted by fits without the place of the press.
 
     | meaning                                                              | shape           | unit |
     |----------------------------------------------------------------------|-----------------|------|
     | pad_force: of each pad, by the response                              | (presses, pads) | N    |
-    | others: total force by the methods to compare with, by name          | (presses,) each | N    |
+    | others: total force by each method of comparison, by name            | (presses,) each | N    |
     | splits: errors when a whole pad, indenter or session is left out     |                 |      |
     """
 
@@ -64,7 +67,7 @@ class HeldOutForces(NamedTuple):
 def fitting_problem(
     skin: je.Skin, data: PressData, places: Places | None, loss: AbstractLoss, folds: int
 ) -> FittingProblem:
-    """The problem of a skin's presses, whose places are divided into so many folds."""
+    """The fitting problem of the presses on a skin, whose places are divided into `folds` folds."""
     geometry = geometry_of(skin, places.position.dtype if places else None)
     return FittingProblem(LocatedPresses(data, geometry, places), loss, folds_by_place(data.place, folds))
 
@@ -122,12 +125,12 @@ def hold_out_response(
     image_sum: np.ndarray,
     true_position: np.ndarray | None = None,
 ) -> HeldOutForces:
-    """What fits that never saw a press's place predict of it, by the response and by the methods to compare with.
+    """Predict each press by fits without its place: by the response and by the methods of comparison.
 
     Args:
-        groups: number of each press's part, (presses,), by what is left out at a time; see `leave_out`.
+        groups: number of each press's part, (presses,), for each kind of part to leave out; see `leave_out`.
         image_sum: integral of each press's image, (presses,) S m^2.
-        true_position: of the presses, (presses, 2) m, if a simulation knows it exactly.
+        true_position: exact positions of the presses, (presses, 2) m, if a simulation made them.
     """
     presses, loss, fold = problem
     curve, field = response.choice.curve, response.choice.field

@@ -1,14 +1,14 @@
-"""What became of a fit, and what to do about it."""
+"""Outcome of a fit as a code, with what to do about it."""
 
 import enum
 
 
 class FitError(ValueError):
-    """Samples that cannot be handed to a fit at all: wrong shapes, weights that are not positive."""
+    """Samples that no fit can take, such as wrong shapes or weights that are not positive."""
 
 
 class FitResult(enum.IntEnum):
-    """What became of a fit. Anything but SUCCESS: do not use its numbers; `message` says what to do."""
+    """Outcome of a fit. Use its numbers only after SUCCESS; otherwise `message` says what to do."""
 
     SUCCESS = 0
     NOT_FINITE = 1
@@ -20,7 +20,7 @@ class FitResult(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """One sentence for a person."""
+        """The outcome in one sentence, and what to do about it."""
         return _MESSAGES[self]
 
 

@@ -1,4 +1,4 @@
-"""Choosing among candidates by what they predict of what they have not seen, and saying why."""
+"""Choice among candidates by their error on held-out samples, with the reason in words."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -12,16 +12,16 @@ from .pads import LocatedPresses, fit_hybrid, sample_forces
 
 
 class Candidate(NamedTuple):
-    """What was tried, and what was found of it by places (of a log: stretches of time) that it had not seen.
+    """A candidate and its error at held-out places (of a log: in held-out stretches of time).
 
     | meaning                                                                        | unit |
     |--------------------------------------------------------------------------------|------|
     | part: "curve", "location" or "channels"                                        |      |
     | name                                                                           |      |
-    | size: coefficients (of a curve, a pad)                                         |      |
+    | size: number of coefficients (for a curve, of one pad)                         |      |
     | rmse: root mean square over places of the held-out error; None: not determined | N    |
-    | low, high: the same with a standard error less and more in the mean square     | N    |
-    | chosen                                                                         |      |
+    | low, high: roots of the mean square minus and plus its standard error          | N    |
+    | chosen: whether it was chosen                                                  |      |
     """
 
     part: str
@@ -44,15 +44,17 @@ class Tried(NamedTuple):
 def simplest(
     part: str, tried: Sequence[Tried], score: Callable[[Any], np.ndarray], over: str
 ) -> tuple[Any, str, tuple[Candidate, ...]]:
-    """The smallest candidate whose mean error is at most the least one plus its standard error, why, and the table.
+    """The smallest candidate whose mean square error is at most the least one plus its standard error.
 
-    One-standard-error rule: Breiman et al. 1984, 3.4.3.
+    This is the one-standard-error rule (Breiman et al. 1984, 3.4.3).
 
     Args:
-        part: what is chosen, as `Candidate` names it.
+        part: "curve", "location" or "channels"; see `Candidate`.
         tried: the candidates; a single one is not scored.
-        score: of a candidate's `choice`, mean square errors (n,) N^2 over places; not finite: not determined.
+        score: mean square errors of a `choice`, (n,) N^2 over places; a value that is not finite: not determined.
         over: what n counts, in words.
+
+    Returns: the choice, the reason in words, and all candidates (none if there was only one).
     """
     if len(tried) == 1:
         return tried[0].choice, "", ()
@@ -73,14 +75,14 @@ def simplest(
 
 
 def _roots(mean: float, error: float) -> tuple[float | None, float | None, float | None]:
-    """Root of a mean square (N^2), and of one standard error less and more."""
+    """Roots (N) of a mean square (N^2), and of it minus and plus its standard error."""
     if not np.isfinite(mean):
         return None, None, None
     return float(np.sqrt(mean)), float(np.sqrt(max(mean - error, 0))), float(np.sqrt(mean + error))
 
 
 class Choice(NamedTuple):
-    """A curve and a field, in words why these, and all that were tried (empty where there was nothing to choose)."""
+    """The chosen curve and field, the reason in words, and all candidates (none if there was only one)."""
 
     curve: AbstractCurve
     field: AbstractField | None
@@ -89,7 +91,7 @@ class Choice(NamedTuple):
 
     @property
     def title(self) -> str:
-        """The names of both, for a table."""
+        """The names of curve and field, for a table."""
         return ", ".join(
             [CURVES.name_of(self.curve)] + ([FIELDS.name_of(self.field)] if self.field is not None else [])
         )
@@ -104,9 +106,9 @@ def choose(
 ) -> Choice:
     """The simplest field, then the simplest curve, whose held-out error is within one standard error of the least.
 
-    The error is the mean over places of the mean square over a press's samples, so that all loads of a ramp count,
-    predicted by fits that never saw the place (see `simplest`). The field is chosen with the first curve; simple means
-    few coefficients.
+    The error is the mean over places of the mean square over the samples of the presses, so that all loads of a ramp
+    count; fits do not use the place (see `simplest`). The simplest has the fewest coefficients. The field is chosen
+    with the first curve, then the curve with that field.
     """
     pads = presses.geometry.pads
     by_field = [Tried(f, "none" if f is None else FIELDS.name_of(f), 0 if f is None else f.size(pads)) for f in fields]
@@ -121,7 +123,7 @@ def choose(
 def place_errors(
     curve: AbstractCurve, field: AbstractField | None, presses: LocatedPresses, loss: AbstractLoss, fold: np.ndarray
 ) -> np.ndarray:
-    """Mean square error of the total force at each place, (places,) N^2, by fits that never saw its fold."""
+    """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place."""
     data = presses.data
     total = np.full(data.sample_force.shape, np.nan)
     for k in np.unique(fold):

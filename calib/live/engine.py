@@ -21,15 +21,18 @@ from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of, remembered
 from ..calibration.localisation import ContactLocator
 from ..fitting.fields import Places
-from ..fitting.pads import nowhere
+from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
 from .results import NO_TOUCHES, FrameResult, TouchEstimates
 
 TOUCH_SIGNIFICANCE = 3.0  # a force above this many standard errors is a touch
 MAX_SEARCH_DELAY = 0.1  # s; then contacts are fitted even if a frame is dropped for it
+MAX_NEGATIVE_TIME = 1.0  # s below zero on a skin that nothing presses, after which the rest levels must be wrong
 MAX_PLACE_AGE = 0.3  # s; older contacts do not describe the present frame
 GATE = 0.6  # see `jaxeit.fuse`
 IMAGE_DTYPE = "float32"  # of the image product; its matrices are built in float64, but read in half the memory
+
+MEASURING = "measuring the rest levels: do not touch the skin"
 
 T = TypeVar("T")
 
@@ -43,22 +46,33 @@ class ReceivedFrame(NamedTuple):
 
 
 class RestLevels:
-    """Rest levels: means of voltages and pressures over `seconds` of frames without contact, of finite values only."""
+    """Rest levels: means of voltages and pressures over `seconds` of frames without contact, of finite values only.
+
+    ``levels`` are these means: voltages (readings,) V and pressures (pads,) Pa, or None until the time is over.
+    ``change`` (pads,) Pa is the mean pressure of the second half of the frames less that of the first.
+    """
 
     def __init__(self, seconds: float):
         self._seconds = seconds
         self._since: int | None = None
-        self._rows: list[tuple[np.ndarray, np.ndarray]] = []
+        self._rows: list[tuple[np.ndarray, np.ndarray, int]] = []
         self.levels: tuple[np.ndarray, np.ndarray] | None = None
+        self.change = np.zeros(0)
 
     def add(self, arrival: ReceivedFrame) -> None:
         """Add a frame without contact."""
         self._since = arrival.host if self._since is None else self._since
-        self._rows.append((arrival.voltage, arrival.pressure))
+        self._rows.append((arrival.voltage, arrival.pressure, arrival.host))
         if arrival.host - self._since >= self._seconds * 1e9:
-            voltages, pressures = zip(*self._rows, strict=True)
+            voltages, pressures, _ = zip(*self._rows, strict=True)
+            first, second = np.array_split(np.stack(pressures), 2)
             self.levels = finite_mean(np.stack(voltages)), finite_mean(np.stack(pressures))
-            self._rows = []
+            self.change = finite_mean(second) - finite_mean(first) if len(second) else np.zeros_like(pressures[0])
+
+    def slide(self) -> None:
+        """Drop the first half of the frames, and wait for as many new ones."""
+        self._rows = self._rows[-(-len(self._rows) // 2) :]
+        self._since, self.levels = (self._rows[0][2] if self._rows else None), None
 
 
 class FrameForces(NamedTuple):
@@ -70,6 +84,7 @@ class FrameForces(NamedTuple):
     | force, standard_error | of each pad                                       | (pads,)   | N    |
     | valid                 | whether the pressure is within the fitted range   | (pads,)   |      |
     | loaded                | whether the pad is pressed                        | (pads,)   |      |
+    | negative              | whether the pressure is as far below zero         | (pads,)   |      |
     | image                 | change of conductivity from which the map is made | (pixels,) | S    |
     """
 
@@ -78,6 +93,7 @@ class FrameForces(NamedTuple):
     standard_error: np.ndarray
     valid: np.ndarray
     loaded: np.ndarray
+    negative: np.ndarray
     image: np.ndarray
 
 
@@ -137,13 +153,14 @@ def _packed_forces(law: ForceLaw, image: Array, pressure: Array, places: Places,
     """The fields of `FrameForces` in one row, so that one transfer from the device suffices."""
     image = image.astype(law.recon.dtype)
     found = fused(law, image, pressure, places if law.field is not None else None, before, GATE)
-    parts = found.map.force, found.force, found.standard_error, found.valid, is_loaded(law, pressure)
+    loaded, negative = is_loaded(law, pressure), is_loaded(law, -pressure)
+    parts = found.map.force, found.force, found.standard_error, found.valid, loaded, negative
     return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])
 
 
 def _unpack_forces(row: np.ndarray, pads: int, image: np.ndarray) -> FrameForces:
-    force, error, valid, loaded = row[-4 * pads :].reshape(4, pads)
-    return FrameForces(row[: -4 * pads], force, error, valid > 0, loaded > 0, image)
+    force, error, valid, loaded, negative = row[-5 * pads :].reshape(5, pads)
+    return FrameForces(row[: -5 * pads], force, error, valid > 0, loaded > 0, negative > 0, image)
 
 
 def _find_contacts(law: ForceLaw, frame: Array) -> tuple[Places, je.Contacts | None]:
@@ -186,6 +203,8 @@ class Engine:
         self._rest = rest
         self._rest_levels = RestLevels(rest)
         self._number = 0
+        self._negative_since: int | None = None
+        self.restless = False
         recon = calibration.recon
         self._used_readings, self._centres = np.asarray(recon.channels), np.asarray(recon.centres)
         self._pad_weights = np.asarray(calibration.masks.weights)
@@ -204,9 +223,37 @@ class Engine:
         """Whether the rest levels are still being measured."""
         return self._rest_levels.levels is None
 
+    @property
+    def state(self) -> str:
+        """What the engine does now, for the operator."""
+        if not self.resting:
+            return "running"
+        return "waiting for the skin to be at rest: do not touch it" if self.restless else MEASURING
+
     def tare(self) -> None:
         """Measure the rest levels again."""
-        self._rest_levels = RestLevels(self._rest)
+        self._rest_levels, self._negative_since, self.restless = RestLevels(self._rest), None, False
+
+    def has_wrong_zero(self, now: int) -> bool:
+        """Whether pads read below zero for so long, at `now` (ns), that the skin was pressed when zero was measured."""
+        return self._negative_since is not None and now - self._negative_since > MAX_NEGATIVE_TIME * 1e9
+
+    def _add_rest(self, arrival: ReceivedFrame) -> None:
+        """Add a frame to the rest levels, and go on measuring if the skin was pressed or released meanwhile."""
+        self._rest_levels.add(arrival)
+        if self._rest_levels.levels is not None:
+            change = np.nan_to_num(self._rest_levels.change)
+            found = self._programs.map(np.zeros(arrival.voltage.size), change, self._programs.nowhere, self._before)
+            self.restless = bool((found.loaded | found.negative).any())
+            if self.restless:
+                self._rest_levels.slide()
+
+    def _note_negative(self, negative: np.ndarray, loaded: np.ndarray, now: int) -> None:
+        """Note since when pads read below zero while none is pressed."""
+        if not negative.any() or loaded.any():
+            self._negative_since = None
+        elif self._negative_since is None:
+            self._negative_since = now
 
     def pressed(self, arrival: ReceivedFrame) -> np.ndarray:
         """Change of pressure on each pad (pads,) Pa; only once the rest levels are measured."""
@@ -216,7 +263,7 @@ class Engine:
     def step(self, arrival: ReceivedFrame, dropped: int = 0) -> FrameResult | None:
         """Process one frame; None while the rest levels are being measured."""
         if self._rest_levels.levels is None:
-            self._rest_levels.add(arrival)
+            self._add_rest(arrival)
             return None
         frame, pressure = arrival.voltage - self._rest_levels.levels[0], self.pressed(arrival)
         lost, silent = ~np.isfinite(frame), ~np.isfinite(pressure)
@@ -225,6 +272,7 @@ class Engine:
         if self._law.remembers:
             self._before = remembered(np.concatenate([self._before, pressure[None]]))
         self._schedule_search(frame, bool(found.loaded.any()))
+        self._note_negative(found.negative & ~silent, found.loaded & ~silent, arrival.host)
         force = np.where(silent, np.nan, found.force)
         error = np.where(silent, np.nan, found.standard_error)
         self._number += 1
@@ -234,7 +282,7 @@ class Engine:
             latency=(time.monotonic_ns() - arrival.host) / 1e9,
             force=force,
             standard_error=error,
-            valid=found.valid & ~silent,
+            valid=found.valid & ~silent & ~found.negative,
             centre=self._centre(found.map, force > TOUCH_SIGNIFICANCE * error),
             map=found.map,
             image=found.image,

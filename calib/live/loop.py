@@ -86,6 +86,10 @@ class FrameQueue:
             return max(0.0, (self._last + self._period - time.monotonic_ns()) / 1e9)
 
 
+def _ignore(line: str) -> None:
+    """Tell nobody."""
+
+
 @dataclass
 class LiveControl:
     """Controls of a running live view (stop, measure rest levels again), and its state for viewers."""
@@ -95,6 +99,7 @@ class LiveControl:
     state: str = "waiting for the devices"
     lost: int = 0  # frames that were sent and did not arrive
     simulated: bool = False  # whether a device reports that its values are simulated
+    warn: Callable[[str], object] = _ignore  # called with what the operator should know
 
 
 Publish = Callable[[FrameResult], object]
@@ -181,7 +186,10 @@ def _process_frames(
 ) -> int:
     count, begun, until = 0, False, time.monotonic() + wait
     while not (control.stop.is_set() or recorder.stop.is_set() or recorder.ended):
-        if control.tare.is_set():
+        wrong_zero = engine.has_wrong_zero(time.monotonic_ns())
+        if wrong_zero:
+            control.warn("pads read below zero: the skin was pressed when zero was measured, which is done again now")
+        if control.tare.is_set() or wrong_zero:
             control.tare.clear()
             engine.tare()
             if director is not None:
@@ -195,7 +203,9 @@ def _process_frames(
         result = engine.step(arrival, queue.dropped)
         control.lost = sum(receiver.counters.lost for receiver in recorder.receivers)
         control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)
-        control.state = "measuring the rest levels: do not touch the skin" if engine.resting else "running"
+        if engine.state != control.state and engine.restless:
+            control.warn(engine.state)
+        control.state = engine.state
         if result is not None:
             count += 1
             for publish in viewers:

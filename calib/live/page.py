@@ -22,7 +22,19 @@ PAGE_FILE = Path(__file__).with_name("page.html")
 MIN_RESULT_INTERVAL = 0.04  # s between two results for a viewer; the eye sees no more
 KEEP_ALIVE_INTERVAL = 1.0  # s between messages without results, which reveal closed connections
 REQUEST_TIMEOUT = 5.0  # s
-SECURITY_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+MAX_CONNECTIONS = 32  # at one time; the connections beyond are closed
+SECURITY_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+SECURITY_HEADERS = {
+    "Content-Security-Policy": SECURITY_POLICY,
+    "X-Frame-Options": "DENY",  # browsers that do not know frame-ancestors
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+OWN_FETCH_SITES = (None, "same-origin", "none")  # Sec-Fetch-Site of this page, of the user, and of programs
 
 
 def page_scene(calibration: Calibration) -> dict[str, object]:
@@ -52,6 +64,7 @@ class Page(ThreadingHTTPServer):
         self._result: FrameResult | None = None
         self._fresh = threading.Condition()
         self._host = host
+        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
         super().__init__((host, port), _Handler)
         self._thread = threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True)
 
@@ -84,6 +97,20 @@ class Page(ThreadingHTTPServer):
     @property
     def _number(self) -> int:
         return 0 if self._result is None else self._result.number
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Handle a connection in a thread of its own, or close it if `MAX_CONNECTIONS` are open."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Handle a connection, then make room for another."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing when a viewer disconnects."""
@@ -120,8 +147,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Measure the rest levels again, if the request comes from the page itself."""
         if not self._is_allowed():
             return
-        origin = self.headers.get("Origin")
-        if self.path != "/tare" or origin not in (None, f"http://{self.headers.get('Host')}"):
+        if self.path != "/tare" or not self._is_own_page():
             self.send_error(HTTPStatus.FORBIDDEN)
             return
         self.server.control.tare.set()
@@ -134,20 +160,27 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_error(HTTPStatus.FORBIDDEN)
         return False
 
+    def _is_own_page(self) -> bool:
+        """Whether this page or a program sent the request, not the page of another site in the same browser."""
+        origin, site = self.headers.get("Origin"), self.headers.get("Sec-Fetch-Site")
+        return origin in (None, f"http://{self.headers.get('Host')}") and site in OWN_FETCH_SITES
+
     def _reply(self, body: bytes, kind: str) -> None:
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
-        self.send_header("Content-Security-Policy", SECURITY_POLICY)
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
+        self._end_headers()
         self.wfile.write(body)
+
+    def _end_headers(self) -> None:
+        for name, value in SECURITY_HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
 
     def _push(self) -> None:
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "text/event-stream")
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
+        self._end_headers()
         number, stop = 0, self.server.control.stop
         while not stop.is_set():
             result = self.server.newest(number)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 
 MAX_BACKLOG = 1 << 20  # bytes held for a listener
 MAX_SEND_BYTES = 1 << 16
+MAX_LISTENERS = 32  # at one time; the connections beyond are closed
+MAX_ACCEPTED = 100  # connections accepted in one call, so that a flood of connections does not hold up the frames
 
 
 class Listener:
@@ -54,11 +56,11 @@ class Broadcaster:
         self.listeners: list[Listener] = []
 
     def accept(self, refuse: bool = False) -> None:
-        """Accept waiting connections; with `refuse`, close these and all others."""
-        with contextlib.suppress(BlockingIOError):
-            while True:
+        """Accept waiting connections, at most `MAX_LISTENERS`; with `refuse`, close these and all others."""
+        with contextlib.suppress(OSError):  # none waits, a client has gone again, or the system has no more sockets
+            for _ in range(MAX_ACCEPTED):
                 client, _ = self._server.accept()
-                if refuse:
+                if refuse or len(self.listeners) >= MAX_LISTENERS:
                     client.close()
                     continue
                 client.setblocking(False)

@@ -21,7 +21,7 @@ MAX_SKEW = 0.05  # a clock farther off than this does not count ticks of the sta
 MAX_SEGMENTS = 1000
 FIT_WINDOW, FIT_STEP, HULL_BLOCK = 60 * SECOND, 30 * SECOND, 10 * SECOND
 MIN_RATE_SPAN = 3 * SECOND  # shorter spans do not determine the rate
-MIN_TICK_SPAN = 10 * SECOND  # longer spans reveal a wrong length of the tick
+MIN_TICK_SPAN = 10 * SECOND  # longer spans reveal a tick that is wrong by `MAX_SKEW`, shorter ones one more wrong
 EARLY_LIMIT = 10_000_000  # ns: a frame that seems to arrive this long before it was sent reveals a clock step
 INITIAL_EARLY_LIMIT = 50_000_000  # ns, while the jitter is not known
 MAX_LEAD = 60 * SECOND  # of device time over host time between two frames: no connection delays frames that long
@@ -354,9 +354,15 @@ def _clock_fit(points: list[_PointSegment], tick_ns: float, samples: int) -> Clo
     residuals = np.concatenate([_block_residuals(p, s, tick_ns) for p, s in zip(points, segments, strict=True)])
     elapsed = longest.last_host - longest.host
     tick = elapsed / max(longest.last_ticks - longest.ticks, 1) if elapsed else tick_ns
-    off = abs(tick / tick_ns - 1) > MAX_SKEW and elapsed > MIN_TICK_SPAN
-    valid = not off and len(segments) < MAX_SEGMENTS and len(segments) <= 1 + samples // 20
+    runs = len(segments) < MAX_SEGMENTS and len(segments) <= 1 + samples // 20
+    valid = runs and not _is_wrong_tick(tick / tick_ns, elapsed)
     return ClockFit(segments, usual_skew, float(np.quantile(residuals, 0.95)), valid, tick / 1e9)
+
+
+def _is_wrong_tick(ratio: float, elapsed: float) -> bool:
+    """Whether a tick of `ratio` times the stated length is wrong: more so than late frames in `elapsed` ns explain."""
+    tolerance = MAX_SKEW if elapsed > MIN_TICK_SPAN else 2 * MAX_BUFFERED / max(elapsed, 1)
+    return max(ratio, 1 / ratio) - 1 > max(tolerance, MAX_SKEW)
 
 
 def _lines(segment: _PointSegment, usual_skew: float) -> list[Line]:

@@ -3,13 +3,15 @@
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from ..session import Status
-from .journal.records import EVENT, PONG, RESTARTED, EventCode, pack_event, pack_frame, pack_pong
+from .journal.records import EVENT, MISCOUNTED, PONG, RESTARTED, EventCode, pack_event, pack_frame, pack_pong
 from .sources import Link, Source
 from .wire.decoding import DecoderCounts, DecoderState
 from .wire.encoding import encode_ping
@@ -21,6 +23,9 @@ TIMEOUT_PERIODS = 3  # periods of silence after which a link is opened again
 MIN_TIMEOUT = 0.5  # s; TCP repeats lost packets only after 0.2 s
 FIRST_FRAME_TIMEOUT = 5.0  # s for the first frame of a connection, and while the rate is not known
 MIN_RATE_FRAMES = 20  # frames from which the rate is known
+MAX_CLOCK_LEAD = 1.0  # s by which a device's clock may run ahead between two frames and still count time
+MAX_LOST = 0.01  # tolerated fraction of lost frames
+MAX_REJECTED = 0.01  # tolerated fraction of rejected frames: a device may send some frames again
 
 FrameCallback = Callable[[int, Frame, int], None]
 
@@ -54,7 +59,10 @@ class StreamCounters:
     problem: str = ""
     frames: int = 0
     lost: int = 0
-    repeated: int = 0
+    rejected: int = 0  # repeated, late, or out of sequence
+    miscounted: int = 0  # kept, though their sequence numbers do not count up
+    last_frame: float = 0.0  # time.monotonic() of the last frame that was kept
+    timeout: float = FIRST_FRAME_TIMEOUT  # s of silence after which a frame is overdue
     connections: int = 0
     simulated: bool = False
     earlier: DecoderCounts = field(default_factory=DecoderCounts)  # of links before the present one
@@ -76,6 +84,7 @@ class StreamReceiver:
     def __init__(self, number: int, source: Source, journal: RecordSink, on_frame: FrameCallback | None = None):
         self.number, self.source, self.counters = number, source, StreamCounters()
         self._journal, self._on_frame, self._sequence = journal, on_frame, SequenceState()
+        self._last_frame: tuple[Frame, int] | None = None  # the last one that was kept, and its arrival (ns)
         self._rejoined = False
         self._link: Link | None = None
         self._last_note = ""
@@ -144,7 +153,7 @@ class StreamReceiver:
                     self._take(frame, host)
                 if frames:
                     last_frame, count = now, count + len(frames)
-                    timeout = self._timeout(now - began, count)
+                    self.counters.timeout = timeout = self._timeout(now - began, count)
             if link.reopens_when_silent and now - last_frame > timeout:
                 raise TimeoutError(
                     f"silent for {now - last_frame:.1f} s" if not data else f"no frame for {now - last_frame:.1f} s"
@@ -161,20 +170,49 @@ class StreamReceiver:
         flags = 0 if frame.checked else int(Status.unchecked)
         flags |= int(Status.crc_resync) if frame.resync else 0
         if frame.seq is not None:
-            self._sequence, place, lost = place_frame(self._sequence, frame.seq)
+            self._sequence, place, lost = place_frame(self._sequence, frame.seq, self._is_newer(frame, host))
             if not place.kept:
-                self.counters.repeated += place is not SequencePlace.SUSPECT
+                self.counters.rejected += 1
                 return
             self.counters.lost += lost
+            self.counters.miscounted += place is SequencePlace.MISCOUNTED
             flags |= int(Status.gap_before) if lost or place is SequencePlace.RESTART else 0
             flags |= RESTARTED if place is SequencePlace.RESTART else 0
+            flags |= MISCOUNTED if place is SequencePlace.MISCOUNTED else 0
         if self._rejoined:
             flags |= int(Status.disconnected | Status.gap_before)
             self._rejoined = False
         self._journal.append(self.number, flags, host, pack_frame(frame))
         self.counters.frames += 1
+        self.counters.last_frame, self._last_frame = host / 1e9, (frame, host)
         if self._on_frame is not None:
             self._on_frame(self.number, frame, host)
+
+    def _is_newer(self, frame: Frame, host: int) -> bool:
+        """Whether the device took this frame later than the last one: by its clock, or by new values if that stands."""
+        last, arrival = self._last_frame or (frame, host)
+        if frame.ticks is None or last.ticks is None:
+            return False
+        passed = (frame.ticks - last.ticks) % (1 << frame.bits) * self.source.plan.tick
+        if passed == 0:
+            return not np.array_equal(frame.values, last.values, equal_nan=frame.values.dtype.kind == "f")
+        return passed <= (host - arrival) / 1e9 + MAX_CLOCK_LEAD
+
+    def shortfalls(self, now: float) -> Iterator[str]:
+        """Why the frames of this stream are not all that its device sent up to `now` (time.monotonic(), s)."""
+        counters, name = self.counters, self.source.plan.name
+        received = counters.frames + counters.rejected
+        if counters.rejected > MAX_REJECTED * received:
+            what = f"{counters.rejected:,} of {received:,} frames were rejected, because they repeat earlier ones"
+            yield f"{name}: {what} or come after later ones; see docs/wire-format.md"
+        if counters.miscounted:
+            what = f"the sequence numbers of {counters.miscounted:,} of {received:,} frames do not count up"
+            yield f"{name}: {what}, so that lost frames cannot be counted; see docs/wire-format.md"
+        if counters.lost > MAX_LOST * received:
+            yield f"{name}: {counters.lost:,} frames were lost; check the link"
+        silence = now - counters.last_frame
+        if counters.frames and not self.ended and silence > counters.timeout:
+            yield f"{name}: no frame came in the last {silence:.1f} s; check the device"
 
     def _note_simulation(self, note: str) -> None:
         """Record once that the values are simulated; the device repeats its note every second."""

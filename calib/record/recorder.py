@@ -7,14 +7,15 @@ from the journal when the recording ends. After a crash of the recorder, `conver
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from .intake import FrameCallback, RecordSink, StreamReceiver, explain_silence
 from .journal.conversion import Progress, convert_journal
 from .journal.file import Journal, JournalError, JournalReader
-from .journal.records import END, PLAN, PONG, pack_end
+from .journal.records import END, EVENT, PLAN, PONG, EventCode, pack_end, pack_event
 from .plan import RecordingPlan
 from .sources import Source
 from .summary import RecordingSummary
@@ -29,6 +30,8 @@ class RecordError(ValueError):
 
 class Recorder:
     """Receives all streams of a recording, one thread each, while its context is entered.
+
+    At the end the journal is told which streams hold less than their devices sent.
 
     ``failure`` is the error that stopped the recording, or None. The threads call ``on_frame`` with every frame that is
     kept (number of the stream, frame, host ns); it must return at once.
@@ -56,9 +59,13 @@ class Recorder:
         return self
 
     def __exit__(self, *error: object) -> None:
+        stopped = time.monotonic()
         self.stop.set()
         for thread in self._threads:
             thread.join()
+        with suppress(JournalError):  # the recording has failed already, and says why
+            for text in chain.from_iterable(receiver.shortfalls(stopped) for receiver in self.receivers):
+                self._journal.append(EVENT, 0, time.monotonic_ns(), pack_event(EventCode.FAULT, text))
 
     def _run(self, receiver: StreamReceiver) -> None:
         try:
@@ -98,6 +105,8 @@ def _receiver_status(receiver: StreamReceiver) -> str:
     counters = receiver.counters
     text = f"{receiver.source.plan.name} {counters.frames:,}"
     text += f" ({counters.lost:,} lost)" if counters.lost else ""
+    text += f" ({counters.rejected:,} rejected)" if counters.rejected else ""
+    text += f" ({counters.miscounted:,} miscounted)" if counters.miscounted else ""
     text += f" ({sum(counters.dropped.values()):,} damaged)" if counters.dropped else ""
     return text if counters.connected or receiver.ended else f"{text} [{counters.problem or 'connecting'}]"
 

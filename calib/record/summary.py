@@ -49,20 +49,26 @@ class StreamSummary:
 class RecordingSummary:
     """Summary of a recording and the session made of it.
 
-    ``complete`` is true if the recording ended as planned and no record is missing; otherwise ``why`` gives the reason.
+    ``complete`` is true if the recording ended as planned, every device sent until its end, and no record is missing;
+    otherwise ``reasons`` says why not.
     """
 
     path: Path
     streams: tuple[StreamSummary, ...]
     complete: bool
-    why: str
+    reasons: tuple[str, ...]
     records_lost: int
     bytes_damaged: int
 
     def render(self) -> str:
         """A line of text for each stream, and one for the whole."""
         lines = ["  " + stream.render() for stream in self.streams]
-        state = "complete" if self.complete else f"not complete ({self.why})"
+        lost = sum(stream.lost for stream in self.streams)
+        but_for = f", but for {lost:,} lost frame{'s' * (lost != 1)}" if lost else ""
+        state = f"complete{but_for}" if self.complete else "not complete"
+        if len(self.reasons) == 1:
+            state += f" ({self.reasons[0]})"
         if self.records_lost or self.bytes_damaged:
             state += f"; {self.records_lost:,} records lost to {self.bytes_damaged:,} damaged bytes"
-        return "\n".join([*lines, f"{self.path}: {state}"])
+        several = [f"  {reason}" for reason in self.reasons] if len(self.reasons) > 1 else []
+        return "\n".join([*lines, f"{self.path}: {state}", *several])

@@ -5,10 +5,12 @@ from .refinement import refine_contacts
 from .regions import RegionError, Regions, find_regions
 from .result import ContactResult, Contacts, strongest
 from .search import ContactFinder
+from .settings import ContactSettings
 
 __all__ = [
     "ContactFinder",
     "ContactResult",
+    "ContactSettings",
     "Contacts",
     "RegionError",
     "Regions",

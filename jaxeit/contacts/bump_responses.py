@@ -1,8 +1,8 @@
 """Whitened readings of Gaussian bumps, from a table.
 
 A contact multiplies the conductivity by ``1 + a g(r - p; s) / mean(sigma_0)``, g a Gaussian bump of height one and
-standard deviation s: pressed together, sheet and metal conduct better in proportion to the coat.  To second order, and
-measured against the full forward map, the readings see K contacts as if the sheet had changed by sigma_0 e,
+standard deviation s: pressed together, sheet and metal conduct better in proportion to the coating.  To second order,
+and measured against the full forward map, the readings see K contacts as if the sheet had changed by sigma_0 e,
 
     e = u - c u^2 / (1 + d u),        u = sum_k a_k g_k / mean(sigma_0),   c = 0.8,  d = 0.7,
 
@@ -13,7 +13,7 @@ Gaussian,
     g(p, s) g(q, t) = exp(-|p - q|^2 / 2(s^2 + t^2)) g((p t^2 + q s^2) / (s^2 + t^2), s t / sqrt(s^2 + t^2)),
 
 so that K contacts are K + K (K + 1) / 2 bumps.  The table holds cubic B-splines over place and log width, with exact
-derivatives, in the few directions of the whitened readings (`whitening`) that bumps reach.
+derivatives, in the few directions of the whitened readings (`imaging.noise`) that bumps reach.
 """
 
 from typing import NamedTuple

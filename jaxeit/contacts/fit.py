@@ -16,7 +16,7 @@ from .bump_responses import Responses
 
 # Largest half length of an oblong contact, m.
 MAX_HALF_LENGTH = 0.04
-# Steps of a fit at most, and steps after which a fit must have shown that it leads somewhere.
+# Largest number of steps of a fit, and number of steps after which it is compared with others.
 MAX_STEPS, TRIAL_STEPS = 20, 4
 # Places of the four bumps along the half length of an oblong contact.
 PLACES_ALONG = np.array([-0.75, -0.25, 0.25, 0.75])
@@ -52,7 +52,7 @@ class ContactFit(NamedTuple):
 
 
 class UnfinishedFit(NamedTuple):
-    """Parameters (m,) last taken, and where the solver stands."""
+    """Parameters (m,) accepted last, and the state of the solver."""
 
     flat: Float[Array, " m"]
     state: LeastSquaresState
@@ -68,7 +68,7 @@ class UnfinishedFit(NamedTuple):
         return ContactFit(self.flat, self.state.square, self.state.converged)
 
 
-def one_row_each(flat: Float[Array, " 4n"]) -> Float[Array, "n 4"]:
+def one_row_each(flat: Float[Array, " parameters"]) -> Float[Array, "contacts 4"]:
     """Contacts (x, y, log width, strength) from all parameters."""
     return flat.reshape(-1, 4)
 

@@ -1,4 +1,4 @@
-"""Everything that a search of contacts needs and that does not depend on the frame, made once."""
+"""Preparing a finder of contacts: everything that does not depend on the frame."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,83 +18,73 @@ from ..model.sensitivity import pair_jacobian
 from .bump_responses import Nodes, mean_conductivity, nodes_of, reached, responses_of, tabulate
 from .fit import bounds_of
 from .search import ContactFinder
+from .settings import ContactSettings
 
 # Frames of noise that set the threshold.
 NOISE_FRAMES = 512
-# Widths of the atoms, as places along the widths of the table: narrow, middling and wide.
+# Widths of the atoms, as fractions of the way from the narrowest to the widest level of the table.
 ATOM_WIDTHS = (0.35, 0.6, 0.85)
 
 
 def prepare_contacts(
     model: Model,
+    settings: ContactSettings | None = None,
     *,
     noise: Float[ArrayLike, "..."],
-    most: int = 3,
-    widths: tuple[float, float] = (0.005, 0.03),
-    columns: int = 41,
-    false_alarm: float = 0.01,
-    model_error: float = 0.015,
-    ratio: float = 0.8,
-    separation: float = 1.2,
     sigma: Float[Array, " elements"] | None = None,
     channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> ContactFinder:
     """Do everything that does not depend on the frame once: make a finder of contacts.
 
-    The finder adds contacts one by one and fits each number of them by Levenberg-Marquardt from two starts: the bump
-    that explains most of what is left, and the strongest contact in two halves. Where both fits of two contacts end
-    badly, it starts a third from the two bumps that explain most together. It goes on for as long as
+    The finder adds contacts one by one and fits each number of contacts by Levenberg-Marquardt from two starts: the
+    bump that explains most of the rest, and the strongest contact split in two. Where both fits of two contacts end
+    badly, it starts a third from the two bumps that explain most together. With the names of `ContactSettings`, it goes
+    on for as long as
 
-    - chi-square falls by more than noise alone makes it fall in a part ``false_alarm`` of blank frames.  The largest
+    - chi-square falls by more than noise alone makes it fall in a fraction ``false_alarm`` of blank frames. The largest
       fall over all places and widths follows ``P(fall > z^2) = 1 - exp(-N (z^2 - 1) exp(-z^2 / 2))``, the Euler
       characteristic of a Gaussian field in three dimensions (Adler 1981), with N from simulated noise;
     - and, from the second contact on, chi-square falls by more than ``(model_error |y|)^2`` and than ``ratio^2`` times
-      what is left (for the third contact ``(2 ratio)^2``, and so on): no real contact is exactly a Gaussian on a sheet
+      the rest (for the third contact ``(2 ratio)^2``, and so on): no real contact is exactly a Gaussian on a sheet
       that is exactly known, and the difference must not become a contact;
     - and two contacts explain as much more than one oblong contact, a row of four bumps (an edge is not two contacts);
     - and all contacts are further apart than ``separation`` times their mean width, and none is below a tenth of the
       strongest.
 
     Args:
+        settings: default `ContactSettings()`.
         noise: standard deviation of each reading, (readings,) V, or their covariance, (readings, readings) V^2.
-        most: contacts looked for, K.
-        widths: smallest and largest standard deviation of a contact, m.
-        columns: nodes of the table along x, from rim to rim; a pitch above the smallest width loses accuracy there.
-        false_alarm: part of blank frames in which a contact is found.
-        model_error: part of the signal that a bump may fail to explain.
-        ratio: part of what is left that a further contact must explain more.
-        separation: least distance of two contacts, in mean widths.
-        sigma: conductivity to linearise at, (elements,) S, best from `fit_background`: on an uneven coat the error of
-            place is otherwise more than twice as large; default: the even sheet.
+        sigma: conductivity to linearise at, (elements,) S, best from `fit_background`: on an uneven coating the error
+            of place is otherwise more than twice as large; default: the even sheet.
         channels: readings to use; a dead reading is left out, never taken for zero.
 
     Raises:
-        InverseError: if a value is out of range or no channel is left.
+        InverseError: if the noise is out of range or no channel is left.
     """
     require_known("prepare_contacts", InverseError, model, noise, sigma, channels)
-    _check(most, widths, columns, false_alarm, model_error, ratio, separation)
+    settings = settings or ContactSettings()
     found = whitened_readings(model, noise, channels)
-    nodes = nodes_of(model, widths, columns)
+    nodes = nodes_of(model, settings.widths, settings.columns)
     slopes, background = _slopes(model, found, sigma)
     seen, beside = reached(tabulate(model, slopes, nodes.fewer(3)))
     values = tabulate(model, seen.T @ slopes, nodes)
     put = partial(jnp.asarray, dtype=model.dtype)
+    bounds = bounds_of(nodes.axes[1], nodes.axes[0], settings.widths)
     finder = ContactFinder(
         whitening=found.whitening,
         compress=put(seen.T @ found.compress),
         rest=put(beside.T @ found.compress),
         responses=responses_of(values, nodes, background, model.dtype),
-        **{name: put(array) for name, array in _atoms(model, values, nodes).items()},
-        **{name: put(bound) for name, bound in bounds_of(nodes.axes[1], nodes.axes[0], widths).items()},
+        **{name: put(array) for name, array in (_atoms(model, values, nodes) | bounds).items()},
         threshold=put(0),
-        model_error=put(model_error),
-        ratio=put(ratio),
-        separation=put(separation),
+        model_error=put(settings.model_error),
+        ratio=put(settings.ratio),
+        separation=put(settings.separation),
         root=put(np.eye(seen.shape[1])),
         whole=jnp.asarray(True),
-        most=most,
+        most=settings.most,
     )
-    ready: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, false_alarm)))
+    ready: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, settings.false_alarm)))
     return ready
 
 
@@ -103,28 +93,6 @@ def _slopes(model: Model, found: Whitened, sigma: Float[Array, " elements"] | No
     slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(found.electrodes))
     at = np.asarray(model.background if sigma is None else sigma, float)
     return found.factor @ (np.asarray(slopes, float) * at), mean_conductivity(model, at)
-
-
-def _check(
-    most: int,
-    widths: tuple[float, float],
-    columns: int,
-    false_alarm: float,
-    model_error: float,
-    ratio: float,
-    separation: float,
-) -> None:
-    for name, value, fine, wanted in (
-        ("most", most, most >= 1, "one or more"),
-        ("widths", widths, 0 < widths[0] < widths[1] < np.inf, "smallest and largest, m"),
-        ("columns", columns, 5 <= columns <= 500, "5 to 500"),
-        ("false_alarm", false_alarm, 0 < false_alarm < 0.5, "above 0 and below 0.5"),
-        ("model_error", model_error, 0 <= model_error < 1, "0 or more, below 1"),
-        ("ratio", ratio, 0 <= ratio < np.inf, "0 or more"),
-        ("separation", separation, 0 <= separation < np.inf, "0 or more"),
-    ):
-        if not fine:
-            raise InverseError(f"{name} is {value}; give {wanted}")
 
 
 def _atoms(model: Model, values: np.ndarray, nodes: Nodes) -> dict[str, np.ndarray]:

@@ -43,8 +43,8 @@ def find_regions(
 ) -> Regions:
     """Find the regions of an image that stand out, one per contact; on the host, one image at a time.
 
-    Pixels of at least ``level`` times the largest value are kept, and each belongs to the summit
-    that the steepest way up (over eight neighbours) ends on. Of two summits whose slopes meet, the lower one
+    Pixels of at least ``level`` times the largest value are kept, and each belongs to the summit at which the steepest
+    way up (over eight neighbours) ends. Of two summits whose slopes meet, the lower one
     is joined to the other unless it rises by more than ``least`` times the largest value above
     their pass, so that ripples are not contacts. A summit that does not rise that far above the threshold is
     dropped. Chen et al. 2025 (arXiv 2503.13036) divide a pad's force by ``sums``.

@@ -1,11 +1,12 @@
 """Contacts found directly: position, width and strength of a few bumps that explain a frame.
 
 Bumps are fitted to whitened readings (`fit`), whose response to bumps comes from a table (`bump_responses`): no mesh,
-no solver and no matrix with a row per element is left when a frame comes. The number of bumps is found by adding one
+no solver and no matrix with a row per element is needed when a frame comes. The number of bumps is found by adding one
 after the other.
 """
 
 from collections.abc import Callable
+from math import prod
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import one_by_one, verb
+from .._compile import sequential_on_cpu, verb
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
@@ -25,7 +26,8 @@ from .starts import Atoms, split
 
 # Least strength of a contact, over that of the strongest. What is weaker is a ripple of the strongest.
 MIN_RELATIVE_STRENGTH = 0.1
-# A further start is given up where so many falls as its last step promises would not make it good enough.
+# A further start is given up if this many more steps, each with the fall that its last step promised, would not make it
+# good enough.
 OUTLOOK = 16
 # Standard deviations above its mean that chi-square may have in a fit that leaves nothing to explain.
 MAX_DEVIATIONS = 4
@@ -130,19 +132,19 @@ class ContactFinder(eqx.Module):
         """The contacts in one frame."""
         there = jnp.isfinite(dv) & self.whitening.channels
         whole = jnp.all(there == self.whitening.channels)
-        seen = jax.lax.cond(whole, lambda dv: self._as_it_is(dv), lambda dv: self._with_gaps(dv), dv)
+        seen = jax.lax.cond(whole, lambda dv: self._complete_frame(dv), lambda dv: self._incomplete_frame(dv), dv)
         bumps = self.bumps(seen.root, whole)
         search = _Search(self, bumps, seen.y)
         found = jax.lax.stop_gradient(search).contacts()  # derivatives: see `Bumps.sensitive`
         return self._contacts(bumps, seen, found, jnp.any(there))
 
-    def _as_it_is(self, dv: Float[Array, " readings"]) -> Frame:
+    def _complete_frame(self, dv: Float[Array, " readings"]) -> Frame:
         sums = self.whitening.sums(dv)
         y, beside = self.compress @ sums, self.rest @ sums
         numbers = self.compress.shape[0] + self.rest.shape[0]
         return Frame(y, beside @ beside, jnp.asarray(numbers, y.dtype), self.root)
 
-    def _with_gaps(self, dv: Float[Array, " readings"]) -> Frame:
+    def _incomplete_frame(self, dv: Float[Array, " readings"]) -> Frame:
         lost = lost_of_frame(self.whitening, dv)
         seen, every = (gap_of(matrix, lost) for matrix in (self.compress, jnp.concatenate([self.compress, self.rest])))
         return Frame(seen.y, jnp.maximum(every.y @ every.y - seen.y @ seen.y, 0), every.rank, seen.root)
@@ -296,14 +298,16 @@ def _padded(fit: ContactFit, most: int) -> ContactFit:
     return fit._replace(flat=jnp.pad(fit.flat, (0, 4 * most - len(fit.flat))))
 
 
-_alone = one_by_one(lambda finder, frame: finder.frame(frame))
+_single_frame = sequential_on_cpu(lambda finder, frame: finder.frame(frame))
 
 
 @verb
 def _find(finder: ContactFinder, frames: Float[Array, "... readings"]) -> Contacts:
     if frames.ndim == 1:
-        one: Contacts = _alone(finder, frames)
+        one: Contacts = _single_frame(finder, frames)
         return one
-    found: Contacts = jax.lax.map(lambda frame: _alone(finder, frame), frames.reshape(-1, frames.shape[-1]))
-    found = jax.tree.map(lambda a: a.reshape(*frames.shape[:-1], *a.shape[1:]), found)
+    batch = frames.shape[:-1]
+    each_frame = frames.reshape(prod(batch), frames.shape[-1])
+    found: Contacts = jax.lax.map(lambda frame: _single_frame(finder, frame), each_frame)
+    found = jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
     return found

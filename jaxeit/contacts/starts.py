@@ -11,11 +11,11 @@ from .fit import Bumps
 # Part of an atom's square that the other atom of a pair must leave unexplained. Two atoms more alike than that are one
 # place twice, and their strengths would be differences of large numbers.
 MIN_INDEPENDENT_FRACTION = 0.05
-# Atoms that explain most alone, of which one is taken to be in the pair that explains most.
+# Number of atoms, those that explain most alone, of which one is assumed to be in the pair that explains most.
 PAIR_CANDIDATES = 64
-# Directions along which a contact is split.
+# Number of directions along which a contact is split.
 SPLIT_DIRECTIONS = 4
-# Width of each half of a contact that is split, over its own.
+# Width of each half of a contact that is split, as a fraction of the contact's own.
 HALF_WIDTH = 0.75
 
 

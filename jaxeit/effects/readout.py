@@ -284,8 +284,8 @@ class AdcRanges(AbstractReadoutEffect):
 
 
 def _decaying_sums(
-    keep: Float[Array, ""] | float, start: Float[Array, "*channels"], parts: Float[Array, "n *channels"]
-) -> Float[Array, "n *channels"]:
+    keep: Float[Array, ""] | float, start: Float[Array, "*channels"], parts: Float[Array, " n *channels"]
+) -> Float[Array, " n *channels"]:
     """``s = keep s + part`` for each of the parts, from ``start``."""
 
     def step(total: Array, part: Array) -> tuple[Array, Array]:

@@ -53,7 +53,7 @@ from .reconstruction import AbstractReconstructor, IterativeReconstructor, Prove
 from .settings import Imaging
 from .storage import (
     NUMBERS,
-    StoreError,
+    StorageError,
     from_numbers,
     load_reconstructor,
     save_reconstructor,
@@ -105,7 +105,7 @@ __all__ = [
     "Reconstructor",
     "Reweighted",
     "SparseBayes",
-    "StoreError",
+    "StorageError",
     "Tikhonov",
     "TotalVariation",
     "TruncatedSvd",

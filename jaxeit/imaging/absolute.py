@@ -1,4 +1,4 @@
-"""Images by the full forward map: the logarithm of the conductivity, in several steps.
+"""Absolute images through the full forward map: the logarithm of the conductivity, found in several steps.
 
 For absolute readings, or changes too large for one linear step: `gauss_newton` with any penalty, `least_squares_image`
 with a quadratic one and any least-squares solver of optimistix.  A difference of frames is imaged by adding it to the
@@ -50,15 +50,15 @@ class LogConductivity(eqx.Module):
 
 
 class AbstractPenalty(eqx.Module):
-    """What an image costs before the readings are seen."""
+    """The penalty that a prior puts on an image, a number without unit."""
 
     @abstractmethod
     def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
-        """The penalty."""
+        """The penalty of an image x."""
 
     @abstractmethod
     def matrix(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, "basis basis"]:
-        """R with ``R x`` the gradient of the penalty at x."""
+        """R, (basis, basis), where ``R x`` is the gradient of the penalty at x."""
 
 
 class Quadratic(AbstractPenalty):
@@ -123,21 +123,22 @@ def gauss_newton(
 ) -> Float[Array, " basis"]:
     """argmin over x of ``|(readings - voltages(x)) / std|^2 / 2 + penalty(x)``, from x = 0.
 
-    Each step takes the Jacobian and the penalty's matrix anew, and is halved until the sum falls. The last step is the
-    one that promises a fall by less than ``tolerance`` of the sum. Readings that are not finite are left out.
+    Each step computes the Jacobian and the penalty's matrix at the present image, and is halved until the sum falls.
+    The last step is the one that promises a fall of less than ``tolerance`` of the sum. Readings that are not finite
+    are left out.
 
-    Works under `jax.jit`, `jax.vmap` and `jax.grad`. Derivatives are those of the exact minimum (`ImplicitStep`): for
-    precise ones ask for a small tolerance.
+    Works under `jax.jit`, `jax.vmap` and `jax.grad`. Derivatives are those of the exact minimum (`ImplicitStep`):
+    precise derivatives need a small tolerance.
 
     Args:
-        steps: at most.
+        steps: largest number of steps.
     """
     weight, readings = _weights(jnp.asarray(readings), jnp.asarray(std))
     return _most_probable(_Posterior(physics, penalty, readings, weight), steps, tolerance)
 
 
 class _Posterior(eqx.Module):
-    """Readings and penalty, for an image x: minus the logarithm of its probability, as half a sum of squares."""
+    """Minus the logarithm of the posterior probability of an image x, as half a sum of squares."""
 
     physics: LogConductivity
     penalty: AbstractPenalty
@@ -145,12 +146,12 @@ class _Posterior(eqx.Module):
     weight: Float[Array, " readings"]
 
     def residual(self, x: Float[Array, " basis"]) -> Float[Array, " readings_and_one"]:
-        """Half the square of the last number is the penalty, and a half that keeps its root smooth."""
+        """The weighted misfits, and a number of which half the square is the penalty plus 1/2, whose root is smooth."""
         missed = self.weight * (self.readings - self.physics.voltages(x))
         return jnp.append(missed, jnp.sqrt(1 + 2 * self.penalty.value(self.physics.image.picture, x)))
 
     def quadratic(self, x: Float[Array, " basis"]) -> HalfSquares:
-        """Gauss and Newton's, with the penalty's matrix."""
+        """Gauss and Newton's quadratic of the misfits, plus that of the penalty's matrix."""
         picture = self.physics.image.picture
         missed = self.weight * (self.readings - self.physics.voltages(x))
         data = normal_equations(missed, -self.weight[:, None] * self.physics.slopes(x))
@@ -179,7 +180,7 @@ def _most_probable(posterior: _Posterior, steps: int, tolerance: float) -> Float
 def _weights(
     readings: Float[Array, " readings"], std: Float[Array, " readings"]
 ) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
-    """One over the noise, 0 where a reading or its noise is not finite, and readings that are."""
+    """One over the noise, and the readings; both 0 where a reading or its noise is not finite."""
     used = jnp.isfinite(readings) & jnp.isfinite(std)
     return jnp.where(used, 1 / jnp.where(used, std, 1), 0), jnp.where(used, readings, 0)
 
@@ -200,7 +201,7 @@ def least_squares_image(
 
     Args:
         solver: of optimistix; default: `LevenbergMarquardt`, to a millionth (float32: a thousandth).
-        steps: at most.
+        steps: largest number of steps.
 
     Returns:
         (basis,); NaN throughout if the solver did not converge.
@@ -244,7 +245,7 @@ def _voltages(x: Float[Array, " basis"], physics: LogConductivity) -> Float[Arra
 def _voltages_jvp(
     primals: tuple[Float[Array, " basis"], LogConductivity], tangents: tuple[Float[Array, " basis"] | None, Any]
 ) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
-    """By the Jacobian: a solver that asks for all columns would otherwise make them one by one."""
+    """By the Jacobian: a solver that needs all its columns would otherwise compute them one by one."""
     x, physics = primals
     value, of_physics = eqx.filter_jvp(lambda physics: physics.voltages(x), (physics,), (tangents[1],))
     of_image = None if tangents[0] is None else physics.slopes(x) @ tangents[0]

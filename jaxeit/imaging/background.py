@@ -15,9 +15,10 @@ from .absolute import LogConductivity, Quadratic, gauss_newton
 from .noise import InverseError
 from .priors import GaussianSmooth
 
-# Smallest error of a reading, of the root mean square of all: no reading is modelled better.
+# Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
 ERROR_FLOOR = 1e-3
-# Part of the readings that may stay unexplained. More means another skin, order of readings or polarity.
+# Largest fraction of the readings that may stay unexplained. A larger one means another skin, another order of the
+# readings or a wrong polarity.
 MAX_UNEXPLAINED = 0.1
 
 
@@ -48,7 +49,7 @@ def fit_background(
         length: distance over which the coating varies, m.
         model_error: relative error of a reading, from mesh, electrodes and current as they are modelled.
         columns: number of pixels of the coating along x.
-        basis: pixels of the coating laid over the model, ``Pixels(columns).on(model)``; default: made here.
+        basis: pixels of the coating laid over the model, ``Pixels(columns).on(model)``; default: made from ``columns``.
         tolerance: as for `gauss_newton`.
 
     Raises:
@@ -61,7 +62,7 @@ def fit_background(
     known = jnp.where(there, v0, 0)
     level = jnp.sum(jnp.where(there, even**2, 0)) / (even @ known)
     if _is_known(level) and not level > 0:
-        raise InverseError("v0 has the opposite sign of what the skin's protocol gives: turn its polarity")
+        raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
     image = Pixels(columns).on(model) if basis is None else basis
     physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
     prior = GaussianSmooth(cast(float, jnp.asarray(length, model.dtype))).precision(
@@ -76,7 +77,7 @@ def fit_background(
 
 
 def _is_known(value: Any) -> bool:
-    """Whether a value can be checked now: under a transformation of JAX it cannot."""
+    """Whether a value can be checked; under a transformation of JAX its numbers are hidden."""
     return not isinstance(value, Tracer)
 
 
@@ -95,4 +96,7 @@ def _check_explained(
 ) -> None:
     left = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
     if _is_known(left) and not left < MAX_UNEXPLAINED:
-        raise InverseError(f"no coat explains v0: {left:.0%} of it is left; is this its skin, and the order its own?")
+        raise InverseError(
+            f"no coating explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
+            "the skin's protocol"
+        )

@@ -1,6 +1,6 @@
-"""Ways to choose the hyperparameter: how much noise there is, against how much image.
+"""Ways to choose the hyperparameter, the ratio of the noise to the expected signal.
 
-Each looks at one-step images over a range of hyperparameters, through the eigenvectors U and eigenvalues w of
+Each evaluates one-step images over a range of hyperparameters, through the eigenvectors U and eigenvalues w of
 ``J R^-1 J^T`` (`methods` has the symbols): ``x = R^-1 J^T U (w + l^2)^-1 U^T y``.
 """
 
@@ -26,7 +26,7 @@ _RANGE = np.logspace(-4, 2, 241)
 
 
 class HyperparameterError(ValueError):
-    """A hyperparameter that cannot be chosen so; the message says why."""
+    """No hyperparameter can be chosen in this way; the message says why."""
 
 
 class Spectrum(eqx.Module):
@@ -46,13 +46,13 @@ class Spectrum(eqx.Module):
     problem: Problem
 
     def filters(self) -> tuple[np.ndarray, Float[Array, "h k"]]:
-        """The hyperparameters tried, and ``1 / (w + l^2)`` for each."""
+        """The hyperparameters that are tried, (h,), and ``1 / (w + l^2)`` for each, (h, k)."""
         return _RANGE, 1 / (self.squares + jnp.asarray(_RANGE, self.squares.dtype)[:, None] ** 2)
 
 
 @eqx.filter_jit
 def spectrum(problem: Problem) -> Spectrum:
-    """The eigenvectors that all choices share."""
+    """The eigenvectors and eigenvalues that all choices use."""
     gained = problem.precision().solve(problem.jacobian.T)
     scale = jnp.sum(problem.jacobian.T * gained) / problem.readings
     squares, vectors = eigh(problem.jacobian @ gained / scale)
@@ -60,7 +60,7 @@ def spectrum(problem: Problem) -> Spectrum:
 
 
 class AbstractHyperparameter(eqx.Module):
-    """A way to choose; given to `prepare` instead of a number."""
+    """A way to choose the hyperparameter, given to `prepare` in place of a number."""
 
     needs_noise: ClassVar[bool] = False
 
@@ -77,8 +77,8 @@ class AbstractHyperparameter(eqx.Module):
             whiten: takes frames, (..., readings) V, to whitened ones, (..., k).
 
         Raises:
-            HyperparameterError: if none in 1e-4 to 100 will do, or frames hold no change, or readings that are used and
-                not finite.
+            HyperparameterError: if no hyperparameter from 1e-4 to 100 meets the condition, or the frames hold no change
+                or a used reading that is not finite.
         """
 
 
@@ -108,9 +108,9 @@ class AbstractFrameChoice(AbstractHyperparameter):
 
 
 class GeneralisedCrossValidation(AbstractFrameChoice):
-    """The least ``m |y - J x|^2 / tr(I - J Q)^2``: the readings are best told from each other (Golub et al. 1979).
+    """Least ``m |y - J x|^2 / tr(I - J Q)^2``: each reading is best predicted from the others (Golub et al. 1979).
 
-    m counts the independent numbers in a frame, here and below.
+    m is the number of independent numbers in a frame, here and below.
     """
 
     name: ClassVar[str] = "gcv"
@@ -145,7 +145,7 @@ def _slopes(*curves: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 class Discrepancy(AbstractFrameChoice):
-    """The largest with ``|y - J x|^2 <= factor^2 m``: no closer to the readings than their noise (Morozov 1966).
+    """The largest with ``|y - J x|^2 <= factor^2 m``: the misfit is that of the noise (Morozov 1966).
 
     Needs ``noise`` in `prepare`. ``factor`` multiplies the standard deviations; default 1.
     """
@@ -169,7 +169,7 @@ class Discrepancy(AbstractFrameChoice):
 
 
 class NoiseFigure(AbstractHyperparameter):
-    """The smallest whose noise figure is at most ``target``, for a small contact in the middle of the sheet.
+    """The smallest hyperparameter whose noise figure is at most ``target``, for a small contact in mid-sheet.
 
     Signal to noise of the readings over that of the image, root mean squares over readings and area:
     ``NF = (|y| / sqrt(m)) / (|x|_A / sqrt(E |Q e|_A^2))`` with e white.  (0.5 is EIDORS' usual target; there it is
@@ -195,7 +195,7 @@ class NoiseFigure(AbstractHyperparameter):
 
 
 def _changes(frames: Float[Array, "... readings"], whiten: Whiten) -> Float[Array, "... k"]:
-    """Whitened frames, which must say something."""
+    """Whitened frames, (..., k); refuses frames without change and readings that are not finite."""
     y = whiten(frames)
     bad = np.flatnonzero(~np.isfinite(y).all(-1))
     if bad.size:

@@ -1,4 +1,4 @@
-"""How readings are weighed against each other: alike, or by the noise of a recording without contact."""
+"""Weights of the readings: equal, or by the noise of a recording without contact."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -15,7 +15,7 @@ LEAST_DEVIATION = 0.1  # of the median deviation: a reading that hardly changes 
 
 
 class AbstractNoise(eqx.Module):
-    """A choice of what the readings' noise is taken for; ``needs_frames``: whether it must be measured."""
+    """A choice of the readings' noise; ``needs_frames``: whether it must be measured."""
 
     needs_frames: ClassVar[bool] = True
 

@@ -12,6 +12,7 @@ independent noise of unit variance and the Jacobian ``C J_z``: what is minimised
 readings.
 """
 
+from math import prod
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -70,11 +71,12 @@ class Whitening(eqx.Module):
         """``P^T v``."""
         if values.ndim == 1:
             return self.current * jnp.sum(self.sign * values[self.lines], -1)
-        by_reading = values.reshape(-1, values.shape[-1]).T  # the frames of a batch lie side by side
+        batch = values.shape[:-1]
+        by_reading = values.reshape(prod(batch), values.shape[-1]).T  # the frames of a batch lie side by side
         sums = jnp.zeros((len(self.lines), by_reading.shape[1]), values.dtype)
         columns = self.sign.T[..., None], self.lines.T
         sums, _ = jax.lax.scan(lambda sums, column: (sums + column[0] * by_reading[column[1]], None), sums, columns)
-        return self.current * sums.T.reshape(*values.shape[:-1], -1)
+        return self.current * sums.T.reshape(*batch, len(self.lines))
 
     def readings(self, z: Float[Array, "k ..."]) -> Float[Array, "readings ..."]:
         """``P z``."""

@@ -1,7 +1,7 @@
 """Images in NumPy: for one frame at a time a call of JAX alone takes longer than the image."""
 
 from functools import cached_property
-from math import isfinite
+from math import isfinite, prod
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,8 @@ class NumpyImages:
         dv = np.asarray(dv)
         require_frames(dv, len(self._used))
         if dv.ndim > 1:
-            return self._batch(dv.reshape(-1, dv.shape[-1])).reshape(*dv.shape[:-1], -1)
+            batch = dv.shape[:-1]
+            return self._batch(dv.reshape(prod(batch), dv.shape[-1])).reshape(*batch, len(self._factor))
         t = self._weighted_sums(dv)
         return self._factor.dot(t) if isfinite(t.dot(t)) else self._mended(dv)
 

@@ -17,7 +17,8 @@ from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
 from ..model.sensitivity import pair_jacobian
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
-from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem, one_step
+from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
+from .methods.one_step import one_step_image
 from .noise import InverseError, Whitened, Whitening, whitened_readings
 from .priors import AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
@@ -105,12 +106,14 @@ def prepare(
         those that the readings hold.
 
     Raises:
-        InverseError: if a value is out of range or no channel is left, or the result is not finite; or if jit, grad or
-            vmap hides the protocol or the channels.
+        InverseError: if a value is out of range or no channel is left, or the result is not finite; if prior, method or
+            basis is none, such as a method in the place of the prior; or if jit, grad or vmap hides the protocol or the
+            channels.
         HyperparameterError: if the hyperparameter is to be chosen by values that jit, grad or vmap hides.
     """
-    image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
-    method, prior = method or OneStep(), prior or Noser()
+    method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()
+    require_choices(prior, method, basis)
+    image = basis if isinstance(basis, BasisMap) else basis.on(model)
     found = whitened_readings(model, noise, channels)
     problem = Problem(
         jacobian=pair_jacobian(model, sigma, image, found.electrodes, jnp.asarray(found.factor, model.dtype)),
@@ -154,7 +157,7 @@ def _build(
     noise_is_known: bool,
 ) -> tuple[Reconstructor, Float[Array, "r k"]]:
     """The reconstructor, and what a one-step image predicts for the whitened readings, per pair sum."""
-    image, followed = one_step(problem, problem.precision(), compress)
+    image, followed = one_step_image(problem, problem.precision(), compress)
     recon = Reconstructor(
         factor=image if isinstance(method, OneStep) else method.image(problem, compress),
         variance=method.variance(problem) if noise_is_known else jnp.full_like(problem.picture.areas, jnp.inf),
@@ -179,6 +182,18 @@ def _chosen(hyperparameter: Any, problem: Problem, found: Whitened, noise_is_kno
             "function and give the number"
         )
     return hyperparameter.choose(spectrum(problem), partial(_whiten, found, problem.jacobian.dtype))
+
+
+def require_choices(prior: Any, method: Any, basis: Any) -> None:
+    """Refuse a choice that stands in the place of another."""
+    for name, choice, kinds, example in (
+        ("prior", prior, AbstractPrior, "prior=Noser()"),
+        ("method", method, (AbstractLinearMethod, AbstractIterativeMethod), "method=OneStep()"),
+        ("basis", basis, (AbstractBasis, BasisMap), "basis=Pixels(40)"),
+    ):
+        if not isinstance(choice, kinds):
+            stated = type(choice).__name__ if not isinstance(choice, type) else f"the class {choice.__name__}"
+            raise InverseError(f"{stated} is not a {name}; give {name} by its name, such as {example}")
 
 
 def check_range(hyperparameter: Any, method: Any, dtype: np.dtype) -> None:

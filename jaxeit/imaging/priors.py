@@ -1,7 +1,7 @@
-"""Priors: what an image is expected to look like before the data are seen.
+"""Priors: what is known of an image before it is measured.
 
-A prior is a quadratic penalty ``x^T R x``; its *precision* R comes in three forms, each of which says what the methods
-ask for in its own cheapest way.  The overall scale of R does not matter: the hyperparameter has no unit (`inverse`).
+A prior is a quadratic penalty ``x^T R x``; its *precision* R comes in three forms, each of which computes what the
+methods need in the cheapest way.  The overall scale of R does not matter: the hyperparameter has no unit (`methods`).
 """
 
 from abc import abstractmethod
@@ -148,12 +148,12 @@ class AbstractPrior(eqx.Module):
 
         Args:
             jacobian: of whitened readings; of it only sums over the readings may be used, ``J^T J``.
-            at: the image so far, for a prior that is not quadratic (`TotalVariation`); default: none yet.
+            at: the present image, for a prior that is not quadratic (`TotalVariation`); default: no image yet.
         """
 
 
 class Noser(AbstractPrior):
-    """``R = diag(J^T J)^p``: pixels that the readings hardly see are not blown up.
+    """``R = diag(J^T J)^p``: pixels to which the readings are hardly sensitive are not amplified.
 
     Newton's One-Step Error Reconstructor (Cheney et al. 1990); the exponent as in Adler and Guardo.
     Pixels without any sensitivity (corners, under a bolt) are floored at ``floor`` of the largest.
@@ -230,10 +230,11 @@ class GaussianSmooth(AbstractPrior):
 
 
 class TotalVariation(AbstractPrior):
-    """``sum over edges of length * sqrt((x_i - x_j)^2 + beta^2)``: few jumps, anywhere; flat between.
+    """``sum over edges of length * sqrt((x_i - x_j)^2 + beta^2)``: few jumps, and flat parts between them.
 
-    Taken by iteratively reweighted least squares: at an image x, ``R = D^T diag(length / sqrt((D x)^2 + beta^2)) D``
-    (Vogel and Oman 1996).  ``beta``, as a fraction of the largest value of the image, keeps it smooth where x is flat.
+    Minimised by iteratively reweighted least squares, with ``R = D^T diag(length / sqrt((D x)^2 + beta^2)) D`` at an
+    image x (Vogel and Oman 1996).  ``beta``, as a fraction of the largest value of the image, keeps the penalty smooth
+    where x is flat.
     """
 
     follows_image: ClassVar[bool] = True
@@ -256,7 +257,9 @@ def _areas(picture: Picture) -> Float[Array, " basis"]:
     return jnp.maximum(picture.areas, 1e-3 * jnp.max(picture.areas))
 
 
-def _laplacian(picture: Picture, weight: Float[Array, " edges"], floor: float) -> Float[Array, "basis basis"]:
+def _laplacian(
+    picture: Picture, weight: Float[Array, " edges"], floor: Float[Array, ""] | float
+) -> Float[Array, "basis basis"]:
     """``D^T diag(weight) D``, with ``floor`` of its mean diagonal added."""
     first, second = picture.edges.T
     r = jnp.zeros((picture.size, picture.size), weight.dtype)

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
+from math import prod
 
 import equinox as eqx
 import jax
@@ -77,8 +78,9 @@ class AbstractReconstructor(AbstractPictured):
         sums = self.whitening.sums(dv)
 
         def each() -> Float[Array, "... k"]:
-            frames = dv.reshape(-1, self.readings)
-            completed: Array = jax.lax.map(self._complete, (frames, sums.reshape(len(frames), -1)))
+            frames = prod(sums.shape[:-1])
+            each_frame = dv.reshape(frames, self.readings), sums.reshape(frames, sums.shape[-1])
+            completed: Array = jax.lax.map(self._complete, each_frame)
             return completed.reshape(sums.shape)
 
         whole: Array = jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, each)
@@ -95,7 +97,7 @@ class AbstractReconstructor(AbstractPictured):
     def on_host(
         self, dtype: str | None = None
     ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
-        """The same as a function of NumPy arrays."""
+        """The reconstructor as a function of NumPy arrays: frames (..., readings) V to images (..., basis) S."""
 
     @property
     def dtype(self) -> np.dtype:
@@ -119,7 +121,7 @@ def _imaged(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> F
 
 
 class Reconstructor(AbstractReconstructor):
-    """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `whitening`).
+    """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `noise`).
 
     | meaning                                                                          | shape      | unit |
     |----------------------------------------------------------------------------------|------------|------|
@@ -166,7 +168,7 @@ class Reconstructor(AbstractReconstructor):
         )
         return other
 
-    def without(self, channels: Bool[Array, " readings"]) -> "Reconstructor":
+    def without(self, channels: Bool[ArrayLike, " readings"]) -> "Reconstructor":
         """The reconstructor that never had these readings, by an update of its rank; prior and strength stay the same.
 
         Under jit and vmap the flags may be traced; that no reading is left is then not an error.
@@ -216,11 +218,11 @@ class IterativeReconstructor(AbstractReconstructor):
     def on_host(
         self, dtype: str | None = None
     ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
-        """The same as a function of NumPy arrays, in the reconstructor's own precision whatever ``dtype``."""
+        """See `AbstractReconstructor.on_host`; always in the reconstructor's own precision, whatever ``dtype``."""
         del dtype
         return lambda dv: np.asarray(self(dv))
 
     def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
-        frames = sums.reshape(-1, sums.shape[-1]) @ self.compress.T
+        frames = sums.reshape(prod(sums.shape[:-1]), sums.shape[-1]) @ self.compress.T
         images: Array = jax.lax.map(lambda y: self.method.image(self.problem, y), frames)
         return images.reshape(*sums.shape[:-1], images.shape[-1])

@@ -11,7 +11,7 @@ from .hyperparameters import HYPERPARAMETERS, AbstractHyperparameter
 from .measured_noise import NOISES, AbstractNoise, EqualNoise
 from .methods import METHODS, AbstractIterativeMethod, AbstractLinearMethod, OneStep
 from .noise import InverseError
-from .preparation import Settings, prepare
+from .preparation import Settings, prepare, require_choices
 from .priors import PRIORS, AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Reconstructor
 
@@ -23,14 +23,14 @@ class Imaging:
     | meaning                                                       | default          |
     |---------------------------------------------------------------|------------------|
     | basis: what the coefficients of an image stand for             | `Pixels`         |
-    | method: how data and prior are weighed against each other      | `OneStep`        |
+    | method: how an image is made from data and prior              | `OneStep`        |
     | prior: what is expected of an image                            | `Noser`          |
     | hyperparameter: weight of the prior, or a way to choose it     | 0.1              |
     | noise: how the readings are weighed                            | `EqualNoise`     |
 
     Raises:
-        InverseError: for a hyperparameter that is not above zero, or a prior that changes with the image and a method
-            that never takes it anew.
+        InverseError: for a hyperparameter that is not above zero, a choice in the place of another, or a prior that
+            changes with the image and a method that takes it only once.
     """
 
     basis: AbstractBasis = field(default_factory=Pixels)
@@ -40,6 +40,7 @@ class Imaging:
     noise: AbstractNoise = field(default_factory=EqualNoise)
 
     def __post_init__(self) -> None:
+        require_choices(self.prior, self.method, self.basis)
         weight = self.hyperparameter
         if isinstance(weight, int | float) and not 0 < weight < float("inf"):
             raise InverseError(f"the hyperparameter is {weight}; give a number above zero, such as 0.1")

@@ -60,13 +60,13 @@ _KINDS = {"pairs": "iu", "edges": "iu", "channels": "b"}
 _WORDS = {"f": "floating point", "iu": "integers", "b": "boolean"}
 
 
-class StoreError(ValueError):
+class StorageError(ValueError):
     """A file or numbers that are no reconstructor; the message says what is wrong, and where."""
 
 
 def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.ndarray]:
     """The arrays of a reconstructor under the names of `NUMBERS`; of an iterative one, all but its method and prior."""
-    require_known("to_numbers", StoreError, recon)
+    require_known("to_numbers", StorageError, recon)
     parts = (recon, recon.whitening, recon.picture)
     if isinstance(recon, Reconstructor):
         return {name: _part(parts, name) for name in LINEAR_NUMBERS}
@@ -112,23 +112,25 @@ def from_numbers(
     """The reconstructor with these arrays; the reverse of `to_numbers`.
 
     Args:
-        imaging: names the method and the prior of an iterative reconstructor; a linear one is in its arrays whole.
+        imaging: names the method and the prior of an iterative reconstructor; the arrays of a linear one are complete.
 
     Raises:
-        StoreError: if an array is missing, they do not fit each other, or the method is needed and not iterative.
+        StorageError: if an array is missing, they do not fit each other, or the method is needed and not iterative.
     """
     iterative = "jacobian" in numbers
     names = ITERATIVE_NUMBERS if iterative else LINEAR_NUMBERS
     missing = [name for name in names if name not in numbers]
     if missing:
-        raise StoreError(f"{missing[0]}: missing")
+        raise StorageError(f"{missing[0]}: missing")
     sizes = _sizes({name: numbers[name] for name in names})
     if len(extent) != 4 or not np.isfinite(extent).all() or math.prod(shape) != sizes["basis"]:
-        raise StoreError(f"a picture of shape {shape} and extent {extent} does not hold {sizes['basis']} coefficients")
+        raise StorageError(
+            f"a picture of shape {shape} and extent {extent} does not hold {sizes['basis']} coefficients"
+        )
     for name, what, count in (("pairs", "pair sums", sizes["k"]), ("edges", "coefficients", sizes["basis"])):
         array = np.asarray(numbers[name])
         if ((array < 0) | (array >= count)).any():
-            raise StoreError(f"{name}: must count the {count} {what} from 0")
+            raise StorageError(f"{name}: must count the {count} {what} from 0")
     _require_possible({name: np.asarray(numbers[name]) for name in names})
     predict = jnp.asarray(numbers["predict"])
     whitening, picture = _whitening(numbers, sizes["k"], predict.dtype), _picture(numbers, shape, extent)
@@ -150,7 +152,9 @@ def _iterative(
     provenance: Provenance,
 ) -> IterativeReconstructor:
     if imaging is None or not isinstance(imaging.method, AbstractIterativeMethod):
-        raise StoreError("the arrays are of an iterative method; give Imaging(method=..., prior=...) that they are for")
+        raise StorageError(
+            "the arrays are of an iterative method; give Imaging(method=..., prior=...) that they are for"
+        )
     problem = Problem(
         jacobian=jnp.asarray(numbers["jacobian"]),
         readings=jnp.asarray(numbers["count"]),
@@ -198,18 +202,18 @@ def _sizes(numbers: Mapping[str, np.ndarray]) -> dict[str, int]:
     for name, given in numbers.items():
         dimensions, array = NUMBERS[name][0], np.asarray(given)
         if array.dtype.kind not in _KINDS.get(name, "f") or array.dtype == np.float16:
-            raise StoreError(f"{name}: is of type {array.dtype}; it must be {_WORDS[_KINDS.get(name, 'f')]}")
+            raise StorageError(f"{name}: is of type {array.dtype}; it must be {_WORDS[_KINDS.get(name, 'f')]}")
         words = dimensions.replace("*", "readings" if array.ndim == 2 else "").split()
         if len(words) != array.ndim:
-            raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)})")
+            raise StorageError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)})")
         expected = tuple(
             int(word) if word.isdigit() else sizes.setdefault(word, n)
             for word, n in zip(words, array.shape, strict=True)
         )
         if array.shape != expected:
-            raise StoreError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)}), here {expected}")
+            raise StorageError(f"{name}: has shape {array.shape}; it must be ({', '.join(words)}), here {expected}")
         if not np.isfinite(array).all() and name != "variance":
-            raise StoreError(f"{name}: holds values that are not finite")
+            raise StorageError(f"{name}: holds values that are not finite")
     return sizes
 
 
@@ -222,20 +226,20 @@ def _require_possible(numbers: Mapping[str, np.ndarray]) -> None:
     for name, array in numbers.items():
         if (name in _NOT_NEGATIVE and not (array >= 0).all()) or (name in _POSITIVE and not (array > 0).all()):
             least = "zero or more" if name in _NOT_NEGATIVE else "above zero"
-            raise StoreError(f"{name}: holds {array.min():g}; it must be {least}")
+            raise StorageError(f"{name}: holds {array.min():g}; it must be {least}")
     weight = numbers["weight"]
     if not (is_covariance(weight) if weight.ndim == 2 else (weight >= 0).all()):
-        raise StoreError("weight: is not the inverse of a variance or of a covariance matrix")
+        raise StorageError("weight: is not the inverse of a variance or of a covariance matrix")
 
 
 def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
     """Write numbers and provenance to ``path`` (a NumPy .npz), whole or not at all.
 
     Raises:
-        StoreError: for a reconstructor that is not linear, as the file holds a matrix.
+        StorageError: for a reconstructor that is not linear, as the file holds a matrix.
     """
     if not isinstance(recon, Reconstructor):
-        raise StoreError(
+        raise StorageError(
             f"{Path(path).name}: {type(recon).__name__} works on each frame anew and has no matrix to save; prepare "
             "with a linear method, such as OneStep, or save the calibration that it belongs to"
         )
@@ -257,22 +261,22 @@ def load_reconstructor(path: str | Path) -> Reconstructor:
     """Read what `save_reconstructor` wrote.
 
     Raises:
-        StoreError: if the file cannot be read, is damaged or of another kind.
+        StorageError: if the file cannot be read, is damaged or of another kind.
     """
     name = Path(path).name
     try:
         numbers = _read_numbers(path)
         about = json.loads(str(numbers.pop("about")))
         if about["format"] != FORMAT:
-            raise StoreError(f"is a {about['format']!r}; this version reads {FORMAT!r}")
+            raise StorageError(f"is a {about['format']!r}; this version reads {FORMAT!r}")
         return from_numbers(numbers, tuple(about["shape"]), tuple(about["extent"]), about["provenance"])
-    except StoreError as error:
-        raise StoreError(f"{name}: {error}") from None
+    except StorageError as error:
+        raise StorageError(f"{name}: {error}") from None
     except OSError as error:
-        raise StoreError(f"{name}: {error.strerror or 'is no reconstructor'}") from None
+        raise StorageError(f"{name}: {error.strerror or 'is no reconstructor'}") from None
     except _DAMAGE as error:
         why = " ".join(str(error).split())[:120]
-        raise StoreError(f"{name}: is damaged or no reconstructor ({why}); prepare and save it again") from None
+        raise StorageError(f"{name}: is damaged or no reconstructor ({why}); prepare and save it again") from None
 
 
 _DAMAGE = (
@@ -286,8 +290,8 @@ def _read_numbers(path: str | Path) -> dict[str, np.ndarray]:
     with open_regular(path) as raw, zipfile.ZipFile(raw) as file:
         for member in file.infolist():
             if member.compress_type != zipfile.ZIP_STORED:
-                raise StoreError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
-        require("array_bytes", sum(member.file_size for member in file.infolist()), "numbers", StoreError)
+                raise StorageError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
+        require("array_bytes", sum(member.file_size for member in file.infolist()), "numbers", StorageError)
         return {m.filename.removesuffix(".npy"): _read_array(file, m) for m in file.infolist()}
 
 
@@ -298,8 +302,8 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream)
     if dtype.hasobject:
-        raise StoreError(f"{member.filename[:80]!r} holds Python objects, which could run any code; it is not read")
+        raise StorageError(f"{member.filename[:80]!r} holds Python objects, which could run any code; it is not read")
     if math.prod(shape) * dtype.itemsize != len(stream.getbuffer()) - stream.tell():
-        raise StoreError(f"{member.filename[:80]!r} claims another size than it has")
+        raise StorageError(f"{member.filename[:80]!r} claims another size than it has")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)

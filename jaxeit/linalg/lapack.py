@@ -16,12 +16,12 @@ and have derivatives of any order in both directions.
 import re
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from importlib.metadata import version
 from math import gcd
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
@@ -36,13 +36,13 @@ FIRST_SAFE_JAXLIB = (0, 11)  # the first release that certainly has the repair
 SEQUENTIAL_OPERATIONS = 200_000
 
 
-def spreads_stacks(version: str) -> bool:
-    """Whether this version of jaxlib spreads a stack over threads that may all wait for it."""
-    numbers = [int(re.match(r"\d*", part).group() or 0) for part in version.split(".")]  # type: ignore[union-attr]
+def spreads_stacks(release: str) -> bool:
+    """Whether this release of jaxlib spreads a stack over threads that may all wait for it."""
+    numbers = [int(re.match(r"\d*", part).group() or 0) for part in release.split(".")]  # type: ignore[union-attr]
     return tuple(numbers[:2]) < FIRST_SAFE_JAXLIB
 
 
-CUTS_STACKS = spreads_stacks(jaxlib.__version__)
+CUTS_STACKS = spreads_stacks(version("jaxlib"))
 
 
 def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[..., Any]:

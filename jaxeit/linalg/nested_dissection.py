@@ -26,10 +26,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Integer
 
-from .._compile import stacked_product
 from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, on_device
 from .dissection import dissect
 from .lapack import portion_of, portioned
+from .small_matrices import stacked_product
 from .symbolic import Level, lay_out
 
 # Pivots eliminated at once.  Beyond it LAPACK's own threads and XLA's get in each other's way (a

@@ -152,7 +152,7 @@ def _cells(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[
         split = side > 4 * smallest
         if not split.all():
             yield side, centres[~split], wanted[~split]
-        require("mesh_nodes", 4 * np.count_nonzero(split), "triangulate: narrow places")
+        require("mesh_nodes", 4 * int(split.sum()), "triangulate: narrow places")
         centres = (centres[split][:, None] + side * _QUARTERS).reshape(-1, 2)
         side /= 2
 

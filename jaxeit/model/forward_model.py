@@ -80,7 +80,9 @@ class Fields(NamedTuple):
     coat: CoatFields | None
 
 
-def forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None = None) -> Float[Array, " readings"]:
+def forward(
+    model: Model, sigma: Float[ArrayLike, " elements"] | CoatedSheet | None = None
+) -> Float[Array, " readings"]:
     """Voltages of one frame.
 
     Args:

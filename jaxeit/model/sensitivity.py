@@ -28,7 +28,7 @@ _BATCH = 512  # elements at once: their slopes and products stay in a core's cac
 
 def jacobian(
     model: Model,
-    sigma: Float[Array, " elements"] | None = None,
+    sigma: Float[ArrayLike, " elements"] | None = None,
     basis: AbstractBasis | BasisMap | None = None,
 ) -> Float[Array, "readings basis"]:
     """Derivative of `forward` at ``sigma`` with respect to the coefficients of ``basis``, V/S.

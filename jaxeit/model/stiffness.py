@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 from scipy import sparse
 
-from .._compile import stacked_product
+from ..linalg.small_matrices import stacked_product
 
 _ROWS = 4096  # of H at once: the potentials of their nodes stay in a core's cache
 _FEW = 40  # entries of H; of more, XLA's own loops make H x anew for each field and take twice as long as a library

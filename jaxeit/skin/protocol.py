@@ -21,7 +21,7 @@ class Protocol:
     | reading_time: from one reading to the next           | ()            | s    |
 
     Raises:
-        ProtocolError: if a row names an electrode twice in one pair, or the current is not positive.
+        ProtocolError: if a row names an electrode twice in one pair, or the current is not one positive number.
     """
 
     pattern: np.ndarray
@@ -45,6 +45,8 @@ class Protocol:
                 f"row {row} of the pattern, {pattern[row].tolist()}, uses one electrode twice in "
                 "a pair; drive+ and drive-, and sense+ and sense-, must differ"
             )
+        if np.ndim(self.current) != 0:
+            raise ProtocolError(f"the current has shape {np.shape(self.current)}; give one number, A, for all readings")
         if not (np.isfinite(self.current) and self.current > 0):
             raise ProtocolError(f"the current is {self.current} A; give a positive number")
         object.__setattr__(self, "pattern", pattern.astype(np.int32))

@@ -21,7 +21,8 @@ from calib.calibration.force_maps import fused, law_of, remembered
 from calib.calibration.localisation import locator_from_numbers, locator_numbers
 from calib.calibration.press_images import fit_untouched_sheet
 from calib.calibration.storage import to_archive
-from calib.fitting.curves import CURVES, play
+from calib.fitting.curves import CURVES
+from calib.fitting.curves.play_operators import play
 from calib.fitting.fields import Places, geometry_of
 from calib.fitting.pads import LocatedPresses, fit_hybrid
 from calib.presses.pooled import pool_presses

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.calibration.logs import fit_session, render_log, save_logs
-from calib.fitting.curve_fit import FitError
 from calib.fitting.curves import Linear
+from calib.fitting.results import FitError
 from calib.session import SessionFacts, SessionWriter, StreamFacts, open_session, read_archive
 
 RATE = 50.0  # Hz

@@ -199,7 +199,7 @@ def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(imaging, gri
     np.testing.assert_allclose(np.asarray(loaded.recon.on_host()(dv)), np.asarray(loaded.recon(dv)))
     with calib.open_session(grid) as session:
         assert calib.evaluate(loaded, session).summary()["force_rmse"] < 0.5
-    with pytest.raises(je.imaging.StoreError, match="has no matrix to save; prepare with a linear method"):
+    with pytest.raises(je.imaging.StorageError, match="has no matrix to save; prepare with a linear method"):
         je.save_reconstructor(loaded.recon, folder / "iterative.npz")
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 import jaxeit as je
-from jaxeit.contacts import ContactResult, prepare_contacts, refine_contacts, strongest
+from jaxeit.contacts import ContactResult, ContactSettings, prepare_contacts, refine_contacts, strongest
 from jaxeit.imaging.noise import InverseError
 
 from ..helpers import spread_stacks
@@ -19,7 +19,7 @@ FRAMES = 300
 
 @pytest.fixture(scope="module")
 def finder(model):
-    return prepare_contacts(model, noise=np.full(550, STD), most=2, false_alarm=0.05)
+    return prepare_contacts(model, ContactSettings(most=2, false_alarm=0.05), noise=np.full(550, STD))
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +155,7 @@ def single(model):
     """One that looks for a single contact, and without dead channels: small, and compiled quickly."""
     channels = np.ones(550, bool)
     channels[3:60:3] = False
-    return prepare_contacts(model, noise=np.full(550, STD), most=1, columns=31, channels=channels)
+    return prepare_contacts(model, ContactSettings(most=1, columns=31), noise=np.full(550, STD), channels=channels)
 
 
 def test_many_frames_mapped_wait_for_no_thread(single):
@@ -244,13 +244,32 @@ def test_refined_through_the_forward_map(finder, model):
         ({"columns": 3}, "columns"),
         ({"false_alarm": 0.0}, "false_alarm"),
         ({"model_error": 1.0}, "model_error"),
+        ({"ratio": -1.0}, "ratio"),
+        ({"separation": np.inf}, "separation"),
+    ],
+)
+def test_bad_settings_are_refused(settings, message):
+    with pytest.raises(InverseError, match=message):
+        ContactSettings(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
         ({"noise": np.zeros(550)}, "noise of reading 0"),
         ({"channels": np.zeros(550, bool)}, "nothing to reconstruct"),
     ],
 )
-def test_bad_settings_are_refused(model, settings, message):
+def test_bad_noise_and_channels_are_refused(model, settings, message):
     with pytest.raises(InverseError, match=message):
         prepare_contacts(model, **{"noise": np.full(550, STD), **settings})
+
+
+@pytest.mark.parametrize("batch", [(0,), (2, 0)])
+def test_a_batch_of_no_frames_holds_no_contacts(finder, batch):
+    found = finder(np.zeros((*batch, 550)))
+    assert found.present.shape == (*batch, 2)
+    assert found.covariance.shape == (*batch, 2, 4, 4)
 
 
 def test_frames_of_another_length_are_refused(finder):

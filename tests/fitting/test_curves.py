@@ -15,11 +15,9 @@ from calib.fitting.curves import (
     Play,
     PlaySpline,
     PowerLaw,
-    Scale,
-    play,
-    resistant_line,
-    scale_of,
 )
+from calib.fitting.curves.base import Scale, resistant_line, scale_of
+from calib.fitting.curves.play_operators import play
 
 CASES = [
     (Linear(), [4e-3]),
@@ -51,6 +49,15 @@ def test_free_and_bound_are_inverses(curve, params):
     free = curve.free(jnp.asarray(params), some_scale())
     np.testing.assert_allclose(curve.bound(free, some_scale()), params, rtol=1e-12)
     assert np.abs(free).max() < 10
+
+
+def test_the_order_of_curves_is_that_in_which_ties_are_broken():
+    """`simplest` takes the earlier of two curves of one size, and a short log is fitted with the first of all."""
+    names = list(CURVES)
+    assert names[0] == "linear"
+    for earlier, later in (("affine", "power"), ("spline", "hysteresis")):
+        assert CURVES[earlier]().size == CURVES[later]().size
+        assert names.index(earlier) < names.index(later)
 
 
 @pytest.mark.parametrize("name", CURVES)

@@ -7,25 +7,16 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize
 
-from calib.fitting.curve_fit import default_solver, fit_curve, fit_curves, fit_samples
-from calib.fitting.curve_problem import design_effect
-from calib.fitting.curves import Affine, AffinePlay, Linear, MonotoneSpline, PowerLaw
-from calib.fitting.fitted_curve import predict_pads
+from calib.fitting.curves import Affine, AffinePlay, Linear, MonotoneSpline, PowerLaw, fit_curve, fit_curves
+from calib.fitting.curves.fit import default_solver, fit_samples
+from calib.fitting.curves.fitted import predict_pads
+from calib.fitting.curves.problem import design_effect
+from calib.fitting.curves.samples import Samples, gather
+from calib.fitting.logs import BestChannel, fit_log, time_split
 from calib.fitting.losses import Cauchy, Huber, SoftL1, Squared
 from calib.fitting.results import FitError, FitResult
-from calib.fitting.samples import Samples, gather
 from calib.fitting.selection import Tried, simplest
-from calib.fitting.validation import (
-    BestChannel,
-    assign_folds,
-    cross_validate,
-    fit_log,
-    mae,
-    percent_full_scale,
-    rmse,
-    score,
-    time_split,
-)
+from calib.fitting.validation import assign_folds, cross_validate, mae, percent_full_scale, rmse, score
 
 from ..helpers import REAL_DATA, spread_stacks
 
@@ -135,7 +126,8 @@ def on_a_loop(noise: float, width: float):
     """Pressure up and down twice, and the force of a bent spline with noise, more on the way up than down."""
     pressure = 2000 * (1 - np.cos(np.linspace(0, 4 * np.pi, N)))
     side = width * np.sign(np.gradient(pressure)) + noise * np.random.default_rng(5).normal(size=N)
-    return pressure, np.asarray(MonotoneSpline(4000.0)(jnp.asarray(SLOPES), pressure)) + side
+    force = MonotoneSpline(4000.0)(jnp.asarray(SLOPES), jnp.asarray(pressure))
+    return pressure, np.asarray(force) + side
 
 
 @pytest.mark.parametrize("groups", [None, GROUPS], ids=["blocks", "presses"])

@@ -14,7 +14,6 @@ import jaxeit as je
 from calib import cli
 from calib.fitting.curves import CURVES, Linear
 from calib.fitting.fields import (
-    _RATIOS,
     FIELDS,
     Constant,
     GaussianProcess,
@@ -25,10 +24,11 @@ from calib.fitting.fields import (
     fit_field,
     geometry_of,
     log_gain,
-    pad_features,
-    restored,
     single_places,
 )
+from calib.fitting.fields.base import restored
+from calib.fitting.fields.evidence import PRIOR_RATIOS
+from calib.fitting.fields.fitted import pad_features
 from calib.fitting.held_out import folds_by_place, hold_out
 from calib.fitting.losses import SoftL1
 from calib.fitting.pads import LocatedPresses, fit_hybrid
@@ -173,7 +173,7 @@ def test_coefficients_are_those_of_every_prior_weighed_by_its_evidence(geometry)
     null = linalg.null_space(share.T).T  # contrasts free of the pads' levels: restricted likelihood
     y, z = null @ log_ratio, null @ z
     logs, means, covariances, variances = [], [], [], []
-    for ratio in _RATIOS:
+    for ratio in PRIOR_RATIOS:
         k = np.eye(56) + ratio * z @ z.T
         variance = y @ np.linalg.solve(k, y) / 56
         logs.append(-0.5 * (np.linalg.slogdet(k)[1] + 56 * np.log(variance)))

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calib.fitting.fields import Places, geometry_of, pad_features, single_places
+from calib.fitting.fields import Places, geometry_of, single_places
+from calib.fitting.fields.fitted import pad_features
 from calib.fitting.recursive import Estimate, RecursiveLeastSquares, SensitivityTracker, Touched, follow, follow_frames
 
 

@@ -18,7 +18,7 @@ jax.config.update("jax_enable_x64", True)
 import equinox as eqx, jax.numpy as jnp, numpy as np
 import jaxeit as je
 from calib.fitting.curves import PowerLaw
-from calib.fitting.curve_fit import fit_curves
+from calib.fitting.curves import fit_curves
 from calib.fitting.fields import GaussianProcess, fit_field, geometry_of, single_places
 
 skin, rng = je.load_skin("testbed"), np.random.default_rng(0)

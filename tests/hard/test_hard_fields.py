@@ -7,24 +7,21 @@ import numpy as np
 import pytest
 
 from calib.calibration.localisation import ImageCentroid
-from calib.fitting.curve_fit import FitResult
 from calib.fitting.fields import (
     FittedField,
     PadEdge,
     Places,
     RadialBasis,
-    _distance,
-    _nearest,
-    _of_shape,
-    _pressed,
-    _project,
-    _Whitened,
     fit_field,
     geometry_of,
     log_gain,
-    pad_features,
     single_places,
 )
+from calib.fitting.fields.evidence import LevelFree, _of_shape, without_levels
+from calib.fitting.fields.fit import _supported_box
+from calib.fitting.fields.fitted import pad_features
+from calib.fitting.fields.geometry import distance, nearest_points
+from calib.fitting.results import FitResult
 
 FEATURES = eqx.filter_jit(pad_features)
 ONE = np.array([[0.03, 0.05]])
@@ -36,7 +33,7 @@ def geometry(skin):
 
 
 def test_a_place_on_a_wall_has_a_slope_of_zero():
-    np.testing.assert_array_equal(jax.grad(_distance)(jnp.ones(2), jnp.ones(2)), 0)
+    np.testing.assert_array_equal(jax.grad(distance)(jnp.ones(2), jnp.ones(2)), 0)
 
 
 @pytest.mark.parametrize("field", [PadEdge(), RadialBasis()])
@@ -50,7 +47,7 @@ def test_a_contact_that_is_not_there_changes_nothing(geometry, field):
 
 
 def test_a_side_of_no_length_is_its_corner():
-    np.testing.assert_array_equal(_nearest(jnp.ones(2), jnp.zeros((1, 2)), jnp.zeros((1, 2))), 0)
+    np.testing.assert_array_equal(nearest_points(jnp.ones(2), jnp.zeros((1, 2)), jnp.zeros((1, 2))), 0)
 
 
 def test_a_contact_that_is_not_known_has_an_uncertainty_and_no_gain(geometry):
@@ -67,7 +64,7 @@ def test_a_contact_that_is_not_known_has_an_uncertainty_and_no_gain(geometry):
 def test_a_pad_that_no_press_tells_of_is_bounded_by_the_reach_alone(geometry):
     """The press pins its own pad to where it was; the three others it says nothing of."""
     reach = jnp.array([[0.01, 0.01], [0.19, 0.19]])
-    box = np.asarray(_pressed(RadialBasis(), geometry, single_places(ONE, 4), jnp.array([[1.0, 0, 0, 0]]), reach))
+    box = np.asarray(_supported_box(RadialBasis(), geometry, single_places(ONE, 4), jnp.array([[1.0, 0, 0, 0]]), reach))
     corners = np.stack([geometry.start.min(1), geometry.start.max(1)], 1)
     np.testing.assert_allclose(box[0], np.repeat(ONE, 2, 0))
     np.testing.assert_allclose(box[1:], np.clip(corners[1:], *reach))
@@ -97,8 +94,8 @@ def test_a_pad_without_presses_leaves_the_others_their_levels():
     rng = np.random.default_rng(0)
     z, y, weight = (jnp.asarray(a) for a in (rng.normal(size=(9, 2)), rng.normal(size=9), np.ones(9)))
     share = jnp.asarray(np.eye(2)[np.arange(9) % 2])
-    with_a_third = _project(z, y, jnp.pad(share, ((0, 0), (0, 1))), weight)
-    for mine, theirs in zip(with_a_third, _project(z, y, share, weight), strict=True):
+    with_a_third = without_levels(z, y, jnp.pad(share, ((0, 0), (0, 1))), weight)
+    for mine, theirs in zip(with_a_third, without_levels(z, y, share, weight), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9)
 
 
@@ -106,7 +103,7 @@ def test_features_that_are_alike_leave_evidence_in_single_precision():
     """Rounding leaves eigenvalues below zero, ten million times which is less than minus one."""
     rng = np.random.default_rng(1)
     z = (rng.normal(size=(20, 2)) @ rng.normal(size=(2, 6))).astype("f4")
-    white = _Whitened(jnp.asarray(z), jnp.asarray(rng.normal(size=20), "f4"), jnp.asarray(18, "f4"))
+    white = LevelFree(jnp.asarray(z), jnp.asarray(rng.normal(size=20), "f4"), jnp.asarray(18, "f4"))
     assert np.linalg.eigvalsh(z.T @ z).min() < -1e-7
     assert np.isfinite(_of_shape(white, jnp.ones(6, "f4")).evidence).all()
 

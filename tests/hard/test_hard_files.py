@@ -163,7 +163,7 @@ def test_numbers_of_another_kind_are_refused_by_name(tmp_path):
     with np.load(tmp_path / "good.npz") as file:
         arrays = dict(file)
     np.savez(tmp_path / "bad.npz", **arrays | {"factor": arrays["factor"].astype(int)})
-    with pytest.raises(je.imaging.StoreError, match="factor: is of type int64; it must be"):
+    with pytest.raises(je.imaging.StorageError, match="factor: is of type int64; it must be"):
         je.load_reconstructor(tmp_path / "bad.npz")
 
 

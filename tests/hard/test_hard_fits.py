@@ -9,9 +9,6 @@ import pytest
 from scipy.optimize import nnls
 
 import calib
-from calib.fitting.covariance import cluster_covariance, independent_covariance, thin_svd
-from calib.fitting.curve_fit import fit_curves, held_pressure
-from calib.fitting.curve_problem import residual_scale, residuals
 from calib.fitting.curves import (
     CURVES,
     Affine,
@@ -21,11 +18,15 @@ from calib.fitting.curves import (
     MonotoneSpline,
     Play,
     PowerLaw,
-    scale_of,
+    fit_curves,
 )
+from calib.fitting.curves.base import scale_of
+from calib.fitting.curves.covariance import cluster_covariance, independent_covariance, thin_svd
+from calib.fitting.curves.fit import held_pressure
+from calib.fitting.curves.problem import residual_scale, residuals
+from calib.fitting.curves.samples import gather
 from calib.fitting.losses import Cauchy, Huber, SoftL1, Squared
 from calib.fitting.results import FitError, FitResult
-from calib.fitting.samples import gather
 from calib.presses import PressError, find_presses
 from calib.presses.corrections import CorrectionError, LowPass, sample_rate
 from calib.session import PressTable, SessionError, SessionFacts, SessionWriter, StreamFacts

@@ -488,7 +488,7 @@ def test_second_derivatives_of_the_forward_map(hard, tiny):
 @pytest.mark.slow
 def test_contacts_know_how_they_hang_on_a_frame_of_nothing(model):
     """No touch, a frame of zeros, gaps, nothing at all: no contact, and a derivative of zero, not of NaN."""
-    finder = je.prepare_contacts(model, noise=np.full(550, 1e-5), most=1, columns=11)
+    finder = je.prepare_contacts(model, je.contacts.ContactSettings(most=1, columns=11), noise=np.full(550, 1e-5))
 
     def numbers(dv):
         found = finder(dv)

@@ -18,8 +18,8 @@ from h5py import h5d, h5p, h5s, h5t
 
 import jaxeit as je
 from calib.calibration.calibration import load_calibration
+from calib.fitting.logs.blend import fit_blend
 from calib.fitting.results import FitError
-from calib.fitting.validation import fit_blend
 from calib.session import SessionError, open_session
 from jaxeit.toml import MAX_DEPTH, MAX_KEY_PARTS
 from tests.fuzzing import calibration

@@ -57,7 +57,9 @@ def test_a_touch_is_seen_through_the_field(model, uneven, untouched):
     dv = np.asarray(je.forward(uneven, je.conductivity(uneven) * (1 + 0.1 * bump))) - untouched
     error = {}
     for name, sigma in (("even", None), ("known", fit_background(model, untouched, columns=15))):
-        finder = je.prepare_contacts(model, noise=np.full(550, 1e-5), sigma=sigma, most=1, columns=31)
+        finder = je.prepare_contacts(
+            model, je.contacts.ContactSettings(most=1, columns=31), noise=np.full(550, 1e-5), sigma=sigma
+        )
         error[name] = float(jnp.linalg.norm(finder(dv).position[0] - place))
     assert error["known"] < 5e-4
     assert error["known"] < 0.5 * error["even"]
@@ -70,7 +72,7 @@ def test_a_touch_is_seen_through_the_field(model, uneven, untouched):
         (lambda v: v * np.nan, {}, "no reading"),
         (lambda v: -v, {}, "polarity"),
         pytest.param(
-            lambda v: v * np.where(np.arange(len(v)) % 2, 3.0, 1.0), {}, "no coat explains", marks=pytest.mark.slow
+            lambda v: v * np.where(np.arange(len(v)) % 2, 3.0, 1.0), {}, "no coating explains", marks=pytest.mark.slow
         ),
         (lambda v: v, {"std": 0.0}, "std is 0.0"),
     ],

@@ -6,6 +6,7 @@ import pytest
 
 import jaxeit as je
 from jaxeit.imaging.hyperparameters import Spectrum
+from jaxeit.imaging.methods import Problem
 
 STD = 2e-6
 
@@ -111,10 +112,13 @@ def test_the_corner_of_the_l_curve_bends_most(model, coarse, jac, frames, held):
     assert turn(h) > max(turn(3 * h), turn(h / 3))
 
 
-def test_where_the_l_curve_stands_still_it_does_not_bend():
+def test_where_the_l_curve_stands_still_it_does_not_bend(coarse):
     """As in float32 at small values, where the image does not change any more: 0 / 0 would be chosen."""
     squares, y = jnp.array([100, 0], jnp.float32), jnp.array([[1, 1e-3]], jnp.float32)
-    assert je.LCurve(y).choose(Spectrum(squares, jnp.eye(2, dtype=y.dtype), None, None), lambda y: y) > 1e-3
+    jacobian = jnp.zeros((2, coarse.size), jnp.float32)
+    problem = Problem(jacobian, jnp.array(2.0), jnp.array(1.0), je.Noser(), coarse.picture)
+    spectrum = Spectrum(squares, jnp.eye(2, dtype=jnp.float32), jacobian.T, problem)
+    assert je.LCurve(y).choose(spectrum, lambda y: y) > 1e-3
 
 
 @pytest.mark.parametrize("choice", [je.GeneralisedCrossValidation, je.LCurve, je.Discrepancy])

@@ -124,6 +124,14 @@ def test_frames_of_another_protocol_are_refused(recon, shape):
         recon(np.zeros(shape))
 
 
+@pytest.mark.parametrize("shape", [(0, 550), (2, 0, 550)])
+@pytest.mark.parametrize("method", [je.OneStep(), je.NonNegative()], ids=["linear", "iterative"])
+def test_a_batch_of_no_frames_gives_no_images(model, shape, method):
+    recon = je.prepare(model, method=method, basis=je.Pixels(6))
+    for images in (recon(np.zeros(shape)), recon.on_host()(np.zeros(shape)), recon.compiled()(np.zeros(shape))):
+        assert images.shape == (*shape[:-1], 36)
+
+
 def test_a_dead_channel_is_left_out_and_may_hold_anything(model, pixels):
     channels = np.ones(550, bool)
     channels[[3, 77]] = False
@@ -166,6 +174,25 @@ def test_float32_images_follow_float64(skin, model, pixels, recon):
 def test_settings_that_cannot_be_are_refused(model, pixels, settings, message):
     with pytest.raises(je.imaging.InverseError, match=message):
         je.prepare(model, basis=pixels, **settings)
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ((je.OneStep(), je.Noser()), r"OneStep is not a prior; give prior by its name, such as prior=Noser\(\)"),
+        ((None, je.Noser()), "Noser is not a method; give method by its name"),
+        ((je.Noser, None), "the class Noser is not a prior"),
+        ((None, None, 20), "int is not a basis; give basis by its name"),
+    ],
+)
+def test_a_choice_in_the_place_of_another_is_refused(model, choices, message):
+    with pytest.raises(je.imaging.InverseError, match=message):
+        je.prepare(model, *choices)
+
+
+def test_imaging_refuses_a_method_for_a_prior():
+    with pytest.raises(je.imaging.InverseError, match="OneStep is not a prior"):
+        je.Imaging(prior=je.OneStep())
 
 
 def test_a_conductivity_that_is_not_positive_is_refused(model, pixels):

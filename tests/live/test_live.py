@@ -4,17 +4,20 @@ import base64
 import http.client
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
+from inspect import unwrap
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -27,10 +30,11 @@ from calib.cli import main
 from calib.live import loop as live_module
 from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestLevels
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
-from calib.live.page import Page
+from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
 from calib.live.results import TouchEstimates
 from calib.live.scan_control import ScanDirector, prepare_director
+from calib.record.broadcast import MAX_LISTENERS, Broadcaster
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
 from calib.record.plan import StreamPlan
 from calib.record.planning import plan_recording
@@ -60,7 +64,8 @@ class FakePrograms:
         self.places.append(places)
         share = np.array([0.25, 0.75])
         image = np.concatenate([pressure[0] * share, pressure[1] * share])
-        return FrameForces(image, pressure, np.full(PADS, 0.1), pressure < 50, pressure > 1, 1e-3 * image)
+        loaded, negative = pressure > 2, pressure < -2
+        return FrameForces(image, pressure, np.full(PADS, 0.1), pressure < 50, loaded, negative, 1e-3 * image)
 
     def search(self, frame):
         self.searched.append(frame)
@@ -73,10 +78,18 @@ class SearchingPrograms(FakePrograms):
     searches = True
 
 
+@pytest.fixture(scope="module", autouse=True)
+def stand_ins():
+    """Annotations are not checked here: calibrations and reconstructors are stand-ins of no class of the packages."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+        yield
+
+
 @pytest.fixture
 def calibration(monkeypatch, skin):
     """What live needs of one, of two pads and four pixels, without a computation."""
-    monkeypatch.setattr(Engine.__init__, "__defaults__", (2.0, FakePrograms))
+    monkeypatch.setattr(unwrap(Engine.__init__), "__defaults__", (2.0, FakePrograms))
     channels = np.arange(READINGS) > 0
     recon = SimpleNamespace(
         centres=CENTRES, areas=np.ones(4), readings=READINGS, channels=channels, shape=(2, 2), factor=None
@@ -157,6 +170,59 @@ def test_zero_may_be_set_again(calibration):
     np.testing.assert_allclose(engine.step(arrival([51.0, 50.0])).force, [1.0, 0.0])
 
 
+def test_zero_waits_for_rest(calibration):
+    """A skin that is pressed or released while zero is measured is not at rest."""
+    engine = Engine(calibration, 1.0)
+    for n in range(7):
+        pressure = 60.0 if n < 5 else 10.0
+        assert engine.step(arrival([pressure, 20.0], n * S // 2)) is None
+        assert engine.restless == (n >= 5)  # the windows are frames 0 to 2, which are alike, and 3 to 5
+        if n == 2:
+            engine.tare()
+    assert "at rest" in engine.state
+    assert engine.step(arrival([10.0, 20.0], 7 * S // 2)) is None
+    assert engine.state == "running"
+    np.testing.assert_allclose(engine.step(arrival([11.0, 20.0], 5 * S)).force, [1.0, 0.0])
+
+
+def test_a_zero_that_was_measured_in_mid_press_is_noticed_after_the_release(calibration):
+    engine = Engine(calibration, 1.0)
+    for n in range(3):
+        engine.step(arrival([60.0, 20.0], n * S // 2))
+    assert engine.state == "running"
+    released = engine.step(arrival([10.0, 20.0], 2 * S))
+    assert released.force[0] == -50.0
+    assert released.valid.tolist() == [False, True]
+    assert not engine.has_wrong_zero(2 * S + S // 2)
+    engine.step(arrival([10.0, 30.0], 3 * S))  # pressed elsewhere: no time to measure zero
+    assert not engine.has_wrong_zero(4 * S + S // 2)
+    engine.step(arrival([10.0, 20.0], 4 * S))
+    assert engine.has_wrong_zero(5 * S + S // 2)
+    engine.tare()
+    assert not engine.has_wrong_zero(9 * S)
+
+
+def test_live_that_is_joined_in_mid_press_finds_its_zero(calibration):
+    """Joined while 10 N rest on the first pad, which are taken away after a second."""
+    show, results, told = LiveControl(), [], []
+    show.warn = told.append
+    times = [n * S // 100 for n in range(10**5)]
+    eit = frame_packets(1, iter(times), (np.zeros(READINGS, "f4") for _ in times))
+    pressure = frame_packets(2, iter(times), (np.array([10.0 * (t < S), 0.0], "f4") for t in times))
+    with SimulatedDevice([eit, pressure], wait_for=1) as device:
+
+        def publish(result):
+            results.append(result)
+            if told and abs(result.force[0]) < 1:
+                show.stop.set()
+
+        run_live(calibration, *sources_of(device, calibration), [publish], show, LiveSettings(rest=0.3))
+    assert results[-1].force[0] == 0.0
+    assert min(result.force[0] for result in results) == -10.0
+    assert not any(result.valid[0] for result in results if result.force[0] < -2)
+    assert "zero" in told[0]
+
+
 def test_frames_that_come_together_are_all_taken():
     inbox = FrameQueue(StreamPlan("eit", 1), StreamPlan("pressure", 1))
     inbox.put(1, Frame(2, 0, 0, 32, np.array([1.0])), 0)
@@ -192,6 +258,7 @@ def test_the_newest_frame_is_taken_and_the_others_are_counted():
 def test_contacts_are_fitted_when_there_is_time_and_serve_the_next_frames(calibration):
     engine = rested(calibration, SearchingPrograms)
     programs = engine._programs
+    programs.places.clear()  # zero was measured with them too
     engine.step(arrival([11.0, 20.0]))
     engine.use_spare_time(1.0)
     assert programs.searched == []  # nothing is touched
@@ -250,6 +317,7 @@ def test_programs_for_one_frame_are_those_of_the_force_map(model, skin, pixels):
         for mine, theirs in zip(found[1:4], other[1:4], strict=True):
             np.testing.assert_allclose(mine, theirs[0], rtol=1e-12)
         assert found.loaded.tolist() == [True, False, True, False]
+        assert not found.negative.any()
 
 
 # --- the whole -----------------------------------------------------------------------------------
@@ -512,7 +580,10 @@ def test_the_page_is_whole_and_asks_nothing_of_others(page):
     assert reply.status == 200
     assert b"http://" not in body.replace(b"http://www.w3.org", b"")
     assert b"https://" not in body
-    assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
+    policy = reply.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert reply.headers["X-Frame-Options"] == "DENY"
     link.close()
     link, reply, body = fetch(page, "/scene")
     scene = json.loads(body)
@@ -554,10 +625,38 @@ def test_only_our_own_page_may_ask(page):
     assert fetch(page, "/", headers=others)[1].status == 403
     assert fetch(page, "/tare", method="POST", headers={"Origin": "http://evil.example"})[1].status == 403
     assert fetch(page, "/else", method="POST")[1].status == 403
+    for site in ("cross-site", "same-site"):
+        assert fetch(page, "/tare", method="POST", headers={"Sec-Fetch-Site": site})[1].status == 403
     assert not page.control.tare.is_set()
-    own = {"Origin": f"http://127.0.0.1:{port}"}
+    own = {"Origin": f"http://127.0.0.1:{port}", "Sec-Fetch-Site": "same-origin"}
     assert fetch(page, "/tare", method="POST", headers=own)[1].status == 200
     assert page.control.tare.is_set()
+
+
+def test_a_flood_of_connections_leaves_the_viewers_there_are(page, monkeypatch):
+    monkeypatch.setattr(page.RequestHandlerClass, "timeout", 60.0)
+    link, reply, _ = fetch(page, "/results")
+    events(reply, 1)
+    flood = [socket.create_connection(page.server_address[:2], timeout=20) for _ in range(2 * MAX_CONNECTIONS)]
+    refused, _, _ = select.select(flood, [], [], 20)  # those beyond the limit; the others are waited for
+    assert refused[0].recv(1) == b""
+    events(reply, 1)
+    for client in flood:
+        client.close()
+    link.close()
+
+
+def test_a_flood_of_listeners_leaves_those_there_are():
+    with Broadcaster() as lines:
+        first = socket.create_connection(lines.address, timeout=5)
+        lines.publish([b"1\n"])
+        flood = [socket.create_connection(lines.address, timeout=5) for _ in range(2 * MAX_LISTENERS)]
+        lines.publish([b"2\n"])
+        assert len(lines.listeners) == MAX_LISTENERS
+        assert flood[-1].recv(1) == b""
+        assert first.recv(10, socket.MSG_WAITALL | socket.MSG_DONTWAIT) == b"1\n2\n"
+        for client in (first, *flood):
+            client.close()
 
 
 def listening(process="self"):

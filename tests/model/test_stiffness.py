@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 import jaxeit as je
-from jaxeit._compile import _in_loops, stacked_product
+from jaxeit.linalg.small_matrices import product_by_loops, stacked_product
 from jaxeit.model.stiffness import _shared_out
 
 from ..helpers import square_model
@@ -77,7 +77,7 @@ def test_both_ways_to_multiply_agree(small, monkeypatch):
     found = []
     for few in (0, 100):
         monkeypatch.setattr("jaxeit.model.stiffness._FEW", few)
-        monkeypatch.setattr("jaxeit._compile._LOOPED", 0)
+        monkeypatch.setattr("jaxeit.linalg.small_matrices.MIN_LOOPED_MULTIPLICATIONS", 0)
         found.append(np.asarray(_products(image, potential)))
     np.testing.assert_allclose(*found, atol=1e-14 * np.abs(found[0]).max())
 
@@ -87,9 +87,9 @@ def test_stacked_products(terms, columns):
     keys = jax.random.split(jax.random.key(terms))
     left, right = (jax.random.normal(key, (5, terms, n)) for key, n in zip(keys, (6, columns), strict=True))
     wanted = np.asarray(left).transpose(0, 2, 1) @ np.asarray(right)
-    for found in (stacked_product(left, right), jax.jit(_in_loops)(left, right)):
+    for found in (stacked_product(left, right), jax.jit(product_by_loops)(left, right)):
         np.testing.assert_allclose(found, wanted, atol=1e-13)
-    np.testing.assert_allclose(jax.vmap(_in_loops)(left[None], right[None])[0], wanted, atol=1e-13)
+    np.testing.assert_allclose(jax.vmap(product_by_loops)(left[None], right[None])[0], wanted, atol=1e-13)
 
 
 def test_half_of_the_stiffness_has_few_entries_a_row(model):
@@ -163,7 +163,7 @@ def test_what_users_compile_agrees_with_a_direct_solver(optimised):
 
 def test_without_fusion_the_library_multiplies(monkeypatch):
     """Else each product of a loop would be stored."""
-    monkeypatch.setattr("jaxeit._compile._LOOPED", 0)
+    monkeypatch.setattr("jaxeit.linalg.small_matrices.MIN_LOOPED_MULTIPLICATIONS", 0)
     left = jnp.ones((3, 5, 4))
     before = jax.config.read("jax_disable_most_optimizations")
     texts = []

@@ -1,13 +1,16 @@
 """Recording: the journal and what is made of it, and the recorder under every fault that could be arranged."""
 
 import errno
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from itertools import count
 from typing import NamedTuple
@@ -17,6 +20,7 @@ import numpy as np
 import pytest
 
 from benchmarks.memory import Growth, growth, resident
+from calib.check import check_session
 from calib.cli import main
 from calib.record.device import SimulatedDevice
 from calib.record.journal.conversion import convert_journal
@@ -717,7 +721,7 @@ def test_two_hundred_killed_recorders_leave_sessions(device, tmp_path, hard):
             path.unlink()
     taken, decoded = max(kill.taken for kill in found), max(kill.decoded for kill in found)
     told = f"all opened, marked not complete; lost of a stream at most {taken} frame in work, {decoded} read with it, "
-    told += f"of at most {PIECE >> 10} KiB that one read brings; the last one left had come "
+    told += f"of at most {MAX_READ_BYTES >> 10} KiB that one read brings; the last one left had come "
     told += f"{np.median([kill.age for kill in found]):.0f} ms before the kill (median)"
     hard("fault 1: kill -9 of the recorder", "200 kills at random moments", beyond=told)
 
@@ -945,7 +949,63 @@ def test_streams_that_come_and_go_are_recorded_with_their_gaps(tmp_path):
         assert not (status & Status.clock_step).any()
         true = seq * (S // 500)
         assert np.ptp(stream.time - true) < 20_000_000
-        assert {*session.events.code.tolist()} == {EventCode.CONNECTED, EventCode.LOST}
+        assert {*session.events.code.tolist()} == {EventCode.CONNECTED, EventCode.LOST, EventCode.FAULT}
+        assert not session.complete
+        assert "frames were lost; check the link" in summary.render()
+
+
+# --- devices that lie ----------------------------------------------------------------------------
+
+LIE_RATE, LIE_SECONDS = 200, 1.5
+
+
+def lying(name, seq=lambda n: n, ticks=lambda n: n * 1_000_000 // LIE_RATE, frames=10_000):
+    """Frames of a device whose sequence numbers or ticks are not what they should be."""
+    kind, channels = STREAM_KINDS[name], {"stage": 3, "pressure": 4, "eit": 550}.get(name, 1)
+    rng = np.random.default_rng(0)
+    for n in range(frames):
+        values = rng.normal(size=channels).astype("<f4")
+        yield int(n * S / LIE_RATE), encode_frame(kind.number, seq(n) % 2**32, ticks(n), values)
+
+
+LIES = {
+    "pressure": (lying("pressure", seq=lambda n: 7), "do not count up"),
+    "force": (lying("force", seq=lambda n: -n), "do not count up"),
+    "stage": (lying("stage", seq=lambda n: n % 32), "do not count up"),
+    "temperature": (lying("temperature", seq=lambda n: 7, ticks=lambda n: 7), "its clock stands still"),
+    "barometer": (lying("barometer", ticks=lambda n: n * 1000 // LIE_RATE), "rather 0.001"),
+    "eit": (lying("eit", frames=40), "no frame came in the last"),
+}
+
+
+@pytest.fixture(scope="module")
+def lies(tmp_path_factory):
+    """What is said of a recording of devices that lie, and the session."""
+    path = tmp_path_factory.mktemp("lies") / "s.h5"
+    with SimulatedDevice([packets for packets, _ in LIES.values()], wait_for=1) as device:
+        urls = [f"--{name}={url}" for name, url in zip(LIES, device.urls, strict=True)]
+        out, err = io.StringIO(), io.StringIO()
+        with redirect_stdout(out), redirect_stderr(err):
+            status = main(["record", *urls, "--skin", "testbed", "--seconds", str(LIE_SECONDS), "-o", str(path)])
+    return status, out.getvalue() + err.getvalue(), path
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_device_that_lies_is_named_and_its_frames_are_kept(lies, name):
+    status, said, path = lies
+    assert status == 2, said
+    assert "not complete" in said
+    assert re.search(rf"{name}: .*{LIES[name][1]}", said), said
+    with open_session(path) as session:
+        stream = session.stream(name)
+        expected = 40 if name == "eit" else 0.9 * LIE_SECONDS * LIE_RATE
+        assert len(stream) >= expected
+        assert 5e-3 * (len(stream) - 1) == pytest.approx(np.ptp(stream.time) / 1e9, rel=0.5)
+        assert not session.complete
+        faults = [label for code, label in zip(session.events.code, session.events.label, strict=True) if code == 6]
+        assert any(LIES[name][1] in label for label in faults if label.startswith(name))
+        found = [finding.what for finding in check_session(session).findings if finding.where == "/events"]
+        assert found == faults
 
 
 @pytest.mark.slow

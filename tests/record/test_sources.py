@@ -489,7 +489,7 @@ def test_repeated_and_reordered_frames_are_kept_once_in_order(hard):
         until(lambda: run.counters.frames == 7)
     assert run.kept.seq == [0, 1, 2, 5, 6, 7, 8]
     assert np.flatnonzero(run.kept.flags & Status.gap_before).tolist() == [3]
-    assert (run.counters.lost, run.counters.repeated) == (2, 6)
+    assert (run.counters.lost, run.counters.rejected) == (2, 6)
     told = "kept once, in order; what comes after a later one is counted as lost, and flagged"
     hard("fault 9: frames repeated and reordered", "up to 64 behind", beyond=told)
 

@@ -368,6 +368,17 @@ def test_a_restart_is_believed_once_two_frames_agree():
     ]
 
 
+@pytest.mark.parametrize("numbers", [[7] * 4, [9, 8, 7, 6], [30, 31, 0, 1], [65534, 65535, 0, 1]])
+def test_frames_that_a_device_took_later_are_new_whatever_their_numbers_say(numbers):
+    order, places = SequenceState(), []
+    for number in numbers:
+        order, place, lost = place_frame(order, number, newer=True)
+        places.append(place)
+        assert lost == 0
+    assert all(place.kept for place in places)
+    assert SequencePlace.MISCOUNTED in places
+
+
 @given(st.permutations(range(100, 100 + REORDER_WINDOW)), st.integers(0, 3))
 def test_reordered_and_repeated_frames_are_kept_once_in_order(numbers, repeats):
     order, kept, lost = SequenceState(), [], 0

@@ -14,8 +14,7 @@ import jaxeit as je
 from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.hysteresis_loops import Loops
-from calib.fitting.curve_fit import FittedCurve
-from calib.fitting.curves import Linear
+from calib.fitting.curves import FittedCurve, Linear
 from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.fitting.held_out import Split
 from calib.fitting.selection import Candidate

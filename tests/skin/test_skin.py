@@ -150,6 +150,12 @@ def test_adjacent_never_senses_what_it_drives():
     assert (je.skin.reciprocal_rows(pattern) >= 0).all()
 
 
+@pytest.mark.parametrize("current", [np.full(8, 1e-3), [1e-3]])
+def test_a_current_for_each_reading_is_refused(current):
+    with pytest.raises(je.skin.ProtocolError, match=r"the current has shape .*; give one number, A, for all readings"):
+        je.Protocol(je.skin.adjacent(8), current=current)
+
+
 def test_what_is_not_text_or_cannot_be_read_is_named(tmp_path):
     with pytest.raises(je.toml.TomlError, match=r"cannot be read \(.*\); check the name and the folder"):
         read_text(tmp_path)

@@ -58,7 +58,11 @@ def run(args: argparse.Namespace) -> int:
     calibration = load_calibration(args.calibration)
     plan, sources = plan_recording({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
     orders = StopRequest()
-    show = LiveControl(stop=orders.stop)
+
+    def tell(line: str) -> None:
+        print(f"jaxeit: {line}", file=sys.stderr)
+
+    show = LiveControl(stop=orders.stop, warn=tell)
     also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
     timer = Timer(args.seconds or 0.0, orders.stop_recording)
     timer.daemon = True
@@ -77,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
             Presentation(host=args.host, port=args.port, publish=args.publish, output=args.output),
             LiveSettings(event_driven=args.event_driven, realtime=args.realtime, rest=args.rest, wait=args.wait),
             also=also,
-            tell=lambda line: print(f"jaxeit: {line}", file=sys.stderr),
+            tell=tell,
         )
         timer.cancel()
     print(f"jaxeit: {count} frames", file=sys.stderr)

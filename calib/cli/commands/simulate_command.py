@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..arguments import prepare_outputs, skin_of
+from ..signals import interruption_status
 from ..terminal import announce_model, progress_bar
 
 
@@ -42,9 +43,9 @@ def run(args: argparse.Namespace) -> int:
     announce_model(bench.scene.skin, SIMULATION)
     try:
         simulate(bench, args.output, progress=progress_bar("blocks"))
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         print(f"jaxeit: interrupted; the same command goes on from {args.output}.part", file=sys.stderr)
-        return 130
+        return interruption_status(interrupt)
     print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
     return _serve(args.output) if args.serve else 0
 

@@ -6,7 +6,7 @@ writes them. The session appears whole or not at all; the caller removes the jou
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from .file import JournalError, JournalReader, Record
 from .records import (
     END,
     EVENT,
+    MISCOUNTED,
     PLAN,
     PONG,
     RESTARTED,
@@ -57,26 +58,30 @@ def convert_journal(
     """
     reader = JournalReader(journal)
     plan = _plan(reader)
-    surveys, end, plan = _survey_streams(reader, plan, progress)
+    surveys, end, faults, plan = _survey_streams(reader, plan, progress)
     if not any(survey.frames for survey in surveys.values()):
         raise JournalError(f"{reader.path.name}: no frame was recorded; delete the file and record again")
     fits = {number: survey.clock_fit() for number, survey in surveys.items()}
-    complete = end is not None and end[0] and not reader.lost
-    _write(reader, plan, surveys, fits, Path(output), complete, recovered, progress)
+    complete = end is not None and end[0] and not reader.lost and not faults
+    facts = _session_facts(plan, complete, recovered)
+    _write(SessionWriter(output, facts), reader, plan, surveys, fits, progress)
     return RecordingSummary(
         Path(output),
         tuple(survey.summary(fits[number]) for number, survey in surveys.items()),
         complete,
-        _incomplete_reason(end, reader),
+        (*_incomplete_reasons(end, reader), *faults),
         reader.lost,
         reader.damaged + reader.torn,
     )
 
 
-def _incomplete_reason(end: tuple[bool, str] | None, reader: JournalReader) -> str:
+def _incomplete_reasons(end: tuple[bool, str] | None, reader: JournalReader) -> Iterator[str]:
     if end is None:
-        return "the recorder was killed"
-    return end[1] or ("records are damaged" if reader.lost else "")
+        yield "the recorder was killed"
+    elif end[1]:
+        yield end[1]
+    if reader.lost:
+        yield "records are damaged"
 
 
 def _plan(reader: JournalReader) -> RecordingPlan:
@@ -89,9 +94,9 @@ def _plan(reader: JournalReader) -> RecordingPlan:
 
 def _survey_streams(
     reader: JournalReader, plan: RecordingPlan, progress: Progress
-) -> tuple[dict[int, StreamSurvey], tuple[bool, str] | None, RecordingPlan]:
-    """First reading: a survey of each stream, the end of the recording, and the plan with the notes of the devices."""
-    end = None
+) -> tuple[dict[int, StreamSurvey], tuple[bool, str] | None, list[str], RecordingPlan]:
+    """First reading: survey of each stream, end of the recording, faults, and the plan with the notes of devices."""
+    end, faults = None, list[str]()
     surveys = {number: StreamSurvey(stream, SequenceAndClock(stream)) for number, stream in enumerate(plan.streams)}
     for record in reader:
         progress(len(record.payload))
@@ -104,7 +109,9 @@ def _survey_streams(
                 if number in surveys:
                     surveys[number].add_pong(pong, record.host)
             elif record.stream == EVENT:
-                plan = _with_simulation(plan, *unpack_event(record.payload))
+                code, label = unpack_event(record.payload)
+                plan = _with_simulation(plan, code, label)
+                faults += [label] * (code is EventCode.FAULT)
             elif record.stream == END:
                 end = unpack_end(record.payload)
         except JournalError as error:  # the checksum holds: another version wrote the record
@@ -112,7 +119,7 @@ def _survey_streams(
             raise JournalError(f"{reader.path.name}: record {record.number:,} {error}; {todo}") from error
     for survey in surveys.values():
         survey.flush()
-    return surveys, end, plan
+    return surveys, end, faults, plan
 
 
 def _with_simulation(plan: RecordingPlan, code: EventCode, label: str) -> RecordingPlan:
@@ -171,7 +178,7 @@ class _StreamWriter:
         if not block.payloads:
             return
         batch = UnpackedBlock(block, self._tracker)
-        times, flags = batch.host, batch.flags & ~RESTARTED
+        times, flags = batch.host, batch.flags & ~(RESTARTED | MISCOUNTED)
         flags |= np.where(batch.missing > 0, int(Status.gap_before), 0)
         if self._fit is not None and batch.ticks is not None:
             times = self._aligned_times(batch.ticks, batch.steps)
@@ -206,37 +213,35 @@ class _StreamWriter:
         return times
 
 
+def _session_facts(plan: RecordingPlan, complete: bool, recovered: bool) -> SessionFacts:
+    return SessionFacts(
+        title=plan.title,
+        skin_name=plan.skin_name,
+        skin_toml=plan.skin_toml,
+        pattern=plan.pattern,
+        current=plan.current,
+        frequency=plan.frequency,
+        offset=plan.offset,
+        epoch=plan.moment,
+        simulated=plan.simulated,
+        scene=plan.scene,
+        seed=plan.seed,
+        license=plan.license,
+        session_id=plan.session_id,
+        creator=plan.creator,
+        complete=complete,
+        recovered=recovered,
+    )
+
+
 def _write(
+    writer: SessionWriter,
     reader: JournalReader,
     plan: RecordingPlan,
     surveys: dict[int, StreamSurvey],
     fits: dict[int, ClockFit | None],
-    output: str | os.PathLike[str],
-    complete: bool,
-    recovered: bool,
     progress: Progress,
 ) -> None:
-    writer = SessionWriter(
-        output,
-        SessionFacts(
-            title=plan.title,
-            skin_name=plan.skin_name,
-            skin_toml=plan.skin_toml,
-            pattern=plan.pattern,
-            current=plan.current,
-            frequency=plan.frequency,
-            offset=plan.offset,
-            epoch=plan.moment,
-            simulated=plan.simulated,
-            scene=plan.scene,
-            seed=plan.seed,
-            license=plan.license,
-            session_id=plan.session_id,
-            creator=plan.creator,
-            complete=complete,
-            recovered=recovered,
-        ),
-    )
     with writer:
         streams = {
             number: _StreamWriter(writer, survey, fits[number], plan.host_epoch)
@@ -248,6 +253,9 @@ def _write(
             stream.flush()
             _write_clock(writer, plan, surveys[number], fits[number])
         events += [(time, EventCode.CLOCK_STEP, stream.name) for stream in streams.values() for time in stream.steps]
+        end = max(survey.last for survey in surveys.values()) - plan.host_epoch
+        notes = [f"{survey.plan.name}: {note}" for survey in surveys.values() if (note := survey.clock_note())]
+        events += [(end, EventCode.FAULT, storable_text(note)) for note in notes]
         if events:
             times, codes, labels = zip(*sorted(events), strict=True)
             writer.add_events(times, [int(code) for code in codes], labels)

@@ -13,7 +13,8 @@ from ..wire.messages import Frame, Pong
 from .file import JournalError
 
 PLAN, EVENT, END, PONG = 0xFFFF, 0xFFFE, 0xFFFD, 0xFFFC  # stream numbers of records that are no frames
-RESTARTED = 1 << 15  # a flag beside those of `Status`: the sequence numbers restarted before this frame
+# Flags beside those of `Status`: the sequence numbers restarted before this frame, or do not count up to it.
+RESTARTED, MISCOUNTED = 1 << 15, 1 << 14
 FRAME_HEAD = struct.Struct("<BxxxIQ")
 VALUE_TYPES = tuple(np.dtype(t) for t in ("<f4", "<i2", "<f8"))
 PONG_BODY = struct.Struct("<HqQ")
@@ -29,6 +30,7 @@ class EventCode(enum.IntEnum):
     CLOCK_STEP = 3
     NOTE = 4
     SIMULATED = 5  # the device reports that its values are simulated; the label holds scene and seed
+    FAULT = 6  # what makes the recording incomplete or its time stamps doubtful
 
 
 def pack_frame(frame: Frame) -> bytes:

@@ -10,7 +10,7 @@ from ..plan import StreamPlan
 from ..summary import ARRIVAL_CLOCK, StreamSummary
 from ..wire.messages import Pong
 from .file import Record
-from .records import RESTARTED, FrameBatch, check_frame, layout_key, unpack_frames
+from .records import MISCOUNTED, RESTARTED, FrameBatch, check_frame, layout_key, unpack_frames
 
 MAX_BATCH_FRAMES = 512
 MAX_PONGS = 100_000  # answers to pings that are kept of each stream
@@ -66,13 +66,13 @@ class SequenceAndClock:
         return self.clock.extend(frames.ticks, frames.bits, host, rejoined, restarted)
 
     def missing(self, seq: np.ndarray | None, flags: np.ndarray) -> np.ndarray:
-        """Number of frames missing before each frame, from the sequence numbers; 0 where the device restarted."""
+        """Number of frames missing before each frame, from the sequence numbers; 0 where these do not count up."""
         if seq is None:
             return np.zeros(len(flags), np.int64)
         before = self._last if len(self._last) else seq[:1] - np.uint32(1)
         self._last = seq[-1:]
         jumps = (np.diff(seq, prepend=before) - np.uint32(1)).astype(np.int64)
-        return np.where(flags & RESTARTED, 0, jumps)
+        return np.where(flags & (RESTARTED | MISCOUNTED), 0, jumps)
 
 
 @dataclass
@@ -115,7 +115,7 @@ class StreamSurvey:
         self.frames += len(batch)
         self.lost += int(batch.missing.sum())
         self.types.add(batch.values.dtype.str[1:])
-        self.numbered &= batch.seq is not None
+        self.numbered &= batch.seq is not None and not (batch.flags & MISCOUNTED).any()
         self.bits = batch.bits
         self.ticking &= batch.ticks is not None
 
@@ -149,8 +149,14 @@ class StreamSurvey:
             steps, drift, rest = self.tracker.clock.steps, 1e6 * fit.skew, fit.residual_p95 / 1e6
             latency = self.latency(fit)
             return StreamSummary(self.plan.name, self.frames, self.lost, steps, drift, rest, METHOD, latency=latency)
-        note = ""
-        if self.ticking and self.frames:
-            ratio = self.tracker.clock.fit().tick_s
-            note = f"its ticks are not of {self.plan.tick:g} s (rather {ratio:.3g}): give tick=; times are of arrival"
-        return StreamSummary(self.plan.name, self.frames, self.lost, 0, 0.0, 0.0, ARRIVAL_CLOCK, note)
+        return StreamSummary(self.plan.name, self.frames, self.lost, 0, 0.0, 0.0, ARRIVAL_CLOCK, self.clock_note())
+
+    def clock_note(self) -> str:
+        """What is wrong with the device's clock if its time stamps cannot be used, or an empty text."""
+        if not self.ticking or not self.frames or self.clock_fit() is not None:
+            return ""
+        period, elapsed = self.tracker.clock.period, (self.last - self.first) / max(self.frames - 1, 1)
+        if not period:
+            return "its clock stands still: check the device; times are of arrival"
+        tick = self.plan.tick * elapsed / period
+        return f"its ticks are not of {self.plan.tick:g} s (rather {tick:.3g}): give tick=; times are of arrival"

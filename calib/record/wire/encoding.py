@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from typing import SupportsInt
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from .messages import (
 MAX_NOTE_BYTES = MAX_FRAME_BYTES - 1024
 
 
-def encode_frame(stream: int, seq: int, ticks: int, values: np.ndarray, bits: int = 32) -> bytes:
+def encode_frame(stream: int, seq: SupportsInt, ticks: SupportsInt, values: np.ndarray, bits: int = 32) -> bytes:
     """One binary frame with its closing zero; `values` (channels,) f4 or i2.
 
     Raises:

@@ -1,9 +1,9 @@
-"""Many channels as one signal that need not be a formula: a Gaussian process over their principal components.
+"""One signal of many channels by a Gaussian process over their principal components.
 
-The force is a plane plus a smooth function (squared exponential, a length for each input) of the few directions in
-which the channels vary, and of how far the first of them has lately moved: differences from first-order lags of some
-seconds, the creep of soft material.  Lengths, sizes and noise are those of largest evidence (Rasmussen and Williams
-2006, 5.4), and so is the number of directions; samples that are not fitted have no say.
+The force is a linear function plus a smooth one (squared exponential, a length for each input). The inputs are the
+first principal components of the channels, and the differences of the first component from its first-order lags of some
+seconds, for the creep of soft material. Lengths, variances, noise and the number of components are those of
+largest evidence (Rasmussen and Williams 2006, 5.4), from the fitted samples alone.
 """
 
 from dataclasses import dataclass
@@ -18,16 +18,21 @@ from scipy.optimize import minimize
 
 from jaxeit.linalg.lapack import cho_solve, cholesky, solve_triangular
 
-from .curves import AbstractCurve
+from ..curves.base import AbstractCurve
 
 Hyper = Float[Array, " hyperparameters"]
 
-_MOST = 400  # samples from which the hyperparameters are found
-_STEPS = 60
-_JITTER = 1e-8
+# Samples that the hyperparameters are fitted to, evenly spread over the log; each step costs their cube.
+MAX_SAMPLES = 400
+# Steps of the minimiser; the evidence is flat near its maximum.
+MAX_STEPS = 60
+# Noise variance that keeps the kernel matrix positive definite in float64 where samples repeat.
+JITTER = 1e-8
 
 
 class _Found(NamedTuple):
+    """Log evidence, number of components, hyperparameters, inputs (n, inputs), and the force (N) that is one unit."""
+
     evidence: float
     directions: int
     hyper: np.ndarray
@@ -37,7 +42,7 @@ class _Found(NamedTuple):
 
 @dataclass(frozen=True)
 class SmoothChannels:
-    """For `fit_log`: one signal in N of all channels by a Gaussian process, creep included.
+    """Make one signal in N of all channels by a Gaussian process, creep included; for `fit_log`.
 
     | meaning                                               | default   | unit |
     |-------------------------------------------------------|-----------|------|
@@ -64,27 +69,27 @@ class SmoothChannels:
         return out, f"{signals.shape[1]} channels along {best.directions} directions{lags}"
 
     def _tried(self, inputs: np.ndarray, force: np.ndarray, train: np.ndarray, directions: int) -> _Found:
-        """The hyperparameters of largest evidence; directions left out are zero, so that all share a program."""
+        """The hyperparameters of largest evidence; unused directions are zero, so that all share a compiled program."""
         kept = inputs * (np.arange(inputs.shape[1]) < len(self.lags) + directions)
-        rows = np.flatnonzero(train)[_spread(int(train.sum()), _MOST)]
+        rows = np.flatnonzero(train)[_evenly(int(train.sum()), MAX_SAMPLES)]
         size = float(np.std(force[train]))
         cost = partial(_cost_and_slope, jnp.asarray(kept[rows]), jnp.asarray(force[rows] / size))
         start = np.r_[np.zeros(kept.shape[1]), 0.0, -1.0, np.log(0.03**2)]
         found = minimize(lambda h: tuple(np.asarray(part, float) for part in cost(h)), start, jac=True,
                          method="L-BFGS-B", bounds=[(-7, 7)] * kept.shape[1] + [(-12, 12)] * 2 + [(-16, 2)],
-                         options={"maxiter": _STEPS})  # fmt: skip
+                         options={"maxiter": MAX_STEPS})  # fmt: skip
         return _Found(-float(found.fun), directions, found.x, kept, size)
 
 
-def _spread(n: int, most: int) -> np.ndarray:
-    """At most `most` of the numbers below n, evenly."""
+def _evenly(n: int, most: int) -> np.ndarray:
+    """At most `most` of the numbers 0 to n - 1, evenly spaced."""
     return np.linspace(0, n - 1, min(n, most)).astype(int)
 
 
 def _inputs(
     time: np.ndarray, signals: np.ndarray, train: np.ndarray, directions: int, lags: tuple[float, ...]
 ) -> np.ndarray:
-    """How far the first principal component is from its lags, and all over their largest value, (n, inputs)."""
+    """Differences of the first principal component from its lags, then all components, (n, inputs) of order one."""
     axes = np.linalg.svd(signals[train], full_matrices=False)[2][:directions]
     along = signals @ axes.T
     along = along / np.abs(along[train]).max(0)
@@ -92,7 +97,7 @@ def _inputs(
 
 
 def lagged(time: np.ndarray, signal: np.ndarray, lag: float) -> np.ndarray:
-    """First-order lag of a signal (n,) by `lag` in the unit of time; missing samples hold it still."""
+    """First-order lag of a signal (n,) by `lag`, in the unit of time; missing samples do not change its state."""
     out, state, before = np.empty(len(signal)), np.nan, time[0]
     for k, (now, value) in enumerate(zip(time, signal, strict=True)):
         if np.isfinite(value):
@@ -110,7 +115,7 @@ def _kernel(hyper: Hyper, p: Float[Array, "n d"], q: Float[Array, "m d"]) -> Flo
 
 
 def _factor(hyper: Hyper, inputs: Float[Array, "n d"]) -> Float[Array, "n n"]:
-    noise = jnp.exp(hyper[-1]) + _JITTER
+    noise = jnp.exp(hyper[-1]) + JITTER
     return cholesky(_kernel(hyper, inputs, inputs) + noise * jnp.eye(len(inputs), dtype=inputs.dtype), lower=True)
 
 

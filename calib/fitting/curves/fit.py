@@ -1,28 +1,29 @@
 """Robust fit of a curve to pressure and force samples, with covariance and a result code.
 
 For residuals r_i = (F_i - h(P_i)) / (sigma_i s), s a robust scale, the fit minimises sum_i w^2 rho(r_i^2 / w^2) / 2
-(an M-estimate of width w). The loss goes to `optimistix.least_squares` as transformed residuals
-sign(r) w sqrt(rho(r^2 / w^2)), whose squares *are* the loss: any solver of least squares will do, and none needs a
-reweighting loop; the default one is told the loss's own curvature, and ends sooner. The scale is 1.4826 times the
-median absolute residual (MAD), found again after each of a few rounds and then held.
+(an M-estimate of width w). `optimistix.least_squares` gets the residuals transformed to
+sign(r) w sqrt(rho(r^2 / w^2)), whose squares are the loss: every least-squares solver can minimise it, without a
+reweighting loop. The default solver also uses the curvature of the loss and needs fewer steps. The scale s is 1.4826
+times the median absolute residual (MAD); it is estimated at the start of each of a few rounds and held within it.
 
-Slopes and exponents are above zero. They are looked for as multiples of their start, down to next to nothing: a slope
-that the samples want at zero or below has its logarithm at minus infinity, and no solver arrives there. Where the
-samples want a slope at zero or just below, it ends on its bound, and the curve is flat there: a fit like any other,
-with the standard errors of slopes that may be below zero. Where they want it far below - the bound explains a good part
-of what is left - the curve is the wrong one, and the result says AT_BOUND.
+Slopes and exponents are positive. The solver's unknowns are their multiples of the start, with a lower bound that
+stands for zero, because the logarithm of a slope that tends to zero diverges. Where the samples favour a slope at or
+just below zero, the slope ends on its bound, and the curve is flat there: a valid fit, with the standard errors of a
+slope that may be negative. Where they favour a slope far below zero, so that the bound explains a good part of the
+residuals, the curve is the wrong one, and the result is AT_BOUND.
 
-A spline's bends are expected to be of a known size (`AbstractCurve.bends`), as one more residual each. Samples that
-err together, by presses or by stretches of time, as they do on the two branches of a loop, weigh as the few that they
-are then; else the spline would follow one branch here and the other there. Many samples that err each for itself leave
-the bends to the samples, and the covariance is that of the samples alone.
+The roughness penalty of a spline (`AbstractCurve.bends`) adds one residual for each bend. Samples may err together,
+within a press or a stretch of time, as on the two branches of a hysteresis loop. Such samples count as the few
+independent ones that they amount to (`problem.design_effect`); otherwise the spline would follow one branch here and
+the other one there. Where many samples err independently, the penalty is negligible. The covariance is that of the
+samples alone.
 
-Samples of one press are near-duplicates. Given `groups` (a press or location per sample), the covariance is the
-cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), so that it is honest for a dozen presses; the
-sample count then hardly matters, which is the point. Without groups it is Huber's (Robust Statistics, 1981, 7.6).
+Samples of one press are near-duplicates. With `groups` (the press or location of each sample), the covariance is the
+cluster sandwich with the CR2 correction of Bell and McCaffrey (2002), which is valid from about a dozen presses on and
+hardly depends on the number of samples in a press. Without groups it is Huber's (Robust Statistics, 1981, 7.6).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,21 +36,25 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxeit as je
 from jaxeit.least_squares import ImplicitStep, LevenbergMarquardt
 
+from ..losses import AbstractLoss, SoftL1
+from ..results import FitError, FitResult
+from .base import AbstractCurve, scale_of
 from .covariance import CurveMinimum, covariance_at
-from .curve_problem import CurveProblem
-from .curves import AbstractCurve, scale_of
-from .fitted_curve import FittedCurve
-from .losses import AbstractLoss, SoftL1
-from .results import FitError, FitResult
+from .fitted import FittedCurve
+from .problem import CurveProblem
 from .samples import Numbers, Samples, bucket, gather
 
 Solver = optx.AbstractLeastSquaresSolver[Any, Any, Any, Any]
 Flag = Bool[Array, ""] | bool
 
+# Rounds of minimisation: each estimates the scale of the residuals where the one before ended.
+ROUNDS = 4
 # Relative precision of all rounds but the last, which only serve to find the scale of the residuals.
 ROUND_PRECISION = 1e-4
-# Part of the residuals' influence that slopes below zero may explain; beyond it, a rising curve is the wrong one.
+# Part of the residuals' influence that slopes below zero may explain; beyond it the samples contradict a rising curve.
 MAX_CONTRADICTION = 0.25
+# Least rise of the curve over the fitted pressures, as a fraction of the typical force.
+MIN_RISE = 1e-3
 
 
 def default_solver(dtype: DTypeLike) -> LevenbergMarquardt:
@@ -59,12 +64,11 @@ def default_solver(dtype: DTypeLike) -> LevenbergMarquardt:
 
 
 def _solve(problem: CurveProblem, solver: Solver, max_steps: int, rounds: int) -> tuple[CurveMinimum, Bool[Array, ""]]:
-    """The minimum after so many rounds, in each of which the scale of the residuals is held; and whether the last round
-    converged.
-    """
+    """The minimum after `rounds` rounds, and whether the last round converged."""
     dtype = problem.start.dtype
     slack = jnp.ones(rounds, dtype).at[:-1].set(max(ROUND_PRECISION / solver.rtol, 1.0))
-    bent = jnp.ones(rounds, dtype).at[0].set(0)  # the first round's residuals tell only what the start lacks
+    # No penalty in the first round, whose residuals show the error of the start rather than that of the samples.
+    bent = jnp.ones(rounds, dtype).at[0].set(0)
     options = {"lower": problem.lower, "curvature": problem.curvature}
 
     def one_round(multiple: Array, settings: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
@@ -96,7 +100,7 @@ def _groups_used(samples: Samples, n_groups: int) -> Int[Array, ""]:
 
 
 def held_pressure(pressure: Float[Array, " n"], present: Bool[Array, " n"]) -> Float[Array, " n"]:
-    """Pressures with the last one before each gap held: what a curve with memory has been through."""
+    """Pressures (n,) Pa for a curve with memory: the last pressure before a gap fills it, 0 a gap at the start."""
     last = jax.lax.cummax(jnp.where(present, jnp.arange(len(pressure)), -1))
     return jnp.where(last >= 0, jnp.where(present, pressure, 0.0)[last], 0.0)
 
@@ -109,7 +113,7 @@ def _pressure_range(samples: Samples) -> Float[Array, "2"]:
 
 
 def _judge(finite: Flag, enough: Flag, ended: Flag, rises: Flag, determined: Flag, inside: Flag) -> Int[Array, ""]:
-    """The first thing that went wrong, as a FitResult code."""
+    """The code of the first check that failed, in the order below; SUCCESS if none did."""
     checks = [
         (finite, FitResult.NOT_FINITE),
         (enough, FitResult.TOO_FEW),
@@ -122,23 +126,17 @@ def _judge(finite: Flag, enough: Flag, ended: Flag, rises: Flag, determined: Fla
     return jnp.select(bad, [jnp.int32(code) for _, code in checks], jnp.int32(FitResult.SUCCESS))
 
 
-def fit_samples(
-    curve: AbstractCurve,
-    samples: Samples,
-    loss: AbstractLoss,
-    solver: Solver,
-    *,
-    n_groups: int,
-    max_steps: int = 64,
-    rounds: int = 4,
-) -> FittedCurve:
-    """The pure fit of one pad: fixed shapes, works under jit, vmap and grad, never raises; see `fit_curves`.
+class _Fit(NamedTuple):
+    """What one pad's fit works on: the samples used, the problem made of them, and which samples are finite."""
 
-    A valid sample that is not finite makes the whole fit NOT_FINITE, with NaN parameters. `n_groups` 0 means
-    that samples are independent.
-    """
+    used: Samples
+    problem: CurveProblem
+    present: Bool[Array, " n"]
+
+
+def _prepare(curve: AbstractCurve, samples: Samples, loss: AbstractLoss, n_groups: int) -> _Fit:
+    """The fit's problem, in which values that are not valid are replaced by zeros or held pressures."""
     present = jnp.isfinite(samples.pressure) & jnp.isfinite(samples.force)
-    clean = jnp.all(present | ~samples.valid)
     valid = samples.valid & present
     used = Samples(
         held_pressure(samples.pressure, present) if curve.path else jnp.where(valid, samples.pressure, 0.0),
@@ -151,30 +149,48 @@ def fit_samples(
     curve = curve.at(scale)
     start = curve.free(curve.initial(used.pressure, used.force, valid, scale), scale)
     seen = eqx.tree_at(lambda s: s.pressure, used, curve.seen(used.pressure))
-    problem = CurveProblem(curve, seen, scale, loss, start, n_groups)
+    return _Fit(used, CurveProblem(curve, seen, scale, loss, start, n_groups), present)
+
+
+def fit_samples(
+    curve: AbstractCurve,
+    samples: Samples,
+    loss: AbstractLoss,
+    solver: Solver,
+    *,
+    n_groups: int,
+    max_steps: int = 64,
+    rounds: int = ROUNDS,
+) -> FittedCurve:
+    """The pure fit of one pad: fixed shapes, works under jit, vmap and grad, never raises; see `fit_curves`.
+
+    A valid sample that is not finite makes the whole fit NOT_FINITE, with NaN parameters. `n_groups` = 0 means
+    that the samples are independent.
+    """
+    used, problem, present = _prepare(curve, samples, loss, n_groups)
+    curve, scale = problem.curve, problem.scale
     end, ended = _solve(problem, solver, max_steps, rounds)
     found = covariance_at(end, problem)
 
-    n, k = jnp.sum(valid), end.free.size
+    n, k = jnp.sum(used.valid), end.free.size
     params = curve.bound(end.free, scale)
     limits = _pressure_range(used)
     groups = _groups_used(used, n_groups)
-    rise = jnp.diff(curve(params, limits))[0]
-    raw = jnp.where(valid, used.force - curve.given(params, seen.pressure), 0.0)
+    raw = jnp.where(used.valid, used.force - curve.given(params, problem.samples.pressure), 0.0)
+    clean = jnp.all(present | ~samples.valid)
     result = _judge(
         finite=clean & (n > 0) & jnp.all(jnp.isfinite(params)),
         enough=(n > k) & ((groups > k) if n_groups else True),
         ended=ended,
-        rises=rise > 1e-3 * scale.force,
+        rises=jnp.diff(curve(params, limits))[0] > MIN_RISE * scale.force,
         determined=(found.rank == k) & found.enough,
         inside=~jnp.any(end.vanished) | (found.missed < MAX_CONTRADICTION),
     )
     unusable = (result == FitResult.NOT_FINITE) | (result == FitResult.TOO_FEW)
-    failed = result != FitResult.SUCCESS
     return FittedCurve(
         curve=curve,
         parameters=jnp.where(unusable, jnp.nan, params),
-        covariance=jnp.where(failed, jnp.nan, found.covariance),
+        covariance=jnp.where(result != FitResult.SUCCESS, jnp.nan, found.covariance),
         pressure_range=jnp.where(n > 0, limits, jnp.nan),
         scale=jnp.where(unusable, jnp.nan, end.spread),
         residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / (n - k))),
@@ -220,16 +236,17 @@ def fit_curves(
     Args:
       pressures: (pads, n) Pa, baseline removed. NaN: missing.
       forces: (n,) or (pads, n) N. NaN: missing.
-      mask: (n,) or (pads, n) samples to use; left out, all finite ones are. A sample the mask vouches for
-        but that is not finite makes its pad NOT_FINITE.
+      mask: (n,) or (pads, n) samples to use; default: all finite ones. A sample that the mask selects but that is
+        not finite makes its pad NOT_FINITE.
       groups: (n,) or (pads, n) press or location of each sample; samples of a group are taken as dependent.
-      sigma: (n,) or (pads, n) noise of the force, relative is enough (left out: equal).
+      sigma: (n,) or (pads, n) noise of the force, up to a common factor; default: equal.
       loss: `SoftL1()` by default; also `Huber`, `Cauchy`, `Squared`.
       solver: an optimistix least-squares solver (default: `default_solver`).
-      dtype: None keeps that of the input; float64 with 64-bit numbers off is refused.
+      max_steps: limit of the solver's steps in each round.
+      dtype: of the fit; default: that of the input. float64 is refused where JAX has 64-bit numbers off.
 
-    Returns: a `FittedCurve` with a leading pad axis. Look at `result` before anything else; a bad pad does not
-      change its neighbours by one bit.
+    Returns: a `FittedCurve` with a leading pad axis. Check `result` first. A bad pad does not change the numbers of
+      other pads.
 
     Raises: `FitError` for shapes that do not fit together, or sigma not above zero.
     """
@@ -238,7 +255,7 @@ def fit_curves(
     samples, n_groups = gather(pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype, length=length)
     loss = SoftL1() if loss is None else loss
     solver = default_solver(samples.pressure.dtype) if solver is None else solver
-    return _fit_pads(curve, samples, loss, solver, bucket(n_groups) if n_groups else 0, max_steps, 4)
+    return _fit_pads(curve, samples, loss, solver, bucket(n_groups) if n_groups else 0, max_steps, ROUNDS)
 
 
 def fit_curve(

@@ -1,4 +1,4 @@
-"""A fitted curve: its numbers, their covariance, and what it predicts."""
+"""A fitted curve: its parameters, their covariance, and the forces that it predicts."""
 
 from typing import NamedTuple
 
@@ -10,12 +10,12 @@ from jaxtyping import Array, Float, Int, Real
 
 import jaxeit as je
 
-from .curves import AbstractCurve
-from .results import FitResult
+from ..results import FitResult
+from .base import AbstractCurve
 
 
 class Prediction(NamedTuple):
-    """Force (N), standard error of the curve (N; not of a new sample), and whether to believe it."""
+    """Force (N), standard error of the curve (N; without the noise of a new sample), and whether both are valid."""
 
     force: Array
     standard_error: Array
@@ -23,12 +23,12 @@ class Prediction(NamedTuple):
 
 
 class FittedCurve(eqx.Module):
-    """A curve with its numbers and their honesty. From `fit_curves` every array has a leading pad axis.
+    """A curve with its parameters and their uncertainty. From `fit_curves` every array has a leading pad axis.
 
     | field          | meaning                                                   | shape  | unit             |
     |----------------|-----------------------------------------------------------|--------|------------------|
-    | curve          | the curve, its reference pressure set                     |        |                  |
-    | parameters     | as named by `curve.names`                                 | (k,)   | `curve.units`    |
+    | curve          | the curve with all its settings                           |        |                  |
+    | parameters     | values of the parameters `curve.names`                    | (k,)   | `curve.units`    |
     | covariance     | of the parameters                                         | (k, k) | products thereof |
     | pressure_range | smallest and largest pressure fitted                      | (2,)   | Pa               |
     | scale          | robust standard deviation of the residuals                | ()     | N (1 with sigma) |
@@ -36,7 +36,7 @@ class FittedCurve(eqx.Module):
     | n, n_missing   | samples used, samples dropped as not finite               | ()     |                  |
     | n_groups       | presses used (0: samples taken as independent)            | ()     |                  |
     | rank           | parameters (directions) that the samples determine        | ()     |                  |
-    | result         | a `FitResult`; anything but 0 means: do not use           | ()     |                  |
+    | result         | a `FitResult`; do not use a fit whose code is not 0       | ()     |                  |
     """
 
     curve: AbstractCurve
@@ -53,20 +53,20 @@ class FittedCurve(eqx.Module):
 
     @property
     def standard_errors(self) -> Float[Array, "*pads k"]:
-        """Of the parameters, in their units."""
+        """Standard errors of the parameters, in their units."""
         return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def pad(self, index: int) -> "FittedCurve":
-        """One pad of a batch."""
+        """The fit of one pad of a batch."""
         found: FittedCurve = jax.tree.map(lambda leaf: leaf[index], self)
         return found
 
     def message(self) -> str:
-        """What became of the fit, for a person (one pad)."""
+        """The outcome of the fit in one sentence, and what to do about it (one pad)."""
         return FitResult(int(self.result)).message
 
     def predict(self, pressure: Real[ArrayLike, "..."], tolerance: float = 0.05) -> Prediction:
-        """Force at `pressure` (any shape, Pa), by the delta method: se^2 = g' C g, g = dh/dparameters (one pad).
+        """Force of one pad at `pressure` (any shape, Pa); by the delta method, se^2 = g' C g with g = dh/dparameters.
 
         `valid` is false for NaN, for a failed fit, and more than `tolerance` of the fitted range outside that range.
         """
@@ -82,6 +82,6 @@ class FittedCurve(eqx.Module):
 
 @je.verb
 def predict_pads(fitted: FittedCurve, pressures: Float[Array, "pads n"], tolerance: float = 0.05) -> Prediction:
-    """`FittedCurve.predict` for every pad of a batch: pressures (pads, n) -> arrays (pads, n)."""
+    """`FittedCurve.predict` for every pad of a batch, from pressures (pads, n) Pa; arrays are (pads, n)."""
     found: Prediction = eqx.filter_vmap(lambda f, p: f.predict(p, tolerance))(fitted, pressures)
     return found

@@ -10,18 +10,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .results import FitError
+from ..results import FitError
 
 Numbers = ArrayLike | Sequence[Any]
-"""What users give as numbers: an array, a number, or a list of either."""
+"""Numbers from a user: an array, a number, or a list of either."""
 
 
 class Samples(eqx.Module):
-    """What one pad's fit is given, or with a leading axis that of several; values that are not `valid` are ignored.
+    """Samples of one pad, or of several with a leading pad axis. Values that are not `valid` are ignored.
 
     | field    | meaning                                    | shape | unit |
     |----------|--------------------------------------------|-------|------|
-    | pressure | baseline removed (or what a curve has seen) | (n,) | Pa   |
+    | pressure | baseline removed (or `AbstractCurve.seen`) | (n,)  | Pa   |
     | force    | baseline removed                           | (n,)  | N    |
     | sigma    | relative (or absolute) noise of the force  | (n,)  | 1, N |
     | valid    | use this sample                            | (n,)  |      |
@@ -36,7 +36,7 @@ class Samples(eqx.Module):
 
 
 def bucket(n: int) -> int:
-    """The next of 64, 96, 128, 192, 256, ...: array lengths that recur, so that compiled fits are reused."""
+    """The least of the lengths 64, 96, 128, 192, 256, ... that holds n, so that compiled programs are reused."""
     power = 1 << max(n - 1, 63).bit_length()
     return power * 3 // 4 if n <= power * 3 // 4 else power
 
@@ -70,9 +70,9 @@ def gather(
 
 
 def _numbers(values: Any, what: str, dtype: Any) -> np.ndarray:
-    """An array of `dtype` (None: as it comes, as JAX would take it), refusing a silent loss of precision."""
+    """An array of `dtype` (None: the precision of the values). A silent loss of precision is refused."""
     if dtype is not None and jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
-        raise FitError("float64 was asked for but JAX has 64-bit numbers off; set JAX_ENABLE_X64=1 or ask for float32.")
+        raise FitError("dtype is float64 but JAX has 64-bit numbers off; set JAX_ENABLE_X64=1 or give float32.")
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise FitError(f"{what} must be numbers, not {array.dtype}.")

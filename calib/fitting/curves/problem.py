@@ -1,18 +1,20 @@
-"""What a curve's fit minimises: residuals of the samples, and of the bends that are expected of a spline."""
+"""What the fit of a curve minimises: the residuals of the samples, and the roughness penalty of a spline."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .curves import AbstractCurve, Scale
-from .losses import AbstractLoss
-from .order_statistics import MAD_TO_SIGMA, median
+from ..losses import AbstractLoss
+from ..order_statistics import MAD_TO_SIGMA, median
+from .base import AbstractCurve, Scale
 from .samples import Samples
 
-# Parts of the samples in order of time; residuals of different parts are taken as independent.
+# Parts into which samples without groups are cut in order of time; residuals of different parts count as independent.
+# Longer parts would be closer to independent, more parts would give a more certain variance of their sums.
 TIME_BLOCKS = 20
-# Smallest slope or exponent, as a multiple of its start: it stands for zero, whose logarithm no solver arrives at.
+# Lower bound of a slope or exponent, as a multiple of its start, about exp(-12). It stands for zero, whose logarithm is
+# not finite.
 SMALLEST_MULTIPLE = 6e-6
 
 Parameters = Float[Array, " k"]
@@ -22,24 +24,24 @@ Spread = Float[Array, ""] | float
 def residuals(
     free: Parameters, curve: AbstractCurve, samples: Samples, scale: Scale, spread: Spread
 ) -> Float[Array, " n"]:
-    """Standardised residuals; zero at samples that are not valid. Pressures are as `AbstractCurve.seen` has them."""
+    """Standardised residuals; zero where a sample is not valid. `samples.pressure` comes from `AbstractCurve.seen`."""
     force = curve.given(curve.bound(free, scale), samples.pressure)
     r = (samples.force - force) / (samples.sigma * spread)
     return jnp.where(samples.valid, r, 0.0)
 
 
 def residual_scale(free: Parameters, curve: AbstractCurve, samples: Samples, scale: Scale) -> Float[Array, ""]:
-    """Robust standard deviation of the residuals; never below rounding, so that perfect samples can be fitted too."""
+    """Robust standard deviation of the residuals; not below rounding, so that samples without noise can be fitted."""
     mad = MAD_TO_SIGMA * median(jnp.abs(residuals(free, curve, samples, scale, 1.0)), samples.valid)
     floor = 10 * jnp.sqrt(jnp.finfo(mad.dtype).eps) * scale.force
     return jnp.where(mad > floor, mad, floor)
 
 
 def design_effect(influence: Float[Array, " n"], samples: Samples, n_groups: int) -> Float[Array, ""]:
-    """Variance of sums of residuals over groups, over that of sums of independent ones; one at least.
+    """Variance of the residuals' sums over groups, divided by that of independent residuals; at least one.
 
-    So many times fewer independent samples would tell as much (Kish 1965, Survey Sampling, 8.2). Without groups the
-    sums are over `TIME_BLOCKS` parts of the samples in their order.
+    n samples carry the information of n / effect independent ones (Kish 1965, Survey Sampling, 8.2). Without groups
+    the sums are over `TIME_BLOCKS` parts of the samples in their order.
     """
     count = jnp.cumsum(samples.valid)
     block = (count - 1) * TIME_BLOCKS // count[-1]
@@ -49,15 +51,15 @@ def design_effect(influence: Float[Array, " n"], samples: Samples, n_groups: int
 
 
 class CurveProblem(eqx.Module):
-    """A curve and its samples, for parameters as multiples of their start (an offset: in units of the force's size).
+    """A curve and its samples. Unknowns are parameters as multiples of their start (an offset: in units of the force).
 
     | field    | meaning                                                                  | shape |
     |----------|--------------------------------------------------------------------------|-------|
-    | curve    | with its reference pressure                                              |       |
-    | samples  | with the pressures as `AbstractCurve.seen` has them                      |       |
+    | curve    | the curve with all its settings                                          |       |
+    | samples  | the samples, with the result of `AbstractCurve.seen` as pressure         |       |
     | scale    | sizes of the samples                                                     |       |
-    | loss     |                                                                          |       |
-    | start    | free parameters                                                          | (k,)  |
+    | loss     | robust loss of the residuals                                             |       |
+    | start    | free parameters of the start                                             | (k,)  |
     | n_groups | number of groups; 0: samples are independent                             |       |
     """
 
@@ -80,11 +82,11 @@ class CurveProblem(eqx.Module):
 
     @property
     def bends(self) -> Float[Array, "m k"]:
-        """See `AbstractCurve.bends`."""
+        """Roughness penalty, see `AbstractCurve.bends`."""
         return jnp.asarray(self.curve.bends, self.start.dtype)
 
     def vanished(self, multiple: Parameters) -> Bool[Array, " k"]:
-        """Which slopes and exponents are next to nothing."""
+        """Flags of the slopes and exponents that ended on their lower bound."""
         return jnp.asarray(self.curve.positive) & (multiple < 2 * SMALLEST_MULTIPLE)
 
     def free(self, multiple: Parameters) -> Parameters:
@@ -93,7 +95,7 @@ class CurveProblem(eqx.Module):
         return jnp.where(self.curve.positive, self.start + jnp.log(above), multiple)
 
     def weights(self, multiple: Parameters, bent: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Scale of the residuals there, and the weight of the bends, ``bent`` times the root of the design effect."""
+        """Scale of the residuals at `multiple`; weight of the penalty, `bent` times the root of the design effect."""
         spread = residual_scale(self.free(multiple), self.curve, self.samples, self.scale)
         if not len(self.bends):
             return spread, bent
@@ -103,12 +105,12 @@ class CurveProblem(eqx.Module):
     def objective(
         self, multiple: Parameters, spread: Float[Array, ""], weight: Float[Array, ""]
     ) -> Float[Array, " residuals"]:
-        """Residuals whose squares are the loss, and the bends, clipped like the slopes: as steep at a bound."""
+        """Residuals whose squares are the loss, then those of the penalty, its slopes clipped at their bound too."""
         left = residuals(self.free(multiple), self.curve, self.samples, self.scale, spread)
         bends = weight * (self.bends @ jnp.maximum(multiple, SMALLEST_MULTIPLE))
         return jnp.concatenate([self.loss.transform(left), bends])
 
     def curvature(self, transformed: Float[Array, " residuals"]) -> Float[Array, " residuals"]:
-        """See `AbstractLoss.curvature`; the bends have no loss."""
+        """`AbstractLoss.curvature` of the samples' residuals; one for those of the penalty, which are squared."""
         n = len(self.samples.force)
         return jnp.concatenate([self.loss.curvature(transformed[:n]), jnp.ones_like(transformed[n:])])

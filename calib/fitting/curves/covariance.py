@@ -8,13 +8,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxeit.linalg.lapack import eigh, svd
 
-from .curve_problem import CurveProblem, residuals
+from .problem import CurveProblem, residuals
+
+# Leverage of one press in a direction above which the press alone determines it; CR2 divides by the rest.
+MAX_LEVERAGE = 1 - 1e-3
+# Least mean derivative of the influence in any direction; below it nearly all samples there are outliers.
+MIN_STEEPNESS = 0.05
 
 
 def independent_covariance(
     left: Float[Array, "n k"], psi: Float[Array, " n"], dpsi: Float[Array, " n"], valid: Bool[Array, " n"]
 ) -> Float[Array, "k k"]:
-    """Huber's covariance in whitened coordinates: independent residuals of one size."""
+    """Huber's covariance in whitened coordinates, for independent residuals of equal variance."""
     n, k = jnp.sum(valid).astype(psi.dtype), left.shape[1]
     mean = jnp.sum(dpsi) / n
     variance = jnp.sum(jnp.where(valid, (dpsi - mean) ** 2, 0.0)) / n
@@ -26,27 +31,27 @@ def independent_covariance(
 def cluster_covariance(
     left: Float[Array, "n k"], psi: Float[Array, " n"], dpsi: Float[Array, " n"], group: Int[Array, " n"], n_groups: int
 ) -> tuple[Float[Array, "k k"], Bool[Array, ""]]:
-    """Sandwich over presses in whitened coordinates, and whether there are presses enough for it.
+    """Sandwich over presses in whitened coordinates, and whether there are enough presses for it.
 
-    Scores are corrected for what their press itself decided (CR2). With G = U S V' the corrected score
-    U_g' (I - U_g U_g')^(-1/2) psi_g equals (I - U_g' U_g)^(-1/2) U_g' psi_g, a k x k matter per press. A press that
-    alone decides a direction (an eigenvalue of one) leaves no scatter to learn from. The bread weighs each sample
-    with its own psi', since residuals grow with load and so does the slope.
+    Scores are corrected for the leverage of their own press (CR2). With G = U S V' the corrected score
+    U_g' (I - U_g U_g')^(-1/2) psi_g equals (I - U_g' U_g)^(-1/2) U_g' psi_g, which needs only a k x k root per press.
+    A press that alone determines a direction (an eigenvalue of one) leaves no scatter to estimate a variance from. The
+    bread weights each sample with its own psi', because both residuals and slope grow with the load.
     """
     score = jax.ops.segment_sum(left * psi[:, None], group, n_groups)
     leverage = jax.ops.segment_sum(left[:, :, None] * left[:, None, :], group, n_groups)
     values, vectors = jax.vmap(eigh)(leverage)
-    decided = values > 1 - 1e-3
+    decided = values > MAX_LEVERAGE
     root = jax.lax.rsqrt(1 - values)
     adjusted = jnp.einsum("gij,gj,gkj,gk->gi", vectors, root, vectors, score)
     steepness, axes = eigh(left.T @ (left * dpsi[:, None]))
     bread = axes / steepness @ axes.T
-    enough = ~jnp.any(decided) & (steepness[0] > 0.05)
+    enough = ~jnp.any(decided) & (steepness[0] > MIN_STEEPNESS)
     return bread @ adjusted.T @ adjusted @ bread, enough
 
 
 def thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, " k"], Float[Array, "k k"]]:
-    """U, singular values and V' of a tall matrix of few columns, by Gram-Schmidt done twice (Giraud et al. 2005)."""
+    """U, singular values and V' of a tall matrix of few columns, by Gram-Schmidt applied twice (Giraud et al. 2005)."""
     columns: list[Array] = []
     for column in matrix.T:
         for _ in range(2):
@@ -60,7 +65,15 @@ def thin_svd(matrix: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Ar
 
 
 class CurveMinimum(NamedTuple):
-    """Where a fit ended: free parameters (k,), scale of the residuals, weight of the bends, which slopes vanished."""
+    """End of a fit.
+
+    | field       | meaning                                             | shape |
+    |-------------|-----------------------------------------------------|-------|
+    | free        | free parameters                                     | (k,)  |
+    | spread      | scale of the residuals                              | ()    |
+    | bend_weight | weight of the roughness penalty                     | ()    |
+    | vanished    | slopes and exponents that are on their lower bound  | (k,)  |
+    """
 
     free: Float[Array, " k"]
     spread: Float[Array, ""]
@@ -69,10 +82,15 @@ class CurveMinimum(NamedTuple):
 
 
 class CurveCovariance(NamedTuple):
-    """Covariance of the parameters in their units (k, k); how many directions the samples determine; whether the groups
-    suffice; and the share of the residuals' influence that lies along the Jacobian, which is zero at a minimum.
+    """Covariance of the parameters, and what it rests on.
 
-    There is such a share only for slopes that vanished: what the samples and the expected bends both want below zero.
+    | field      | meaning                                                                              | shape  |
+    |------------|--------------------------------------------------------------------------------------|--------|
+    | covariance | of the parameters, in their units                                                    | (k, k) |
+    | rank       | number of directions that the samples determine                                      | ()     |
+    | enough     | whether there are enough groups                                                      | ()     |
+    | missed     | share of the residuals' influence that slopes below zero would explain; 0 if none is | ()     |
+    |            | on its bound                                                                         |        |
     """
 
     covariance: Float[Array, "k k"]
@@ -84,8 +102,8 @@ class CurveCovariance(NamedTuple):
 def covariance_at(end: CurveMinimum, problem: CurveProblem) -> CurveCovariance:
     """Covariance at the end of a fit.
 
-    The Jacobian is that of slopes themselves, as multiples of their start, not of their logarithms: a slope on its
-    bound is not degenerate.
+    The Jacobian is with respect to the slopes as multiples of their start, not to their logarithms, so that a slope on
+    its bound is not degenerate.
     """
     curve, samples, scale, loss = problem.curve, problem.samples, problem.scale, problem.loss
     unit = jnp.where(curve.positive, jnp.exp(problem.start - end.free), 1.0)

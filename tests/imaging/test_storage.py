@@ -72,19 +72,19 @@ def test_single_precision_is_the_same_image_to_single_precision(recon):
 def test_a_cut_file_is_refused(path, cut):
     whole = path.read_bytes()
     path.write_bytes(whole[:cut] if cut >= 0 else whole[:-1000])
-    with pytest.raises(je.imaging.StoreError, match=r"^recon\.npz: ") as caught:
+    with pytest.raises(je.imaging.StorageError, match=r"^recon\.npz: ") as caught:
         je.load_reconstructor(path)
     assert "\\n" not in str(caught.value)
 
 
 def test_missing_and_foreign_files_are_named(tmp_path):
-    with pytest.raises(je.imaging.StoreError, match=r"none\.npz: No such file"):
+    with pytest.raises(je.imaging.StorageError, match=r"none\.npz: No such file"):
         je.load_reconstructor(tmp_path / "none.npz")
     np.savez(tmp_path / "other.npz", a=np.ones(3))
-    with pytest.raises(je.imaging.StoreError, match=r"other\.npz: is damaged or no reconstructor"):
+    with pytest.raises(je.imaging.StorageError, match=r"other\.npz: is damaged or no reconstructor"):
         je.load_reconstructor(tmp_path / "other.npz")
     np.savez(tmp_path / "new.npz", about=np.array(json.dumps({"format": "jaxeit reconstructor 2"})))
-    with pytest.raises(je.imaging.StoreError, match="this version reads"):
+    with pytest.raises(je.imaging.StorageError, match="this version reads"):
         je.load_reconstructor(tmp_path / "new.npz")
 
 
@@ -104,12 +104,12 @@ def test_missing_and_foreign_files_are_named(tmp_path):
 def test_numbers_that_do_not_fit_are_refused(recon, name, value, message):
     numbers = je.imaging.to_numbers(recon)
     numbers = {k: v for k, v in numbers.items() if k != name} | ({} if value is None else {name: value})
-    with pytest.raises(je.imaging.StoreError, match=message):
+    with pytest.raises(je.imaging.StorageError, match=message):
         je.imaging.from_numbers(numbers, recon.shape, recon.extent)
 
 
 def test_a_picture_that_does_not_hold_the_image_is_refused(recon):
-    with pytest.raises(je.imaging.StoreError, match="does not hold 144"):
+    with pytest.raises(je.imaging.StorageError, match="does not hold 144"):
         je.imaging.from_numbers(je.imaging.to_numbers(recon), (3, 3), recon.extent)
 
 

@@ -1,0 +1,97 @@
+"""Posterior of linear coefficients, averaged over priors.
+
+Each prior of a fixed list, of every size and shape, is weighted by its restricted marginal likelihood, with the noise
+profiled and the levels of the pads integrated out (Patterson and Thompson 1971, Biometrika 58; Rasmussen and Williams
+2006, 5.4).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxeit.linalg.lapack import eigh, solve
+
+# Sizes of the prior: variance of a coefficient over the variance of the noise. The smallest allows no visible field,
+# the largest leaves the coefficients to the presses; four sizes per decade.
+PRIOR_RATIOS = np.logspace(-3, 7, 41)
+
+
+class LevelFree(NamedTuple):
+    """Weighted features z (n, m) and log ratios y (n,) of presses without the pads' levels; degrees of freedom left."""
+
+    z: Array
+    y: Array
+    degrees: Array
+
+
+def without_levels(
+    z: Float[Array, "n m"], y: Float[Array, " n"], share: Float[Array, "n pads"], weight: Float[Array, " n"]
+) -> LevelFree:
+    """Project the levels of the pads out of features and log ratios, since they belong to the curves."""
+    root = jnp.sqrt(weight)[:, None]
+    z, y, x = z * root, y * root[:, 0], share * root
+    present = jnp.sum(x**2, 0) > 0
+    gram = x.T @ x + jnp.diag(jnp.where(present, 1e-12, 1.0).astype(x.dtype))
+    levels = solve(gram, x.T @ jnp.column_stack([z, y]))
+    left = jnp.column_stack([z, y]) - x @ levels
+    return LevelFree(left[:, :-1], left[:, -1], jnp.maximum(jnp.sum(weight) - jnp.sum(present), 1.0))
+
+
+class Posterior(NamedTuple):
+    """Coefficients and covariance over all priors, the largest log evidence, and the variance of the noise."""
+
+    coefficients: Array
+    covariance: Array
+    evidence: Array
+    variance: Array
+
+
+class _Shape(NamedTuple):
+    """Posteriors of one shape of prior, in the axes in which the prior of every size is diagonal; rows are sizes.
+
+    | field    | meaning                                                | shape      |
+    |----------|--------------------------------------------------------|------------|
+    | evidence | log of the restricted marginal likelihood              | (sizes,)   |
+    | variance | of the noise                                           | (sizes,)   |
+    | shrink   | posterior variance of the coordinates over the noise's | (sizes, m) |
+    | moment   | posterior mean of the coordinates                      | (sizes, m) |
+    | axes     | coefficients for each coordinate                       | (m, m)     |
+    """
+
+    evidence: Array
+    variance: Array
+    shrink: Array
+    moment: Array
+    axes: Array
+
+
+def _of_shape(levelled: LevelFree, shape: Float[Array, " m"]) -> _Shape:
+    root, ratio = jnp.sqrt(shape), jnp.asarray(PRIOR_RATIOS, shape.dtype)[:, None]
+    values, vectors = eigh(root[:, None] * (levelled.z.T @ levelled.z) * root)
+    values, axes = jnp.maximum(values, 0), root[:, None] * vectors
+    moment = axes.T @ (levelled.z.T @ levelled.y)
+    shrink = ratio / (1 + ratio * values)
+    square = jnp.maximum(levelled.y @ levelled.y - jnp.sum(shrink * moment**2, 1), jnp.finfo(shape.dtype).tiny)
+    evidence = -0.5 * (jnp.sum(jnp.log1p(ratio * values), 1) + levelled.degrees * jnp.log(square))
+    return _Shape(evidence, square / levelled.degrees, shrink, shrink * moment, axes)
+
+
+def average_over_priors(levelled: LevelFree, shapes: Float[Array, "shapes m"]) -> Posterior:
+    """Posterior over all sizes and shapes of the prior; its covariance by the law of total variance."""
+    each = jax.lax.map(lambda shape: _of_shape(levelled, shape), shapes)
+    weight = jnp.exp(each.evidence - jnp.max(each.evidence))
+    weight = weight / jnp.sum(weight)
+    of_shape = jnp.sum(weight, 1)
+    share = weight / jnp.where(of_shape > 0, of_shape, 1)[:, None]
+    middle = jnp.einsum("sr,srk->sk", share, each.moment)
+    about = each.moment - middle[:, None]
+    within = jnp.einsum("sr,sri,srj->sij", weight, about, about)
+    within = within + jax.vmap(jnp.diag)(jnp.einsum("sr,sr,srk->sk", weight, each.variance, each.shrink))
+    means = jnp.einsum("sik,sk->si", each.axes, middle)
+    mean = of_shape @ means
+    between = jnp.einsum("s,si,sj->ij", of_shape, means - mean, means - mean)
+    covariance = jnp.einsum("sik,skl,sjl->ij", each.axes, within, each.axes) + between
+    return Posterior(mean, covariance, jnp.max(each.evidence), jnp.sum(weight * each.variance))

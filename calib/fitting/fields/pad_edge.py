@@ -1,0 +1,66 @@
+"""Fields of the distance to walls: the sides of a pad and the rim of the sheet."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .base import REFERENCE_WIDTH, AbstractField, Features, cubic_bspline
+from .geometry import Geometry, OnPads, distance, nearest_points
+
+
+class PadEdge(AbstractField):
+    """Distance to the walls: a pad is stiff at its sides, and the part of a load beyond the rim of the sheet is lost.
+
+    Features are bumps (cubic B-splines) over octaves of distance, the n-th centred where the distance is
+    (2^n - 1) `width` (m), summed over the sides of the pad; and the same bumps of the distance to the rim. A
+    coefficient without presses at its distance keeps its prior. Walls are alike, so that all pads share the
+    coefficients, and a few dozen presses suffice.
+    """
+
+    name: ClassVar[str] = "edge"
+
+    width: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=8e-3)
+    bumps: int = eqx.field(static=True, default=4)
+    shared: bool = eqx.field(static=True, default=True)
+
+    def basis(self, geometry: Geometry, place: OnPads) -> Features:
+        real = jnp.any(geometry.start != geometry.end, -1)
+        to_sides = distance(nearest_points(place, geometry.start, geometry.end), place[..., None, :])
+        to_rim = distance(nearest_points(place, geometry.rim[:, 0], geometry.rim[:, 1]), place[..., None, :]).min(-1)
+        sides = jnp.sum(jnp.where(real[..., None], self._bumps(to_sides), 0), -2)
+        return jnp.concatenate([sides, self._bumps(to_rim)], -1)
+
+    def supported(self, low: Float[Array, "... 2"], high: Float[Array, "... 2"]) -> tuple[Array, Array]:
+        """The box of the farthest press on every side, because all walls are alike."""
+        farthest = jnp.max(jnp.maximum(-low, high), -1, keepdims=True)
+        return jnp.broadcast_to(-farthest, low.shape), jnp.broadcast_to(farthest, high.shape)
+
+    def _bumps(self, metres: Float[Array, "..."]) -> Float[Array, "... bumps"]:
+        octaves = jnp.log2(1 + metres / self.width.astype(metres.dtype))
+        return cubic_bspline(octaves[..., None] - jnp.arange(self.bumps))
+
+    def shapes(self) -> Float[np.ndarray, "shapes k"]:
+        return np.ones((1, 2 * self.bumps))
+
+
+class PadEdgeSize(PadEdge):
+    """`PadEdge`, times a power of the contact's estimated width, for pads that respond differently to broad contacts.
+
+    Press with tips of several diameters to determine the power.
+    """
+
+    name: ClassVar[str] = "edge-size"
+
+    def features(
+        self, geometry: Geometry, place: OnPads, width: Float[ArrayLike, "..."] = REFERENCE_WIDTH
+    ) -> Float[Array, "... pads m"]:
+        edge = super().features(geometry, place)
+        size = jnp.log(jnp.asarray(width, edge.dtype) / REFERENCE_WIDTH)
+        return jnp.concatenate([edge, jnp.broadcast_to(size[..., None, None], (*edge.shape[:-1], 1))], -1)
+
+    def shapes(self) -> Float[np.ndarray, "shapes k"]:
+        return np.ones((1, 2 * self.bumps + 1))

@@ -1,0 +1,65 @@
+"""Places of contacts, as the images of frames tell them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+
+class Places(eqx.Module):
+    """Contacts of frames, as their images tell them.
+
+    | field     | meaning                                                              | shape        | unit |
+    |-----------|----------------------------------------------------------------------|--------------|------|
+    | position  | of each contact, in the flat coordinates of the sheet; NaN: none     | (n, K, 2)    | m    |
+    | weight    | share of each contact in what a pad carries; a row of zeros: unknown | (n, K, pads) | 1    |
+    | width     | of its bump, as in `jaxeit.Contacts`; NaN: not known                 | (n, K)       | m    |
+    | amplitude | of its bump; 0: not known, or none                                   | (n, K)       | S    |
+    """
+
+    position: Float[Array, "n K 2"]
+    weight: Float[Array, "n K pads"]
+    width: Float[Array, "n K"]
+    amplitude: Float[Array, "n K"]
+
+    @property
+    def known(self) -> Bool[Array, "n pads"]:
+        """Whether the place of a contact on each pad is known."""
+        return jnp.sum(self.weight, 1) > 0
+
+    def __getitem__(self, rows: Any) -> "Places":
+        """The places of some frames."""
+        found: Places = jax.tree.map(lambda leaf: leaf[rows], self)
+        return found
+
+
+def single_places(
+    position: Float[ArrayLike, "n 2"] | Sequence[Sequence[float]],
+    pads: int,
+    width: Float[ArrayLike, "..."] = np.nan,
+    amplitude: Float[ArrayLike, "..."] = 0.0,
+) -> Places:
+    """Places with one contact per frame at (n, 2) m, NaN: unknown, that counts for all pads.
+
+    Args:
+        width: of the contact's bump, (n,) m; NaN: not known.
+        amplitude: of the contact's bump, (n,) S; 0: not known.
+    """
+    position = jnp.asarray(position)
+    known = jnp.all(jnp.isfinite(position), -1)
+    weight = jnp.broadcast_to(known[:, None, None], (len(position), 1, pads))
+    bump = (jnp.broadcast_to(jnp.asarray(value, position.dtype), known.shape)[:, None] for value in (width, amplitude))
+    return Places(position[:, None], weight.astype(position.dtype), *bump)
+
+
+def nowhere(pressures: Float[Array, "n pads"], contacts: int = 1) -> Places:
+    """Places of n frames in which no contact is known."""
+    n, pads = pressures.shape
+    position = jnp.full((n, contacts, 2), jnp.nan, pressures.dtype)
+    weight, none = (jnp.zeros((n, contacts, *more), pressures.dtype) for more in ((pads,), ()))
+    return Places(position, weight, none + jnp.nan, none)

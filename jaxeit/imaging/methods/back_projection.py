@@ -1,0 +1,19 @@
+"""Back-projection: each pixel as a weighted mean of the readings."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .base import AbstractLinearMethod, Problem
+
+
+class BackProjection(AbstractLinearMethod):
+    """Each pixel is the mean of the readings weighted by its sensitivity, ``x_j = J_j . y / (|J_j|^2 + floor)``.
+
+    The oldest method, for comparison; it uses neither prior nor hyperparameter, and its images are blurred.
+    """
+
+    floor: float = 1e-3
+
+    def image(self, problem: Problem, y: Float[Array, "k m"]) -> Float[Array, "basis m"]:
+        power = jnp.sum(problem.jacobian**2, 0)
+        return (y.T @ problem.jacobian / (power + self.floor * jnp.max(power))).T

@@ -1,0 +1,100 @@
+"""Every command that writes, ended or failing while it writes: one line, no half-written file, what was there stays."""
+
+import errno
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from calib.cli import main
+from calib.session import storage
+from tests.record.test_full_disk import SCENE
+from tests.record.test_recorder import both, journal
+
+EARLIER = b"an earlier result"
+
+
+def raised(number):
+    """A fault: the signal arrives."""
+    return lambda: os.kill(os.getpid(), number)
+
+
+def failed(number):
+    """A fault: the disk refuses."""
+
+    def fail():
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+FAULTS = {
+    "SIGTERM": (raised(signal.SIGTERM), 143, "ended by SIGTERM"),
+    "SIGHUP": (raised(signal.SIGHUP), 129, "ended by SIGHUP"),
+    "SIGINT": (raised(signal.SIGINT), 130, "interrupted"),
+    "disk full": (failed(errno.ENOSPC), 2, "No space left on device"),
+    "read-only": (failed(errno.EROFS), 2, "Read-only file system"),
+}
+
+
+@pytest.fixture(scope="module")
+def calibrated(bundled, tmp_path_factory):
+    path = tmp_path_factory.mktemp("calibrated") / "calibration.h5"
+    grid = next(path for path in bundled if path.stem == "testbed_grid")
+    assert main(["calibrate", str(grid), "-o", str(path), "--pixels", "10"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def commands(bundled, calibrated, tmp_path_factory):
+    """Arguments of each command but its output, by the suffix of what it writes."""
+    folder = tmp_path_factory.mktemp("inputs")
+    grid, presses = (next(path for path in bundled if path.stem == f"testbed_{name}") for name in ("grid", "presses"))
+    (folder / "scene.toml").write_text(SCENE)
+    table = np.column_stack([np.arange(200) / 100, np.random.default_rng(0).normal(size=(200, 2))])
+    np.savetxt(folder / "log.csv", table, delimiter=",", header="t,f,p", comments="")
+    journal(folder / "s.h5.part", both(40))
+    columns = ["--column", "time=t", "--column", "force=f", "--column", "pressure=p"]
+    return {
+        "simulate": (["simulate", folder / "scene.toml"], "-o", "session.h5"),
+        "import": (["import", "csv", folder / "log.csv", *columns], "-o", "session.h5"),
+        "recover": (["recover", folder / "s.h5.part"], "-o", "session.h5"),
+        "calibrate": (["calibrate", grid, "--pixels", "10"], "-o", "calibration.h5"),
+        "report": (["calibrate", grid, "--pixels", "10", "-o", folder / "c.h5"], "--report", "report.html"),
+        "apply": (["apply", calibrated, presses], "-o", "map.h5"),
+    }
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["simulate", "import", "recover", "calibrate", "report", "apply"])
+def test_a_command_that_is_cut_short_leaves_what_was_there(name, fault, commands, tmp_path, monkeypatch, capsys):
+    cause, status, words = FAULTS[fault]
+    arguments, option, output = commands[name]
+    arguments = list(map(str, [*arguments, option, tmp_path / output]))
+    if name in ("simulate", "import", "recover"):  # these do not replace a file
+        before = set()
+    else:
+        (tmp_path / output).write_bytes(EARLIER)
+        before = {output}
+    monkeypatch.setattr(storage, "sync", spoilt(cause, tmp_path))
+    assert main(arguments) == status
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith("jaxeit: ")
+    assert words in told
+    assert {path.name for path in tmp_path.iterdir() if not path.is_dir()} == before
+    if before:
+        assert (tmp_path / output).read_bytes() == EARLIER
+    monkeypatch.undo()
+    assert main(arguments) == 0  # the same command works afterwards
+    assert (tmp_path / output).stat().st_size > len(EARLIER)
+
+
+def spoilt(cause, folder):
+    """`storage.sync` that meets the fault at the first file in ``folder``."""
+
+    def sync(path):
+        if path.is_relative_to(folder):
+            cause()
+
+    return sync
