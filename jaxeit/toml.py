@@ -1,7 +1,9 @@
 """TOML files read key by key: errors name the key that is missing, wrong or unknown, and the reason."""
 
+import codecs
 import difflib
 import math
+import os
 import re
 import reprlib
 import tomllib
@@ -41,9 +43,10 @@ def read_text(path: Path) -> str:
     """The text of a file, or a `TomlError` that names it."""
     try:
         with open_regular(path) as file:
-            raw = file.read(current_budget().text_bytes + 1)
-        require("text_bytes", len(raw), str(path), TomlError)
-        return raw.decode()
+            size, raw = os.fstat(file.fileno()).st_size, file.read(current_budget().text_bytes)
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(raw, final=size <= len(raw))
+        require("text_bytes", size, str(path), TomlError)
+        return text
     except UnicodeDecodeError:
         raise TomlError(f"{path}: is not text; give a TOML file") from None
     except OSError as error:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from .signals import interruption_status, termination_raised
 from .terminal import one_line
 
 COMMANDS = {
@@ -31,7 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 for bad input with one line on standard error."""
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
-        return _run(argv)
+        with termination_raised():
+            return _run(argv)
     except (ValueError, OSError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and _nobody_reads():
             return 128 + signal.SIGPIPE  # as a shell reports a program that the signal ended
@@ -42,9 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"jaxeit: {OUT_OF_MEMORY} ({one_line(error)[:200]})", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("jaxeit: interrupted; nothing was written", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as interrupt:
+        print(f"jaxeit: {str(interrupt) or 'interrupted'}; nothing was written", file=sys.stderr)
+        return interruption_status(interrupt)
 
 
 OUT_OF_MEMORY = "this machine has too little memory for it; use less data, a coarser fidelity or fewer pixels"

@@ -20,6 +20,8 @@ import jaxeit as je
 from calib.calibration.calibration import load_calibration
 from calib.fitting.logs.blend import fit_blend
 from calib.fitting.results import FitError
+from calib.presses.corrections import window_means
+from calib.presses.streams import ArrayStream, PressError, recording_end
 from calib.session import SessionError, open_session
 from jaxeit.toml import MAX_DEPTH, MAX_KEY_PARTS
 from tests.fuzzing import calibration
@@ -96,6 +98,8 @@ def process(code, folder, *arguments):
     limited = (
         "import json, resource, sys; from pathlib import Path\n"
         "import calib.cli, calib.session, jaxeit as je; from calib.calibration import Recipe\n"
+        "from calib.record.journal.file import JournalReader\n"
+        "from calib.session import file_hash, open_session\n"
         "size = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()\n"
         f"resource.setrlimit(resource.RLIMIT_AS, (size + {MEMORY}, resource.RLIM_INFINITY))\n"
         "def said(read, *given):\n"
@@ -166,7 +170,7 @@ def test_what_is_beyond_the_budget_is_not_allocated(good, tmp_path, monkeypatch)
     assert str(caught.value).endswith("or raise all limits with JAXEIT_BUDGET=4")
 
 
-READERS = "calib.session.open_session, calib.session.file_hash, je.load_skin, Recipe.load, je.load_reconstructor"
+READERS = "open_session, file_hash, je.load_skin, Recipe.load, je.load_reconstructor, JournalReader"
 
 
 def test_only_regular_files_are_opened(tmp_path):
@@ -206,7 +210,7 @@ TEXTS = {
     "20,000 arrays in each other": ("a = " + "[" * 20_000, "nested too deeply"),
     "20,000 tables in each other": ("a = " + "{a = " * 20_000, "nested too deeply"),
     "texts without end": ('a = "' + '\\"' * 100_000, "not valid TOML: Unterminated string"),
-    "2 MB": ("#" * (2 << 20), "bytes of text, the limit is 1,048,576"),
+    "2 MB": ("#" * (2 << 20), "2,097,152 bytes of text, the limit is 1,048,576"),
     "10^12 electrodes": (edited(("columns = 5", "columns = 1000000"), ("rows = 5", "rows = 1000000")),
                          "1,000,000,000,000 electrodes, the limit is 1,024"),
     "2,000 electrodes": (edited(("columns = 5", "columns = 50"), ("rows = 5", "rows = 40")), "2,000 electrodes, the"),
@@ -368,6 +372,30 @@ def test_calibrations_that_lie_are_refused_when_they_are_opened(lie, calibrated,
 )
 def test_what_is_a_covariance(matrix, is_one):
     assert je.linalg.is_covariance(matrix) is is_one
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1e308, 1e300, 2e18, -1e200])
+def test_values_that_nothing_measures_are_missing_and_overflow_nowhere(size, good, tmp_path):
+    """Warnings are errors here: squares and sums of such values would overflow."""
+    values = np.full((200, 1), 2.5)
+    values[::2] = size
+    with open_session(changed(good, tmp_path, replace(FORCE, data=values))) as session:
+        force = session.streams["force"].read()
+    assert np.isnan(force[::2]).all()
+    means = window_means(force, np.array([[0, 100], [100, 200]]))
+    np.testing.assert_allclose(means.mean, 2.5)
+    assert np.float32(force[1::2]).sum() == 250
+
+
+def test_streams_without_samples_are_named():
+    full, empty = (ArrayStream(name, np.arange(n), np.zeros((n, 2))) for name, n in (("force", 3), ("eit", 0)))
+    assert recording_end([full]) == 3
+    for streams, said in (([full, empty], "^/streams/eit: no samples"), ([], "^/streams: no samples")):
+        with pytest.raises(PressError, match=f"{said}, so that no press can be cut out; record again$"):
+            recording_end(streams)
 
 
 # --- the command line -------------------------------------------------------------------------------------------------

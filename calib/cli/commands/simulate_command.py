@@ -44,7 +44,10 @@ def run(args: argparse.Namespace) -> int:
     try:
         simulate(bench, args.output, progress=progress_bar("blocks"))
     except KeyboardInterrupt as interrupt:
-        print(f"jaxeit: interrupted; the same command goes on from {args.output}.part", file=sys.stderr)
+        print(
+            f"jaxeit: {str(interrupt) or 'interrupted'}; the same command goes on from {args.output}.part",
+            file=sys.stderr,
+        )
         return interruption_status(interrupt)
     print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
     return _serve(args.output) if args.serve else 0
