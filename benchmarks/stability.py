@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxeit as je
-from tests import hard_sheet as sheet
-from tests import hard_strip as strip
+from tests import hard_sheet as sheet, hard_strip as strip
 from tests.oracles.rational import inverse_corner
 
 from .figures import BLUE, GREY, ORANGE, legend, panels

@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from jaxeit_bounds import current_budget, open_regular, require
+from .budget import current_budget, require
+from .files import open_regular
 
 __all__ = [
     "TomlError",

@@ -31,7 +31,8 @@ from ..calibration.recipe import Recipe
 from ..report.document import write_report
 from ..report.figures import require_matplotlib
 from ..runtime import settings, take_over
-from ..session import SessionError, open_session
+from ..session import Session, SessionError, open_session
+from .logs import fit_log_into, log_summary
 from .workers import begin
 
 try:
@@ -54,7 +55,7 @@ class Outcome:
     | skipped: it was there already                                        |
     | simulated: so its calibration says                                   |
     | seconds: that it took                                                |
-    | summary: of the calibration's evaluation; empty if it failed         |
+    | summary: of the evaluation, or of a log's second half; empty: failed |
     """
 
     session: str
@@ -105,6 +106,7 @@ def calibrate_many(
         report: write ``out/NAME.html`` too.
         tell: told of each session as it ends.
 
+    A session without EIT is a log of force and pressure: it gets a curve, as `jaxeit calibrate` fits it, and no page.
     A session that fails is named in its outcome and the rest complete; so is one that kills its worker, if the pool is
     the default one. Call it below ``if __name__ == "__main__":``, as spawned processes import the main module.
 
@@ -194,7 +196,8 @@ def _line(outcome: Outcome, width: int) -> str:
         return f"{name}  FAILED: {outcome.reason}"
     s = outcome.summary
     cv = s.get("cv_calibrated_ddof1", float("nan"))
-    numbers = f"{s['presses']:9.0f}{cv:21.3f}{s['force_rmse']:10.2f}{s['force_rmse_percent_full_scale']:15.1f}"
+    kind = f"{s['presses']:9.0f}{cv:21.3f}" if "presses" in s else f"{'log':>9}{'':21}"
+    numbers = f"{kind}{s['force_rmse']:10.2f}{s['force_rmse_percent_full_scale']:15.1f}"
     return name + numbers + ("   SIMULATED" if outcome.simulated else "")
 
 
@@ -268,32 +271,41 @@ def calibrate_one(task: _Task) -> Outcome:
         take_over(task.settings)
         try:
             with _claimed(task.calibration):
-                calibration, skipped = _calibrated(task)
-                skipped &= not _reported(task, calibration)
+                return replace(_done(task), seconds=time.perf_counter() - start)
         except Exception as error:
             reason = _said(error).removeprefix(f"{Path(task.session).name}: ")
             return _failed(task, reason, time.perf_counter() - start)
-    return Outcome(
-        session=task.session,
-        calibration=task.calibration,
-        skipped=skipped,
-        simulated=calibration.simulated,
-        seconds=time.perf_counter() - start,
-        summary=calibration.evaluation.summary(),
-    )
 
 
-def _calibrated(task: _Task) -> tuple[Calibration, bool]:
-    """The calibration of a task, and whether it was there."""
+def _done(task: _Task) -> Outcome:
+    """What became of a task; a session without EIT is a log, which has a curve and no page."""
     with open_session(task.session) as session:
         mark = _digest(session.hash, task.mark)
-        with contextlib.suppress(SessionError):
-            found = load_calibration(task.calibration)
-            if found.provenance.get("batch") == mark:
-                return found, True
-        _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
-        skin, recipe = pickle.loads(task.choices)
-        made = calibrate([session], skin, recipe=recipe)
+        if "eit" not in session.streams:
+            return _fitted_log(task, session, mark)
+        calibration, skipped = _calibrated(task, session, mark)
+    skipped &= not _reported(task, calibration)
+    summary = calibration.evaluation.summary()
+    return Outcome(task.session, task.calibration, "", skipped, calibration.simulated, summary=summary)
+
+
+def _fitted_log(task: _Task, session: Session, mark: str) -> Outcome:
+    outcome = Outcome(task.session, task.calibration, simulated=session.simulated)
+    if summary := log_summary(task.calibration, mark):
+        return replace(outcome, skipped=True, summary=summary)
+    _, recipe = pickle.loads(task.choices)
+    return replace(outcome, summary=fit_log_into(task.calibration, session, recipe, mark))
+
+
+def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
+    """The calibration of a task, and whether it was there."""
+    with contextlib.suppress(SessionError):
+        found = load_calibration(task.calibration)
+        if found.provenance.get("batch") == mark:
+            return found, True
+    _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
+    skin, recipe = pickle.loads(task.choices)
+    made = calibrate([session], skin, recipe=recipe)
     made = replace(made, provenance=made.provenance | {"batch": mark})
     made.save(task.calibration)
     return made, False

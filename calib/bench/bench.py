@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import jaxeit as je
-from jaxeit_bounds import require
+from jaxeit.budget import require
 
 
 class BenchError(ValueError):

@@ -167,8 +167,8 @@ def render_log(name: str, found: SessionFit) -> str:
     )
 
 
-def save_logs(fits: Mapping[str, SessionFit], path: str | Path) -> None:
-    """Write the curves of several logs, whole or not at all."""
+def save_logs(fits: Mapping[str, SessionFit], path: str | Path, **attributes: str | float) -> None:
+    """Write the curves of several logs, whole or not at all; ``attributes`` are kept with them."""
     arrays: dict[str, Any] = {}
     for number, (name, found) in enumerate(fits.items()):
         at = f"logs/{number}/"
@@ -181,4 +181,4 @@ def save_logs(fits: Mapping[str, SessionFit], path: str | Path) -> None:
             at + "covariance": (np.asarray(fitted.covariance), "", "of the parameters"),
             at + "held_out_rmse": (np.array([fit.held_out.rmse]), "N", "on the second half"),
         }
-    write_archive(path, FORMAT, {"logs": len(fits)}, arrays)
+    write_archive(path, FORMAT, {"logs": len(fits), **attributes}, arrays)

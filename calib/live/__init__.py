@@ -4,22 +4,6 @@ A frame passes from the receiving threads (`record`) through `loop` and `engine`
 to every viewer.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from .._lazy import lazy_names
-
-if TYPE_CHECKING:
-    from .engine import Engine
-    from .loop import LiveControl, LiveError, LiveSettings, run_live
-    from .presentation import Presentation, present
-    from .results import FrameResult, TouchEstimates
-
-__getattr__, __all__ = lazy_names(
-    __name__,
-    {
-        "engine": "Engine",
-        "loop": "LiveControl LiveError LiveSettings run_live",
-        "presentation": "Presentation present",
-        "results": "FrameResult TouchEstimates",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

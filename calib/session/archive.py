@@ -17,7 +17,7 @@ import numpy as np
 from h5py import h5g
 from numpy.typing import ArrayLike, DTypeLike
 
-from jaxeit_bounds import OR_RAISE, current_budget
+from jaxeit.budget import OR_RAISE, current_budget
 
 from .chunks import MAX_RANK, GuardedArray
 from .errors import printable, problem

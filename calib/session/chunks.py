@@ -21,7 +21,7 @@ MAX_CHUNK_BYTES = 16 << 20
 MAX_CHUNKS = 1 << 20
 MAX_COMPACT_BYTES = 64 << 10
 MAX_TEXT_BYTES = 4096
-WRITE_AS = "write it chunked with gzip, shuffle and fletcher32"
+WRITE_AS = "write it chunked with gzip, shuffle and fletcher32, or convert the file with `jaxeit import hdf5`"
 ALLOWED = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 
 

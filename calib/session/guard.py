@@ -17,7 +17,8 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5t
 
-from jaxeit_bounds import current_budget, open_regular
+from jaxeit.budget import current_budget
+from jaxeit.files import open_regular
 
 from .errors import SessionError, printable, problem
 
@@ -29,7 +30,7 @@ MAX_MEMBERS = 1024
 DEFLATE_RATIO = 1040
 """Limit of stored over compressed size: one byte of deflate expands to at most 1032 bytes."""
 
-REWRITE = 'write it with h5py.File(..., libver=("v110", "v110"))'
+CONVERT = "convert the file with `jaxeit import hdf5 {} -o session.h5`"
 DAMAGED = "the file is damaged; take another copy, or record it again"
 
 
@@ -102,7 +103,13 @@ def _foreign_kind(head: bytes) -> tuple[str, str]:
     if head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
         return "is a Python pickle, which could run any code", "it is never read; " + sessions
     if head.startswith((b"\x93NUMPY", b"PK\x03\x04")):
-        return "is a NumPy or zip file, not HDF5", sessions
+        return "is a NumPy or zip file, not HDF5", "use `jaxeit import npz` for arrays"
+    if head.startswith(b"MATLAB "):
+        return "is a MATLAB file", "use `jaxeit import mat`"
+    if head.startswith(b"PAR1"):
+        return "is a Parquet file, not HDF5", "use `jaxeit import parquet`"
+    if head.startswith(b"\x89MCAP"):
+        return "is an MCAP file, not HDF5", "use `jaxeit import mcap`"
     if head.startswith(b"CDF"):
         return "is a classic netCDF file, not HDF5", "convert it with `nccopy -k nc4`"
     if head.startswith(b"\x1f\x8b"):
@@ -119,7 +126,7 @@ def _check_superblock(path: Path, head: bytes) -> None:
     version, offsets, lengths, flags = head[8:12]
     if version != 3:
         what = f"is in an older HDF5 layout (superblock {version}) without checksums"
-        raise problem(path, "file", what, REWRITE)
+        raise problem(path, "file", what, CONVERT.format(printable(path.name)))
     base, _, end, _ = struct.unpack("<4Q", head[12:44])
     if (offsets, lengths, base) != (8, 8, 0):
         raise problem(path, "file", "has an unusual HDF5 header", DAMAGED)
@@ -265,7 +272,8 @@ def _attribute_value(node: Node, name: str, attr: h5a.AttrID) -> str | int | flo
         raise node.error(f"attribute {name} holds {size:,} bytes", "keep attributes small")
     if not plain_type(kind) or items < 1 or len(attr.shape) > 1:
         what = f"attribute {name} is {type_kind(kind)}"
-        raise node.error(what, "write one number or one fixed-length text")
+        todo = "write one number or one fixed-length text, or " + CONVERT.format(printable(node.path.name))
+        raise node.error(what, todo)
     value = np.zeros(attr.shape, kind.dtype)
     attr.read(value)
     if kind.get_class() == h5t.STRING:

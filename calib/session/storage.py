@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 
-from jaxeit_bounds import open_regular
+from jaxeit.files import open_regular
 
 from .errors import printable, problem
 from .guard import MAX_ATTRIBUTE_BYTES

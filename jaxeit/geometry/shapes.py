@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxeit_bounds import require
+from ..budget import require
 
 TOLERANCE = 1e-9
 """Points this close to the rim, relative to the domain's diagonal, count as being on it."""

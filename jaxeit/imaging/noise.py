@@ -25,9 +25,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 
-from jaxeit_bounds import require
-
 from .._compile import is_traced, require_known
+from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
 from ..model.discretisation import Model

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxeit_bounds import open_regular, require
-
 from .._compile import require_known
+from ..budget import require
+from ..files import open_regular
 from ..linalg import is_covariance
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem

@@ -14,8 +14,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxeit_bounds import require
-
+from ..budget import require
 from ..geometry.shapes import Domain, Rectangle
 from .footprints import AbstractFootprint, Feature, cycle, neighbours, require_placed
 from .sizes import SizeField, divide_rim, fill, narrow_places, thin

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxeit_bounds import require
-
+from ..budget import require
 from ..geometry.shapes import Domain
 
 STEPS_PER_OCTAVE = 3

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from jaxeit_bounds import require
-
+from ..budget import require
 from ..registry import Registry
 from .discretisation import Model
 from .stiffness import Stiffness, stiffness

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxeit_bounds import require
-
 from .._compile import is_traced
+from ..budget import require
 from ..effects import AbstractCoatEffect, AbstractEffect, chosen
 from ..linalg import AbstractLinearSolver, default_solver
 from ..linalg.base import on_device

@@ -15,9 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
-from jaxeit_bounds import require
-
 from .._compile import verb
+from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model

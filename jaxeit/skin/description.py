@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxeit_bounds import require
-
+from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
 from ..registry import RegistryError

@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from jaxeit_bounds import require
-
+from ..budget import require
 from ..geometry.shapes import Domain
 from ..meshing.elements import Space
 from ..meshing.outlines import ArcFootprint

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from jaxeit_bounds import require
-
+from ..budget import require
 from ..geometry.shapes import Domain
 from ..toml import TomlError, TomlTable
 

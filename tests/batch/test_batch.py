@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 
 import calib
+import calib.batch.logs as batch_logs
 import calib.batch.sessions as batch
 import jaxeit as je
 from calib.batch import cluster
+from calib.calibration.recipe_text import curve_choice
 from calib.cli import main
 from calib.runtime import settings, take_over
 
@@ -272,3 +274,62 @@ def test_a_session_that_kills_its_worker_is_named_and_the_rest_complete(made, bu
     assert [bool(o.reason) for o in outcomes] == [False, True, False, False]
     assert "worker process died" in outcomes[1].reason
     assert sorted(os.listdir(out)) == ["a.h5", "c.h5", "d.h5"]
+
+
+# --- logs without EIT ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """Two logs of force and pressure, and one whose force is missing."""
+    folder, paths = tmp_path / "logs", []
+    folder.mkdir()
+    time = np.arange(0, 20, 0.05)
+    force = 5 * (1 - np.cos(time))
+    for name, slope in (("a", 200.0), ("b", 300.0), ("silent", 100.0)):
+        rows = np.column_stack([time, force, slope * force + np.sin(40 * time)])
+        np.savetxt(folder / "log.csv", rows, delimiter=",")
+        paths.append(folder / f"{name}.h5")
+        stream = "force=1:N" if name != "silent" else "load=1:N"
+        words = ["--time", "0:s", "--stream", stream, "--stream", "pressure=2:Pa"]
+        assert main(["import", "csv", str(folder / "log.csv"), *words, "-o", str(paths[-1])]) == 0
+    return [str(path) for path in paths]
+
+
+def test_logs_without_eit_get_the_curves_that_they_get_singly(logs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(batch, "_in_own_pools", lambda tasks, jobs, note: batch._run(Here(), tasks, note))
+    words = ["calibrate", *logs, "-o", str(tmp_path / "out"), "--jobs", "2", "--json"]
+    capsys.readouterr()
+    assert main(words) == 2
+    said = capsys.readouterr()
+    assert "silent.h5: /streams/force: missing" in said.err
+    told = json.loads(said.out)
+    assert sorted(os.listdir(tmp_path / "out")) == ["a.h5", "b.h5"]
+    for path in logs[:2]:
+        single = tmp_path / "single.h5"
+        assert main(["calibrate", path, "-o", str(single)]) == 0
+        kept = tmp_path / "out" / os.path.basename(path)
+        ours, theirs = (calib.session.read_archive(one, "pressure-force-curves").arrays for one in (kept, single))
+        assert {name: array.tolist() for name, array in ours.items()} == {n: a.tolist() for n, a in theirs.items()}
+        assert told[path]["force_rmse"] == theirs["logs/0/held_out_rmse"][0]
+
+
+def test_a_log_is_done_once_and_shown_in_the_table(logs, tmp_path):
+    first = batch.calibrate_many(logs[:1], tmp_path / "out", executor=Here(), report=True)
+    (again,) = batch.calibrate_many(logs[:1], tmp_path / "out", executor=Here(), report=True)
+    assert again.skipped
+    assert again.summary == first[0].summary
+    (other,) = batch.calibrate_many(
+        logs[:1], tmp_path / "out", executor=Here(), recipe=calib.Recipe(curve=calib.Affine())
+    )
+    assert not other.skipped
+    assert "a.h5" in batch.render_outcomes([again], "out")
+    assert "      log" in batch.render_outcomes([again], "out")
+
+
+def test_auto_lets_all_curves_compete_for_a_log(logs, tmp_path, monkeypatch):
+    tried = []
+    monkeypatch.setattr(batch_logs, "fit_session", lambda session, curves, loss: tried.append(len(curves)))
+    recipe = calib.Recipe(curve=curve_choice("auto"))
+    assert batch.calibrate_many(logs[:1], tmp_path / "out", executor=Here(), recipe=recipe)[0].reason
+    assert tried == [len(calib.fitting.CURVES.shipped)]

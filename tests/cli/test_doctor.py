@@ -6,8 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib.cli import diagnosis as doctor
-from calib.cli import main
+from calib.cli import diagnosis as doctor, main
 from calib.cli.diagnosis import Line, examine
 from calib.record import priority
 from calib.record.priority import PriorityError

@@ -55,7 +55,7 @@ def commands(bundled, calibrated, tmp_path_factory):
     table = np.column_stack([np.arange(200) / 100, np.random.default_rng(0).normal(size=(200, 2))])
     np.savetxt(folder / "log.csv", table, delimiter=",", header="t,f,p", comments="")
     journal(folder / "s.h5.part", both(40))
-    columns = ["--column", "time=t", "--column", "force=f", "--column", "pressure=p"]
+    columns = ["--time", "t:s", "--stream", "force=f:N", "--stream", "pressure=p:Pa"]
     return {
         "simulate": (["simulate", folder / "scene.toml"], "-o", "session.h5"),
         "import": (["import", "csv", folder / "log.csv", *columns], "-o", "session.h5"),

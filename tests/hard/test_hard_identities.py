@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import jaxeit as je
 from calib.presses import find_presses
@@ -19,8 +18,7 @@ from calib.session import SessionFacts, SessionWriter, StreamFacts, open_session
 from jaxeit.model.forward_model import coefficients, transfer
 
 from ..hard_sheet import MESH, paired, sheet_model
-from ..hard_strip import PLACES as STRIP_PLACES
-from ..hard_strip import STRIP, Unchecked, strip_error
+from ..hard_strip import PLACES as STRIP_PLACES, STRIP, Unchecked, strip_error
 from ..helpers import skin_of
 from ..session.test_session import options
 

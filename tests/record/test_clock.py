@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial import ConvexHull
 
 from calib.record.clock import MAX_SEGMENTS, NO_LATENCY, DeviceClock, lower_hull, smallest_latency

@@ -10,8 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from calib.record.wire.decoding import DecoderCounts, DecoderState, decode, decode_lines
 from calib.record.wire.encoding import (

@@ -18,8 +18,7 @@ from calib.fitting.curves import FittedCurve, Linear
 from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.fitting.held_out import Split
 from calib.fitting.selection import Candidate
-from calib.report import document as report
-from calib.report import figures
+from calib.report import document as report, figures
 from calib.report.document import write_report
 from calib.report.figures import ReportError, localisation_figure, png, sensitivity_figure
 from calib.report.force_series import ForceSeries, force_series_figure

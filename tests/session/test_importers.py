@@ -15,9 +15,8 @@ from calib.calibration.logs import fit_session, render_log
 from calib.cli import main
 from calib.fitting.curves import Linear
 from calib.session import SessionError, Status, file_hash, importers, open_session
-from calib.session.importers import ImportReport, add_arguments, import_csv, run
+from calib.session.importers import About, CsvImporter, ImportReport, add_arguments, import_csv, run
 from calib.session.importers.columns import parse_stream, parse_time
-from calib.session.importers.csv_tables import _file_spec
 from calib.session.importers.sentinels import sentinel_warnings
 
 from ..helpers import REAL_DATA
@@ -29,8 +28,8 @@ def load(*words: object, folder: Path, sort: bool = False) -> ImportReport:
     """Import as typed at the command line, into ``folder/s.h5``."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    args = parser.parse_args(["csv", *map(str, words), "-o", str(folder / "s.h5")])
-    return import_csv([_file_spec(g) for g in args.groups], args.output, sort=sort)
+    args = parser.parse_args(["csv", *map(str, words), "-o", str(folder / "s.h5"), *(["--sort"] if sort else [])])
+    return CsvImporter.convert(args, Path(args.output), About())
 
 
 def table(folder: Path, text: str, name: str = "log.csv") -> Path:
@@ -242,7 +241,7 @@ def test_requests_that_cannot_be_met(words: list[str], said: str, tmp_path: Path
     ("content", "said"),
     [
         (b"", "holds no rows"),
-        (b"Once upon a time\nthere was, a, robot\nthat felt nothing, at, all\n", "have a time"),
+        (b"Once upon a time\nthere was, a, robot\nthat felt nothing, at, all\n", "holds no number"),
         (b"0,1,2\n", "only 1 of 1 rows"),
         (bytes(100), "not text"),
         (gzip.compress(b"0,1,2\n1,2,3\n" * 999, mtime=0)[:40], "gzip file is damaged"),
@@ -356,7 +355,7 @@ class LinesImporter(importers.AbstractImporter):
 
 
 def test_a_format_of_another_package_is_known_by_its_entry_point(tmp_path, monkeypatch, capsys):
-    assert list(importers.importers()) == ["csv"]
+    assert list(importers.importers()) == ["csv", "hdf5", "mat", "mcap", "npz", "parquet"]
     point = EntryPoint("lines", f"{__name__}:LinesImporter", "calib.importers")
     monkeypatch.setattr(importers, "entry_points", lambda group: [point] if group == point.group else [])
     importers.importers.cache_clear()
@@ -379,4 +378,4 @@ def test_a_format_of_another_package_is_known_by_its_entry_point(tmp_path, monke
 def test_no_other_format_is_taken(capsys):
     with pytest.raises(SystemExit):
         main(["import", "xlsx", "log.xlsx", "-o", "s.h5"])
-    assert "invalid choice: 'xlsx' (choose from csv)" in capsys.readouterr().err.replace("'csv'", "csv")
+    assert "invalid choice: xlsx (choose from csv, hdf5" in capsys.readouterr().err.replace("'", "")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxeit_bounds import require
+from jaxeit.budget import require
 
 from ..curves.base import AbstractCurve
 from ..curves.fit import fit_curves

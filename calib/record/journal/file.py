@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from jaxeit_bounds import open_regular
+from jaxeit.files import open_regular
 
 from ...session.storage import sync
 

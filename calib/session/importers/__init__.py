@@ -1,35 +1,54 @@
 """Bring recordings made elsewhere into the session format: a class for each format.
 
-A new format is one class derived from `AbstractImporter` in a module of this room, and its import here; another
-package adds one by an entry point of the group ``calib.importers``.
+A new format is one class derived from `AbstractImporter` in a module of `formats`, and its import in the ``__init__``
+there; another package adds one by an entry point of the group ``calib.importers``. A format of tables derives from
+`AbstractTableImporter`, or from `AbstractArrayImporter` where a file holds named arrays: it then has the options of all
+tables.
 """
 
 import argparse
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from importlib.metadata import entry_points
+from inspect import isabstract
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from .arrays import AbstractArrayImporter
 from .base import About, AbstractImporter, add_common_arguments, parse_epoch
 from .columns import FileSpec, StreamSpec
-from .csv_tables import import_csv
+from .formats import CsvImporter, Hdf5Importer, MatImporter, McapImporter, NpzImporter, ParquetImporter, import_csv
 from .reports import FileReport, ImportReport, StreamReport
+from .table_importer import AbstractTableImporter
+from .table_session import import_tables
+from .tables import AbstractTableFile, Table
 
 if TYPE_CHECKING:  # a second to import, and only wanted with --skin
     import jaxeit as je
 
 __all__ = [
     "About",
+    "AbstractArrayImporter",
     "AbstractImporter",
+    "AbstractTableFile",
+    "AbstractTableImporter",
+    "CsvImporter",
     "FileReport",
     "FileSpec",
+    "Hdf5Importer",
     "ImportReport",
+    "MatImporter",
+    "McapImporter",
+    "NpzImporter",
+    "ParquetImporter",
     "StreamReport",
     "StreamSpec",
+    "Table",
     "add_arguments",
     "import_csv",
+    "import_tables",
     "importers",
     "run",
 ]
@@ -41,8 +60,18 @@ def importers() -> dict[str, type[AbstractImporter]]:
 
     They are not in a `jaxeit.registry.Registry`, whose package takes a second to import.
     """
-    shipped = {kind.name: kind for kind in AbstractImporter.__subclasses__() if kind.__module__.startswith(__name__)}
+    kinds = sorted(_formats(AbstractImporter), key=lambda kind: kind.name)
+    shipped = {kind.name: kind for kind in kinds if kind.__module__.startswith(__name__)}
     return {point.name: point.load() for point in entry_points(group="calib.importers")} | shipped
+
+
+def _formats(kind: type) -> Iterator[type[AbstractImporter]]:
+    """The formats among the classes below one."""
+    subclasses: Sequence[type[AbstractImporter]] = kind.__subclasses__()
+    for one in subclasses:
+        if not isabstract(one):
+            yield one
+        yield from _formats(one)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import problem
+from ..errors import SessionError, problem
 from ..units import Unit
 from .tables import Table
 
@@ -26,8 +26,13 @@ class Clock:
     equal: np.ndarray
     sorted: int
 
+    @property
+    def counts_from_1970(self) -> bool:
+        """Whether the clock says when the recording was made."""
+        return float(self.seconds[0]) >= UNIX_TIME_FROM
 
-def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool) -> Clock:
+
+def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool, counted: str = "line") -> Clock:
     """Strictly increasing times; repeated ones are left out, backward ones refused or sorted."""
     seconds = table.values[:, 0] * unit.factor
     rows = np.flatnonzero(np.isfinite(seconds))
@@ -35,7 +40,7 @@ def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool) -> C
     back = np.flatnonzero(np.diff(seconds[rows]) < 0) + 1
     if len(back) and not sort:
         line = table.line[rows[back[0]]]
-        what = f"time goes back at {len(back):,} rows, first at line {line}"
+        what = f"time goes back at {len(back):,} rows, first at {counted} {line}"
         raise problem(path, f"column {column}", what, "check the clock's column, or give --sort")
     if len(back):
         rows = rows[np.argsort(seconds[rows], kind="stable")]
@@ -47,8 +52,39 @@ def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool) -> C
     return Clock(kept, seconds[kept], without, np.sort(rows[repeat]), len(back))
 
 
+def clock_of_rate(path: Path, rows: int, rate_hz: float, start: float) -> Clock:
+    """The clock of a table without one: row k is at ``start + k / rate_hz`` s."""
+    if rows < 2:
+        raise problem(path, "file", f"holds {rows} rows", "give a table of at least two rows")
+    none = np.empty(0, np.int64)
+    return Clock(np.arange(rows), start + np.arange(rows) / rate_hz, none, none, 0)
+
+
+def join_clocks(paths: Sequence[Path], clocks: Sequence[Clock], gap: float | None) -> list[Clock]:
+    """The clocks of files that follow each other as one clock.
+
+    With ``gap`` in s each file begins that long after the end of the one before; without it, the clocks must be one.
+    """
+    joined = [clocks[0]]
+    for path, before, clock in zip(paths[1:], paths, clocks[1:], strict=False):
+        end, first = float(joined[-1].seconds[-1]), float(clock.seconds[0])
+        if gap is not None and clock.counts_from_1970:
+            raise problem(path, "--gap", "the clock counts from 1970 and says the pause itself", "leave --gap out")
+        if gap is None and first <= end:
+            what = f"begins at {first:g} s, and {before.name} ends at {end:g} s"
+            raise problem(path, "clock", what, "give the files in order; for clocks that start anew give --gap SECONDS")
+        shift = 0.0 if gap is None else end + gap - first
+        joined.append(replace(clock, seconds=clock.seconds + shift))
+    return joined
+
+
 def common_start(clocks: Sequence[Clock], epoch: datetime | None) -> tuple[datetime, float, bool]:
     """The epoch, the clock reading in s that belongs to it, and whether it is known."""
+    if len({clock.counts_from_1970 for clock in clocks}) > 1:
+        raise SessionError(
+            "import: one clock counts from 1970 and another from its own start; give --start of the table with a "
+            "stated rate, or import into two sessions"
+        )
     first = min(float(c.seconds[0]) for c in clocks)
     if first >= UNIX_TIME_FROM:
         whole = math.floor(first)
@@ -59,6 +95,7 @@ def common_start(clocks: Sequence[Clock], epoch: datetime | None) -> tuple[datet
 
 
 def nanoseconds(path: Path, clock: Clock, zero: float) -> np.ndarray:
+    """Times in ns since the clock's reading ``zero`` in s; raises `SessionError` where they do not fit int64."""
     times = np.rint((clock.seconds - zero) * 1e9)
     if np.abs(times).max() >= 2.0**62 or (np.diff(times) <= 0).any():
         raise problem(path, "clock", "cannot be kept in nanoseconds", "check the unit of --time")

@@ -1,19 +1,23 @@
-"""Which columns of a table are the clock and the streams, as ``0:ms`` and ``force=4:N`` say."""
+"""Which columns of a table are the clock and the streams, as ``0:ms``, ``force=4:N`` and ``signal=s0-s3:V`` say."""
 
+import csv
 import itertools
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import SessionError, printable
+from ..errors import SessionError, printable, problem
 from ..units import KNOWN_UNITS, UNITS
-
-MAX_COLUMNS = 100_000
-"""More columns in one range are taken for a mistake."""
+from .limits import MAX_COLUMNS
 
 
 @dataclass(frozen=True)
 class StreamSpec:
-    """A stream to make: its name, its columns (numbers or header names), their unit (empty: the header says)."""
+    """A stream to make: its name, its columns (numbers, header names or ranges of names), their unit.
+
+    An empty unit means that the header says it.
+    """
 
     name: str
     columns: tuple[str, ...]
@@ -22,13 +26,34 @@ class StreamSpec:
 
 @dataclass(frozen=True)
 class FileSpec:
-    """A file to read: the clock's column and unit (empty: the header says), streams, numbers that mean missing."""
+    """A file to read, or several of one layout that follow each other.
+
+    | field           | meaning                                                                     | unit |
+    |-----------------|-----------------------------------------------------------------------------|------|
+    | path            | the file                                                                    |      |
+    | time, time_unit | column of the clock and its unit; an empty unit: the header says it         |      |
+    | streams         | what to make of the columns                                                 |      |
+    | missing         | numbers that mean that there is no reading                                  |      |
+    | following       | files of the same layout that continue this one, in order                   |      |
+    | rate_hz         | rate of a table without a clock; ``time`` is empty then                     | Hz   |
+    | start           | time of the first row of a table without a clock                            | s    |
+    | gap             | pause before each following file; None: all files are of one clock          | s    |
+    """
 
     path: Path
     time: str
     time_unit: str
     streams: tuple[StreamSpec, ...]
     missing: tuple[float, ...] = ()
+    following: tuple[Path, ...] = ()
+    rate_hz: float | None = None
+    start: float = 0.0
+    gap: float | None = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files, in order."""
+        return (self.path, *self.following)
 
 
 def parse_time(text: str) -> tuple[str, str]:
@@ -46,9 +71,10 @@ def _column_and_unit(text: str) -> tuple[str, str]:
 
 
 def parse_stream(text: str) -> StreamSpec:
-    """``NAME=COLUMNS:UNIT``, as ``force=4:g`` or ``sensor=1-15:counts``.
+    """``NAME=COLUMNS:UNIT``, as ``force=4:g``, ``sensor=1-15:counts`` or ``signal=s0-s3:V``.
 
-    Without a unit, ``NAME=COLUMNS``, the header must say it. Raises `SessionError`.
+    A header name that holds a comma stands in quotes: ``p="p, left":kPa``. Without a unit, ``NAME=COLUMNS``, the header
+    must say it. Raises `SessionError`.
     """
     name, equals, rest = text.partition("=")
     columns, unit = _column_and_unit(rest)
@@ -57,16 +83,105 @@ def parse_stream(text: str) -> StreamSpec:
         raise SessionError(f"{where}: not NAME=COLUMNS:UNIT; write it as force=4:N")
     if unit and unit not in UNITS:
         raise SessionError(f"{where}: unit {printable(unit)!r} not known; use one of: {KNOWN_UNITS}")
-    parts = tuple(itertools.chain(*(_column_range(c.strip()) for c in columns.split(","))))
-    return StreamSpec(name, parts, unit)
+    try:
+        (cells,) = csv.reader([columns], skipinitialspace=True, strict=True)
+    except (ValueError, csv.Error):
+        raise SessionError(f"{where}: quotes do not match; write it as force=4:N") from None
+    return StreamSpec(name, tuple(itertools.chain(*(_column_range(c.strip()) for c in cells))), unit)
 
 
 def _column_range(text: str) -> list[str]:
-    """``3`` -> 3; ``1-15`` -> 1..15; anything else is a header name."""
+    """``3`` -> 3; ``1-15`` -> 1..15; anything else is a header name or a range of header names."""
     first, dash, last = text.partition("-")
     if not (dash and first.isdecimal() and last.isdecimal()):
         return [text]
+    return [str(i) for i in _numbers_from_to(text, first, last)]
+
+
+def _numbers_from_to(text: str, first: str, last: str) -> range:
     low, high = int(first), int(last)
     if low > high or high - low > MAX_COLUMNS:
-        raise SessionError(f"columns {text}: not a range; write it as 1-15")
-    return [str(i) for i in range(low, high + 1)]
+        raise SessionError(f"columns {printable(text)}: not a range; write it as 1-15")
+    return range(low, high + 1)
+
+
+# --- names in the header -------------------------------------------------------------------------
+
+_NAME_AND_UNIT = re.compile(r"(.*?)\s*(?:[(\[]\s*(.*?)\s*[)\]]|[/_,]\s*(\w+))")
+_NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
+
+
+def name_and_unit(head: str) -> tuple[str, str]:
+    """``load (N)``, ``load [N]``, ``load/N``, ``load_N`` -> load and N; the whole name where no known unit ends it.
+
+    A digit is no unit: ``s_1`` is the name of a channel.
+    """
+    found = _NAME_AND_UNIT.fullmatch(head)
+    unit = (found[2] or found[3]) if found else ""
+    return (found[1], unit) if found and unit in UNITS and unit != "1" else (head, "")
+
+
+def column_indices(path: Path, column: str, header: Sequence[str], columns: int) -> list[int]:
+    """The columns that one text names; raises `SessionError`.
+
+    A text is a header name, in which unit and case may be left out, the name of an array of several columns
+    (``C`` for ``C[0]``, ``C[1]``), a number counted from zero, or a range of header names. A header name goes first.
+    """
+    found = _named(path, column, header)
+    if found is not None:
+        return [found]
+    elements = [i for i, head in enumerate(header) if re.fullmatch(re.escape(column) + r"\[\d+\]", head)]
+    if elements:
+        return elements
+    if column.isdecimal():
+        if int(column) < columns:
+            return [int(column)]
+        what = f"not there; the file has columns 0 to {columns - 1}"
+        raise problem(path, f"column {column}", what, "count columns from zero")
+    names = _range_of_names(path, column, header)
+    if names is not None:
+        return names
+    what = f"not there; header names: {_listed(header) or 'none, it has no header'}"
+    raise problem(path, f"column {column!r}", what, "use one of them, or count from zero")
+
+
+def _listed(header: Sequence[str]) -> str:
+    """Names in the header; those of one array as a range."""
+    groups = itertools.groupby(header, key=lambda head: re.sub(r"\[\d+\]$", "[]", head))
+    ends = [(names[0], names[-1]) for names in (list(group) for _, group in groups)]
+    return ", ".join(first if first == last else f"{first}-{last}" for first, last in ends)
+
+
+def _named(path: Path, column: str, header: Sequence[str]) -> int | None:
+    """The column of this header name, or None. A name that several columns have is refused."""
+    exact = [i for i, head in enumerate(header) if head == column]
+    bare = [i for i, head in enumerate(header) if name_and_unit(head)[0].lower() == column.lower()]
+    found = exact or bare
+    if len(found) > 1:
+        what = f"is the name of columns {', '.join(map(str, found[:8]))}"
+        raise problem(path, f"column {column!r}", what, "give the column's number, counted from zero")
+    return found[0] if found else None
+
+
+def _range_of_names(path: Path, text: str, header: Sequence[str]) -> list[int] | None:
+    """``s0-s3`` -> s0, s1, s2, s3, by number; ``x-z`` -> the columns from x to z, as the header has them."""
+    for dash in (match.start() for match in re.finditer("-", text)):
+        first, last = text[:dash].strip(), text[dash + 1 :].strip()
+        low, high = _NUMBERED.fullmatch(first), _NUMBERED.fullmatch(last)
+        if low and high and (low[1], low[3]) == (high[1], high[3]):
+            numbers = _numbers_from_to(text, low[2], high[2])
+            names = [f"{low[1]}{number:0{len(low[2])}}{low[3]}" for number in numbers]
+            indices = [_named(path, name, header) for name in names]
+            if indices[0] is not None:
+                return _all_there(path, text, names, indices)
+        start, end = _named(path, first, header), _named(path, last, header)
+        if start is not None and end is not None and start <= end:
+            return list(range(start, end + 1))
+    return None
+
+
+def _all_there(path: Path, text: str, names: Sequence[str], indices: Sequence[int | None]) -> list[int]:
+    for name, index in zip(names, indices, strict=True):
+        if index is None:
+            raise problem(path, f"columns {text!r}", f"no column is called {printable(name)}", "name each column")
+    return [index for index in indices if index is not None]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class StreamReport:
-    """What became of one stream; counts are of values, over all its channels."""
+    """What became of one stream; counts are of values, over all its channels and files."""
 
     name: str
     variable: str
@@ -24,7 +24,10 @@ class StreamReport:
 
 @dataclass(frozen=True)
 class FileReport:
-    """What became of one file; ``first_*`` are line numbers counted from 1."""
+    """What became of one file; ``first_*`` are numbers of lines, or of rows in a binary file, as ``counted`` says.
+
+    Streams that several files continue are in the report of the last of these files.
+    """
 
     path: Path
     rows_read: int
@@ -34,6 +37,7 @@ class FileReport:
     first_equal_time: int | None
     rows_sorted: int
     streams: tuple[StreamReport, ...]
+    counted: str = "line"
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class ImportReport:
     epoch: datetime
     epoch_known: bool
     files: tuple[FileReport, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -51,7 +56,7 @@ class ImportReport:
         found = [w for f in self.files for s in f.streams for w in s.warnings]
         if not self.epoch_known:
             found.append("the clock does not say when the recording began; give --epoch if known")
-        return tuple(found)
+        return (*found, *self.notes)
 
     def summary(self) -> str:
         """The report as text, one line per stream, loss and warning."""
@@ -63,11 +68,11 @@ class ImportReport:
 def _file_lines(report: FileReport) -> Iterator[str]:
     yield f"{report.path.name}: {report.rows_read:,} rows"
     if report.rows_without_time:
-        first = report.first_without_time
-        yield f"  {report.rows_without_time:,} rows without a time left out (first: line {first})"
+        first = f"{report.counted} {report.first_without_time}"
+        yield f"  {report.rows_without_time:,} rows without a time left out (first: {first})"
     if report.equal_times:
-        first = report.first_equal_time
-        yield f"  {report.equal_times:,} rows with a repeated time left out (first: line {first})"
+        first = f"{report.counted} {report.first_equal_time}"
+        yield f"  {report.equal_times:,} rows with a repeated time left out (first: {first})"
     if report.rows_sorted:
         yield f"  {report.rows_sorted:,} rows went back in time and were sorted"
     for s in report.streams:
@@ -76,4 +81,4 @@ def _file_lines(report: FileReport) -> Iterator[str]:
         if s.declared_missing:
             yield f"    {s.declared_missing:,} values declared missing"
         if s.not_numbers:
-            yield f"    {s.not_numbers:,} cells are not numbers (first: line {s.first_not_number})"
+            yield f"    {s.not_numbers:,} cells are not numbers (first: {report.counted} {s.first_not_number})"

@@ -1,0 +1,54 @@
+"""Names of `calib` and their modules, from which `__init__.py` imports them on first use."""
+
+from . import (
+    batch as batch,
+    bench as bench,
+    calibration as calibration,
+    check as check,
+    fitting as fitting,
+    live as live,
+    presses as presses,
+    record as record,
+    report as report,
+    session as session,
+)
+from .batch.sessions import calibrate_many as calibrate_many
+from .bench import Bench as Bench, load_bench as load_bench, simulate as simulate
+from .calibration import (
+    Calibration as Calibration,
+    Evaluation as Evaluation,
+    FittedContact as FittedContact,
+    ForceEstimate as ForceEstimate,
+    ImageCentroid as ImageCentroid,
+    Recipe as Recipe,
+    apply as apply,
+    calibrate as calibrate,
+    evaluate as evaluate,
+    force_map as force_map,
+    load_calibration as load_calibration,
+    locate as locate,
+)
+from .check import check_session as check_session
+from .fitting import (
+    Affine as Affine,
+    Bilinear as Bilinear,
+    GaussianProcess as GaussianProcess,
+    Linear as Linear,
+    MonotonePolynomial as MonotonePolynomial,
+    MonotoneSpline as MonotoneSpline,
+    PadEdge as PadEdge,
+    PadEdgeSize as PadEdgeSize,
+    PowerLaw as PowerLaw,
+    RadialBasis as RadialBasis,
+    TensorSpline as TensorSpline,
+    fit_curve as fit_curve,
+    fit_curves as fit_curves,
+)
+from .report.document import write_report as write_report
+from .session import (
+    Session as Session,
+    SessionError as SessionError,
+    SessionWriter as SessionWriter,
+    open_session as open_session,
+)
+from .session.importers import import_csv as import_csv
