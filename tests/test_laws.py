@@ -20,7 +20,8 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "budget", "files", "_compile", "toml", "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
+    "budget", "files", "_compile", "toml",
+    "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "scan", "accuracy",
 ]  # fmt: skip
 BENCH = [
