@@ -19,6 +19,7 @@ from . import (
 )
 from ._compile import bind as bind, compiler_options as compiler_options, reuse_memory as reuse_memory, verb as verb
 from .accuracy import fit_fidelity as fit_fidelity, ladder as ladder
+from .budget import Budget as Budget, BudgetError as BudgetError
 from .contacts import (
     ContactFinder as ContactFinder,
     Contacts as Contacts,

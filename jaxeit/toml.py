@@ -1,7 +1,11 @@
 """TOML files read key by key: errors name the key that is missing, wrong or unknown, and the reason."""
 
+import codecs
 import difflib
 import math
+import os
+import re
+import reprlib
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -9,14 +13,27 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from .budget import current_budget, require
+from .files import open_regular
+
 __all__ = [
     "TomlError",
     "TomlTable",
     "parse_toml",
+    "parse_values",
     "read_text",
 ]
 
+MAX_KEY_PARTS = 16
+"""Parts of one dotted key: the parser's time and memory grow with their square."""
+
+MAX_DEPTH = 32
+"""Arrays and inline tables within each other: the parser calls itself for each."""
+
 T = TypeVar("T")
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 
 
 class TomlError(ValueError):
@@ -26,7 +43,11 @@ class TomlError(ValueError):
 def read_text(path: Path) -> str:
     """The text of a file, or a `TomlError` that names it."""
     try:
-        return path.read_text(encoding="utf-8")
+        with open_regular(path) as file:
+            size, raw = os.fstat(file.fileno()).st_size, file.read(current_budget().text_bytes)
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(raw, final=size <= len(raw))
+        require("text_bytes", size, str(path), TomlError)
+        return text
     except UnicodeDecodeError:
         raise TomlError(f"{path}: is not text; give a TOML file") from None
     except OSError as error:
@@ -41,15 +62,54 @@ def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T], allow_
             text that a session or calibration file holds.
     """
     try:
-        return build(TomlTable(tomllib.loads(text), source, allow_import))
-    except tomllib.TOMLDecodeError as error:
-        raise TomlError(f"{source}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise TomlError(f"{source}: not valid TOML: nested too deeply") from None
+        return build(TomlTable(parse_values(text, source), source, allow_import))
     except TomlError:
         raise
     except ValueError as error:  # an object refused the values it was given
         raise TomlError(f"{source}: {error}") from None
+
+
+def parse_values(text: str, source: str) -> dict[str, Any]:
+    """The values of a TOML text; a `TomlError` that names ``source`` for what is not TOML or too large.
+
+    The limits are checked first, because the parser needs time and memory that grow with the square of a key's parts.
+    """
+    require("text_bytes", len(text), source, TomlError)
+    if reason := _beyond_limits(text):
+        raise TomlError(f"{source}: not valid TOML: {reason}")
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # the parser's own, and Python's of a number of too many digits
+        raise TomlError(f"{source}: not valid TOML: {error}") from None
+    except RecursionError:  # called at the end of a deep stack
+        raise TomlError(f"{source}: not valid TOML: nested too deeply") from None
+
+
+# Texts, comments, and the marks that are counted. A text without its end reaches to the end of its line, so that every
+# character is looked at once.
+_TOKENS = re.compile(
+    r"""(?P<text>"{3}(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5})?|'{3}(?:[^']|'(?!''))*+(?:'{3,5})?"""
+    r"""|"(?:[^"\\\n]|\\[^\n])*+"?|'[^'\n]*+'?)|(?P<comment>\#[^\n]*+)"""
+    r"""|(?P<word>[\w+-]++|[ \t]++)|(?P<dot>\.)|(?P<open>[\[{])|(?P<close>[\]}])|(?P<other>.)""",
+    re.DOTALL,
+)
+
+
+def _beyond_limits(text: str) -> str:
+    """What is nested too deeply in a TOML text, or named by too many parts; empty if nothing is."""
+    depth = dots = 0
+    for token in _TOKENS.finditer(text):
+        kind = token.lastgroup
+        if kind == "dot":
+            dots += 1
+        elif kind not in ("text", "word"):
+            dots = 0
+        depth += (kind == "open") - (kind == "close")
+        if dots >= MAX_KEY_PARTS or depth > MAX_DEPTH:
+            line = text.count("\n", 0, token.start()) + 1
+            what = f"a key of more than {MAX_KEY_PARTS} parts" if dots >= MAX_KEY_PARTS else "nested too deeply"
+            return f"{what} (at line {line})"
+    return ""
 
 
 class TomlTable:
@@ -73,7 +133,7 @@ class TomlTable:
             return default
         value = self._values[key]
         if not kind(value):
-            raise self.error(key, f"is {value!r}; give {meaning}")
+            raise self.error(key, f"is {_SHORT.repr(value)}; give {meaning}")
         return value
 
     def number(self, key: str, meaning: str, default: Any = ..., least: float = 0.0) -> float:
@@ -129,7 +189,7 @@ class TomlTable:
             if key not in self._asked:
                 near = difflib.get_close_matches(key, self._asked, 1)
                 hint = f"did you mean {near[0]!r}?" if near else "known: " + self._known()
-                raise self.error(key, f"unknown key; {hint}")
+                raise self.error(_SHORT.repr(key)[1:-1], f"unknown key; {hint}")
 
     def _known(self) -> str:
         return ", ".join(sorted(self._asked))

@@ -20,7 +20,8 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "_compile", "toml", "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
+    "budget", "files", "_compile", "toml",
+    "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "scan", "accuracy",
 ]  # fmt: skip
 BENCH = [
@@ -58,6 +59,19 @@ def test_imports_run_down_the_list(package, order):
         for used in _imports(path, package):
             if used and used != room:
                 assert order.index(used) < order.index(room), f"{path} imports {used}"
+
+
+def test_files_are_read_and_recorded_without_jax():
+    """The recorder and the readers of files hold the limits of `jaxeit.budget`, and start without JAX."""
+    code = "import sys, calib.session, calib.record.recorder; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_toml_enters_by_one_door():
+    """Parsed without limits, a short text needs time and memory without end."""
+    users = {str(p.relative_to(ROOT)) for n in ("jaxeit", "calib") for p in (ROOT / n).rglob("*.py")
+             if "tomllib" in p.read_text()}  # fmt: skip
+    assert users == {"jaxeit/toml.py"}
 
 
 def test_jaxeit_knows_nothing_of_calib_or_files():

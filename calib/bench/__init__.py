@@ -7,9 +7,10 @@ discretisation error of the simulation (no inverse crime).
 from .bench import Bench, BenchError, Companion, Timing, load_bench, presets
 from .costs import PartCost, measure_costs, render_costs
 from .dataset import grid, simulate_contacts, write_data_set
-from .simulation import simulate
+from .simulation import SIMULATION, simulate
 
 __all__ = [
+    "SIMULATION",
     "Bench",
     "BenchError",
     "Companion",

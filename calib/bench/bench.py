@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import jaxeit as je
+from jaxeit.budget import require
 
 
 class BenchError(ValueError):
@@ -165,6 +166,7 @@ def _sites(table: je.toml.TomlTable, domain: je.geometry.Domain) -> np.ndarray:
     if table.has("sites"):
         return table.array("sites", 2, "[[x, y], ...] in m")
     columns, rows = table.count("columns"), table.count("rows")
+    require("sites", columns * rows, table.where, je.toml.TomlError)
     margin = table.number("margin", "least distance of the tip's centre from the rim, m")
     (x0, y0), (x1, y1) = domain.bounds
     x = np.linspace(x0 + margin, x1 - margin, columns)

@@ -21,6 +21,9 @@ from .streams import AbstractSimulatedStream, SampleBlock, SimulatedStreams, sim
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
+SIMULATION = je.Fidelity(edge_length=0.02)
+"""Finer than that of a calibration, which must not compensate for the error of its own mesh."""
+
 
 def simulate(
     bench: Bench,
@@ -42,7 +45,7 @@ def simulate(
     Raises:
         ValueError: if the scene cannot be discretised or the file not written.
     """
-    fidelity = je.Fidelity(edge_length=0.02) if fidelity is None else fidelity
+    fidelity = SIMULATION if fidelity is None else fidelity
     path = Path(path)
     made = simulated_streams(bench, fidelity)
     store = _BlockStore(path.with_name(path.name + ".part"), _fingerprint(bench, fidelity))

@@ -162,6 +162,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         _shaped(choices, name, (len(skin.pads), *array.shape[1:]), "f")
     curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
     fitted = _fitted(arrays, "pads/", len(skin.pads), kind())
+    _require_possible(arrays)
     located = provenance.get("location", "none") != "none"
     return {
         "skin": skin,
@@ -215,6 +216,33 @@ def _fitted(arrays: Mapping[str, np.ndarray], where: str, pads: int, curve: Abst
 def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray:
     """An array that is used as it is, once it has been looked at."""
     array = arrays[name]
-    if array.shape != shape or array.dtype.kind not in kinds:
+    if array.shape != shape or array.dtype.kind not in kinds or array.dtype == np.float16:
         raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not numbers of shape {shape}")
     return array
+
+
+_NOT_NEGATIVE = (
+    "image/masks",
+    "pads/scale",
+    "pads/residual_rms",
+    "baseline/scale",
+    "location/noise",
+    "location/spread",
+)
+_RANGES = ("pads/pressure_range", "baseline/pressure_range")
+_COVARIANCES = ("pads/covariance", "baseline/covariance", "location/covariance")
+
+
+def _require_possible(arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse numbers that no fit gives: sizes below zero, ranges turned round, covariances that are none."""
+    given = {name: np.asarray(array) for name, array in arrays.items()}
+    for name in filter(given.__contains__, _NOT_NEGATIVE):
+        if (given[name] < 0).any():
+            raise ValueError(f"{name} holds {np.nanmin(given[name]):g}, below zero")
+    for name in filter(given.__contains__, _RANGES):
+        if (given[name][..., 0] > given[name][..., 1]).any():
+            raise ValueError(f"{name} ends below its start")
+    for name in filter(given.__contains__, _COVARIANCES):
+        known = np.isfinite(given[name]).all((-2, -1))  # a fit that failed has none
+        if not je.linalg.is_covariance(given[name][known]):
+            raise ValueError(f"{name} is no covariance: not symmetric, or of a variance below zero")

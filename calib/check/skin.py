@@ -1,6 +1,5 @@
 """Check the skin that a session describes, and the protocol of its scan."""
 
-import tomllib
 from collections.abc import Iterator
 
 import numpy as np
@@ -39,7 +38,7 @@ def _own_skin(session: Session, findings: list[Finding]) -> je.Skin | None:
 
 
 def _differences(text: str, other: str, name: str) -> Iterator[Finding]:
-    a, b = _flat(tomllib.loads(text)), _flat(tomllib.loads(other))
+    a, b = (_flat(je.toml.parse_values(part, name)) for part in (text, other))
     keys = sorted(k for k in a.keys() | b.keys() if a.get(k) != b.get(k))
     if keys:
         what = f"the recorded skin differs from {name} in: {listed(keys)}"

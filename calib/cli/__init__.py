@@ -1,11 +1,15 @@
 """The `jaxeit` command.  Each command is a module of its own, imported when it is called, so that --help is quick."""
 
 import argparse
+import os
+import select
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from .signals import interruption_status, termination_raised
 from .terminal import one_line
 
 COMMANDS = {
@@ -28,15 +32,49 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 for bad input with one line on standard error."""
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
+        with termination_raised():
+            return _run(argv)
+    except (ValueError, OSError, ImportError) as error:
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            return 128 + signal.SIGPIPE  # as a shell reports a program that the signal ended
+        print(f"jaxeit: {one_line(error)}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        print(f"jaxeit: {OUT_OF_MEMORY} ({one_line(error)[:200]})", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as interrupt:
+        print(f"jaxeit: {str(interrupt) or 'interrupted'}; nothing was written", file=sys.stderr)
+        return interruption_status(interrupt)
+
+
+OUT_OF_MEMORY = "this machine has too little memory for it; use less data, a coarser fidelity or fewer pixels"
+
+
+def _run(argv: list[str]) -> int:
+    """The status of one command, once what it printed has been written."""
+    try:
         args = _parser(argv).parse_args(argv)
         status: int = args.command(args)
         return status
-    except (ValueError, OSError, ImportError) as error:
-        print(f"jaxeit: {one_line(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("jaxeit: interrupted; nothing was written", file=sys.stderr)
-        return 130
+    finally:
+        sys.stdout.flush()
+
+
+def _nobody_reads() -> bool:
+    """Whether standard output is a pipe that its reader has closed; what is left in its buffer is then dropped."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)  # a closed pipe is reported without being asked for
+    if not any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether an error is Python's or JAX's way to say that memory could not be allocated."""
+    return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error)
 
 
 def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:

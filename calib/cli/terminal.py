@@ -5,7 +5,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import jaxeit as je
+
+LONG_NODES = 5000
+"""Nodes of a mesh that take about 10 s from the skin to the first voltages, compilation included."""
 
 
 def one_line(error: Exception) -> str:
@@ -49,6 +55,16 @@ def status_line() -> Iterator[Callable[[str], None]]:
         yield lambda line: print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
     finally:
         print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+def announce_model(skin: "je.Skin", fidelity: "je.Fidelity") -> None:
+    """Say on standard error what a command begins to compute, if that takes longer than about 10 s."""
+    import jaxeit as je
+
+    nodes = je.model.expected_mesh_nodes(skin, fidelity)
+    if nodes > LONG_NODES:
+        sizes = f"{len(skin.electrodes)} electrodes, {skin.protocol.readings:,} readings, about {nodes:,} mesh nodes"
+        print(f"jaxeit: {skin.name}: {sizes}: this takes a while", file=sys.stderr, flush=True)
 
 
 def file_size(path: str) -> int:

@@ -50,8 +50,17 @@ class ArrayStream:
 
 
 def recording_end(streams: Iterable[ReadableStream]) -> int:
-    """Earliest end of the streams in ns. A stream ends one ns after its last sample, since windows are half open."""
-    return min(int(stream.time[-1]) + 1 for stream in streams)
+    """Earliest end of the streams in ns. A stream ends one ns after its last sample, since windows are half open.
+
+    Raises:
+        PressError: without streams, or if one of them holds no sample.
+    """
+    last = {stream.name: stream.time[-1:] for stream in streams}
+    empty = [name for name, time in last.items() if not len(time)]
+    if empty or not last:
+        where = f"/streams/{empty[0]}" if empty else "/streams"
+        raise PressError(f"{where}: no samples, so that no press can be cut out; record again")
+    return min(int(time[0]) + 1 for time in last.values())
 
 
 def index_ranges(time: np.ndarray, windows: np.ndarray) -> np.ndarray:

@@ -17,6 +17,8 @@ import numpy as np
 from h5py import h5g
 from numpy.typing import ArrayLike, DTypeLike
 
+from jaxeit.budget import OR_RAISE, current_budget
+
 from .chunks import MAX_RANK, GuardedArray
 from .errors import printable, problem
 from .guard import Node, open_guarded, root_node, translated
@@ -37,7 +39,6 @@ from .tables import FORMAT
 ARCHIVE_VERSION = "1.0"
 MAX_DEPTH = 4
 MAX_ARRAYS = 4096
-MAX_READ_BYTES = 2 << 30
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 DIMENSION = re.compile(r"dim_\d+[a-d]?")
 OWN_ATTRIBUTES = {"format", "format_version", "Conventions", "complete"}
@@ -77,13 +78,13 @@ def write_archive(
 def read_archive(path: str | os.PathLike[str], format: str) -> Archive:
     """Read a whole result file of the given ``format``; raises `SessionError`.
 
-    Files with more than 2 GiB of arrays are refused: read them in slices with `open_archive`.
+    Files whose arrays are more bytes than the budget allows at once are refused: read them in slices with
+    `open_archive`.
     """
     with open_archive(path, format) as reader:
         total = sum(array.nbytes for array in reader.arrays.values())
-        if total > MAX_READ_BYTES:
-            what = f"holds {total:,} bytes"
-            raise problem(reader.path, "file", what, "read it in slices with open_archive")
+        if beyond := current_budget().excess("array_bytes", total):
+            raise problem(reader.path, "file", beyond[0], f"read it in slices with open_archive, {OR_RAISE}")
         arrays = {name: array.read() for name, array in reader.arrays.items()}
         units = {name: array.units for name, array in reader.arrays.items()}
         long_names = {name: array.long_name for name, array in reader.arrays.items()}

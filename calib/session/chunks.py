@@ -42,8 +42,17 @@ class GuardedArray:
 
     def __post_init__(self) -> None:
         with translated(self.node.path, self.node.where):
+            plist = self.node.id.get_create_plist()
+            self._check_storage(plist)
             self._check_type()
-            self._check_layout(self.node.id.get_create_plist())
+            self._check_layout(plist)
+
+    def _check_storage(self, plist: h5p.PropDCID) -> None:
+        """Refuse data in other files, before the library opens these to find the shape of a virtual dataset."""
+        if plist.get_layout() == h5d.VIRTUAL:
+            raise self.node.error("is a virtual dataset, which reads other files", WRITE_AS)
+        if plist.get_external_count():
+            raise self.node.error("has external storage, which reads other files", WRITE_AS)
 
     def _check_type(self) -> None:
         node, kind = self.node, self.node.id.get_type()
@@ -54,19 +63,20 @@ class GuardedArray:
         self.shape, self.dtype = node.id.shape, np.dtype(kind.dtype.str)
         if self.shape is None or len(self.shape) > MAX_RANK:
             raise node.error("has no shape or too many dimensions", f"use at most {MAX_RANK}")
-        node.budget.claim(node.where, self.nbytes)
+        node.claims.add(node.where, self.nbytes)
 
     @property
     def nbytes(self) -> int:
         """Logical size in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
+    @property
+    def row_bytes(self) -> int:
+        """Size of one row in bytes."""
+        return math.prod(self.shape[1:]) * self.dtype.itemsize
+
     def _check_layout(self, plist: h5p.PropDCID) -> None:
         layout = plist.get_layout()
-        if layout == h5d.VIRTUAL:
-            raise self.node.error("is a virtual dataset, which reads other files", WRITE_AS)
-        if plist.get_external_count():
-            raise self.node.error("has external storage, which reads other files", WRITE_AS)
         if layout == h5d.COMPACT and self.nbytes <= MAX_COMPACT_BYTES:
             self.chunk = self.shape
         elif layout == h5d.CHUNKED:
@@ -96,7 +106,12 @@ class GuardedArray:
             raise self.node.error(f"{expected - stored:,} of {expected:,} chunks missing", DAMAGED)
 
     def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows ``start:stop`` (all by default) as stored; a scalar if the dataset is one."""
+        """Rows ``start:stop`` (all by default) as stored; a scalar if the dataset is one.
+
+        `SessionError` if they are more bytes than the budget allows at once.
+        """
+        rows = len(range(*slice(start, stop).indices(self.shape[0]))) if self.shape else 1
+        self.node.require("array_bytes", rows * self.row_bytes)
         with translated(self.node.path, self.node.where):
             if not self.shape or self.node.id.get_create_plist().get_layout() == h5d.COMPACT:
                 return self._read_compact()[slice(start, stop) if self.shape else ...]

@@ -8,7 +8,6 @@ bounded numbers of members and attributes. Values are plain numbers and fixed-le
 
 import contextlib
 import os
-import stat
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,10 +17,12 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5t
 
+from jaxeit.budget import current_budget
+from jaxeit.files import open_regular
+
 from .errors import SessionError, printable, problem
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-MAX_LOGICAL_BYTES = 64 << 30
 MAX_ATTRIBUTES = 256
 MAX_ATTRIBUTE_BYTES = 256 << 10
 MAX_ATTRIBUTE_ITEMS = 64
@@ -34,16 +35,15 @@ DAMAGED = "the file is damaged; take another copy, or record it again"
 
 
 @dataclass
-class Budget:
-    """Limit of the bytes that the arrays of one file may claim together, and the bytes claimed so far."""
+class Claims:
+    """Bytes that the arrays of one file claim together, as far as they have been looked at."""
 
     path: Path
-    limit: int = MAX_LOGICAL_BYTES
     claimed: int = 0
     seen: set[str] = field(default_factory=set)
 
-    def claim(self, where: str, size: int) -> None:
-        """Count the `size` bytes of the array `where`, once for each array; `SessionError` beyond the limit."""
+    def add(self, where: str, size: int) -> None:
+        """Count the `size` bytes of the array `where`, once for each array; `SessionError` beyond the budget."""
         if where in self.seen:
             return
         self.seen.add(where)
@@ -52,9 +52,13 @@ class Budget:
         if size > plausible:
             what = f"claims {size:,} bytes, more than a file of this size can hold"
             raise problem(self.path, where, what, DAMAGED)
-        if self.claimed > self.limit:
-            what = f"arrays claim {self.claimed:,} bytes, the limit is {self.limit:,}"
-            raise problem(self.path, where, what, "split the recording into shorter sessions")
+        require_within(self.path, where, "file_bytes", self.claimed)
+
+
+def require_within(path: Path, where: str, limit: str, asked: float) -> None:
+    """Raise `SessionError` if more is asked for than the budget's limit of that name allows."""
+    if beyond := current_budget().excess(limit, asked):
+        raise problem(path, where, *beyond)
 
 
 @contextlib.contextmanager
@@ -83,17 +87,14 @@ def check_file(path: Path) -> None:
 
 def _first_bytes(path: Path) -> bytes:
     try:
-        mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
-            raise problem(path, "file", "is a folder", "name the .h5 file in it")
-        if not stat.S_ISREG(mode):
-            raise problem(path, "file", "is not a regular file", "name a .h5 file")
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             return stream.read(512)
+    except IsADirectoryError:
+        raise problem(path, "file", "is a folder", "name the .h5 file in it") from None
     except FileNotFoundError:
         raise problem(path, "file", "does not exist", "check the name and the folder") from None
     except OSError as error:
-        raise problem(path, "file", f"cannot be read ({error.strerror})", "check access") from error
+        raise problem(path, "file", f"cannot be read ({error.strerror})", "check the name and access") from error
 
 
 def _foreign_kind(head: bytes) -> tuple[str, str]:
@@ -151,15 +152,22 @@ class Node:
     path: Path
     where: str
     id: h5g.GroupID | h5d.DatasetID
-    budget: Budget
+    claims: Claims
 
     def error(self, what: str, todo: str) -> Exception:
         """A `SessionError` about this node."""
         return problem(self.path, self.where, what, todo)
 
+    def require(self, limit: str, asked: float) -> None:
+        """Raise `SessionError` if more is asked for than the budget's limit of that name allows."""
+        require_within(self.path, self.where, limit, asked)
+
     def child(self, name: str) -> "Node | None":
-        """The member `name`, or None. A link to elsewhere is refused."""
+        """The member `name`, or None. A name that is a path, and a link to elsewhere, are refused."""
         where = f"{self.where.rstrip('/')}/{name}"
+        if not is_member_name(name):
+            # The library takes names for paths, and would follow any link on the way.
+            raise self.error(f"names the member {printable(name)!r}, which is a path", "give the name of one member")
         with translated(self.path, where):
             if not self.id.links.exists(name.encode()):
                 return None
@@ -170,7 +178,7 @@ class Node:
             opened = h5o.open(self.id, name.encode())
         if not isinstance(opened, h5g.GroupID | h5d.DatasetID):
             raise problem(self.path, where, "is neither group nor dataset", DAMAGED)
-        return Node(self.path, where, opened, self.budget)
+        return Node(self.path, where, opened, self.claims)
 
     def group(self, name: str) -> "Node | None":
         """The member `name` as a group, or None."""
@@ -245,6 +253,11 @@ class Node:
         return value
 
 
+def is_member_name(name: str) -> bool:
+    """Whether a name is that of one member of a group, and no path: HDF5 ends a name at a zero byte."""
+    return name not in ("", ".") and not {"/", "\0"} & set(name)
+
+
 def _link_kind(kind: int) -> str:
     names = {h5l.TYPE_SOFT: "a soft link", h5l.TYPE_EXTERNAL: "an external link"}
     return names.get(kind, "a user-defined link")
@@ -293,6 +306,6 @@ def type_kind(kind: h5t.TypeID) -> str:
 
 
 def root_node(file: h5py.File, path: Path) -> Node:
-    """The root group of an opened file as a `Node` with a fresh `Budget`."""
+    """The root group of an opened file as a `Node` with fresh `Claims`."""
     with translated(path, "file"):
-        return Node(path, "/", h5g.open(file.id, b"/"), Budget(path))
+        return Node(path, "/", h5g.open(file.id, b"/"), Claims(path))

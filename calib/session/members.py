@@ -7,7 +7,6 @@ from .errors import printable, problem
 from .guard import Node, translated
 from .units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, Unit
 
-MAX_TABLE_ROWS = 1 << 20
 SCHEMA = "see data/schema/README.md"
 
 
@@ -25,9 +24,10 @@ def small_array(node: Node, shape: tuple[int | None, ...], kinds: str) -> np.nda
     fits = len(array.shape) == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )
-    if not fits or array.dtype.kind not in kinds or (array.shape or (1,))[0] > MAX_TABLE_ROWS:
+    if not fits or array.dtype.kind not in kinds:
         want = "(" + ", ".join("rows" if n is None else str(n) for n in shape) + ")"
         raise node.error(f"is {array.dtype} of shape {array.shape}", f"write shape {want}; {SCHEMA}")
+    node.require("table_rows", (array.shape or (1,))[0])
     return array.read()
 
 

@@ -20,6 +20,8 @@ import h5py
 import numpy as np
 from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 
+from jaxeit.files import open_regular
+
 from .errors import printable, problem
 from .guard import MAX_ATTRIBUTE_BYTES
 
@@ -33,7 +35,7 @@ AttributeValue = str | bool | int | float | Sequence[str]
 def file_hash(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file as hexadecimal digits. The file is read in bounded pieces."""
     digest = hashlib.sha256()
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         while piece := stream.read(1 << 20):
             digest.update(piece)
     return digest.hexdigest()

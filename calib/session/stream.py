@@ -10,7 +10,11 @@ from .guard import Node
 from .members import declared_unit, required
 from .tables import STREAM_EXTRAS
 
-MAX_CHANNELS = 100_000
+LARGEST_VALUE = 1e18
+"""In SI units. What is larger was not measured; its square would overflow where float32 is computed with."""
+
+TIME_BLOCK = 1 << 20
+"""Time stamps that are read and checked at once."""
 
 
 class Stream:
@@ -54,8 +58,9 @@ class Stream:
             raise values.node.error(what, "write numbers (time, channel)")
         self.channels = values.shape[1] if len(values.shape) == 2 else 1
         self.shape = (values.shape[0], self.channels)
-        if not 1 <= self.channels <= MAX_CHANNELS:
-            raise values.node.error(f"has {self.channels:,} channels", "give at least one")
+        if self.channels < 1:
+            raise values.node.error("has no channels", "give at least one")
+        values.node.require("channels", self.channels)
         self._check_rows("time", time)
 
     def _check_rows(self, name: str, array: GuardedArray) -> None:
@@ -72,18 +77,27 @@ class Stream:
     @functools.cached_property
     def time(self) -> np.ndarray:
         """Time stamps (n,) int64 ns since the session's epoch, checked to be strictly increasing."""
-        times = self._time.read().astype(np.int64)
-        # A difference of damaged times could overflow, hence a comparison.
-        bad = times[1:] <= times[:-1]
-        if bad.any():
-            row = int(np.argmax(bad)) + 1
-            what = f"does not increase at row {row} ({times[row - 1]} then {times[row]})"
-            raise self._time.node.error(what, "sort the rows and drop equal times")
+        self._time.node.require("array_bytes", 8 * len(self))
+        times = np.empty(len(self), np.int64)
+        for start in range(0, len(self), TIME_BLOCK):  # a file of zeros is refused after its first block
+            stop = min(start + TIME_BLOCK, len(self))
+            times[start:stop] = self._time.read(start, stop)
+            self._require_increase(times, max(start - 1, 0), stop)
         times.setflags(write=False)
         return times
 
+    def _require_increase(self, times: np.ndarray, start: int, stop: int) -> None:
+        # A difference of damaged times could overflow, hence a comparison.
+        bad = times[start + 1 : stop] <= times[start : stop - 1]
+        if bad.any():
+            row = start + int(np.argmax(bad)) + 1
+            what = f"does not increase at row {row} ({times[row - 1]} then {times[row]})"
+            raise self._time.node.error(what, "sort the rows and drop equal times")
+
     def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Samples ``start:stop`` as float64 (n, channels) in SI; missing values are NaN."""
+        """Samples ``start:stop`` as float64 (n, channels) in SI; missing values, and those above 1e18, are NaN."""
+        rows = len(range(*slice(start, stop).indices(len(self))))
+        self._values.node.require("array_bytes", 8 * rows * self.channels)
         raw = self._values.read(start, stop).reshape(-1, self.channels)
         values = raw.astype(np.float64)
         if self._fill is not None and not np.isnan(self._fill):
@@ -94,7 +108,7 @@ class Stream:
             # In place, and only if necessary, because a long session spends most of its time here.
             values = np.multiply(values, scale, out=values) if scale != 1.0 else values
             values = np.add(values, shift, out=values) if shift != 0.0 else values
-        values[np.isinf(values)] = np.nan
+        values[np.abs(values) > LARGEST_VALUE] = np.nan
         return values
 
     def blocks(self, max_bytes: int = 32 << 20) -> Iterator[tuple[int, int, np.ndarray]]:

@@ -444,9 +444,11 @@ def _protocol(
     if array.min() < 0 or array.max() > np.iinfo("i2").max:
         raise problem(path, "pattern", "names impossible electrodes", "count electrodes from 0")
     found: dict[str, Any] = {"pattern": array.astype("i2")}
-    for name, value in (("current", current), ("frequency", frequency)):
+    for name, value, least in (("current", current, np.nextafter(0, 1)), ("frequency", frequency, 0.0)):
         if value is not None:
             found[name] = float(value)
+            if not least <= found[name] < np.inf:
+                raise problem(path, name, f"is {value}", "give a current above zero, a frequency of zero or more")
     if offset is not None:
         found["offset"] = np.asarray(offset, np.float64)
         if found["offset"].shape != (len(array),) or not np.isfinite(found["offset"]).all():

@@ -5,14 +5,20 @@ measured by the arc length s, counter-clockwise from an origin that each class s
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..budget import require
+
 TOLERANCE = 1e-9
 """Points this close to the rim, relative to the domain's diagonal, count as being on it."""
+
+BLOCK = 1 << 20
+"""Pairs of a point and a side, or of two sides, that are compared at once."""
 
 
 class Domain(ABC):
@@ -113,7 +119,9 @@ class _Polygonal(Domain):
         return np.asarray(self.corner_points[side] + along * vectors[side])
 
     def boundary_coordinate(self, points: ArrayLike) -> np.ndarray:
-        points = as_points(points)
+        return _by_blocks(self._nearest_coordinate, as_points(points), len(self.corner_points))
+
+    def _nearest_coordinate(self, points: np.ndarray) -> np.ndarray:
         along, squared = self._on_sides(points)
         side = np.argmin(squared, axis=1)
         _, lengths, starts = self._sides
@@ -121,7 +129,11 @@ class _Polygonal(Domain):
         return np.where(s >= self.perimeter, 0.0, s)
 
     def clearance(self, s: ArrayLike) -> np.ndarray:
-        s, count = np.mod(np.asarray(s, float), self.perimeter), len(self.corner_points)
+        around = np.mod(np.asarray(s, float), self.perimeter)
+        return _by_blocks(self._distance_across, around, len(self.corner_points))
+
+    def _distance_across(self, s: np.ndarray) -> np.ndarray:
+        count = len(self.corner_points)
         squared = self._on_sides(self.boundary_point(s))[1]
         own = np.clip(np.searchsorted(self._sides[2], s, side="right") - 1, 0, count - 1)
         apart = np.mod(np.arange(count) - own[:, None], count)
@@ -136,6 +148,9 @@ class _Polygonal(Domain):
         return along, ((offset - along[..., None] * vectors) ** 2).sum(-1)
 
     def _inside(self, points: np.ndarray) -> np.ndarray:
+        return _by_blocks(self._crosses_oddly, points, len(self.corner_points))
+
+    def _crosses_oddly(self, points: np.ndarray) -> np.ndarray:
         """Even-odd rule: a point is inside if a ray to the right crosses the rim an odd number of
         times."""
         (vectors, _, _), start = self._sides, self.corner_points
@@ -280,6 +295,14 @@ def as_points(points: ArrayLike) -> np.ndarray:
     return array
 
 
+def _by_blocks(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray, sides: int) -> np.ndarray:
+    """``function`` of values (n, ...), each compared with so many sides, in blocks of bounded memory; (n,)."""
+    rows = max(1, BLOCK // sides)
+    if len(values) <= rows:
+        return function(values)
+    return np.concatenate([function(values[start : start + rows]) for start in range(0, len(values), rows)])
+
+
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """z component of the cross product of plane vectors (..., 2); NumPy >= 2.5 has no such one."""
     product: np.ndarray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -304,6 +327,7 @@ def _require_polygon(points: np.ndarray) -> None:
     if not np.all(np.isfinite(points)):
         row = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
         raise ValueError(f"Polygon: vertex {row} is {points[row]}; give finite metres")
+    require("corners", len(points), "Polygon")
     _require_simple(points)
 
 
@@ -327,11 +351,25 @@ def _require_simple(points: np.ndarray) -> None:
 
 def _meeting_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     n = len(points)
-    first, second = np.triu_indices(n, 1)
+    first, second = _close_sides(points, tolerance)
     distance = _segment_distance(points[first], points[(first + 1) % n], points[second], points[(second + 1) % n])
     neighbours = (second == first + 1) | ((first == 0) & (second == n - 1))
     meet = np.where(neighbours, _folds_back(points, first, second), distance <= tolerance)
     return first[meet], second[meet]
+
+
+def _close_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of sides, the lower number first, whose bounding boxes meet."""
+    n, ends = len(points), np.stack([points, np.roll(points, -1, axis=0)])
+    low, high = ends.min(0) - tolerance, ends.max(0) + tolerance
+    rows = max(1, BLOCK // n)
+    found = []
+    for start in range(0, n, rows):
+        part = slice(start, start + rows)
+        meets = ((low[part, None] <= high) & (low <= high[part, None])).all(-1)
+        found.append(np.argwhere(np.triu(meets, start + 1)) + np.array([start, 0]))
+    first, second = np.concatenate(found).T
+    return first, second
 
 
 def _folds_back(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 
 from .._compile import is_traced, require_known
+from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
 from ..model.discretisation import Model
@@ -94,6 +95,7 @@ def pairs_of(pattern: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def whitened(pattern: np.ndarray, current: Any, weight: Any, channels: np.ndarray, dtype: np.dtype) -> "Whitened":
     """The pair sums of a protocol, from its pattern (readings, 4); in NumPy unless JAX traces current or weight."""
     electrodes, pairs = pairs_of(pattern)
+    require("array_bytes", 8 * len(electrodes) ** 2, "prepare: covariance of the pairs of electrodes")
     lines, sign = lines_of(pairs, len(electrodes))
     arrays = {
         "pairs": pairs.astype(np.int32),

@@ -19,6 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compile import require_known
+from ..budget import require
+from ..files import open_regular
+from ..linalg import is_covariance
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem
 from .noise import Whitening, lines_of
@@ -128,6 +131,7 @@ def from_numbers(
         array = np.asarray(numbers[name])
         if ((array < 0) | (array >= count)).any():
             raise StorageError(f"{name}: must count the {count} {what} from 0")
+    _require_possible({name: np.asarray(numbers[name]) for name in names})
     predict = jnp.asarray(numbers["predict"])
     whitening, picture = _whitening(numbers, sizes["k"], predict.dtype), _picture(numbers, shape, extent)
     about = Provenance(provenance or {})
@@ -197,7 +201,7 @@ def _sizes(numbers: Mapping[str, np.ndarray]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for name, given in numbers.items():
         dimensions, array = NUMBERS[name][0], np.asarray(given)
-        if array.dtype.kind not in _KINDS.get(name, "f"):
+        if array.dtype.kind not in _KINDS.get(name, "f") or array.dtype == np.float16:
             raise StorageError(f"{name}: is of type {array.dtype}; it must be {_WORDS[_KINDS.get(name, 'f')]}")
         words = dimensions.replace("*", "readings" if array.ndim == 2 else "").split()
         if len(words) != array.ndim:
@@ -211,6 +215,21 @@ def _sizes(numbers: Mapping[str, np.ndarray]) -> dict[str, int]:
         if not np.isfinite(array).all() and name != "variance":
             raise StorageError(f"{name}: holds values that are not finite")
     return sizes
+
+
+_NOT_NEGATIVE = ("areas", "edge_length", "variance")
+_POSITIVE = ("current", "count", "hyperparameter")
+
+
+def _require_possible(numbers: Mapping[str, np.ndarray]) -> None:
+    """Refuse numbers that no reconstructor has: areas below zero, a current of zero, noise without a covariance."""
+    for name, array in numbers.items():
+        if (name in _NOT_NEGATIVE and not (array >= 0).all()) or (name in _POSITIVE and not (array > 0).all()):
+            least = "zero or more" if name in _NOT_NEGATIVE else "above zero"
+            raise StorageError(f"{name}: holds {array.min():g}; it must be {least}")
+    weight = numbers["weight"]
+    if not (is_covariance(weight) if weight.ndim == 2 else (weight >= 0).all()):
+        raise StorageError("weight: is not the inverse of a variance or of a covariance matrix")
 
 
 def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
@@ -268,10 +287,11 @@ _DAMAGE = (
 
 def _read_numbers(path: str | Path) -> dict[str, np.ndarray]:
     """The arrays of a .npz; none is taken to be larger than the file that holds it."""
-    with zipfile.ZipFile(path) as file:
+    with open_regular(path) as raw, zipfile.ZipFile(raw) as file:
         for member in file.infolist():
             if member.compress_type != zipfile.ZIP_STORED:
                 raise StorageError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
+        require("array_bytes", sum(member.file_size for member in file.infolist()), "numbers", StorageError)
         return {m.filename.removesuffix(".npy"): _read_array(file, m) for m in file.infolist()}
 
 

@@ -3,6 +3,7 @@
 from ..registry import Registry
 from .base import AbstractLinearSolver, AbstractPlan, PatternError, SparsityPattern, inverse_columns, matvec, solve_spd
 from .conjugate_gradient import ConjugateGradient, Single
+from .covariance import is_covariance
 from .dense import Dense
 from .nested_dissection import NestedDissection
 
@@ -18,6 +19,7 @@ __all__ = [
     "SparsityPattern",
     "default_solver",
     "inverse_columns",
+    "is_covariance",
     "matvec",
     "solve_spd",
 ]

@@ -14,14 +14,12 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..budget import require
 from ..geometry.shapes import Domain, Rectangle
 from .footprints import AbstractFootprint, Feature, cycle, neighbours, require_placed
 from .sizes import SizeField, divide_rim, fill, narrow_places, thin
 from .smoothing import Problem, missing_edges, relax
 from .triangles import Mesh, MeshError, place
-
-MAX_NODES = 2_000_000
-"""A mesh that would be larger is taken for a mistake in units."""
 
 START_SPACING = 0.72
 """Least distance of the nodes to start from, over the wanted edge length."""
@@ -56,6 +54,8 @@ def triangulate(
     their place in ``footprints``, and MeshError if the mesh reached does not pass `Mesh.check`.
     """
     fine = _lengths(domain, edge_length, growth, electrode_edge)
+    nodes = expected_nodes(domain, footprints, edge_length, growth, fine)
+    require("mesh_nodes", nodes, f"triangulate: edge_length {edge_length:.3g} m")
     require_placed(domain, footprints)
     footprints = [
         footprint.subdivided(domain, near, edge_length, growth - 1)
@@ -69,6 +69,33 @@ def triangulate(
     points, triangles = relax(problem, thin(free, problem.fixed, START_SPACING * size(free)))
     _require_followed(problem, triangles)
     return Mesh(points, triangles).check()
+
+
+def expected_nodes(
+    domain: Domain,
+    footprints: Sequence[AbstractFootprint],
+    edge_length: float,
+    growth: float,
+    electrode_edge: float | None = None,
+) -> float:
+    """About how many nodes `triangulate` will make, within a fifth where electrodes are spread over the domain.
+
+    The integral of the nodes per area, ``1 / (sqrt(3)/2 h^2)``, over the sheet. Around a feature of radius r the edges
+    grow as ``h = s + k d`` with the distance d, as far as the next feature. No edge is longer than the sheet is wide.
+    """
+    width = 2 * domain.area / domain.perimeter
+    longest, slope = min(edge_length, domain.perimeter / 16, width), growth - 1
+    shortest = edge_length / 4 if electrode_edge is None else electrode_edge
+    own = sum(len(footprint.nodes(domain)) for footprint in footprints)
+    features = [feature for footprint in footprints for feature in footprint.features(domain, longest, shortest)]
+    radius = np.array([feature.radius for feature in features])
+    size = np.minimum([feature.size for feature in features], longest)
+    room = np.maximum(np.sqrt(domain.area / (np.pi * max(1, len(features)))) - radius, 0)
+    away = np.minimum((longest - size) / slope, room)
+    end = size + slope * away
+    graded = ((radius - size / slope) * (1 / size - 1 / end) + np.log(end / size) / slope) / slope
+    even = (radius * away + away**2 / 2) / longest**2
+    return float(own + (domain.area / longest**2 + 2 * np.pi * (graded - even).sum()) / np.sqrt(0.75))
 
 
 def _require_followed(problem: Problem, triangles: np.ndarray) -> None:
@@ -89,12 +116,6 @@ def _lengths(domain: Domain, edge_length: float, growth: float, edge: float | No
             raise ValueError(f"triangulate: {name} is {value}; give a positive length in metres")
     if not 1 < growth <= 2:
         raise ValueError(f"triangulate: growth is {growth}; give a ratio above 1 and at most 2")
-    nodes = domain.area / (np.sqrt(0.75) * edge_length**2)
-    if nodes > MAX_NODES:
-        raise ValueError(
-            f"triangulate: edge_length {edge_length} m makes about {nodes:.1e} nodes, above the "
-            f"limit of {MAX_NODES}; is it in metres?"
-        )
     return min(fine, edge_length)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..budget import require
 from ..geometry.shapes import Domain
 
 STEPS_PER_OCTAVE = 3
@@ -107,6 +108,7 @@ def _divide(domain: Domain, start: float, stop: float, size: SizeField, samples:
     edges_to = np.concatenate([[0.0], np.cumsum(steps)])
     # A touch of slack: 1.3 edges' worth is one edge, not two.
     count = max(1, int(np.ceil(edges_to[-1] - 0.3)))
+    require("mesh_nodes", count, "triangulate: rim")
     return np.asarray(np.interp(np.arange(count) / count * edges_to[-1], edges_to, s))
 
 
@@ -140,6 +142,7 @@ def _cells(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[
     """Leaves of a quadtree no larger than about four wanted edges: (side, centres, sizes there)."""
     side = 2.0 * size.cap
     counts = np.ceil(extent / side + 1e-9).astype(int)
+    require("mesh_nodes", float(np.prod(counts, dtype=float)), "triangulate: domain")
     x, y = np.meshgrid(np.arange(counts[0]), np.arange(counts[1]))
     centres = middle + (np.stack([x, y], -1).reshape(-1, 2) - (counts - 1) / 2) * side
     while len(centres):
@@ -148,6 +151,7 @@ def _cells(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[
         split = side > 4 * smallest
         if not split.all():
             yield side, centres[~split], wanted[~split]
+        require("mesh_nodes", 4 * int(split.sum()), "triangulate: narrow places")
         centres = (centres[split][:, None] + side * _QUARTERS).reshape(-1, 2)
         side /= 2
 

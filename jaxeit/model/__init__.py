@@ -11,7 +11,7 @@ from .bases import (
     Picture,
     Pixels,
 )
-from .discretisation import Model, discretise, make_mesh
+from .discretisation import Model, discretise, expected_mesh_nodes, make_mesh
 from .fidelity import Fidelity, FidelityError
 from .forward_model import CoatedSheet, DerivativeError, conductivity, forward, load_spread, rounding
 from .pneumatics import pad_response
@@ -39,6 +39,7 @@ __all__ = [
     "System",
     "conductivity",
     "discretise",
+    "expected_mesh_nodes",
     "forward",
     "jacobian",
     "load_spread",

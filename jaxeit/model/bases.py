@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
+from ..budget import require
 from ..registry import Registry
 from .discretisation import Model
 from .stiffness import Stiffness, stiffness
@@ -161,6 +162,7 @@ class Pixels(AbstractBasis):
         chart = _host(model.chart)
         low, high = chart.min(0), chart.max(0)
         rows = self.rows or max(1, round(self.columns * (high[1] - low[1]) / (high[0] - low[0])))
+        require("coefficients", self.columns * rows, f"{type(self).__name__} over the sheet", BasisError)
         counts = np.array([self.columns, rows])
         pixel = (high - low) / counts
         corners = (chart[_host(model.triangles)] - low) / pixel  # in units of pixels
@@ -207,6 +209,7 @@ class Bumps(AbstractBasis):
         chart, places = _host(model.chart), _host(model.centroids)
         low, high = chart.min(0), chart.max(0)
         rows = self.rows or max(2, round((self.columns - 1) * (high[1] - low[1]) / (high[0] - low[0])) + 1)
+        require("coefficients", self.columns * rows, f"{type(self).__name__} over the sheet", BasisError)
         counts = np.array([self.columns, rows])
         pitch = (high - low) / (counts - 1)
         x, y = np.meshgrid(np.arange(self.columns), np.arange(rows))

@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._compile import is_traced
+from ..budget import require
 from ..effects import AbstractCoatEffect, AbstractEffect, chosen
 from ..linalg import AbstractLinearSolver, default_solver
 from ..linalg.base import on_device
 from ..meshing.elements import Space, function_space
 from ..meshing.footprints import AbstractFootprint
-from ..meshing.generation import triangulate
+from ..meshing.generation import expected_nodes, triangulate
 from ..meshing.triangles import Mesh
 from ..skin.description import Skin
 from ..skin.electrodes import touched
@@ -89,6 +90,7 @@ def discretise(
     Raises:
         FidelityError: float64 asked for while JAX is in 32-bit mode.
         ElectrodeError, MeshError: the electrodes do not fit the sheet, each other or the mesh.
+        BudgetError: the mesh or the fields would be larger than `Budget` allows.
     """
     fidelity = Fidelity.standard() if fidelity is None else fidelity
     require_dtype(fidelity.dtype)
@@ -97,6 +99,7 @@ def discretise(
     values = _model_arrays(skin, sheet.mesh)
     electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
     unknowns = number_unknowns(sheet, electrodes, ground)
+    require("array_bytes", fidelity.dtype.itemsize * unknowns.count * len(electrodes), "model: one field per electrode")
     arrays, pattern = system_arrays(sheet, unknowns, electrodes)
     solver = fidelity.solver or default_solver(unknowns.count)
 
@@ -130,8 +133,17 @@ def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:
 def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
     """The mesh that `discretise` makes: graded around the electrodes, checked."""
     length = _edge_length(scene.skin, fidelity)
-    footprints = [electrode.footprint(fidelity.electrode_segments) for electrode in scene.skin.electrodes]
-    return _mesh(scene.skin, footprints, length, fidelity.growth)
+    return _mesh(scene.skin, _footprints(scene.skin, fidelity), length, fidelity.growth)
+
+
+def expected_mesh_nodes(skin: Skin, fidelity: Fidelity) -> int:
+    """About how many nodes `make_mesh` will make, found in milliseconds from areas, edge lengths and their growth."""
+    footprints = _footprints(skin, fidelity)
+    return round(expected_nodes(skin.domain, footprints, _edge_length(skin, fidelity), fidelity.growth))
+
+
+def _footprints(skin: Skin, fidelity: Fidelity) -> list[AbstractFootprint]:
+    return [electrode.footprint(fidelity.electrode_segments) for electrode in skin.electrodes]
 
 
 def _spaces(scene: Scene, fidelity: Fidelity, mesh: Mesh | None) -> tuple[Space, Space | None]:

@@ -50,8 +50,8 @@ class Fidelity:
             raise FidelityError(f"edge_length is {self.edge_length}; give 0.001 to 0.25")
         if self.order not in BY_ORDER:
             raise FidelityError(f"order is {self.order}; give one of {sorted(BY_ORDER)}")
-        if self.electrode_segments < 6:
-            raise FidelityError(f"electrode_segments is {self.electrode_segments}; give 6 or more")
+        if not 6 <= self.electrode_segments <= 4096:
+            raise FidelityError(f"electrode_segments is {self.electrode_segments}; give 6 to 4096")
         if not 1.05 <= self.growth <= 2:
             raise FidelityError(f"growth is {self.growth}; give 1.05 to 2")
         if not 0 <= self.interpolation <= 0.1:

@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 
 from .._compile import verb
+from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model
@@ -96,6 +97,8 @@ def _pair_slopes(
     scale: Float[Array, " elements"] | None = None,
 ) -> Float[Array, "basis k"]:
     """dZ for these pairs of electrodes."""
+    pair_count = np.shape(pairs)[0]
+    require("array_bytes", model.dtype.itemsize * image.size * pair_count, "jacobian: image times pairs of electrodes")
     made_for, given = (image.elements, image.stiffness.unknowns), (len(model.areas), model.system.unknowns)
     if made_for != given:
         raise ValueError(

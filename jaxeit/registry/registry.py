@@ -11,14 +11,13 @@ import functools
 import importlib
 import re
 import sys
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from importlib.metadata import EntryPoint, entry_points
 from inspect import isabstract, isclass
 from typing import Any, Generic, TypeVar, cast
 
-from ..toml import TomlTable
+from ..toml import TomlError, TomlTable, parse_values
 from .settings import Part, settings_of, word
 
 T = TypeVar("T")
@@ -237,6 +236,6 @@ def split_word(text: str) -> tuple[str, dict[str, Any]]:
 def _value(text: str) -> Any:
     """A value as TOML writes it; a text needs no quotes."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_values(f"value = {text}", "value")["value"]
+    except TomlError:
         return text

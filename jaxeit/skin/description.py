@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
 from ..registry import RegistryError
@@ -155,6 +156,7 @@ def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ..
     except RegistryError as error:
         raise table.error("kind", str(error)) from None
     electrodes = kind.read(table, domain)
+    require("electrodes", len(electrodes), table.where, TomlError)
     table.done()
     return electrodes
 

@@ -5,10 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from ..budget import require
 from ..geometry.shapes import Domain
 from ..meshing.elements import Space
 from ..meshing.outlines import ArcFootprint
-from ..toml import TomlTable
+from ..toml import TomlError, TomlTable
 from .electrodes import AbstractElectrode, ElectrodeError, Pieces, require_contact, require_positive
 
 
@@ -49,6 +50,7 @@ class BoundaryPatch(AbstractElectrode):
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["BoundaryPatch", ...]:
         count = table.count("count")
+        require("electrodes", count, table.where, TomlError)
         width = table.positive("width", "a length in m")
         first = table.number("first", "arc length of electrode 0's centre in m", 0.0)
         direction = table.choice("direction", "counter-clockwise", "clockwise", default="counter-clockwise")

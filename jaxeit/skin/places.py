@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from ..budget import require
 from ..geometry.shapes import Domain
-from ..toml import TomlTable
+from ..toml import TomlError, TomlTable
 
 
 def read_positions(table: TomlTable) -> list[tuple[float, float]]:
@@ -30,6 +31,7 @@ def read_area_contact(table: TomlTable) -> float:
 
 def _grid(table: TomlTable) -> np.ndarray:
     columns, rows = table.count("columns"), table.count("rows")
+    require("electrodes", columns * rows, table.where, TomlError)
     pitch = table.positive("pitch", "a length in m")
     origin = table.vector("origin", 2, "[x, y] of the first electrode in m")
     order = table.choice("order", "snake", "rows", default="rows")

@@ -310,7 +310,7 @@ BOLT = DiscFootprint((0.05, 0.05), 0.003)
         ([], {"edge_length": 0.0}, "edge_length is 0.0; give a positive length"),
         ([], {"edge_length": 0.01, "electrode_edge": -1}, "electrode_edge is -1"),
         ([], {"edge_length": 0.01, "growth": 1.0}, "growth is 1.0"),
-        ([], {"edge_length": 1e-5}, "is it in metres"),
+        ([], {"edge_length": 1e-5}, "check that lengths are in metres"),
         (
             [BOLT, DiscFootprint((0.001, 0.1), 0.003)],
             {"edge_length": 0.01},

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
 from ..recipe_options import add_imaging_arguments, imaging_of
-from ..terminal import progress_bar
+from ..terminal import announce_model, progress_bar
 
 if TYPE_CHECKING:
     from jaxeit.accuracy import Choice, Ladder
@@ -42,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
         require_matplotlib_for("-o")
     rungs, budget = _rungs(args), 0.1 if args.smoke else 0.5
     scene = bench_scene(args.what)
+    announce_model(scene.skin, je.Fidelity.draft() if args.smoke else je.Fidelity.reference())
     with jax.enable_x64(True):  # and no cache of programs: how long they take to compile is measured
         found = je.ladder(scene, rungs, budget=budget, progress=progress_bar("rungs"))
     if args.output:

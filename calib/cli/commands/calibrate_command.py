@@ -13,7 +13,7 @@ from ...fitting import CURVES
 from ...session import Session
 from ..arguments import count, prepare_outputs, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
-from ..terminal import stage_bar, title
+from ..terminal import announce_model, stage_bar, title
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate_together(args: argparse.Namespace) -> int:
+    from jaxeit.skin import parse_skin
+
     from ...calibration.evaluation import render_table
     from ...calibration.procedure import STAGES, calibrate, evaluate
     from ...session import open_session
@@ -62,6 +64,7 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         sessions = [stack.enter_context(open_session(path)) for path in args.sessions]
         if all("eit" not in session.streams for session in sessions):
             return _calibrate_logs(args, recipe, sessions)
+        announce_model(skin or parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml"), recipe.fidelity)
         stages = stack.enter_context(stage_bar(len(STAGES)))
         calibration = calibrate(sessions, skin, recipe=recipe, ignore_errors=args.force, progress=stages)
         tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}

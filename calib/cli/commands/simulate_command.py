@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..arguments import prepare_outputs, skin_of
 from ..signals import interruption_status
-from ..terminal import progress_bar
+from ..terminal import announce_model, progress_bar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    from ...bench import load_bench, measure_costs, render_costs, simulate
+    from ...bench import SIMULATION, load_bench, measure_costs, render_costs, simulate
 
     if args.data_set:
         return _simulate_data_set(args)
@@ -41,10 +41,14 @@ def run(args: argparse.Namespace) -> int:
     prepare_outputs(args.output)
     if args.serve and Path(args.output).exists():
         return _serve(args.output)
+    announce_model(bench.scene.skin, SIMULATION)
     try:
         simulate(bench, args.output, progress=progress_bar("blocks"))
     except KeyboardInterrupt as interrupt:
-        print(f"jaxeit: interrupted; the same command goes on from {args.output}.part", file=sys.stderr)
+        print(
+            f"jaxeit: {str(interrupt) or 'interrupted'}; the same command goes on from {args.output}.part",
+            file=sys.stderr,
+        )
         return interruption_status(interrupt)
     print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
     return _serve(args.output) if args.serve else 0

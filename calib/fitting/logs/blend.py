@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxeit.budget import require
+
 from ..curves.base import AbstractCurve
 from ..curves.fit import fit_curves
-from ..results import FitResult
+from ..results import FitError, FitResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,11 @@ def fit_blend(signals: np.ndarray, force: np.ndarray, stretches: int = 20, folds
 
     The ridge is the one of `RIDGES` with the smallest squared error in cross-validation. Folds consist of stretches of
     time, dealt out in turn. Few long stretches would measure extrapolation to states that occur in one stretch alone.
+
+    Raises:
+        FitError: for more channels than `Budget` allows; memory grows with the fourth power of their number.
     """
+    require("blend_channels", signals.shape[1], "fit_blend", FitError)
     fold = (np.arange(len(force)) * stretches // len(force)) % folds
 
     def held_out(ridge: float) -> float:

@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from jaxeit.files import open_regular
+
 from ...session.storage import sync
 
 try:
@@ -177,7 +179,7 @@ class JournalReader:
 
     def _open(self) -> BinaryIO:
         try:
-            file = self.path.open("rb")
+            file = open_regular(self.path)
         except OSError as error:
             raise JournalError(f"{self.path.name}: {error.strerror}; name a .part file") from error
         if fcntl is not None:

@@ -1,0 +1,27 @@
+"""Whether a matrix that was read from a file can be a covariance."""
+
+import numpy as np
+
+ROUNDING = 16.0
+"""Eigenvalue below zero of correlations that rounding explains, over the square root of the precision."""
+
+
+def is_covariance(matrices: np.ndarray) -> bool:
+    """Whether matrices (..., n, n) are symmetric and positive semidefinite, but for rounding.
+
+    The test is the Cholesky factorisation of the correlations with a small multiple of the identity added, which costs
+    a fraction of the eigenvalues. Values that are not finite are no covariance.
+    """
+    matrices = np.asarray(matrices)
+    variance = np.diagonal(matrices, axis1=-2, axis2=-1).astype(np.float64)
+    if not np.isfinite(matrices).all() or (variance < 0).any():
+        return False
+    size = np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = matrices / size[..., :, None] / size[..., None, :]
+    tolerance = ROUNDING * float(np.sqrt(np.finfo(matrices.dtype).eps))
+    symmetric = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(initial=0.0) <= tolerance
+    try:
+        np.linalg.cholesky(correlation + tolerance * np.eye(matrices.shape[-1]))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(symmetric)
