@@ -41,6 +41,11 @@ class Budget:
     | sites           | a simulated bench                                                       |
     | coefficients    | the basis of an image                                                   |
     | mesh_nodes      | a mesh                                                                  |
+    | import_text     | a text file to import, unpacked, bytes                                  |
+    | import_rows     | a table to import                                                       |
+    | import_numbers  | all files of an import together                                         |
+    | child_bytes     | address space of the process that reads a foreign binary file           |
+    | child_seconds   | time of that process                                                    |
     """
 
     text_bytes: int = _limit(1 << 20, "bytes of text", "describe less, such as outlines of fewer corners")
@@ -54,6 +59,11 @@ class Budget:
     sites: int = _limit(1 << 20, "places to press", "simulate fewer at a time")
     coefficients: int = _limit(100_000, "coefficients of an image", "choose fewer pixels or bumps")
     mesh_nodes: int = _limit(500_000, "mesh nodes", "choose a coarser fidelity, and check that lengths are in metres")
+    import_text: int = _limit(4 << 30, "bytes of text, unpacked", "split the recording into shorter ones")
+    import_rows: int = _limit(20_000_000, "rows", "split the recording into shorter ones")
+    import_numbers: int = _limit(100_000_000, "numbers in one import", "name fewer columns, or split the recording")
+    child_bytes: int = _limit(4 << 30, "bytes of memory", "split the recording into shorter ones")
+    child_seconds: int = _limit(300, "seconds", "split the recording into shorter ones")
 
     def scaled(self, factor: float) -> "Budget":
         """All limits times a factor."""

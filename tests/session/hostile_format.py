@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.session.importers import AbstractArrayImporter
 from calib.session.importers.arrays import ArrayShape
-from calib.session.importers.limits import CHILD_BYTES
+from jaxeit.budget import Budget
 
 
 class Hostile(AbstractArrayImporter):
@@ -17,7 +17,7 @@ class Hostile(AbstractArrayImporter):
     @classmethod
     def outline(cls, path):
         if path.name == "memory":
-            np.ones(CHILD_BYTES // 8)
+            np.ones(Budget().child_bytes // 8)
         if path.name == "crash":
             os.abort()
         if path.name == "loop":

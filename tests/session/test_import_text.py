@@ -2,6 +2,7 @@
 
 import gzip
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 
 from calib.cli import main
 from calib.session import SessionError, Status, open_session
+from calib.session.importers import limits
 from calib.session.importers.formats import text_files
 from calib.session.importers.formats.csv_tables import CsvFile
+from jaxeit.budget import Budget
 
 TIME = np.arange(5) / 4
 PRESSURE = np.array([0.5, 1.25, -2.5, 1000.75, 3.0])
@@ -231,12 +234,12 @@ def test_clocks_that_start_anew_need_the_pause_between_them(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("limit", "said"), [("MAX_ROWS", "has more than 1,000 rows"), ("MAX_TEXT_BYTES", "more than 1,000 bytes of text")]
+    ("limit", "said"), [("import_rows", "rows, the limit is 1,000"), ("import_text", "unpacked, the limit is 1,000")]
 )
 def test_a_packed_file_is_refused_before_it_is_parsed(limit, said, tmp_path, capsys, monkeypatch):
     path = tmp_path / "log.csv.gz"
     path.write_bytes(gzip.compress(b"0,1\n" * 5_000_000, 1))
-    monkeypatch.setattr(text_files, limit, 1000)
+    monkeypatch.setattr(limits, "current_budget", lambda: replace(Budget(), **{limit: 1000}))
     monkeypatch.setattr(text_files, "lines_of", lambda path: pytest.fail("was parsed"))
     assert said in refusal(capsys, path, "--time", "0:s", "--stream", "force=1:N")
 
@@ -246,8 +249,9 @@ def test_numbers_of_all_files_together_are_limited(tmp_path, capsys, monkeypatch
     words = ("--time", "0:s", "--stream", "force=1:N")
     brought(paths, *words)
     (tmp_path / "s.h5").unlink()
-    monkeypatch.setattr("calib.session.importers.limits.MAX_CELLS", 17)
-    assert "20.csv: file: 3 rows of 2 columns are more than 17 numbers" in refusal(capsys, paths, *words)
+    monkeypatch.setattr(limits, "current_budget", lambda: replace(Budget(), import_numbers=17))
+    told = refusal(capsys, paths, *words)
+    assert "20.csv: file: makes, with its 3 rows of 2 columns, 18 numbers in one import, the limit is 17" in told
 
 
 def test_the_progress_bar_knows_how_many_lines_there_are(tmp_path):

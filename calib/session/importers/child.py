@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxeit.budget import current_budget
+
 from ..errors import SessionError, printable, problem
 from ..storage import writing
-from .limits import CHILD_BYTES, CHILD_SECONDS
 
 try:
     import resource
@@ -62,7 +63,7 @@ def in_child(reader: type, task: str, path: Path, *, names: Sequence[str] = (), 
     if status == NO_LIBRARY:
         raise ImportError(said)
     if status == TOO_LONG:
-        raise problem(path, "file", f"takes more than {CHILD_SECONDS} s to read", DAMAGED)
+        raise problem(path, "file", f"takes more than {current_budget().child_seconds} s to read", DAMAGED)
     what = f"ends the process that reads it ({printable(said) or f'status {status}'})"
     raise problem(path, "file", what, DAMAGED)
 
@@ -70,9 +71,15 @@ def in_child(reader: type, task: str, path: Path, *, names: Sequence[str] = (), 
 def _asked(request: str) -> tuple[int, str]:
     """Exit status and last line of a child process."""
     environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    options: dict[str, Any] = {"env": environment, "capture_output": True, "text": True, "timeout": CHILD_SECONDS}
+    options: dict[str, Any] = {"env": environment, "capture_output": True, "text": True}
     try:
-        done = subprocess.run([sys.executable, "-P", "-c", COMMAND], input=request, check=False, **options)
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", COMMAND],
+            input=request,
+            check=False,
+            timeout=current_budget().child_seconds,
+            **options,
+        )
     except subprocess.TimeoutExpired:
         return TOO_LONG, ""
     lines = (done.stdout if done.returncode == 0 else done.stderr).splitlines()
@@ -101,7 +108,7 @@ def answer(text: str) -> tuple[int, str]:
     except ImportError as error:
         return NO_LIBRARY, str(error)
     except MemoryError:
-        what = f"needs more than {CHILD_BYTES:,} bytes of memory"
+        what = f"needs more than {current_budget().child_bytes:,} bytes of memory"
         return BAD_FILE, str(problem(path, "file", what, "split the recording into shorter ones"))
     except Exception as error:  # whatever a library of a format raises
         what = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
@@ -110,7 +117,8 @@ def answer(text: str) -> tuple[int, str]:
 
 def _limit() -> None:
     if resource is not None:
-        for kind, limit in ((resource.RLIMIT_AS, CHILD_BYTES), (resource.RLIMIT_CPU, CHILD_SECONDS)):
+        budget = current_budget()
+        for kind, limit in ((resource.RLIMIT_AS, budget.child_bytes), (resource.RLIMIT_CPU, budget.child_seconds)):
             with contextlib.suppress(ValueError, OSError):  # a lower limit is in force already
                 resource.setrlimit(kind, (limit, limit))
 

@@ -10,11 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from jaxeit.budget import current_budget
+
 from ...errors import printable, problem
 from ..arrays import AbstractArrayImporter, ArrayShape
 from ..child import library
 from ..columns import FileSpec
-from ..limits import MAX_NAMES, MAX_ROWS, check_size
+from ..limits import MAX_NAMES, check_size
 from ..tables import first_bytes
 
 EXTRA = "tables"
@@ -126,9 +128,9 @@ def _columns(path: Path, bag: Any, connections: list[Any], fields: Sequence[str]
     """Values (messages, columns) of each field of a topic."""
     getters = [None if field == LOG_TIME else attrgetter(field) for field in fields]
     rows: list[list[np.ndarray]] = [[] for _ in fields]
-    only_time = all(getter is None for getter in getters)
+    only_time, most = all(getter is None for getter in getters), current_budget().import_rows
     for number, (connection, time, raw) in enumerate(bag.messages(connections=connections)):
-        if number >= MAX_ROWS:
+        if number >= most:
             check_size(path, number + 1, 0)
         message = None if only_time else bag.deserialize(raw, connection.msgtype)
         for values, getter in zip(rows, getters, strict=True):

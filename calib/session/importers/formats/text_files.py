@@ -10,7 +10,7 @@ from io import BufferedReader, TextIOWrapper
 from pathlib import Path
 
 from ...errors import problem
-from ..limits import MAX_LINE, MAX_ROWS, MAX_TEXT_BYTES
+from ..limits import MAX_LINE, require_within
 from ..tables import first_bytes
 
 PIECE = 1 << 20
@@ -39,11 +39,8 @@ def count_lines(path: Path) -> int:
     with _reading(path), _open_bytes(path) as stream:
         while piece := stream.read(PIECE):
             lines, returns, size = lines + piece.count(b"\n"), returns + piece.count(b"\r"), size + len(piece)
-            if size > MAX_TEXT_BYTES:
-                what = f"holds more than {MAX_TEXT_BYTES:,} bytes of text, unpacked"
-                raise problem(path, "file", what, "split the recording into shorter ones")
-            if max(lines, returns) > MAX_ROWS:
-                raise problem(path, "file", f"has more than {MAX_ROWS:,} rows", "split the recording into shorter ones")
+            require_within(path, "import_text", size)
+            require_within(path, "import_rows", max(lines, returns))
     return max(lines, returns)
 
 
