@@ -123,7 +123,7 @@ def test_what_is_too_short_is_refused_in_words(tmp_path):
             JournalReader(tmp_path / "cut")
     with pytest.raises(JournalError, match="No such file"):
         JournalReader(tmp_path / "none")
-    with pytest.raises(JournalError, match="directory"):
+    with pytest.raises(JournalError, match="is a folder"):
         JournalReader(tmp_path)
 
 
