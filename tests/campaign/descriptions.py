@@ -20,8 +20,21 @@ from .telling import Verdict, judged, same, tell
 Random = np.random.Generator
 NUMBER = re.compile(r"(?<![\w.\"-])-?\d+\.?\d*(?:e-?\d+)?(?![\w.\"])")
 NEVER_BELOW_ZERO = (
-    "tip_diameter", "rest", "ramp", "hold", "release", "recovery", "blank", "eit_rate", "pad_rate", "eit_step",
-    "pressure_step", "force_step", "width", "length", "half_pressure",
+    "tip_diameter",
+    "rest",
+    "ramp",
+    "hold",
+    "release",
+    "recovery",
+    "blank",
+    "eit_rate",
+    "pad_rate",
+    "eit_step",
+    "pressure_step",
+    "force_step",
+    "width",
+    "length",
+    "half_pressure",
 )  # fmt: skip; noise of a negative standard deviation is the same noise
 UNSEEN = ("version", "minimum", "maximum", "accuracy", "frequency", "reading_time")  # no reading depends on them
 TOLERANCE = 0.1  # of the rms reading: what the sheet and the electrodes of an honest skin scatter
@@ -91,29 +104,27 @@ def _predicted(honest: Honest, found: je.Skin) -> Verdict:
 
 
 def scene(rng: Random, folder: Path) -> tuple[str, Verdict]:
-    """Read as `simulate` does: what is accepted is what is written, neither ignored nor below zero where none can be."""
+    """Read as `simulate` does: what is accepted is what is written, not ignored, nor below zero where none can be."""
     scenes = sorted((Path(calib.__file__).parent / "bench" / "scenes").glob("*.toml"))
     text = scenes[int(rng.integers(len(scenes)))].read_text()
     text = "\n".join(line.split(" #")[0].rstrip() for line in text.splitlines() if not line.startswith("#")) + "\n"
     new, name = _edited(rng, text)
-    path = folder / "lie.toml"
+    path, original = folder / "lie.toml", folder / "honest.toml"
     path.write_text(new)
-    out = folder / "never" / "s.h5"  # a folder that is not there: what is accepted is not simulated
-    if new != text:
-        try:
-            bench = load_bench(path)
-        except ValueError:
-            answer = tell("simulate", path, "-o", folder / "s.h5")
-            return f"scene: {name}", Verdict("refused" if answer.refused else "BROKEN", answer.err)
-        assert not out.exists()
-        below = re.search(rf"\b({'|'.join(NEVER_BELOW_ZERO)}) = -", name)
-        (folder / "honest.toml").write_text(text)
-        honest = load_bench(folder / "honest.toml")
-        if below:
-            return f"scene: {name}", Verdict("SILENT", f"{below[1]} below zero is accepted")
-        if _numbers(bench) == _numbers(honest):
-            return f"scene: {name}", Verdict("SILENT", "the number is ignored")
-    return f"scene: {name}", Verdict("harmless", "as it is written")
+    original.write_text(text)
+    return f"scene: {name}", _loaded(path, original, name)
+
+
+def _loaded(path: Path, original: Path, name: str) -> Verdict:
+    try:
+        bench = load_bench(path)
+    except ValueError:
+        return Verdict("refused", tell("simulate", path, "-o", path.with_suffix(".h5")).err)
+    below = re.search(rf"\b({'|'.join(NEVER_BELOW_ZERO)}) = -(?!0)", name)
+    if below:
+        return Verdict("SILENT", f"{below[1]} below zero is accepted")
+    ignored = path.read_text() != original.read_text() and _numbers(bench) == _numbers(load_bench(original))
+    return Verdict("SILENT", "the number is ignored") if ignored else Verdict("harmless", "as it is written")
 
 
 def _numbers(part: Any) -> Any:

@@ -196,7 +196,8 @@ def in_bursts(s: Sent, rng: Random) -> Sent:
 
 
 KINDS = (
-    nothing,     numbers_stand, numbers_fall, numbers_wrap, numbers_at_random, numbers_skip, numbers_jump, ticks_in_another_unit,
+    nothing, numbers_stand, numbers_fall, numbers_wrap, numbers_at_random, numbers_skip, numbers_jump,
+    ticks_in_another_unit,
     ticks_stand, ticks_fall, ticks_at_random, ticks_jump, ticks_wrap, ticks_of_32_bits_as_64, another_type,
     another_width, another_stream, too_large, not_numbers, dies, pauses, loses, repeats, disorders, values_stand,
     in_bursts,
@@ -257,7 +258,9 @@ def received(sent: dict[int, Sent], path: Path, spoil: Callable[[bytes], bytes])
             source = Source(replace(PLAN_OF_BOTH.streams[number]), "wire://")
             with (
                 patch.object(Source, "link", lambda _, link=link: link),
-                patch.object(intake, "time", SimpleNamespace(monotonic=clock.monotonic, monotonic_ns=clock.monotonic_ns)),
+                patch.object(
+                    intake, "time", SimpleNamespace(monotonic=clock.monotonic, monotonic_ns=clock.monotonic_ns)
+                ),
             ):
                 receiver = intake.StreamReceiver(number, source, journal)
                 receiver.run(stop)
@@ -270,7 +273,7 @@ def received(sent: dict[int, Sent], path: Path, spoil: Callable[[bytes], bytes])
 
 
 def lie(rng: Random, honest: Honest, folder: Path) -> tuple[str, Verdict]:
-    """Two devices of which one lies, sometimes in two ways; `recover` and `check` must say so, or nothing is changed."""
+    """Two devices of which one lies, sometimes in two ways: `recover` or `check` says so, or nothing is changed."""
     true = {number: honest_device(number, rng) for number in (0, 1)}
     liar = int(rng.integers(2))
     kinds = [KINDS[i] for i in rng.choice(len(KINDS), 1 + (rng.random() < 0.3), replace=False)]

@@ -49,7 +49,8 @@ def magnitudes(rng: Random, honest: Honest) -> Change:
 def other_order(rng: Random, honest: Honest) -> Change:
     """Readings reversed, rolled or permuted."""
     shift, order = int(rng.integers(1, 208)), rng.permutation(208)
-    return lies.readings(pick(rng, (lambda n: np.arange(n)[::-1], lambda n: np.roll(np.arange(n), shift), lambda n: order)))
+    orders = (lambda n: np.arange(n)[::-1], lambda n: np.roll(np.arange(n), shift), lambda n: order)
+    return lies.readings(pick(rng, orders))
 
 
 def exchanged_electrodes(rng: Random, honest: Honest) -> Change:
@@ -100,7 +101,8 @@ def places(rng: Random, honest: Honest) -> Change:
     """Mirrored, turned, exchanged, in another unit, far off."""
     factor, far = pick(rng, (1e3, 1e2, 1e6, 10.0, 0.1, 1e-3)), sign(rng) * rng.uniform(0.06, 1e5)
     return pick(rng, (
-        lies.moved(lambda x, y: 0.2 - x), lies.moved(y=lambda x, y: 0.2 - y), lies.moved(lambda x, y: y, lambda x, y: x),
+        lies.moved(lambda x, y: 0.2 - x), lies.moved(y=lambda x, y: 0.2 - y),
+        lies.moved(lambda x, y: y, lambda x, y: x),
         lies.moved(lambda x, y: 0.2 - x, lambda x, y: 0.2 - y), lies.moved(lambda x, y: x + far),
         lies.moved(y=lambda x, y: y + far), lies.moved(lambda x, y: factor * x, lambda x, y: factor * y),
     ))  # fmt: skip
@@ -196,7 +198,7 @@ KINDS = (
 
 
 def lie(rng: Random, honest: Honest, folder: Path) -> tuple[str, Verdict]:
-    """Tell one lie or two of different kinds to `check`; if nothing is said, compare what `apply` and `evaluate` give."""
+    """Tell one lie or two of different kinds to `check`; without a word, compare what `apply` and `evaluate` give."""
     chosen = [KINDS[i] for i in rng.choice(len(KINDS), 1 + (rng.random() < 0.3), replace=False)]
     recording, name = honest.recording, " and ".join(kind.__name__ for kind in chosen)
     for kind in chosen:

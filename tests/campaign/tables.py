@@ -62,7 +62,8 @@ def shuffled_by_number(t: Table, rng: Random) -> Table:
     order = order[::-1] if (order == np.arange(6)).all() else order
     rows = [[row[i] for i in order] for row in t.rows]
     numbers = {"time": "0:s", "force": "force=1:N", "pressure": "pressure=2-5:Pa"}
-    return replace(t, header=[[], t.header][int(rng.integers(2))] and [t.header[i] for i in order], rows=rows, **numbers)
+    header = [t.header[i] for i in order] if rng.integers(2) else []
+    return replace(t, header=header, rows=rows, **numbers)
 
 
 def contradicting_unit(t: Table, rng: Random) -> Table:
@@ -216,7 +217,7 @@ def clock_in_numbers(t: Table, rng: Random) -> Table:
 
 
 KINDS = (
-    nothing,     shuffled_columns, shuffled_by_number, contradicting_unit, unit_in_header, wrong_unit, decimal_comma,
+    nothing, shuffled_columns, shuffled_by_number, contradicting_unit, unit_in_header, wrong_unit, decimal_comma,
     two_decimal_signs, thousands, quoted_names, header_again, same_name_twice, falling, shuffled_rows, repeated_rows,
     repeated_times, gap, cells_missing, ragged, shifted_cells, footer, clock_jumps, clock_in_numbers,
 )  # fmt: skip

@@ -89,6 +89,7 @@ def same(found: Any, honest: Any, tolerance: float = TOLERANCE) -> bool:
         return False
     known = np.isfinite(found)
     scale = np.nanmax(np.abs(honest), initial=0.0)
-    return bool((np.abs(found - honest)[known & np.isfinite(honest)] <= tolerance * scale).all()) and not (
-        known & ~np.isfinite(honest)
-    ).any()
+    return (
+        bool((np.abs(found - honest)[known & np.isfinite(honest)] <= tolerance * scale).all())
+        and not (known & ~np.isfinite(honest)).any()
+    )

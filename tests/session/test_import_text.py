@@ -275,7 +275,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ("time (ms),force", "--time time:s: read in s, but the header says ms ('time (ms)')"),
+        ("time (ms),force", "--time time: read in s, but the header says ms ('time (ms)')"),
         ("time,force (mN)", "--stream force: read in N, but the header says mN ('force (mN)')"),
         ("time (s),force [N]", None),
         ("time,force_m", None),  # not a unit of force

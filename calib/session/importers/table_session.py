@@ -145,9 +145,7 @@ def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About
     return _Part(path, table, clock, places, units, file.counted, tuple(notes))
 
 
-def _contradictions(
-    path: Path, where: str, unit: str, indices: Sequence[int], header: Sequence[str]
-) -> Iterator[str]:
+def _contradictions(path: Path, where: str, unit: str, indices: Sequence[int], header: Sequence[str]) -> Iterator[str]:
     """A note if a header states a unit that measures the same in another size, such as mN where N was given."""
     for head in (header[i] for i in indices if i < len(header)):
         said = name_and_unit(head)[1]
