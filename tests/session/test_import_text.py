@@ -83,6 +83,12 @@ def test_what_was_written_is_what_is_read(writer, encoding, tmp_path):
     np.testing.assert_array_equal(found["time"], TIME * 1e9)
 
 
+def test_a_name_that_holds_a_comma_is_told_as_it_is_to_be_written(tmp_path, capsys):
+    path = written(tmp_path, '"t","p, left","f"\n0,1,2\n1,4,5\n')
+    told = refusal(capsys, path, "--time", "t:s", "--stream", "pressure=p, left:kPa")
+    assert """column 'p': not there; header names: t, "p, left", f;""" in told
+
+
 def test_names_may_hold_delimiters_and_line_ends(tmp_path):
     """As Excel writes a head with a line break in it."""
     text = '"t\n(s)","p, left","Force\r\n[N]","say ""g"""\n0,1,2,3\n1,4,5,6\n'

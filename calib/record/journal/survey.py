@@ -159,4 +159,4 @@ class StreamSurvey:
         if not period:
             return "its clock stands still: check the device; times are of arrival"
         tick = self.plan.tick * elapsed / period
-        return f"its ticks are not of {self.plan.tick:g} s (rather {tick:.3g}): give tick=; times are of arrival"
+        return f"its ticks are not of {self.plan.tick:g} s (rather {tick:.2g}): give tick=; times are of arrival"

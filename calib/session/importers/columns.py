@@ -146,8 +146,9 @@ def column_indices(path: Path, column: str, header: Sequence[str], columns: int)
 
 
 def _listed(header: Sequence[str]) -> str:
-    """Names in the header; those of one array as a range."""
-    groups = itertools.groupby(header, key=lambda head: re.sub(r"\[\d+\]$", "[]", head))
+    """Names in the header as a user writes them: those of one array as a range, one that holds a comma in quotes."""
+    written = [f'"{head}"' if "," in head else head for head in header]
+    groups = itertools.groupby(written, key=lambda head: re.sub(r"\[\d+\]$", "[]", head))
     ends = [(names[0], names[-1]) for names in (list(group) for _, group in groups)]
     return ", ".join(first if first == last else f"{first}-{last}" for first, last in ends)
 
