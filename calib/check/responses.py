@@ -76,7 +76,9 @@ def _falling_findings(skin: je.Skin, strongest: np.ndarray, largest: np.ndarray)
         clear = np.abs(change) > MIN_PAD_RESPONSE * np.median(np.abs(largest))
         if clear.sum() >= MIN_FALLING and (change[clear] < 0).all():
             what = f"column {column}, pad {pad.name!r}, falls on pressing, in {clear.sum()} of {clear.sum()} presses"
-            yield Finding(Severity.ERROR, PRESSURE, what, "negate this column at import, or exchange its sensor's ports")
+            yield Finding(
+                Severity.ERROR, PRESSURE, what, "negate this column at import, or exchange its sensor's ports"
+            )
 
 
 def _unfelt_findings(evidence: PressEvidence, response: np.ndarray) -> Iterator[Finding]:
