@@ -76,14 +76,15 @@ def told(number: int, seed: int, honest: Honest, folder: Path) -> dict[str, Any]
     return {"number": number, "family": family, "lie": name, **verdict._asdict(), "seconds": seconds, "grown": grown}
 
 
-def run(numbers: range, seed: int, root: Path) -> list[dict[str, Any]]:
-    """Tell the lies of these numbers."""
+def run(numbers: range, seed: int, root: Path, seconds: float) -> list[dict[str, Any]]:
+    """Tell the lies of these numbers, or those of them for which there is time."""
     jax.config.update("jax_enable_x64", True)
     signal.signal(signal.SIGALRM, _stop)
     honest, folder = Honest.make(root / "honest"), root / "lies"
     folder.mkdir()
     assert len(honest.maps) == len(honest.short_maps)  # compiled before the first lie is timed
-    return [told(number, seed, honest, folder) for number in numbers]
+    end = time.monotonic() + seconds
+    return [told(number, seed, honest, folder) for number in numbers if time.monotonic() < end]
 
 
 def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
@@ -109,6 +110,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("count", type=int)
     parser.add_argument("seed", type=int)
     parser.add_argument("--first", type=int, default=0, help="number of the first lie")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="tell no further lie after that time")
     parser.add_argument("--only", type=int, help="tell the lie of this number alone")
     return parser.parse_args()
 
@@ -117,6 +119,6 @@ if __name__ == "__main__":
     args = _arguments()
     numbers = range(args.first, args.first + args.count) if args.only is None else range(args.only, args.only + 1)
     with tempfile.TemporaryDirectory() as root:
-        records = run(numbers, args.seed, Path(root))
+        records = run(numbers, args.seed, Path(root), args.seconds)
     print(json.dumps(records[0] if args.only is not None else summary(records), indent=1))
     sys.exit(any(r["verdict"] in ("SILENT", "BROKEN") for r in records))
