@@ -186,11 +186,7 @@ def _process_frames(
 ) -> int:
     count, begun, until = 0, False, time.monotonic() + wait
     while not (control.stop.is_set() or recorder.stop.is_set() or recorder.ended):
-        wrong_zero = engine.has_wrong_zero(time.monotonic_ns())
-        if wrong_zero:
-            control.warn("pads read below zero: the skin was pressed when zero was measured, which is done again now")
-        if control.tare.is_set() or wrong_zero:
-            control.tare.clear()
+        if _must_tare(engine, control):
             engine.tare()
             if director is not None:
                 director.request_all()
@@ -201,11 +197,7 @@ def _process_frames(
             continue
         begun = True
         result = engine.step(arrival, queue.dropped)
-        control.lost = sum(receiver.counters.lost for receiver in recorder.receivers)
-        control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)
-        if engine.state != control.state and engine.restless:
-            control.warn(engine.state)
-        control.state = engine.state
+        _tell_state(control, engine, recorder)
         if result is not None:
             count += 1
             for publish in viewers:
@@ -214,3 +206,23 @@ def _process_frames(
                 director.update(engine.pressed(arrival), result.centre)
             engine.use_spare_time(queue.time_to_next())
     return count
+
+
+def _must_tare(engine: Engine, control: LiveControl) -> bool:
+    """Whether the rest levels are to be measured again: on request, or because they must be wrong."""
+    wrong = engine.has_wrong_zero(time.monotonic_ns())
+    if wrong:
+        control.warn("pads read below zero: the skin was pressed when zero was measured, which is done again now")
+    if control.tare.is_set():
+        control.tare.clear()
+        return True
+    return wrong
+
+
+def _tell_state(control: LiveControl, engine: Engine, recorder: Recorder) -> None:
+    """Show viewers the state of engine and streams, and warn the operator of a skin that is not at rest."""
+    control.lost = sum(receiver.counters.lost for receiver in recorder.receivers)
+    control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)
+    if engine.state != control.state and engine.restless:
+        control.warn(engine.state)
+    control.state = engine.state

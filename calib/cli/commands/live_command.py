@@ -35,17 +35,7 @@ _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 def run(args: argparse.Namespace) -> int:
     """Show force maps until somebody stops it."""
-    from ...record.priority import real_time
-
-    with real_time(args.realtime):
-        pass  # refused at once or not at all
-    for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
-        os.environ.setdefault(name, "1")
-    if args.rerun is not None:
-        _require_rerun()
-    from ...runtime import set_up_live
-
-    set_up_live()
+    _set_up_process(args)
     from threading import Timer
 
     from ...calibration.calibration import load_calibration
@@ -58,11 +48,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = load_calibration(args.calibration)
     plan, sources = plan_recording({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
     orders = StopRequest()
-
-    def tell(line: str) -> None:
-        print(f"jaxeit: {line}", file=sys.stderr)
-
-    show = LiveControl(stop=orders.stop, warn=tell)
+    show = LiveControl(stop=orders.stop, warn=_tell)
     also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
     timer = Timer(args.seconds or 0.0, orders.stop_recording)
     timer.daemon = True
@@ -81,11 +67,30 @@ def run(args: argparse.Namespace) -> int:
             Presentation(host=args.host, port=args.port, publish=args.publish, output=args.output),
             LiveSettings(event_driven=args.event_driven, realtime=args.realtime, rest=args.rest, wait=args.wait),
             also=also,
-            tell=tell,
+            tell=_tell,
         )
         timer.cancel()
-    print(f"jaxeit: {count} frames", file=sys.stderr)
+    _tell(f"{count} frames")
     return orders.status
+
+
+def _set_up_process(args: argparse.Namespace) -> None:
+    """Refuse at once what this machine cannot do, and set up numerical libraries for single frames."""
+    from ...record.priority import real_time
+
+    with real_time(args.realtime):
+        pass
+    for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
+        os.environ.setdefault(name, "1")
+    if args.rerun is not None:
+        _require_rerun()
+    from ...runtime import set_up_live
+
+    set_up_live()
+
+
+def _tell(line: str) -> None:
+    print(f"jaxeit: {line}", file=sys.stderr)
 
 
 def _require_rerun() -> None:
