@@ -67,9 +67,8 @@ def solved(scene: Scene, fidelity: Fidelity, touches: Sequence[Touch]) -> Soluti
     untouched = conductivity(model)
     sheets = tuple(touched(model, untouched, touch) for touch in touches)
     program = compiled(forward, model, sheets[0])
-    coated = isinstance(
-        sheets[0], CoatedSheet
-    )  # the untouched sheet then is a plain array, which needs a program of its own
+    # The touched sheets are then `CoatedSheet`s and the untouched one an array, which needs a program of its own.
+    coated = isinstance(sheets[0], CoatedSheet)
     v0 = np.asarray(forward(model, untouched) if coated else program.run(untouched))
     dv = np.stack([np.asarray(program.run(sigma)) for sigma in sheets]) - v0
     return Solution(model, setup, program, untouched, sheets, Readings(fidelity, model.system.unknowns, v0, dv))

@@ -204,9 +204,8 @@ class Creep(AbstractMemoryEffect):
         def older(state: tuple[Array, Array], load: Array) -> tuple[tuple[Array, Array], Array]:
             before, age = state
             grown = load > before
-            old = jnp.where(grown, before, 1.0) / jnp.where(
-                grown, load, 1.0
-            )  # share of the load that was present before
+            # the share of the load that was present before
+            old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)
             age = jnp.where(load > 0, old * (age + line.interval.astype(age.dtype)), 0.0)
             return (load, age), age
 

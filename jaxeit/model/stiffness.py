@@ -60,9 +60,8 @@ class Stiffness(eqx.Module):
         first, second = pairs
 
         def add(i: Int[Array, ""], sums: Float[Array, "size pairs"]) -> Float[Array, "size pairs"]:
-            start = jnp.minimum(
-                i * batch, lines - batch
-            )  # the last batch repeats lines of the one before, to have the same size
+            # The last batch repeats lines of the one before, so that all batches have one size.
+            start = jnp.minimum(i * batch, lines - batch)
 
             def cut(table: Shaped[Array, "lines ..."]) -> Shaped[Array, "batch ..."]:
                 return jax.lax.dynamic_slice_in_dim(table, start, batch)

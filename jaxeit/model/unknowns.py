@@ -27,7 +27,8 @@ from ..meshing.elements import Space
 from ..skin.electrodes import ElectrodeError, Touched
 
 RIM_PENALTY = 10.0
-"""Decrease of the ground weight from the middle of the sheet to its size: resistance to the rest is larger there."""
+"""Sets the fall of the ground weight with the distance from the middle of the sheet: the resistance to the rest of the
+sheet grows with it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,9 +67,8 @@ class RingFootprint(AbstractFootprint):
         return True  # the two sides that join the polygons lie on the ring itself
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        within = self._hole.reach * np.cos(
-            np.pi / self.inner_segments
-        )  # distance of the midpoints of the sides from the centre
+        # The sides of the polygon are nearest to the centre at their midpoints, the apothem away.
+        within = self._hole.reach * np.cos(np.pi / self.inner_segments)
         return np.asarray(
             np.maximum(self._whole.distance(points), within - np.linalg.norm(points - self.position, axis=1))
         )
