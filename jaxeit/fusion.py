@@ -75,7 +75,7 @@ class ForceMap(eqx.Module):
 def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
     """Masks of the skin's pads on a pixel image, by exact areas of overlap.
 
-    Where pads overlap they share the pixel equally (a partition of unity).
+    Pads that overlap share the pixel equally (a partition of unity).
 
     Raises:
         FusionError: if the image is not one of pixels, or a pad lies outside it.
@@ -118,9 +118,9 @@ class ContactShares(eqx.Module):
     lies: Float[Array, "... K pads"]
 
 
-# A contact with less than this part of its bump on a pad lies beside the pad.
+# A contact with a smaller part of its bump on a pad lies beside the pad: the tail of its bump takes no force.
 MIN_PART_ON_PAD = 0.05
-# Logarithm of zero that leads to no difference of infinities, and so to no NaN.
+# Finite stand-in for the logarithm of zero: a difference of two infinities would be NaN.
 LOG_OF_ZERO = -1e30
 
 
@@ -154,7 +154,7 @@ def contact_shares(
     on = lies > MIN_PART_ON_PAD
     mine = jnp.where(on | ~jnp.any(on, -2, keepdims=True), inside, 0)
     total = mine.sum(-2, keepdims=True)
-    # From logarithms, since far from every contact all bumps underflow to zero.
+    # Computed from logarithms, because all bumps underflow to zero far from every contact.
     part = jnp.where(there[..., None], jax.nn.softmax(jnp.where(there[..., None], log_bump, LOG_OF_ZERO), -2), 0)
     return ContactShares(part, mine / jnp.where(total > 0, total, 1), lies)
 
@@ -212,7 +212,7 @@ def fuse(
     whole = part.sum(-1, keepdims=True)
     part = part / jnp.where(whole > 0, whole, 1)
     force = (part * jnp.where(known, forces, 0)[..., None]).sum(-2)
-    # NaN is set last, so that it spreads neither through a sum nor through a derivative.
+    # NaN is set last, so that it enters neither a sum nor a derivative of the other pads.
     silent = (~known).astype(mass.dtype) @ masks.weights > 0
     force = jnp.where(silent, jnp.nan, force)
     error = None if pad_errors is None else _root((part**2 * (pad_errors**2)[..., None]).sum(-2))
@@ -227,7 +227,7 @@ def _root(square: Float[Array, "..."]) -> Float[Array, "..."]:
 def _balance(
     seen: Float[Array, "... pixels"], masks: PadMasks, contacts: ContactShares
 ) -> Float[Array, "... pads pixels"]:
-    """Factor on the image over each pad with which its contacts have their shares; 1 for a pad with one contact.
+    """Factor on the image over each pad that gives every contact its share; 1 for a pad with one contact.
 
     The share of a contact that the image does not show goes to the other contacts.
     """

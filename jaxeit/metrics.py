@@ -33,7 +33,7 @@ __all__ = [
 
 
 Places: TypeAlias = Float[ArrayLike, "... 2"] | Sequence[float]
-"""Positions on the flat sheet, m; also one as a list or tuple."""
+"""Positions on the flat sheet, m; a single position may be a list or tuple."""
 
 
 class MetricError(ValueError):
@@ -42,7 +42,7 @@ class MetricError(ValueError):
 
 @runtime_checkable
 class Pictured(Protocol):
-    """Anything that knows where the pixels of an image lie: a reconstructor, a basis map or a picture.
+    """An object that states the places of the pixels of an image: a reconstructor, a basis map or a picture.
 
     | meaning                                              | shape       | unit |
     |------------------------------------------------------|-------------|------|
@@ -52,13 +52,16 @@ class Pictured(Protocol):
     """
 
     @property
-    def centres(self) -> Float[Array, "pixels 2"]: ...
+    def centres(self) -> Float[Array, "pixels 2"]:
+        """Centres of the pixels in the sheet's flat coordinates, (pixels, 2) m."""
 
     @property
-    def areas(self) -> Float[Array, " pixels"]: ...
+    def areas(self) -> Float[Array, " pixels"]:
+        """Areas of the pixels on the sheet, (pixels,) m^2; zero for a pixel that misses it."""
 
     @property
-    def shape(self) -> tuple[int, ...]: ...
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns of the picture."""
 
 
 class AbstractEstimator(eqx.Module):
@@ -141,11 +144,11 @@ def image_sum(image: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " p
 def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) -> Float[Array, "..."]:
     """Standard deviation over mean along the last axis.
 
-    NaN where the mean is zero, and for a single value with ``ddof=1``, whose spread is unknown.
+    NaN where the mean is zero, and for a single value with ``ddof=1``, for which the standard deviation is undefined.
 
     Args:
         values: (..., n).
-        ddof: degrees of freedom that the mean takes, 0 or 1; without a default, since results differ.
+        ddof: degrees of freedom subtracted for the mean, 0 or 1; required, since results differ.
     """
     values = jnp.asarray(values)
     mean = jnp.mean(values, -1)
@@ -287,13 +290,13 @@ def structural_similarity(
 
     with m and s the local means and (co)variances, s_ab = mean(a b) - m_a m_b, under a Gaussian
     window, and the mean taken over all pixels. The window is cut to the square of ceil(2 ``width``)
-    pixels to each side; at the rim the part of it that lies on the picture is scaled up to a sum
-    of one (neither zeros nor reflections are assumed beyond the rim). 1 for equal pictures.
+    pixels to each side; at the rim, the part of the window on the picture is
+    normalised to a sum of one (neither zeros nor reflections are assumed beyond the rim). 1 for equal pictures.
 
     Args:
-        image, truth: (..., rows, columns), of a range of about one, such as 0 and 1.
+        image, truth: (..., rows, columns), with values in a range of about one, such as 0 to 1.
         width: standard deviation of the window, pixels.
-        c1, c2: keep the quotient steady where both pictures are empty, or flat.
+        c1, c2: constants that bound the quotient where both pictures are zero, or constant.
 
     Raises:
         MetricError: if the shapes differ, there is no picture, or a setting is not above zero.
@@ -409,10 +412,10 @@ def _otsu_thresholds(
 ) -> Float[Array, " {classes}-1"]:
     edges, count = _histogram(values, jnp.where(jnp.isfinite(values), weights, 0), bins)
     mass, moment = _sums(count), _sums(count * jnp.linspace(-1, 1, bins, dtype=count.dtype))
-    inside, first = mass - mass[:, None], moment - moment[:, None]  # of the class from edge i to edge j
+    inside, first = mass - mass[:, None], moment - moment[:, None]  # sums over the class from edge i to edge j
     gain = jnp.where(inside > 0, first**2 / jnp.where(inside > 0, inside, 1), 0)
     cuts = _best_cuts(jnp.where(jnp.tri(bins + 1, k=-1, dtype=bool), -jnp.inf, gain), classes)
-    filled = _sums(count > 0)  # bins with something in them below each edge
+    filled = _sums(count > 0)  # number of bins below each edge that are not empty
     alike = filled == filled[cuts][:, None]
     return jnp.sum(alike * edges, 1) / jnp.sum(alike, 1)
 

@@ -25,15 +25,16 @@ __all__ = [
 ]
 
 MAX_KEY_PARTS = 16
-"""Parts of one dotted key: the parser's time and memory grow with their square."""
+"""Largest number of parts of one dotted key: the parser's time and memory grow with the square of this number."""
 
 MAX_DEPTH = 32
-"""Arrays and inline tables within each other: the parser calls itself for each."""
+"""Largest depth of nested arrays and inline tables: the parser calls itself once per level."""
 
 T = TypeVar("T")
 
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
+# Values in messages are cut to 60 characters, so that a message remains one line.
+SHORT_REPR = reprlib.Repr()
+SHORT_REPR.maxstring = SHORT_REPR.maxother = SHORT_REPR.maxlong = 60
 
 
 class TomlError(ValueError):
@@ -41,7 +42,7 @@ class TomlError(ValueError):
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, or a `TomlError` that names it."""
+    """The text of a file; raises a `TomlError` that names the file if it cannot be read."""
     try:
         with open_regular(path) as file:
             size, raw = os.fstat(file.fileno()).st_size, file.read(current_budget().text_bytes)
@@ -55,7 +56,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T], allow_import: bool = False) -> T:
-    """The result of ``build`` for the text; every ValueError on the way becomes a `TomlError` that names ``source``.
+    """The result of ``build`` for the text; a ValueError of ``build`` becomes a `TomlError` that names ``source``.
 
     Args:
         allow_import: whether the text may name classes by import path.  Set it for a file that the user names, not for
@@ -65,12 +66,12 @@ def parse_toml(text: str, source: str, build: Callable[["TomlTable"], T], allow_
         return build(TomlTable(parse_values(text, source), source, allow_import))
     except TomlError:
         raise
-    except ValueError as error:  # an object refused the values it was given
+    except ValueError as error:  # a class refused the values of its settings
         raise TomlError(f"{source}: {error}") from None
 
 
 def parse_values(text: str, source: str) -> dict[str, Any]:
-    """The values of a TOML text; a `TomlError` that names ``source`` for what is not TOML or too large.
+    """The values of a TOML text; raises a `TomlError` that names ``source`` if the text is not TOML or too large.
 
     The limits are checked first, because the parser needs time and memory that grow with the square of a key's parts.
     """
@@ -79,14 +80,14 @@ def parse_values(text: str, source: str) -> dict[str, Any]:
         raise TomlError(f"{source}: not valid TOML: {reason}")
     try:
         return tomllib.loads(text)
-    except ValueError as error:  # the parser's own, and Python's of a number of too many digits
+    except ValueError as error:  # from the parser, or from Python for a number with too many digits
         raise TomlError(f"{source}: not valid TOML: {error}") from None
-    except RecursionError:  # called at the end of a deep stack
+    except RecursionError:  # the caller had already used most of the stack
         raise TomlError(f"{source}: not valid TOML: nested too deeply") from None
 
 
-# Texts, comments, and the marks that are counted. A text without its end reaches to the end of its line, so that every
-# character is looked at once.
+# Strings, comments, and the marks that are counted. A string without a closing quote ends with its line, so that the
+# scan reads every character once and its time is linear.
 _TOKENS = re.compile(
     r"""(?P<text>"{3}(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5})?|'{3}(?:[^']|'(?!''))*+(?:'{3,5})?"""
     r"""|"(?:[^"\\\n]|\\[^\n])*+"?|'[^'\n]*+'?)|(?P<comment>\#[^\n]*+)"""
@@ -96,7 +97,7 @@ _TOKENS = re.compile(
 
 
 def _beyond_limits(text: str) -> str:
-    """What is nested too deeply in a TOML text, or named by too many parts; empty if nothing is."""
+    """The reason why a TOML text exceeds the limits of depth and key parts; empty if it does not."""
     depth = dots = 0
     for token in _TOKENS.finditer(text):
         kind = token.lastgroup
@@ -120,41 +121,60 @@ class TomlTable:
         self.allow_import = allow_import
 
     def error(self, key: str, reason: str) -> TomlError:
+        """A `TomlError` that names the file, the key and the reason; the caller raises it."""
         return TomlError(f"{self.where}: {key}: {reason}")
 
     def has(self, key: str) -> bool:
+        """Whether the table has the key; `done` then counts the key as known."""
         self._asked.add(key)
         return key in self._values
 
     def get(self, key: str, kind: Callable[[Any], bool], meaning: str, default: Any = ...) -> Any:
+        """The value of a key.
+
+        Args:
+            kind: whether a value is acceptable.
+            meaning: what to give, for messages.
+            default: the value of a missing key; if it is not given, the key is required.
+
+        Raises:
+            TomlError: for a required key that is missing, or a value that is not acceptable.
+        """
         if not self.has(key):
             if default is ...:
                 raise self.error(key, f"missing; give {meaning}")
             return default
         value = self._values[key]
         if not kind(value):
-            raise self.error(key, f"is {_SHORT.repr(value)}; give {meaning}")
+            raise self.error(key, f"is {SHORT_REPR.repr(value)}; give {meaning}")
         return value
 
     def number(self, key: str, meaning: str, default: Any = ..., least: float = 0.0) -> float:
+        """A finite number, ``least`` or more; arguments and errors as for `get`."""
+
         def good(value: Any) -> bool:
             return _is_number(value) and value >= least
 
         return float(self.get(key, good, meaning, default))
 
     def positive(self, key: str, meaning: str) -> float:
+        """A finite number above zero; arguments and errors as for `get`."""
         return float(self.get(key, lambda v: _is_number(v) and v > 0, f"{meaning}, above zero"))
 
     def count(self, key: str) -> int:
+        """A whole number from 1 to `MAX_COUNT`; errors as for `get`."""
         meaning = f"a whole number from 1 to {MAX_COUNT:,}"
         return int(self.get(key, lambda v: type(v) is int and 0 < v <= MAX_COUNT, meaning))
 
     def choice(self, key: str, *names: str, default: Any = ...) -> str:
+        """One of ``names``; errors as for `get`."""
         meaning = "one of " + ", ".join(f'"{name}"' for name in names)
         chosen: str = self.get(key, lambda v: v in names, meaning, default)
         return chosen
 
     def array(self, key: str, columns: int | None, meaning: str) -> np.ndarray:
+        """Finite numbers: (rows, columns), or (numbers,) if ``columns`` is None, never empty; errors as for `get`."""
+
         def good(value: Any) -> bool:
             rows = value if columns is not None else [value]
             return (
@@ -167,16 +187,20 @@ class TomlTable:
         return np.array(self.get(key, good, meaning))
 
     def vector(self, key: str, length: int, meaning: str) -> tuple[float, ...]:
+        """A list of ``length`` finite numbers; errors as for `get`."""
         value = self.array(key, None, meaning)
         if len(value) != length:
             raise self.error(key, f"has {len(value)} numbers; give {meaning}")
         return tuple(map(float, value))
 
     def table(self, key: str) -> "TomlTable":
+        """The table ``[key]``; errors as for `get`."""
         value = self.get(key, lambda v: isinstance(v, dict), f"a table [{key}]")
         return TomlTable(value, f"{self.where}: [{key}]", self.allow_import)
 
     def tables(self, key: str) -> list["TomlTable"]:
+        """The tables ``[[key]]`` in the order of the file, none if the key is missing; errors as for `get`."""
+
         def good(value: Any) -> bool:
             return isinstance(value, list) and all(isinstance(v, dict) for v in value)
 
@@ -185,11 +209,12 @@ class TomlTable:
         return [TomlTable(v, f"{where} {i + 1}", self.allow_import) for i, v in enumerate(values)]
 
     def done(self) -> None:
+        """Raise a `TomlError` for the first key that was not read, naming the nearest known key."""
         for key in self._values:
             if key not in self._asked:
                 near = difflib.get_close_matches(key, self._asked, 1)
                 hint = f"did you mean {near[0]!r}?" if near else "known: " + self._known()
-                raise self.error(_SHORT.repr(key)[1:-1], f"unknown key; {hint}")
+                raise self.error(SHORT_REPR.repr(key)[1:-1], f"unknown key; {hint}")
 
     def _known(self) -> str:
         return ", ".join(sorted(self._asked))

@@ -1,4 +1,4 @@
-"""What accuracy costs in time: settings to compare, the study, and the recommendation drawn from it."""
+"""Accuracy against time: settings to compare, the study, and its recommendation."""
 
 from .recommendation import Ladder, Rung
 from .settings import (

@@ -1,4 +1,4 @@
-"""Images of the reference's frames, judged against the touches that made the frames."""
+"""Errors of images of the reference's frames, relative to the touches that made the frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from .settings import Choice, LadderError, Touch
 from .solutions import gaussian
 from .timing import clocked, finished
 
-_ESTIMATOR = LevelCentroid(0.5)
+HALF_MAXIMUM_CENTROID = LevelCentroid(0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,17 +45,17 @@ class JudgedImages:
 def judged_images(
     skin: Skin, model: Model, choice: Choice, touches: Sequence[Touch], truth: Reference
 ) -> JudgedImages | None:
-    """Image the reference's frames as ``choice`` says and judge the images; None if it asks for no images.
+    """Image the reference's frames with the imaging of ``choice`` and measure their errors; None if it has no imaging.
 
     Raises:
-        LadderError: if the image of a touch is nowhere positive.
+        LadderError: if the image of a touch is not positive anywhere.
     """
     how = choice.imaging
     if how is None:
         return None
     spent, recon = clocked(lambda: jax.block_until_ready(how.prepare(model, frames=truth.differences)))
     image = recon(truth.differences.astype(model.dtype))
-    distances = np.asarray(localisation_error(_ESTIMATOR(image, recon), _places(touches, model.dtype)))
+    distances = np.asarray(localisation_error(HALF_MAXIMUM_CENTROID(image, recon), _places(touches, model.dtype)))
     if not np.isfinite(distances).all():
         lost = touches[int(np.argmin(np.isfinite(distances)))].name
         raise LadderError(f"{choice.label} shows nothing of the touch {lost!r}; give another touch, or another imaging")
@@ -76,7 +76,7 @@ def misplaced(
 ) -> Float[np.ndarray, " touches"]:
     """Share of the force that the force map shows in the wrong place, for exact pad forces.
 
-    Half of the sum of what the force map has too much and what it has too little, for a force of one.
+    Half of the sum of excess and missing force over the pixels, for a force of one.
     """
     bumps = np.stack([gaussian(np.asarray(recon.centres, np.float64), t) for t in touches]) * np.asarray(recon.areas)
     masks = _masks(skin, recon, bumps)

@@ -81,7 +81,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The extrapolated readings that rungs are judged by.
+    """The extrapolated readings that define the errors of rungs.
 
     | meaning                                                       | shape               | unit |
     |---------------------------------------------------------------|---------------------|------|
@@ -109,7 +109,7 @@ class Ladder:
     | skin: name of the skin                         |
     | effects: names of the scene's effects          |
     | device: platform that computed                 |
-    | touches, reference: what rungs are judged by   |
+    | touches, reference: for the errors of rungs    |
     | rungs                                          |
     """
 
@@ -132,23 +132,23 @@ class Ladder:
         return tuple(first.values())
 
     def front(self) -> tuple[Rung, ...]:
-        """Rungs of the fidelities that no other beats in both difference error and time of a forward solve."""
+        """Rungs of the fidelities that no other rung beats in both difference error and time of a forward solve."""
         return undominated(self.fidelities(), lambda r: (self.certain(r), r.forward.median))
 
     def image_front(self) -> tuple[Rung, ...]:
-        """Rungs that no other beats in both localisation error and time of a frame."""
+        """Rungs that no other rung beats in both localisation error and time of a frame."""
         images = {r: r.image for r in self.rungs if r.image}
         return undominated(list(images), lambda r: (images[r].localisation, images[r].frame.median))
 
     def recommend(self, *, budget_ms: float | None = None, error: float | None = None) -> Rung:
-        """The quickest rung within ``error``; if ``error`` is not given, the most accurate rung within the budget.
+        """The fastest rung within ``error``; if ``error`` is not given, the most accurate rung within the budget.
 
         Args:
             budget_ms: largest median time of a forward solve, ms.
             error: largest difference error, relative; the uncertainty of the reference counts as an error.
 
         Raises:
-            LadderError: if neither is given, or no rung fulfils both.
+            LadderError: if neither is given, or no rung meets both.
         """
         require_wishes(budget_ms, error)
         quick = [r for r in self.fidelities() if budget_ms is None or 1e3 * r.forward.median <= budget_ms]
@@ -160,13 +160,13 @@ class Ladder:
         return min(good, key=lambda r: r.forward.median)
 
     def advice(self, *, budget_ms: float | None = None, error: float | None = None) -> str:
-        """The rung that `recommend` gives, and on a second line the `Fidelity` to write for it."""
+        """Text with the rung of `recommend`, and the expression of its `Fidelity` on a second line."""
         rung = self.recommend(budget_ms=budget_ms, error=error)
         f = rung.choice.fidelity
         made = f"edge_length={f.edge_length:g}, order={f.order}, dtype='{f.dtype}'"
         made += f", electrode_segments={f.electrode_segments}, growth={f.growth:g}"
         solver = "" if f.solver is None else f", solver={f.solver!r}"
-        return f"recommended: {self._said(rung)}\n    jaxeit.Fidelity({made}{solver})"
+        return f"recommended: {self._text(rung)}\n    jaxeit.Fidelity({made}{solver})"
 
     def table(self, width: int = 110) -> str:
         """The measurements as text; columns that do not fit ``width`` are left out, the least important first."""
@@ -179,14 +179,14 @@ class Ladder:
     def _refusal(self, quick: Sequence[Rung], budget_ms: float | None, error: float | None) -> str:
         if not quick:
             best = min(self.rungs, key=lambda r: r.forward.median)
-            return f"no rung solves in {budget_ms:g} ms; the quickest, {self._said(best)}: give more time"
+            return f"no rung solves in {budget_ms:g} ms; the quickest, {self._text(best)}: give more time"
         best = min(quick, key=self.certain)
         within = "" if budget_ms is None else f" in {budget_ms:g} ms"
         return (
-            f"no rung has an error of {error:g}{within}; the best, {self._said(best)}: allow more, or give finer rungs"
+            f"no rung has an error of {error:g}{within}; the best, {self._text(best)}: allow more, or give finer rungs"
         )
 
-    def _said(self, rung: Rung) -> str:
+    def _text(self, rung: Rung) -> str:
         return f"{rung.choice.label}, has {self.certain(rung):.2g} in {1e3 * rung.forward.median:.3g} ms"
 
 
@@ -201,7 +201,7 @@ def undominated(items: Sequence[T], costs: Callable[[T], tuple[float, float]]) -
 
 
 def require_wishes(budget_ms: float | None, error: float | None) -> None:
-    """Raise a `LadderError` if neither wish is given, or one is not above zero."""
+    """Raise a `LadderError` if neither limit is given, or one is not above zero."""
     for name, value in (("budget_ms", budget_ms), ("error", error)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise LadderError(f"{name} is {value}; give a number above zero")
@@ -209,11 +209,11 @@ def require_wishes(budget_ms: float | None, error: float | None) -> None:
         raise LadderError("there is nothing to recommend by; give budget_ms, error or both")
 
 
-# --- what is printed -------------------------------------------------------------------------------------------------
+# --- tables ----------------------------------------------------------------------------------------------------------
 
 _Cell = Callable[[Ladder, Any], str]
 # Head, cell, and priority: where the width is too small, the column with the largest number is left out first.
-_FIDELITY: tuple[tuple[str, _Cell, int], ...] = (
+FIDELITY_COLUMNS: tuple[tuple[str, _Cell, int], ...] = (
     ("", lambda found, r: "*" if r in found.front() else "", 0),
     ("rung", lambda found, r: r.choice.label, 0),
     ("P", lambda found, r: str(r.choice.fidelity.order), 6),
@@ -229,7 +229,7 @@ _FIDELITY: tuple[tuple[str, _Cell, int], ...] = (
     ("compile s", lambda found, r: f"{r.compile:.2g}", 3),
     ("MB", lambda found, r: "" if r.memory is None else f"{r.memory / 1e6:.3g}", 8),
 )
-_IMAGES: tuple[tuple[str, _Cell, int], ...] = (
+IMAGE_COLUMNS: tuple[tuple[str, _Cell, int], ...] = (
     ("", lambda found, r: "*" if r in found.image_front() else "", 0),
     ("rung", lambda found, r: r.choice.label, 0),
     ("off mm", lambda found, r: f"{1e3 * r.image.localisation:.2f}", 0),
@@ -242,7 +242,7 @@ _IMAGES: tuple[tuple[str, _Cell, int], ...] = (
 )
 
 
-_IMAGED = (
+IMAGE_NOTE = (
     "Images of the reference's frames, without noise; by default {usual}. "
     "off: mean distance from the touch to the centroid of the half maximum; misplaced: share of the force that the "
     "force map shows in the wrong place; frame: a single frame; frames/s: in a batch."
@@ -270,11 +270,11 @@ def _report(found: Ladder, width: int) -> str:
         f"Touches: {', '.join(t.name for t in found.touches)}. Times are medians. *: no other rung is both better and "
         "quicker."
     )
-    parts = [textwrap.fill(about, width), _grid(_FIDELITY, found, found.fidelities(), width)]
+    parts = [textwrap.fill(about, width), _grid(FIDELITY_COLUMNS, found, found.fidelities(), width)]
     imaged = [r for r in found.rungs if r.image]
     if imaged:
-        parts.append(textwrap.fill(_IMAGED.format(usual=imaged[0].choice.imaging), width))
-        parts.append(_grid(_IMAGES, found, imaged, width))
+        parts.append(textwrap.fill(IMAGE_NOTE.format(usual=imaged[0].choice.imaging), width))
+        parts.append(_grid(IMAGE_COLUMNS, found, imaged, width))
     return "\n\n".join(parts)
 
 

@@ -1,4 +1,4 @@
-"""The input of a ladder: choices of how to compute, and the touches that they are judged by."""
+"""The input of a ladder: fidelities and imaging methods to compare, and the touches that define their errors."""
 
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +13,7 @@ from ..skin.description import Skin
 
 
 class LadderError(ValueError):
-    """Rungs that cannot be compared, or a wish that no rung fulfils; the message says what to change."""
+    """Rungs that cannot be compared, or a limit that no rung meets; the message says what to change."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """One way to compute, with its label; ``imaging`` None: no images are made."""
+    """A fidelity and an imaging method with a label; ``imaging`` None: no images are made."""
 
     label: str
     fidelity: Fidelity
@@ -50,7 +50,7 @@ class Choice:
 
 
 def few_choices() -> tuple[Choice, ...]:
-    """Rungs for a first look, within a minute."""
+    """Rungs for a first comparison, which takes less than a minute."""
     return (
         Choice("draft", Fidelity.draft()),
         Choice("draft f32", Fidelity.draft(dtype=np.float32), None),
@@ -116,7 +116,7 @@ def _on_pad(skin: Skin, middle: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _by_the_rim(skin: Skin, middle: np.ndarray) -> np.ndarray:
-    """The first place, along the rim, a tenth of the way from the rim to the middle that lies on the sheet."""
+    """The first place along the rim, a tenth of the way from the rim to the middle, that lies on the sheet."""
     rim = skin.domain.boundary_point(np.linspace(0.3, 1.3, 20, endpoint=False) * skin.domain.perimeter)
     places = rim + (middle - rim) / 10
     return np.asarray(places[np.argmax(skin.domain.contains(places))])
@@ -132,7 +132,7 @@ def _between_electrodes(skin: Skin, middle: np.ndarray) -> np.ndarray:
 
 
 def refined(fidelity: Fidelity, factor: float) -> Fidelity:
-    """``factor`` times finer everywhere, with as many more electrode segments and a growth rate to match.
+    """``factor`` times finer everywhere, with more electrode segments in proportion and a growth rate to match.
 
     Quadratic elements in float64: the family of the reference.
     """
@@ -148,6 +148,6 @@ def refined(fidelity: Fidelity, factor: float) -> Fidelity:
 
 
 def _sides(least: float) -> int:
-    """The nearest number of sides that a mesh can halve down to a hub: 6 to 12 times a power of two."""
+    """The next number of polygon sides that a mesh can halve repeatedly to 6 to 12: 6 to 12 times a power of two."""
     power = int(2 ** max(0, int(np.floor(np.log2(least / 6)))))
     return max(6, round(least / power)) * power

@@ -1,9 +1,9 @@
 """Readings of a scene at one fidelity, untouched and touched, and their extrapolation to the reference.
 
-Richardson's extrapolation from two meshes of quadratic elements in float64.  Its order is three for the readings of an
-even sheet (quadratic elements, discs that are polygons) and two for the difference that a touch makes, since
-conductivity is constant by element.  The uncertainty of the reference is, for both, how far an extrapolation of order
-two would move the finer solution (Roache 1994).
+Richardson's extrapolation from two meshes of quadratic elements in float64.  Its order is three for the readings of a
+uniform sheet (quadratic elements, polygons for discs) and two for the difference that a touch makes, since the
+conductivity is constant on each element.  The uncertainty of both is the distance by which an extrapolation of order
+two moves the finer solution (Roache 1994).
 """
 
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ from .timing import Program, clocked, compiled
 
 # Degree-5 quadrature on the triangle (Strang and Fix): barycentric points and weights.
 _A, _B = (6 + np.sqrt(15)) / 21, (6 - np.sqrt(15)) / 21
-_POINTS = np.array(
+QUADRATURE_POINTS = np.array(
     [[1 / 3] * 3]
     + [np.roll([1 - 2 * _A, _A, _A], k) for k in range(3)]
     + [np.roll([1 - 2 * _B, _B, _B], k) for k in range(3)]
 )
-_WEIGHTS = np.array([9 / 40] + 3 * [(155 + np.sqrt(15)) / 1200] + 3 * [(155 - np.sqrt(15)) / 1200])
+QUADRATURE_WEIGHTS = np.array([9 / 40] + 3 * [(155 + np.sqrt(15)) / 1200] + 3 * [(155 - np.sqrt(15)) / 1200])
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +67,15 @@ def solved(scene: Scene, fidelity: Fidelity, touches: Sequence[Touch]) -> Soluti
     untouched = conductivity(model)
     sheets = tuple(touched(model, untouched, touch) for touch in touches)
     program = compiled(forward, model, sheets[0])
-    coated = isinstance(sheets[0], CoatedSheet)  # the untouched sheet is then an array, which is another program
+    # The touched sheets are then `CoatedSheet`s and the untouched one an array, which needs a program of its own.
+    coated = isinstance(sheets[0], CoatedSheet)
     v0 = np.asarray(forward(model, untouched) if coated else program.run(untouched))
     dv = np.stack([np.asarray(program.run(sigma)) for sigma in sheets]) - v0
     return Solution(model, setup, program, untouched, sheets, Readings(fidelity, model.system.unknowns, v0, dv))
 
 
 def touched(model: Model, untouched: Array, touch: Touch) -> Array | CoatedSheet:
-    """Conductivity of the touched sheet: by the scene's response to pressure, or raised directly if it has none."""
+    """Conductivity of the touched sheet: by the scene's response to pressure, or raised directly without one."""
     shape = bump(model, touch)
     pressed = conductivity(model, jnp.asarray(touch.pressure * shape, model.dtype))
     if isinstance(pressed, CoatedSheet) or bool(jnp.any(pressed != untouched)):
@@ -85,8 +86,8 @@ def touched(model: Model, untouched: Array, touch: Touch) -> Array | CoatedSheet
 def bump(model: Model, touch: Touch) -> Float[np.ndarray, " elements"]:
     """Means over the elements of the touch's bump of height one, equal on all meshes up to fourth order."""
     corners = np.asarray(model.chart, np.float64)[np.asarray(model.triangles)]
-    places = np.einsum("qc,ecd->eqd", _POINTS, corners)
-    return np.asarray(gaussian(places, touch) @ _WEIGHTS)
+    places = np.einsum("qc,ecd->eqd", QUADRATURE_POINTS, corners)
+    return np.asarray(gaussian(places, touch) @ QUADRATURE_WEIGHTS)
 
 
 def gaussian(places: Float[np.ndarray, "... 2"], touch: Touch) -> Float[np.ndarray, "..."]:
@@ -117,5 +118,5 @@ def _limit(coarse: Float[np.ndarray, "..."], fine: Float[np.ndarray, "..."], fal
 
 
 def relative_error(found: Float[np.ndarray, "..."], wanted: Float[np.ndarray, "..."]) -> float:
-    """Root of the summed squares of the error, over that of what is wanted."""
+    """Root of the sum of squared errors, over the root of the sum of squared wanted values."""
     return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))

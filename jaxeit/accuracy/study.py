@@ -1,6 +1,6 @@
-"""What accuracy costs in time: a scene at many fidelities, each judged against one reference and timed.
+"""Accuracy against time: the errors, relative to one reference, and the times of a scene at many fidelities.
 
-Host code around the verbs: it builds models, calls compiled programs and takes the time.  Errors are relative to a
+This code runs on the host: it builds models, calls compiled programs and measures times.  Errors are relative to a
 reference that is extrapolated from two meshes finer than that of any rung (`jaxeit.accuracy.solutions`).
 """
 
@@ -35,15 +35,15 @@ def ladder(
     budget: float = 0.5,
     progress: Progress = iter,
 ) -> Ladder:
-    """Build, judge and time ``scene`` at every rung.
+    """Build ``scene`` at every rung, and measure its errors and times.
 
-    Images are made of the reference's frames, so that no rung inverts its own mesh.  The frames have
+    Images are made of the reference's frames, so that no rung inverts data of its own mesh.  The frames have
     no noise: the localisation error is that of the reconstruction alone.
 
     Args:
         scene: the scene to study.
         rungs: default `fidelity_choices` and `image_choices`.
-        touches: contacts to judge by; default `default_touches`.
+        touches: contacts that define the errors; default `default_touches`.
         reference: a coarse and a fine fidelity of one family to extrapolate from; default: the finest rung
             `refined` 1.1 and 1.5 times.
         budget: seconds for the repeats of each timed call; three repeats are made in any case.
@@ -82,7 +82,7 @@ def fit_fidelity(
     rungs: Sequence[Choice] | None = None,
     progress: Progress = iter,
 ) -> Fidelity:
-    """Measure which fidelity suits this scene on this machine: `Ladder.recommend` of a `ladder` without images.
+    """Find the fidelity for this scene on this machine: `Ladder.recommend` of a `ladder` without images.
 
     Args:
         scene: the scene to study.
@@ -91,7 +91,7 @@ def fit_fidelity(
         progress: wraps each pass over the rungs.
 
     Raises:
-        LadderError: if neither wish is given, or no rung fulfils both.
+        LadderError: if neither limit is given, or no rung meets both.
     """
     require_wishes(budget_ms, error)
     choices = fidelity_choices() if rungs is None else rungs

@@ -1,4 +1,4 @@
-"""Times of compiled programs, taken so that a busy moment of the machine falls on all programs alike."""
+"""Times of compiled programs, measured in turn so that a busy moment of the machine affects all programs alike."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -22,7 +22,7 @@ MIN_CALLS, MAX_CALLS = 3, 1000  # timed calls of each program
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A compiled function of one argument, the seconds of its compilation, and the bytes that it takes."""
+    """A compiled function of one argument, the seconds of its compilation, and the memory that it needs, bytes."""
 
     run: Callable[[Any], Any]
     seconds: float
@@ -49,7 +49,7 @@ def clocked(call: Callable[[], T]) -> tuple[float, T]:
 
 
 def finished(call: Callable[[Any], T]) -> Callable[[Any], T]:
-    """``call``, returning when the device has computed the result."""
+    """``call``, but it returns only when the device has computed the result."""
 
     def run(given: Any) -> T:
         out: T = jax.block_until_ready(call(given))
@@ -59,7 +59,7 @@ def finished(call: Callable[[Any], T]) -> Callable[[Any], T]:
 
 
 def in_turn(call: Callable[[Any], Any], inputs: Iterable[Any]) -> Callable[[], Any]:
-    """``call`` with the next of the inputs each time, over and over."""
+    """A function that calls ``call`` with the next input each time and cycles through the inputs."""
     given = cycle(inputs)
     return lambda: call(next(given))
 

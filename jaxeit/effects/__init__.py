@@ -1,7 +1,7 @@
 """Effects: departures from the ideal sensor, one small class each, listed in a scene one by one.
 
 An effect that a scene does not list is neither computed nor compiled.  A new effect is one class in the file of its
-family, or in a file of its own, and its import here: `EFFECTS`, scene files and the tests find it from there.
+family, or in a new file, and its import here; `EFFECTS`, scene files and the tests then know the class.
 """
 
 from ..registry import Registry
@@ -74,7 +74,7 @@ from .readout import (
 )
 
 EFFECTS = Registry(AbstractEffect, "effect", "jaxeit.effects", spell=str)
-"""All effects by the names that scene files use: those of the class."""
+"""All effects by the names that scene files use, which are the class names."""
 
 __all__ = [
     "EFFECTS",

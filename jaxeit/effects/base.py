@@ -2,20 +2,20 @@
 
 | stage      | family                    | acts on                                                           |
 |------------|---------------------------|-------------------------------------------------------------------|
-| mechanics  | `AbstractStageEffect`     | where and when the stage presses                                  |
-| mechanics  | `AbstractLoadEffect`      | how a unit load spreads over the sheet                            |
-| material   | `AbstractMemoryEffect`    | the load that the sheet feels, a history                          |
-| material   | `AbstractSheetEffect`     | pressure and manufacture to conductivity                          |
-| material   | `AbstractCoatEffect`      | the same, with a second sheet that `discretise` makes room for    |
+| mechanics  | `AbstractStageEffect`     | places and times at which the stage presses                       |
+| mechanics  | `AbstractLoadEffect`      | pressure on the sheet under a unit load                           |
+| material   | `AbstractMemoryEffect`    | the load on the sheet, a history                                  |
+| material   | `AbstractSheetEffect`     | conductivity of the sheet, from pressure and manufacture          |
+| material   | `AbstractCoatEffect`      | the same, with a second sheet that `discretise` adds to the model |
 | electrical | `AbstractContactEffect`   | contact conductance of the electrodes                             |
-| electrical | `AbstractTerminalEffect`  | from the transfer matrix to the voltages between terminals        |
-| pneumatics | `AbstractPadEffect`       | how strongly a pad feels each place                               |
+| electrical | `AbstractTerminalEffect`  | voltages between terminals, from the transfer matrix              |
+| pneumatics | `AbstractPadEffect`       | response of a pad to pressure at each place                       |
 | pneumatics | `AbstractPneumaticEffect` | the pressures in the pads, a history                              |
-| readout    | `AbstractScanEffect`      | when in a scan each reading is taken                              |
+| readout    | `AbstractScanEffect`      | time of each reading in a scan                                    |
 | readout    | `AbstractReadoutEffect`   | a recorded stream, a history                                      |
-| readout    | `AbstractClockEffect`     | the time stamps of a stream, and what is lost on its way          |
+| readout    | `AbstractClockEffect`     | the time stamps of a stream, and lost samples                     |
 
-Histories are processed in blocks of samples: a history effect has a state that it passes from one block to the next.
+Histories are processed in blocks of samples; a history effect passes its state from one block to the next.
 """
 
 import enum
@@ -39,7 +39,7 @@ class StreamKind(enum.Enum):
 
 
 class Path(NamedTuple):
-    """What the stage does, press by press.
+    """The motion of the stage, press by press.
 
     | meaning                                    | shape         | unit |
     |--------------------------------------------|---------------|------|
@@ -61,7 +61,7 @@ class Indenter(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """The state of the sheet and where its elements are.
+    """The state of the sheet and the places of its elements.
 
     | meaning                                              | shape         | unit |
     |------------------------------------------------------|---------------|------|
@@ -70,9 +70,9 @@ class Sheet(NamedTuple):
     | centroids                                            | (elements, 2) | m    |
     | size: side of a square of the element's area         | (elements,)   | m    |
     | temperature above that at which sigma was given      | ()            | K    |
-    | share of it that bears the pressure; None: all of it | (elements,)   | 1    |
-    | metal: conductivity of a coat; None: no such sheet   | ()            | S    |
-    | coupling: contact conductance to that                | (elements,)   | S/m^2 |
+    | share of its area under pressure; None: all of it    | (elements,)   | 1    |
+    | metal: conductivity of a coat; None: no coat         | ()            | S    |
+    | coupling: contact conductance to the coat            | (elements,)   | S/m^2 |
     """
 
     sigma: Float[Array, " elements"]
@@ -86,7 +86,7 @@ class Sheet(NamedTuple):
 
 
 class Circuit(NamedTuple):
-    """The sheet as its terminals see it.
+    """The electrical circuit between the terminals of the sheet.
 
     | meaning                                                           | shape                    | unit |
     |-------------------------------------------------------------------|--------------------------|------|
@@ -101,7 +101,7 @@ class Circuit(NamedTuple):
 
 
 class Line(NamedTuple):
-    """What a history effect is given besides its series.
+    """The inputs of a history effect besides its series.
 
     | meaning                                                       | shape         | unit |
     |---------------------------------------------------------------|---------------|------|
@@ -120,7 +120,7 @@ class Line(NamedTuple):
 
 
 class Packets(NamedTuple):
-    """The samples of a block on their way to the host.
+    """The samples of a block between the device and the host.
 
     | meaning                                        | shape   | unit |
     |------------------------------------------------|---------|------|
@@ -134,20 +134,20 @@ class Packets(NamedTuple):
     lost: Bool[Array, " time"]
 
 
-# A block of a series of samples, and what a history effect remembers between blocks.
+# A block of a series of samples, and the state that a history effect keeps between blocks.
 Series = Float[Array, "time channels"]
 State: TypeAlias = PyTree[Array]
 
 
 def parameter(default: float) -> Any:
-    """A numeric field that is a pytree leaf: a new value retraces nothing."""
+    """A numeric field that is a pytree leaf, so that a new value does not trigger recompilation."""
     return eqx.field(converter=jnp.asarray, default=default)
 
 
 class AbstractEffect(eqx.Module):
     """One departure from the ideal sensor.
 
-    ``rank`` orders effects within their family; of effects that name the same ``alternative`` a scene has one.
+    ``rank`` orders effects within their family.  A scene lists at most one effect of each ``alternative``.
     """
 
     stage: ClassVar[str]
@@ -156,21 +156,21 @@ class AbstractEffect(eqx.Module):
 
     @abstractmethod
     def __call__(self, state: Any, /, *context: Any) -> Any:
-        """What the family acts on, after this effect."""
+        """The quantity that the family acts on, after this effect."""
 
 
 class AbstractStageEffect(AbstractEffect):
-    """Mechanics: where and when the stage presses."""
+    """Mechanics: places and times at which the stage presses."""
 
     stage: ClassVar[str] = "mechanics"
 
     @abstractmethod
     def __call__(self, path: Path, key: Key[Array, ""]) -> Path:
-        """What the stage does when told to follow ``path``."""
+        """The motion of the stage when its command is ``path``."""
 
 
 class AbstractLoadEffect(AbstractEffect):
-    """Mechanics: how a unit load spreads from the indenter to the sheet."""
+    """Mechanics: spread of a unit load from the indenter to the sheet."""
 
     stage: ClassVar[str] = "mechanics"
 
@@ -178,14 +178,14 @@ class AbstractLoadEffect(AbstractEffect):
     def __call__(
         self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]
     ) -> Float[Array, " elements"]:
-        """The pressure per unit load, 1/m^2, from that of the stage before."""
+        """The pressure per unit load after this effect, 1/m^2, from that before it."""
 
 
 class AbstractHistoryEffect(AbstractEffect):
-    """An effect on a series of samples, which it is given block by block."""
+    """An effect on a series of samples, which it processes block by block."""
 
     def start(self, first: Float[Array, " channels"]) -> State:
-        """The state before the first sample, given the series' value at rest; by default none."""
+        """The state before the first sample, from the series' value at rest; by default empty."""
         return ()
 
     @abstractmethod
@@ -194,13 +194,13 @@ class AbstractHistoryEffect(AbstractEffect):
 
 
 class AbstractMemoryEffect(AbstractHistoryEffect):
-    """Material: the load of each contact as the sheet feels it, N; each contact is a channel."""
+    """Material: the load of each contact on the sheet, N; each contact is a channel."""
 
     stage: ClassVar[str] = "material"
 
 
 class AbstractSheetEffect(AbstractEffect):
-    """Material: how pressure and manufacture change the sheet's conductivity."""
+    """Material: the change of the sheet's conductivity by pressure and manufacture."""
 
     stage: ClassVar[str] = "material"
 
@@ -209,27 +209,27 @@ class AbstractSheetEffect(AbstractEffect):
         """The sheet after this effect."""
 
     def laid(self, centroids: Float[Array, "elements 2"]) -> "AbstractSheetEffect":
-        """This effect for elements at these places, with everything that depends on places alone computed once; by
-        default the effect itself."""
+        """This effect for elements at these places, (elements, 2) m, with all values that depend on places alone
+        computed in advance; by default the effect itself."""
         return self
 
 
 class AbstractCoatEffect(AbstractSheetEffect):
-    """Material: a second conducting sheet, which touches the first where it is pressed."""
+    """Material: a second conducting sheet, which touches the first under pressure."""
 
 
 class AbstractContactEffect(AbstractEffect):
-    """Electrical: the contact conductance of the electrodes, S/m^2 or S/m as the electrode has it."""
+    """Electrical: the contact conductance of the electrodes, S/m^2 (area electrodes) or S/m (electrodes on the rim)."""
 
     stage: ClassVar[str] = "electrical"
 
     @abstractmethod
     def __call__(self, contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
-        """The conductances after this effect; 0 stands for a perfect contact and stays."""
+        """The conductances after this effect; 0 stands for a perfect contact and remains 0."""
 
 
 class AbstractTerminalEffect(AbstractEffect):
-    """Electrical: how source and amplifier change the voltages at their terminals."""
+    """Electrical: changes of the terminal voltages by source and amplifier."""
 
     stage: ClassVar[str] = "electrical"
 
@@ -239,7 +239,7 @@ class AbstractTerminalEffect(AbstractEffect):
 
 
 class AbstractPadEffect(AbstractEffect):
-    """Pneumatics: how strongly a pad feels the pressure at each place of its footprint."""
+    """Pneumatics: the response of a pad to pressure at each place of its footprint."""
 
     stage: ClassVar[str] = "pneumatics"
 
@@ -257,7 +257,7 @@ class AbstractPneumaticEffect(AbstractHistoryEffect):
 
 
 class AbstractScanEffect(AbstractEffect):
-    """Readout: when each reading of a frame is taken, s after the frame's time."""
+    """Readout: the time of each reading of a frame, s after the frame's time."""
 
     stage: ClassVar[str] = "readout"
 
@@ -265,18 +265,18 @@ class AbstractScanEffect(AbstractEffect):
     def __call__(
         self, when: Float[Array, " readings"], nominal: Float[Array, " readings"]
     ) -> Float[Array, " readings"]:
-        """The times after this effect; ``nominal`` are those of the skin's protocol."""
+        """The times after this effect, s; ``nominal`` are those of the skin's protocol."""
 
 
 class AbstractReadoutEffect(AbstractHistoryEffect):
-    """Readout: how a recorded series departs from the quantity it records."""
+    """Readout: the deviation of a recorded series from the quantity it records."""
 
     stage: ClassVar[str] = "readout"
     stream: eqx.AbstractVar[StreamKind]
 
 
 class AbstractClockEffect(AbstractEffect):
-    """Readout: what clocks and links do to the samples of a stream."""
+    """Readout: errors of clocks and links on the samples of a stream."""
 
     stage: ClassVar[str] = "readout"
     stream: eqx.AbstractVar[StreamKind]
@@ -287,18 +287,18 @@ class AbstractClockEffect(AbstractEffect):
 
 
 def laid(effects: Iterable[AbstractEffect], centroids: Float[Array, "elements 2"]) -> tuple[AbstractEffect, ...]:
-    """The effects, with those of the sheet prepared by `AbstractSheetEffect.laid`, for many sheets on one mesh."""
+    """The effects, with sheet effects prepared by `AbstractSheetEffect.laid`, for many states of one mesh."""
     return tuple(e.laid(centroids) if isinstance(e, AbstractSheetEffect) else e for e in effects)
 
 
 def chosen(effects: Iterable[AbstractEffect], family: type, stream: StreamKind | None = None) -> tuple[Any, ...]:
-    """The effects of one family (and stream) in the order in which they act."""
+    """The effects of one family (and one stream, if given) in the order in which they act."""
     mine = (e for e in effects if isinstance(e, family) and (stream is None or getattr(e, "stream", None) is stream))
     return tuple(sorted(mine, key=lambda e: e.rank))
 
 
 def fold(effects: Iterable[AbstractEffect], family: type, state: Any, *context: Any) -> Any:
-    """Apply the effects of one family in order of rank, each under its own name in the program."""
+    """Apply the effects of one family in order of rank, each in a scope with its name in the compiled program."""
     for effect in chosen(effects, family):
         with jax.named_scope(type(effect).__name__):
             state = effect(state, *context)
@@ -306,7 +306,7 @@ def fold(effects: Iterable[AbstractEffect], family: type, state: Any, *context: 
 
 
 def keys(effects: Iterable[AbstractEffect], key: Key[Array, ""]) -> list[Key[Array, ""]]:
-    """A key for each effect, derived from its name and from the number of equal ones before it.
+    """A key for each effect, derived from its name and from the number of effects of that name before it.
 
     The key of one effect does not change when others are added or removed.
     """
@@ -319,7 +319,7 @@ def keys(effects: Iterable[AbstractEffect], key: Key[Array, ""]) -> list[Key[Arr
 
 
 def history_start(effects: Iterable[AbstractHistoryEffect], first: Float[Array, " channels"]) -> tuple[State, ...]:
-    """States of these history effects before the first sample, given the series' value at rest."""
+    """States of these history effects before the first sample, from the series' value at rest."""
     return tuple(effect.start(first) for effect in effects)
 
 

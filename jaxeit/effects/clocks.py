@@ -9,10 +9,10 @@ from .base import AbstractClockEffect, Packets, StreamKind, parameter
 
 
 class ClockError(AbstractClockEffect):
-    """The device's clock is independent of the host's, and samples arrive late.
+    """The device's clock runs independently of the host's, and samples arrive late.
 
     ``device <- (1 + skew) device + offset``; ``host <- host + latency + x``, x exponential with mean ``jitter``,
-    no earlier in a block than the sample before; where ``batch`` is not 0, at the next whole multiple of it.
+    no earlier in a block than the sample before; if ``batch`` is not 0, at the next whole multiple of ``batch``.
 
     | meaning                                  | default | range            | unit | source                     |
     |------------------------------------------|---------|------------------|------|----------------------------|
@@ -39,7 +39,7 @@ class ClockError(AbstractClockEffect):
 
 
 class DropOut(AbstractClockEffect):
-    """Samples are lost on the way, each by itself with the same probability.
+    """Samples are lost on the way to the host, independently and with the same probability.
 
     | meaning       | default | range     | unit | source     |
     |---------------|---------|-----------|------|------------|

@@ -1,4 +1,4 @@
-"""Material: a coat of metal that conducts on its own."""
+"""Material: a continuous metal coat, which conducts along the sheet."""
 
 from typing import ClassVar
 
@@ -9,16 +9,16 @@ from .material import power
 
 
 class ContinuousCoating(AbstractCoatEffect):
-    """The metal is one sheet, not islands: pressed places far apart are joined through it.
+    """The metal is one sheet, not islands, and connects pressed places that are far apart.
 
-    Sheet and metal, with potentials u and m, exchange current where they are pressed together
+    Sheet and metal, with potentials u and m, exchange current under pressure
     (`jaxeit.model.metal_sheet`):
 
         ``-div(sigma grad u) + g (u - m) = 0``,  ``-div(grad m) / R_m + g (m - u) = 0``,
         ``g = f / rho``,  ``rho = rho_r (p / p_r)^-n``.
 
     It replaces `ContactPiezoresistance` and `HomogenisedIslands`, which are local: list one of the
-    three.  The metal has no contact to any electrode.
+    three.  The metal touches no electrode.
 
     | meaning                                    | default | range      | unit    | source              |
     |--------------------------------------------|---------|------------|---------|---------------------|

@@ -1,4 +1,4 @@
-"""Electrical: electrodes, source and amplifier between the sheet and the voltages."""
+"""Electrical: errors of electrodes, current source and amplifiers."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from .random import own_normal
 class ContactScatter(AbstractContactEffect):
     """Contact conductances vary from electrode to electrode, log-normally.
 
-    ``g <- g exp(std n)``; perfect contacts stay perfect.
+    ``g <- g exp(std n)``; perfect contacts remain perfect.
 
     | meaning                    | default | range  | unit | source     |
     |----------------------------|---------|--------|------|------------|
@@ -28,15 +28,15 @@ class ContactScatter(AbstractContactEffect):
 
 
 class ElectrodeFault(AbstractTerminalEffect):
-    """A lost electrode, as a source of finite compliance and amplifiers of finite input resistance see it.
+    """A lost electrode, with a source of finite compliance and amplifiers of finite input resistance.
 
     A resistance lies between the electrode and its wire.  The drive- wire is ground; each sense wire
-    loads the sheet with an input resistance to ground; the source gives less than its current where
-    that would take more than the compliance.  The circuit of each reading is solved exactly; with no
-    resistance and infinite limits it is the ideal one.
+    loads the sheet with an input resistance to ground; the source gives less than its nominal current where
+    that current needs more than the compliance voltage.  The circuit of each reading is solved exactly; without
+    the resistance and with infinite limits it is the ideal circuit.
 
     Electrodes lost together are one effect with arrays for ``electrode`` and ``resistance``: two
-    effects would each see the other's electrode whole.
+    effects would each take the other's electrode as intact.
 
     | meaning                                     | default | range       | unit | source               |
     |---------------------------------------------|---------|-------------|------|----------------------|
@@ -59,7 +59,7 @@ class ElectrodeFault(AbstractTerminalEffect):
 
         # Inputs draw leak * potential from plus and minus.  With D their difference and M the potential of
         # minus, per ampere:  D = d_a - leak (d_p (M + D) + d_m M),  M = m_a - leak (m_p (M + D) + m_m M).
-        # Written in differences, the lost electrode's resistance does not drown the sheet's in rounding.
+        # Differences are used because the lost electrode's resistance exceeds the sheet's by many digits.
         d_a, d_p, d_m = (_difference(wired, into) for into in (source, plus, minus))
         m_a, m_p, m_m = (_potential(wired, minus, into) for into in (source, plus, minus))
         both, loaded = leak * (d_p + d_m), 1 + leak * (m_p + m_m)
@@ -73,18 +73,18 @@ class ElectrodeFault(AbstractTerminalEffect):
 
 
 class CommonMode(AbstractTerminalEffect):
-    """An amplifier lets some of what both inputs share through: ``V <- V + gain (V+ + V-) / 2``.
+    """An amplifier passes part of the common-mode voltage: ``V <- V + gain (V+ + V-) / 2``.
 
     Potentials are above ground, to which the drive- electrode is tied, without the resistance of lost
-    electrodes.  That of the contacts is part of them; electrodes that are points of the mesh have none
-    that a finer mesh would not change.
+    electrodes.  They include the contact resistance, which has no limit for
+    fine meshes if an electrode is a point of the mesh.
 
     | meaning                           | default | range     | unit | source              |
     |-----------------------------------|---------|-----------|------|---------------------|
     | gain for what both share          | 1e-3    | 0 to 1e-2 | 1    | assumption: 60 dB   |
     """
 
-    rank: ClassVar[int] = -1  # before a fault of the source, which takes its share of this too
+    rank: ClassVar[int] = -1  # before `ElectrodeFault`, whose source scales this voltage too
 
     gain: Float[Array, ""] = parameter(1e-3)
 

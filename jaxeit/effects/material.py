@@ -13,10 +13,10 @@ from .base import AbstractMemoryEffect, AbstractSheetEffect, Line, Series, Sheet
 from .random import own_field
 
 PLAY_OPERATORS = 8
-"""Number of steps in which a hysteresis loop opens."""
+"""Number of play operators, which is the number of steps in which a hysteresis loop opens."""
 
 FRACTION_TERMS = 8
-"""Terms of a continued fraction, which is exact to rounding where it is used."""
+"""Terms of the continued fraction for I2 / I0, enough for rounding error where the fraction is used."""
 
 
 class CoatingNonUniformity(AbstractSheetEffect):
@@ -46,7 +46,7 @@ class CoatingNonUniformity(AbstractSheetEffect):
 
 
 class ContactGain(AbstractSheetEffect):
-    """The protrusions touch unevenly: the pressure that acts is ``p exp(std * field)``.
+    """The protrusions touch unevenly: the effective pressure is ``p exp(std * field)``.
 
     | meaning                 | default | range    | unit | source                              |
     |-------------------------|---------|----------|------|-------------------------------------|
@@ -74,7 +74,7 @@ class ContactGain(AbstractSheetEffect):
 
 
 class ContactPiezoresistance(AbstractSheetEffect):
-    """Pressed together, sheet and metal conduct in parallel: a Hill law of local pressure.
+    """Sheet and metal in contact conduct in parallel: a Hill law of local pressure.
 
     ``sigma <- sigma (1 + A x / (1 + x))``, ``x = (p / p_half)^n``
 
@@ -97,16 +97,16 @@ class ContactPiezoresistance(AbstractSheetEffect):
 
 
 class HomogenisedIslands(AbstractSheetEffect):
-    """Pressed on islands of perfect metal, current takes short cuts through them: instead of `ContactPiezoresistance`.
+    """Islands of perfect metal shunt the current under pressure; an alternative to `ContactPiezoresistance`.
 
     Islands of radius a on a share f of the area touch the sheet of resistance R_s with the specific
     resistance ``rho = rho_r (p / p_r)^-n``.  The dipole of one, from the modified Bessel equation
-    under it, put into Maxwell's mixture (1873):
+    under it, inserted into Maxwell's mixture formula (1873):
 
         ``sigma <- sigma (1 + f b) / (1 - f b)``,  ``b = I2(k) / I0(k)``,  ``k = a sqrt(R_s / rho)``,
 
-    which ends at ``(1 + f) / (1 - f)``: twice for a third.  Within 0.006 of the ratio of a resolved
-    square lattice up to f = 1/3.
+    whose limit at high pressure is ``(1 + f) / (1 - f)``, or 2 for f = 1/3.  The ratio is within 0.006 of
+    that of a resolved square lattice up to f = 1/3.
 
     | meaning                               | default | range      | unit    | source                   |
     |---------------------------------------|---------|------------|---------|--------------------------|
@@ -118,7 +118,7 @@ class HomogenisedIslands(AbstractSheetEffect):
     """
 
     alternative: ClassVar[str] = "how pressure makes the sheet conduct"
-    rank: ClassVar[int] = 1  # after what decides the sheet's own resistance
+    rank: ClassVar[int] = 1  # after the effects on the sheet's own resistance
 
     fraction: Float[Array, ""] = parameter(1 / 3)
     radius: Float[Array, ""] = parameter(2e-3)
@@ -133,15 +133,15 @@ class HomogenisedIslands(AbstractSheetEffect):
 
 
 class ProtrusionGrid(AbstractSheetEffect):
-    """Only protrusions press: squares on a square grid, each with the load of its own cell.
+    """Only protrusions transmit pressure: squares on a square grid, each with the load of its own cell.
 
     ``p <- p / f`` on a share of each element, ``f = (side / pitch)^2``.  The share is that of the
-    protrusions in a square of the element's area around its centroid, in closed form: it is 0 or 1
-    where elements resolve the grid, and f where they are larger than the pitch.  The law that follows
-    acts on that share and mixes the result (`_mixture`), since it is not linear in pressure.
+    protrusions in a square of the element's area around its centroid, in closed form: 0 or 1 where
+    elements resolve the grid, and f where elements are larger than the pitch.  The next law is not
+    linear in pressure: it acts on the share and mixes the result (`_mixture`).
 
-    Not resolved: how a protrusion's load spreads within it, and which elements it cuts; the load is
-    kept on the average over cells.
+    The spread of a load within a protrusion and the elements on its border are not resolved; the
+    load is conserved on the average over cells.
 
     | meaning                             | default | range   | unit | source     |
     |-------------------------------------|---------|---------|------|------------|
@@ -168,7 +168,7 @@ class ProtrusionGrid(AbstractSheetEffect):
 
 
 class SheetTemperature(AbstractSheetEffect):
-    """A warmer sheet resists more: ``sigma <- sigma / (1 + c T)``, T above where sigma was measured.
+    """A warmer sheet has more resistance: ``sigma <- sigma / (1 + c T)``, T relative to sigma's measurement.
 
     | meaning                                 | default | range        | unit | source     |
     |-----------------------------------------|---------|--------------|------|------------|
@@ -182,11 +182,11 @@ class SheetTemperature(AbstractSheetEffect):
 
 
 class Creep(AbstractMemoryEffect):
-    """A contact grows with its age: the sheet feels ``load (1 + c log10(1 + age / t0))``.
+    """The effective load of a contact grows with its age: ``load (1 + c log10(1 + age / t0))``.
 
-    Age is the mean over the load of the time that it has been there: added load is new, removed load
-    had the mean age, and a lifted contact has no age.  After a step this is the logarithmic creep
-    of printed force sensors; nothing remains at zero load.
+    Age is the mean time for which the load has been present: added load has age zero, removed load
+    has the mean age, and a lifted contact has no age.  After a step this is the logarithmic creep
+    of printed force sensors; no effect remains at zero load.
 
     | meaning                            | default | range      | unit | source                           |
     |------------------------------------|---------|------------|------|----------------------------------|
@@ -204,7 +204,8 @@ class Creep(AbstractMemoryEffect):
         def older(state: tuple[Array, Array], load: Array) -> tuple[tuple[Array, Array], Array]:
             before, age = state
             grown = load > before
-            old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)  # share of the load that was there before
+            # the share of the load that was present before
+            old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)
             age = jnp.where(load > 0, old * (age + line.interval.astype(age.dtype)), 0.0)
             return (load, age), age
 
@@ -213,15 +214,15 @@ class Creep(AbstractMemoryEffect):
 
 
 class Hysteresis(AbstractMemoryEffect):
-    """The sheet feels a falling load more than a rising one, at any speed: a Prandtl-Ishlinskii sum.
+    """A falling load has more effect than a rising one, at any speed: a Prandtl-Ishlinskii sum.
 
-    The operators play in the logarithm of the load, so that the loop is a share of the load and
-    closes at zero load.  Each has an excess e over the way up,
+    The play operators act on the logarithm of the load, so that the loop is a share of the load and
+    closes at zero load.  Each has an excess e over the rising branch,
 
         ``e_i <- clip(e_i + ln(load before / load), 0, r_i)``,  ``felt = load exp(w sum of e_i)``,
 
-    with evenly spaced ``r_i`` up to ``ln(reach)`` and w such that all of them open the loop by
-    ``loop``.  A rising load is felt unchanged.
+    with evenly spaced ``r_i`` up to ``ln(reach)`` and w such that the operators together open the loop
+    by ``loop``.  A rising load has its nominal effect.
 
     | meaning                                          | default | range     | unit | source              |
     |--------------------------------------------------|---------|-----------|------|---------------------|
@@ -248,18 +249,18 @@ class Hysteresis(AbstractMemoryEffect):
 
 
 def _logarithm(load: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Logarithm of the load; no load counts as one too small to matter."""
+    """Logarithm of the load; zero counts as the smallest normal number, to avoid an infinite value."""
     return jnp.log(jnp.maximum(load, jnp.finfo(load.dtype).tiny))
 
 
 def power(x: Float[Array, " elements"], exponent: Float[Array, ""]) -> Float[Array, " elements"]:
-    """``x^exponent``, and 0 without pressure, where a power below one would have an infinite slope."""
+    """``x^exponent``, and 0 with zero slope without pressure, where a power below one has an infinite slope."""
     touched = x > 0
     return jnp.where(touched, jnp.where(touched, x, 1.0) ** exponent, 0.0)
 
 
 def _conducting(sheet: Sheet, factor: Float[Array, " elements"]) -> Sheet:
-    """The sheet, ``factor`` times as conductive where pressure acts."""
+    """The sheet with ``factor`` times the conductivity on its share under pressure."""
     if sheet.share is not None:
         factor = _mixture(sheet.share * (factor - 1) / (factor + 1))
     return sheet._replace(sigma=sheet.sigma * factor)
@@ -267,7 +268,7 @@ def _conducting(sheet: Sheet, factor: Float[Array, " elements"]) -> Sheet:
 
 def _mixture(dipole: Float[Array, " elements"]) -> Float[Array, " elements"]:
     """Conductivity of a plane with inclusions, over that without (Maxwell 1873, in two dimensions), from
-    the dipole strength of the inclusions per area: ``share (ratio - 1) / (ratio + 1)`` for plain ones."""
+    the dipole strength of the inclusions per area: ``share (ratio - 1) / (ratio + 1)`` for homogeneous ones."""
     return (1 + dipole) / (1 - dipole)
 
 

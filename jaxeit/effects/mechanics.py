@@ -11,11 +11,11 @@ from .base import AbstractLoadEffect, AbstractStageEffect, Indenter, Path, param
 from .random import normal
 
 RIM_COSINES = np.cos(np.pi * (np.arange(32) + 0.5) / 32)
-"""Cosines of the directions in which a rim is sampled; the error is 3e-6 of the pressure at depth a / 5."""
+"""Cosines of the directions at which the rim is sampled: the error is 3e-6 of the pressure at depth a / 5."""
 
 
 class StageError(AbstractStageEffect):
-    """The stage misses its target places and times: each press has its own errors, all normal.
+    """The stage misses its target places and times: each press has its own errors, normally distributed.
 
     ``place <- place + position n``, ``delay <- delay + jitter n``, ``pace <- pace exp(ripple n)``
 
@@ -42,8 +42,8 @@ class StageError(AbstractStageEffect):
 class LoadSpreading(AbstractLoadEffect):
     """The pad spreads the load: the tip's pressure arrives as a Gaussian.
 
-    ``p / load = exp(-r^2 / (2 s^2)) / (2 pi s^2)``, whose integral over the plane is one; the part
-    that falls outside the sheet is carried by the frame and lost; the rest is not renormalised.
+    ``p / load = exp(-r^2 / (2 s^2)) / (2 pi s^2)``, whose integral over the plane is one; the frame
+    carries the part outside the sheet, which is lost; the rest is not renormalised.
 
     | meaning                                  | default | range   | unit | source          |
     |------------------------------------------|---------|---------|------|-----------------|
@@ -63,17 +63,17 @@ class LoadSpreading(AbstractLoadEffect):
 
 
 class IndentationSpreading(AbstractLoadEffect):
-    """The sheet lies at a depth in an elastic half-space under the tip: instead of `LoadSpreading`.
+    """The sheet lies at a depth in an elastic half-space under the tip; an alternative to `LoadSpreading`.
 
     A load Q at a point gives ``3 Q z^3 / (2 pi R^5)`` at depth z and distance R (Boussinesq 1885).
-    Evenly over a disc of radius a, by the divergence theorem an integral over its rim alone,
+    For an even load on a disc of radius a, the divergence theorem gives an integral over the rim alone,
 
         ``p / load = 1 / (pi a^2) mean of a (a - r cos t) (R^2 + R z + z^2) / (R^3 (R + z))``,
         ``R^2 = z^2 + a^2 + r^2 - 2 a r cos t``, the mean over directions t,
 
-    which is ``(1 - (1 + (a/z)^2)^-1.5) / (pi a^2)`` on the axis and the even tip at depth 0.  A
+    which is ``(1 - (1 + (a/z)^2)^-1.5) / (pi a^2)`` on the axis and an even pressure at depth 0.  A
     Gaussian fits it with width 7.1, 7.4, 8.5, 10.2 mm at depth 2, 5, 10, 15 mm under a 20 mm tip.
-    What falls outside the sheet is lost, as in `LoadSpreading`.
+    The load outside the sheet is lost, as in `LoadSpreading`.
 
     | meaning                            | default | range   | unit | source                        |
     |------------------------------------|---------|---------|------|-------------------------------|
@@ -89,7 +89,7 @@ class IndentationSpreading(AbstractLoadEffect):
     ) -> Float[Array, " elements"]:
         a, z = touch.diameter / 2, self.depth
         square = jnp.sum((centroids - touch.centre) ** 2, -1)
-        off = square > 0  # the root has no slope on the axis, where the pressure has none either
+        off = square > 0  # on the axis the root has no derivative, and that of the pressure is zero
         r = jnp.where(off, jnp.sqrt(jnp.where(off, square, 1.0)), 0.0)[:, None]
         cosine = jnp.asarray(RIM_COSINES, r.dtype)
         rim = a**2 + square[:, None] - 2 * a * r * cosine

@@ -1,8 +1,8 @@
 """Pneumatics: from the pressure on a pad to the pressure in it.
 
-The gas in a pad and the structure around it share the load.  The history effects are given the series of an
-ideal pad: isothermal, always at rest, linear and sealed.  Each effect assumes that everything which the other
-effects describe is ideal.
+The gas in a pad and the structure around it share the load.  The history effects start from the series of an
+ideal pad: isothermal, in equilibrium, linear and sealed.  Each effect takes all that the other effects describe
+as ideal.
 """
 
 from typing import ClassVar
@@ -17,7 +17,7 @@ from .random import own_normal
 
 
 class PadEdgeDip(AbstractPadEffect):
-    """A pad is stiff where its walls are: the response falls by ``d exp(-distance / w)``.
+    """A pad is stiff near its walls: the response falls by ``d exp(-distance / w)``.
 
     | meaning                     | default | range    | unit | source                         |
     |-----------------------------|---------|----------|------|--------------------------------|
@@ -37,7 +37,7 @@ class PadEdgeDip(AbstractPadEffect):
 class PadCrosstalk(AbstractPneumaticEffect):
     """Pads share walls: each feels its own pressure and a fraction of the mean of the other pads' pressures.
 
-    A series does not tell which pads are neighbours: all other pads count alike, as they nearly do in a square of four.
+    A series does not state which pads are neighbours, so all other pads count alike, nearly true in a 2 x 2 square.
 
     | meaning                         | default | range    | unit | source     |
     |---------------------------------|---------|----------|------|------------|
@@ -54,12 +54,12 @@ class PadCrosstalk(AbstractPneumaticEffect):
 
 
 class TpuRelaxation(AbstractPneumaticEffect):
-    """The structure relaxes under load and leaves more of it to the gas: pressure creeps up while a press is held.
+    """The structure relaxes under load, and the gas carries more of it: the pressure rises while a press is held.
 
-    The structure's stiffness falls as ``E(t) / E(0) = 1 - sum_i g_i (1 - exp(-t / tau_i))``: a Prony series, that
-    is Maxwell elements in parallel.  With s the gas's share of a lasting load, p the ideal pressure and P that in
+    The structure's stiffness falls as ``E(t) / E(0) = 1 - sum_i g_i (1 - exp(-t / tau_i))``: a Prony series, or
+    Maxwell elements in parallel.  With s the gas's share of a constant load, p the ideal pressure and P that of
     the gas, ``p = P + (1 - s) sum_i g_i / (1 - sum g) h_i``, ``h_i' = P' - h_i / tau_i``: solved sample by sample,
-    exactly for a P that is linear between samples.
+    exactly if P is linear between samples.
 
     | meaning                                     | default          | range         | unit | source          |
     |---------------------------------------------|------------------|---------------|------|-----------------|
@@ -93,12 +93,12 @@ class TpuRelaxation(AbstractPneumaticEffect):
 
 
 class GasLaw(AbstractPneumaticEffect):
-    """The gas stiffens as it is squeezed: ``(P0 + P)(V0 - dV) = P0 V0``, at constant temperature.
+    """The gas stiffens under compression: ``(P0 + P)(V0 - dV) = P0 V0``, at constant temperature.
 
-    The structure gives way by its compliance C under what the gas does not carry, so that the gas's share of a
+    The structure yields by its compliance C under the load that the gas does not carry, so that the gas's share of a
     small load is ``s = C / (C + V0 / P0)`` and the ideal pressure p makes a compression ``y = dV / V0`` with
     ``p / P0 = s y / (1 - y) + (1 - s) y``.  Its smaller root gives ``P = P0 y / (1 - y)``, which is p for small p,
-    and for every p where the gas carries all.  `GasRelaxation` describes the time before temperatures are equal.
+    and for every p if the gas carries the whole load.  `GasRelaxation` describes the time until temperatures are equal.
 
     | meaning                               | default | range       | unit   | source                       |
     |---------------------------------------|---------|-------------|--------|------------------------------|
@@ -121,11 +121,11 @@ class GasLaw(AbstractPneumaticEffect):
 
 
 class GasRelaxation(AbstractPneumaticEffect):
-    """A quick squeeze warms the gas, which then cools to its walls: adiabatic at first, isothermal in the end.
+    """A fast compression warms the gas, which then cools to its walls: adiabatic at first, isothermal finally.
 
-    With s the gas's share of a lasting load, p the ideal pressure and P that in the gas, ``P = p + (1 - s) e``,
-    where the warmth's pressure follows ``m e' = (gamma - 1) p' - e / tau``, ``m = 1 + s (gamma - 1)``: exactly for a
-    p that is linear between samples.  An imposed volume (s = 0) shows gamma times the lasting pressure at first.
+    With s the gas's share of a constant load, p the ideal pressure and P that of the gas, ``P = p + (1 - s) e``,
+    where the pressure e from heating follows ``m e' = (gamma - 1) p' - e / tau``, ``m = 1 + s (gamma - 1)``: exactly if
+    p is linear between samples.  An imposed volume (s = 0) has gamma times the final pressure at first.
 
     | meaning                        | default | range     | unit | source                                     |
     |--------------------------------|---------|-----------|------|--------------------------------------------|
@@ -152,7 +152,7 @@ class GasRelaxation(AbstractPneumaticEffect):
 class PadTemperature(AbstractPneumaticEffect):
     """Sealed gas gains pressure as it warms, and gage pressure falls as the barometer rises: ``P + k dT - b dP_air``.
 
-    The gas is as warm as the air around.
+    The gas has the temperature of the ambient air.
 
     | meaning                                         | default | range      | unit | source                        |
     |-------------------------------------------------|---------|------------|------|-------------------------------|
@@ -169,9 +169,9 @@ class PadTemperature(AbstractPneumaticEffect):
 
 
 class PadLeak(AbstractPneumaticEffect):
-    """A pad leaks: ``P' = p' - P / tau``, for p linear between samples exactly.
+    """A pad leaks: ``P' = p' - P / tau``, solved exactly if p is linear between samples.
 
-    Pressure from heat and barometer leaks away as well.
+    Pressure from temperature and barometer leaks away as well.
 
     | meaning   | default | range     | unit | source     |
     |-----------|---------|-----------|------|------------|
@@ -215,7 +215,7 @@ def _relaxation(
 ) -> tuple[Float[Array, "*times"], Float[Array, "*times"]]:
     """Factors of ``h' = x' - h / time`` over an interval in which x is linear: the part of h that is kept, and the
     gain of h per change of x."""
-    steps = interval / time  # zero for an infinite time, in which nothing decays
+    steps = interval / time  # zero for an infinite time constant
     gain = jnp.where(steps > 0, -jnp.expm1(-steps) / jnp.where(steps > 0, steps, 1), 1)
     return jnp.exp(-steps).astype(dtype), gain.astype(dtype)
 

@@ -1,4 +1,4 @@
-"""Random numbers of effects, drawn in float32 at any precision: float32 and float64 models see the same numbers."""
+"""Random numbers of effects, always drawn in float32, so that float32 and float64 models have the same numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def own_field(
     """A zero-mean, unit-variance field with covariance exp(-r^2 / (2 length^2)), drawn as in `own_normal`.
 
     Random Fourier features (Rahimi and Recht 2007): a sum of plane waves whose wave vectors have
-    the covariance's spectrum; a function of place, so that every mesh sees the same field.
+    the covariance's spectrum; a function of place, so that the field does not depend on the mesh.
     """
     (key,) = keys((effect,), jax.random.key(seed))
     waves, phases = jax.random.split(key)

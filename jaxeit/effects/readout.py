@@ -1,4 +1,4 @@
-"""Readout: from the quantity at a terminal to the numbers in a recording."""
+"""Readout: errors between the quantity at a terminal and the numbers in a recording."""
 
 from typing import ClassVar
 
@@ -15,7 +15,7 @@ POLE_RATIO = 4.0
 """Ratio of the corner frequencies of neighbouring low passes."""
 
 POLES = 1.08 * POLE_RATIO ** -np.arange(12)
-"""Corner frequencies in rad per sample; the first is chosen for the spectrum near half the sample rate."""
+"""Corner frequencies in rad per sample; the first one is fitted to the spectrum near half the sample rate."""
 
 
 class ScanSkew(AbstractScanEffect):
@@ -39,7 +39,7 @@ class IntermittentElectrode(AbstractReadoutEffect):
 
     While it is open, readings that drive through it have no current and are 0, and readings that sense with it have
     a floating input: a potential drawn for each frame, equal for all readings that sense with it, with their sign.
-    A frame is closed or open as a whole.  `ElectrodeFault` describes an electrode that is always open.
+    The contact does not change within a frame.  `ElectrodeFault` describes an electrode that is always open.
 
     | meaning                                | default | range        | unit | source     |
     |----------------------------------------|---------|--------------|------|------------|
@@ -49,7 +49,7 @@ class IntermittentElectrode(AbstractReadoutEffect):
     | floating: std of the floating input    | 0.01    | 0 to 1       | V    | assumption |
     """
 
-    rank: ClassVar[int] = -3  # at the skin, before all electronics
+    rank: ClassVar[int] = -3  # a fault of the skin acts before the electronics
     stream: ClassVar[StreamKind] = StreamKind.EIT  # type: ignore[misc]
 
     electrode: Int[Array, ""] = parameter(0)
@@ -63,7 +63,7 @@ class IntermittentElectrode(AbstractReadoutEffect):
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         chance, floating = jax.random.split(line.key)
         numbers = jax.random.uniform(chance, series.shape[:1], jnp.float32)
-        # Exact for the two-state process: it tends to its mean share at the sum of both rates.
+        # Exact for a two-state process, which relaxes to its mean open share at the sum of both rates.
         both = self.rate + 1 / self.duration
         turned = -jnp.expm1(-both * line.interval) / both
         to_open, to_stay = self.rate * turned, 1 - turned / self.duration
@@ -101,7 +101,8 @@ class MuxSettling(AbstractReadoutEffect):
         return first[-1]
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        # All frames settle from zero at once; then each passes its end to the next: 550 + 1024 steps, not 563,200.
+        # All frames start from zero in parallel; each then adds the end of the frame before it. 1024 frames of 550
+        # readings take 550 + 1024 steps instead of 563,200.
         times = self.settle / self.time_constant * jnp.arange(1, series.shape[1] + 1)
         left = jnp.exp(-times).astype(series.dtype)
         alone = _decaying_sums(left[0], jnp.zeros_like(series[:, 0]), (1 - left[0]) * series.T).T
@@ -111,7 +112,7 @@ class MuxSettling(AbstractReadoutEffect):
 
 
 class BaselineDrift(AbstractReadoutEffect):
-    """Each channel wanders as a random walk, in proportion to its own value at rest.
+    """Each channel drifts as a random walk, in proportion to its own value at rest.
 
     | meaning                            | default | range        | unit      | source     |
     |------------------------------------|---------|--------------|-----------|------------|
@@ -134,7 +135,7 @@ class BaselineDrift(AbstractReadoutEffect):
 
 
 class GainError(AbstractReadoutEffect):
-    """Each channel has an error of gain that does not change with time: ``v (1 + g)``, g normal.
+    """Each channel has a constant error of gain: ``v (1 + g)``, g normal.
 
     | meaning                     | default | range     | unit | source               |
     |-----------------------------|---------|-----------|------|----------------------|
@@ -153,7 +154,7 @@ class GainError(AbstractReadoutEffect):
 
 
 class LoadCellError(AbstractReadoutEffect):
-    """The characteristic of a load cell is bowed: ``F + 4 n F_max x (1 - |x|)``, ``x = F / F_max``, largest error n.
+    """The characteristic of a load cell is curved: ``F + 4 n F_max x (1 - |x|)``, ``x = F / F_max``, largest error n.
 
     | meaning                                  | default | range     | unit | source                  |
     |------------------------------------------|---------|-----------|------|-------------------------|
@@ -202,11 +203,11 @@ class Noise(AbstractReadoutEffect):
 
 
 class PinkNoise(AbstractReadoutEffect):
-    """1/f noise: of spectral density ``amplitude^2 / f``, one-sided, whatever the rate of the stream.
+    """1/f noise with the one-sided spectral density ``amplitude^2 / f`` at any rate of the stream.
 
-    White noise through twelve first-order low passes, their corners a factor of four apart (Keshner 1982): within
-    10 % of 1/f from 1e-5 of the rate to half of it.  The filters start at rest: noise slower than the recording is
-    missing.
+    White noise passes twelve first-order low passes with corners a factor of four apart (Keshner 1982): the density
+    is within 10 % of 1/f from 1e-5 to a half of the rate.  The filters start at rest, so that noise slower than the
+    recording is missing.
 
     | meaning                                  | default | unit               | source |
     |------------------------------------------|---------|--------------------|--------|
@@ -240,7 +241,7 @@ class Quantisation(AbstractReadoutEffect):
     | lowest, highest value it has  | that of the stream | set it |
     """
 
-    rank: ClassVar[int] = 1  # after everything that adds to the signal
+    rank: ClassVar[int] = 1  # after all effects that add to the signal
 
     step: Float[Array, ""] = parameter(1.0)
     lowest: Float[Array, ""] = parameter(-jnp.inf)
@@ -252,9 +253,9 @@ class Quantisation(AbstractReadoutEffect):
 
 
 class AdcRanges(AbstractReadoutEffect):
-    """A converter behind an amplifier with a gain for each channel: rounds to ``2 full_scale / 2^bits / gain``.
+    """A converter after an amplifier with a gain for each channel rounds to ``2 full_scale / 2^bits / gain``.
 
-    The gain is the largest that has ``headroom`` times the value at rest within the range, else the smallest.  The
+    The gain is the largest one with ``headroom`` times the value at rest within the range, else the smallest.  The
     converter clips at the ends of its counts, ``-2^(bits-1)`` and ``2^(bits-1) - 1``.
 
     | meaning                                | default          | range    | unit               | source        |

@@ -18,7 +18,7 @@ TOLERANCE = 1e-9
 """Points this close to the rim, relative to the domain's diagonal, count as being on it."""
 
 BLOCK = 1 << 20
-"""Pairs of a point and a side, or of two sides, that are compared at once."""
+"""Largest number of pairs, of a point and a side or of two sides, that are compared at once: this bounds memory."""
 
 
 class Domain(ABC):
@@ -36,7 +36,7 @@ class Domain(ABC):
 
     @property
     def is_convex(self) -> bool:
-        """Whether it is known to be convex."""
+        """Whether the domain is known to be convex."""
         return False
 
     @property
@@ -51,7 +51,7 @@ class Domain(ABC):
 
     @abstractmethod
     def boundary_point(self, s: ArrayLike) -> np.ndarray:
-        """Points of the rim at arc lengths s (...) m, any turn of the rim; (..., 2) m."""
+        """Points of the rim at arc lengths s (...) m; (..., 2) m.  The rim is periodic in s."""
 
     @abstractmethod
     def boundary_coordinate(self, points: ArrayLike) -> np.ndarray:
@@ -64,7 +64,7 @@ class Domain(ABC):
 
     @abstractmethod
     def _inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether each of points is in the interior; either answer will do on the rim."""
+        """Whether each of points (n, 2) is in the interior; (n,) bool, of either value on the rim."""
 
     @property
     def tolerance(self) -> float:
@@ -84,7 +84,7 @@ class Domain(ABC):
 
 
 class _Polygonal(Domain):
-    """A rim of straight sides; subclasses give `corner_points`, counter-clockwise from s = 0."""
+    """A domain with straight sides; subclasses give `corner_points`."""
 
     @property
     @abstractmethod
@@ -141,7 +141,7 @@ class _Polygonal(Domain):
         return np.asarray(np.sqrt(np.where(across, squared, np.inf).min(1)))
 
     def _on_sides(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest place on each side, as a fraction of it, and squared distances; (n, sides)."""
+        """Nearest place on each side, as a fraction of the side, and squared distance, m^2; (n, sides) each."""
         vectors, lengths, _ = self._sides
         offset = points[:, None] - self.corner_points
         along = np.clip((offset * vectors).sum(-1) / lengths**2, 0.0, 1.0)
@@ -157,7 +157,7 @@ class _Polygonal(Domain):
         stop = np.roll(start, -1, axis=0)
         x, y = points[:, :1], points[:, 1:]
         spans = (start[:, 1] > y) != (stop[:, 1] > y)
-        # Level sides span nothing, so that the slope put in for them is never used.
+        # A horizontal side spans no y, so that its slope is never used; 1 avoids a division by zero.
         slope = vectors[:, 0] / np.where(vectors[:, 1] == 0.0, 1.0, vectors[:, 1])
         crosses = x < start[:, 0] + (y - start[:, 1]) * slope
         return np.asarray((spans & crosses).sum(1) % 2 == 1)
@@ -204,7 +204,7 @@ class Disc(Domain):
     | radius  | ()    | m    |
     | centre  | (2,)  | m    |
 
-    Raises ValueError unless the radius is positive and everything finite.
+    Raises ValueError unless the radius is positive and all values are finite.
     """
 
     radius: float
@@ -259,7 +259,7 @@ class Disc(Domain):
 
 @dataclass(frozen=True)
 class Polygon(_Polygonal):
-    """A simple polygon; s = 0 is its first vertex.  Clockwise vertices are turned round.
+    """A simple polygon; s = 0 is its first vertex.  Clockwise vertices are reversed.
 
     | meaning  | shape       | unit |
     |----------|-------------|------|
@@ -296,7 +296,7 @@ def as_points(points: ArrayLike) -> np.ndarray:
 
 
 def _by_blocks(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray, sides: int) -> np.ndarray:
-    """``function`` of values (n, ...), each compared with so many sides, in blocks of bounded memory; (n,)."""
+    """``function`` of values (n, ...), each compared with ``sides`` sides, in blocks of bounded memory; (n,)."""
     rows = max(1, BLOCK // sides)
     if len(values) <= rows:
         return function(values)
@@ -304,7 +304,7 @@ def _by_blocks(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray,
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """z component of the cross product of plane vectors (..., 2); NumPy >= 2.5 has no such one."""
+    """z component of the cross product of plane vectors (..., 2); NumPy >= 2.5 has no cross product in the plane."""
     product: np.ndarray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return product
 
@@ -316,7 +316,7 @@ def _require_positive(what: str, **sizes: float) -> None:
 
 
 def _signed_area(points: np.ndarray) -> float:
-    # Relative to the first vertex, so that a polygon far from the origin loses no digits.
+    # Relative to the first vertex, so that a polygon far from the origin loses no digits to cancellation.
     points = points - points[0]
     return 0.5 * float(np.sum(cross(points, np.roll(points, -1, axis=0))))
 
@@ -332,7 +332,7 @@ def _require_polygon(points: np.ndarray) -> None:
 
 
 def _require_simple(points: np.ndarray) -> None:
-    """Refuse a rim that meets itself: any two sides that share more than one corner."""
+    """Raise ValueError for a rim that meets itself: two sides that share more than one corner."""
     tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     if np.any(steps <= tolerance):
@@ -350,6 +350,7 @@ def _require_simple(points: np.ndarray) -> None:
 
 
 def _meeting_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of sides that cross, touch or fold back on each other; the numbers of both sides, (pairs,) each."""
     n = len(points)
     first, second = _close_sides(points, tolerance)
     distance = _segment_distance(points[first], points[(first + 1) % n], points[second], points[(second + 1) % n])
@@ -395,6 +396,7 @@ def _segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray
 
 
 def _point_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance of the points p from the segments a-b, row by row."""
     along = ((p - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)
     distance: np.ndarray = np.linalg.norm(p - a - np.clip(along, 0.0, 1.0)[..., None] * (b - a), axis=-1)
     return distance

@@ -15,7 +15,7 @@ class AbstractSurface(ABC):
 
     @abstractmethod
     def __call__(self, chart: np.ndarray) -> np.ndarray:
-        """Places in space of points of the sheet."""
+        """Places in space, (n, 3) m, of points of the sheet, (n, 2) m."""
 
 
 def _require_radius(radius: float) -> None:
@@ -72,5 +72,5 @@ class Sphere(AbstractSurface):
                 f"the sheet reaches {np.degrees(angle.max()):.0f} degrees around a sphere of radius "
                 f"{self.radius} m; give a larger radius"
             )
-        flat = offset * np.sinc(angle / np.pi)[:, None]  # sin(angle) / angle, one at the centre
+        flat = offset * np.sinc(angle / np.pi)[:, None]  # sin(angle) / angle, which sinc evaluates at the centre too
         return np.column_stack([flat, self.radius * np.cos(angle)])

@@ -26,10 +26,10 @@ __all__ = [
 
 
 SOLVERS: Registry[AbstractLinearSolver] = Registry(AbstractLinearSolver, "linear solver", "jaxeit.solvers")
-"""Linear solvers by the names that recipes use; a solver may hold another."""
+"""Linear solvers by the names that recipes use; a solver may contain another."""
 SOLVERS.parts = (SOLVERS,)
 
 
 def default_solver(n: int) -> AbstractLinearSolver:
-    """The quicker direct solver for n unknowns of a planar mesh."""
+    """The faster direct solver for n unknowns of a planar mesh."""
     return Dense() if n < 300 else NestedDissection()

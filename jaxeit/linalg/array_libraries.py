@@ -20,7 +20,7 @@ class ArrayLibrary(NamedTuple):
     |----------------------------------------------------------------------------------------|
     | namespace: `jax.numpy` or `numpy`                                                      |
     | solve(a, b): x with a x = b                                                            |
-    | cholesky(a): L with L L^T = a, not finite (JAX) or an error (NumPy) where there is none |
+    | cholesky(a): L with L L^T = a, not finite (JAX) or an error (NumPy) if a has no factor  |
     | solve_lower(a, b, trans=0): x with a x = b, or a^T x = b where ``trans`` is 1           |
     | add_at(array, place, values): the array with values added at these places              |
     """

@@ -1,7 +1,7 @@
-"""What every linear solver has in common: the pattern, the product, the differentiable solve.
+"""The common parts of all linear solvers: the pattern, the product, the differentiable solve.
 
-The systems are A x = b with A symmetric positive definite.  Where A may be non-zero is known once,
-on the host (`SparsityPattern`); what stands there changes under jit, vmap and grad (``values``).
+The systems are A x = b with A symmetric positive definite.  The places of A's entries are fixed, on
+the host (`SparsityPattern`); the entries change under jit, vmap and grad (``values``).
 """
 
 from abc import abstractmethod
@@ -26,14 +26,14 @@ def _no_indices() -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SparsityPattern:
-    """Where a symmetric matrix may be non-zero, and where its unknowns lie in space.
+    """The places where a symmetric matrix may be non-zero, and the places of its unknowns in space.
 
     | meaning                                                          | shape  | unit |
     |------------------------------------------------------------------|--------|------|
     | n: number of unknowns                                            |        |      |
     | rows, cols: lower triangle, whole diagonal, each place once      | (nnz,) |      |
-    | coords: place of each unknown, NaN where it has none (optional)  | (n, d) | m    |
-    | root: unknowns that every other may couple to, eliminated last;  | (r,)   |      |
+    | coords: place of each unknown, NaN if it has none (optional)     | (n, d) | m    |
+    | root: unknowns that may couple to every other, eliminated last;  | (r,)   |      |
     |   the inverse is wanted on them (`AbstractLinearSolver.corner`)  |        |      |
 
     Raises `PatternError` for an upper-triangle, repeated or out-of-range entry, or a hole in the
@@ -54,7 +54,7 @@ class SparsityPattern:
 
 
 def index_arrays(pattern: SparsityPattern) -> dict[str, Integer[Array, "..."]]:
-    """The fields that every plan has: entries, where each diagonal one stands among them, the root."""
+    """The fields that every plan has: entries, the position of each diagonal entry among them, the root."""
     diagonal = np.empty(pattern.n, np.int32)
     places = np.flatnonzero(pattern.rows == pattern.cols)
     diagonal[pattern.rows[places]] = places
@@ -65,7 +65,7 @@ def index_arrays(pattern: SparsityPattern) -> dict[str, Integer[Array, "..."]]:
 def on_device(values: np.ndarray | Array | float, dtype: Any) -> Array:
     """An array of this type; `jnp.asarray` would compile a program for nearly every shape.
 
-    Indices are best without a sign: XLA adds the length to those below zero, at every place that looks something up.
+    Indices should be unsigned: for signed indices XLA adds code to every lookup that handles negative values.
     """
     found: Array = jax.device_put(np.array(values, dtype))
     return found
@@ -92,10 +92,10 @@ def _check_places(n: int, coords: np.ndarray | None, root: np.ndarray) -> None:
 
 
 class AbstractPlan(eqx.Module):
-    """What `analyse` found out about a pattern.
+    """The result of `analyse` for a pattern.
 
-    Index arrays are leaves: pass a plan to a jitted function as an argument.  As constants of the
-    program XLA would fold them, for minutes.
+    Index arrays are leaves: pass a plan to a jitted function as an argument.  If they were constants
+    of the program, XLA would spend minutes on constant folding.
     """
 
     rows: eqx.AbstractVar[Integer[Array, " nnz"]]
@@ -109,20 +109,20 @@ class AbstractLinearSolver(eqx.Module):
     """Analyse once on the host, factor once per matrix, solve as often as needed.
 
     A matrix that is not positive definite, or an iteration that does not converge, gives NaN
-    throughout, in the manner of `jax.lax.linalg.cholesky`; whoever lets values in checks them.
+    in all entries, as `jax.lax.linalg.cholesky` does; the caller checks the values.
     """
 
     @abstractmethod
     def analyse(self, pattern: SparsityPattern) -> AbstractPlan:
-        """Everything that depends on the pattern only; host side."""
+        """The plan: all data that depend on the pattern only, computed on the host."""
 
     @abstractmethod
     def factor(self, plan: Any, values: Float[Array, " nnz"]) -> Any:
-        """Factor the matrix with these values, in their dtype; a pytree for `solve`."""
+        """Factor of the matrix with these values, in their dtype; a pytree for `solve`."""
 
     @abstractmethod
     def solve(self, factor: Any, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
-        """Solve for k right-hand sides."""
+        """The solutions for k right-hand sides."""
 
     @abstractmethod
     def columns(self, factor: Any) -> Float[Array, "n r"]:
@@ -139,7 +139,7 @@ def unit_columns(plan: AbstractPlan, dtype: Any) -> Float[Array, "n r"]:
 
 
 def matvec(plan: AbstractPlan, values: Float[Array, " nnz"], x: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """A x from the lower triangle: each entry acts once as (i, j), off the diagonal also as (j, i).
+    """A x from the lower triangle: an entry off the diagonal counts as (i, j) and as (j, i).
 
     Linear in values and in x.
     """
@@ -167,7 +167,7 @@ def solve_spd(
 ) -> Float[Array, "n k"]:
     """x = A^-1 b, differentiable any number of times, forwards and backwards, and under vmap.
 
-    The matrix is factored once.  Tangents obey dx = A^-1 (db - dA x) and cotangents the transpose
+    The matrix is factored once.  Tangents satisfy dx = A^-1 (db - dA x) and cotangents the transpose
     of this, both with the same factor.
     """
     factor = solver.factor(plan, jax.lax.stop_gradient(values))

@@ -1,7 +1,7 @@
-"""Preconditioned conjugate gradients: no factor to keep, or an inexact one made exact.
+"""Preconditioned conjugate gradients: without a factor, or as refinement of an inexact factor.
 
-With the diagonal as preconditioner the memory is that of the matrix, for meshes that no factor
-fits.  With a factorisation in single precision (`Single`) as preconditioner it is iterative
+With the diagonal as preconditioner the memory is that of the matrix, for meshes whose factor is too
+large.  With a factorisation in single precision (`Single`) as preconditioner the method is iterative
 refinement that cannot diverge: double accuracy from single-precision factors.
 """
 
@@ -46,7 +46,7 @@ class ConjugateGradient(AbstractLinearSolver):
     | preconditioner: a linear solver, or None for the diagonal            | None        |
     | tolerance: of the residual relative to the load, after scaling; not  | 1e-12       |
     |   taken below 8 roundings of the precision                           |             |
-    | max_steps: beyond which the result is NaN                            | 5000        |
+    | max_steps: number of steps after which the result is NaN             | 5000        |
     """
 
     preconditioner: AbstractLinearSolver | None = None
@@ -82,7 +82,7 @@ class ConjugateGradient(AbstractLinearSolver):
         def advance(state: State) -> State:
             step, x, r, p, energy = state
             moved = matvec(factor.plan, factor.values, p)
-            # A column that is done has no direction left; its step is zero, not 0 / 0.
+            # A column that has converged exactly has a zero direction; `_ratio` makes its step zero, not 0 / 0.
             x, r = (v + s * _ratio(energy, jnp.sum(p * moved, 0)) for v, s in ((x, p), (r, -moved)))
             z = self._precondition(factor, r)
             new = jnp.sum(r * z, 0)
@@ -102,7 +102,7 @@ def _ratio(above: Float[Array, " k"], below: Float[Array, " k"]) -> Float[Array,
 
 
 class Single(AbstractLinearSolver):
-    """Another solver, in single precision whatever it is given; its answers have single accuracy."""
+    """Another solver in single precision, for values of any precision; its solutions have single accuracy."""
 
     solver: AbstractLinearSolver
 

@@ -3,14 +3,14 @@
 import numpy as np
 
 ROUNDING = 16.0
-"""Eigenvalue below zero of correlations that rounding explains, over the square root of the precision."""
+"""Largest negative eigenvalue of correlations that counts as rounding, over the square root of the precision."""
 
 
 def is_covariance(matrices: np.ndarray) -> bool:
-    """Whether matrices (..., n, n) are symmetric and positive semidefinite, but for rounding.
+    """Whether matrices (..., n, n) are symmetric and positive semidefinite up to rounding.
 
-    The test is the Cholesky factorisation of the correlations with a small multiple of the identity added, which costs
-    a fraction of the eigenvalues. Values that are not finite are no covariance.
+    The test is the Cholesky factorisation of the correlations with a small multiple of the identity added, which takes
+    a fraction of the time for eigenvalues. A matrix with values that are not finite is no covariance.
     """
     matrices = np.asarray(matrices)
     variance = np.diagonal(matrices, axis1=-2, axis2=-1).astype(np.float64)

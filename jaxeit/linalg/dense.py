@@ -1,4 +1,4 @@
-"""Dense Cholesky: the whole matrix at once, for a few hundred unknowns and as an oracle."""
+"""Dense Cholesky factorisation, for a few hundred unknowns and as an oracle."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ class DenseFactor(eqx.Module):
 
 
 class Dense(AbstractLinearSolver):
-    """Cholesky factorisation of the matrix with its zeros: n^3 / 3 operations."""
+    """Cholesky factorisation of the full matrix, zeros included: n^3 / 3 operations."""
 
     def analyse(self, pattern: SparsityPattern) -> DensePlan:
         return DensePlan(**index_arrays(pattern), n=pattern.n)

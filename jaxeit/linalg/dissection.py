@@ -1,9 +1,9 @@
-"""Nested dissection of a graph, on the host: which unknown belongs to which separator.
+"""Nested dissection of a graph, on the host: the assignment of unknowns to separators.
 
 The unknowns are halved at the median of a coordinate; those of one half that touch the other form
-a separator, and each half is treated alike (George 1973).  Of a few such cuts each part takes that of the
-least quotient, unknowns cut out over those of the smaller half, for the fronts of one level are padded to
-the largest.  All parts of one depth are cut together, so the work is a few sorts per depth.  The result is
+a separator, and each half is divided in the same way (George 1973).  Of a few such cuts each part takes the
+one with the least quotient of separator size to smaller half, since the fronts of one level are padded
+to the largest.  All parts of one depth are cut together, so the work is a few sorts per depth.  The result is
 a complete binary tree in heap numbering: 1 is the root separator, 2 t and 2 t + 1 are the halves below t,
 and the deepest nodes are the leaves.
 """
@@ -20,7 +20,7 @@ from .base import SparsityPattern
 def dissect(pattern: SparsityPattern, leaf_size: int) -> tuple[np.ndarray, int]:
     """The tree node that owns each unknown, (n,), and the depth of the tree (0: the root only).
 
-    Unknowns of `SparsityPattern.root` or without a place are owned by the root.
+    Unknowns of `SparsityPattern.root` and unknowns without a place belong to the root.
     """
     coords, placed = _places(pattern)
     depth = _depth(int(np.count_nonzero(placed)), leaf_size)
@@ -52,7 +52,7 @@ def _places(pattern: SparsityPattern) -> tuple[np.ndarray, np.ndarray]:
 def _graph_coordinates(pattern: SparsityPattern, placed: np.ndarray, count: int = 3) -> np.ndarray:
     """Distances along the graph from a few unknowns far from each other, (n, count).
 
-    They stand in for coordinates where there are none.  Unknowns that cannot be reached lie at n.
+    They replace missing coordinates.  Unknowns that cannot be reached have the distance n.
     """
     inside = placed[pattern.rows] & placed[pattern.cols]
     rows, cols = pattern.rows[inside], pattern.cols[inside]
@@ -87,7 +87,7 @@ def _axes(coords: np.ndarray, placed: np.ndarray) -> list[Axis]:
 def _best_halves(
     part: np.ndarray, free: np.ndarray, axes: list[Axis], edges: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Side of each unknown and whether it is cut out, by each part's cheapest cut."""
+    """Side of each unknown, and whether it is in a separator, by the cut of least quotient of each part."""
     tries = [(side, cut) for axis in axes for side in _halves(part, free, axis) for cut in _least_covers(side, edges)]
     costs = np.stack([_quotient(part, free, side, cut) for side, cut in tries])
     best = np.argmin(costs, axis=0)[part]
@@ -97,7 +97,7 @@ def _best_halves(
 
 
 def _quotient(part: np.ndarray, free: np.ndarray, side: np.ndarray, cut: np.ndarray) -> np.ndarray:
-    """Of each part: unknowns cut out, over those left on the smaller side."""
+    """Quotient of each part: size of the separator over that of the smaller side without it."""
     parts, rest = int(part.max()) + 1, free & ~cut
     left, right = (np.bincount(part[rest & (side == s)], minlength=parts) for s in (0, 1))
     smaller = np.minimum(left, right)
@@ -105,8 +105,8 @@ def _quotient(part: np.ndarray, free: np.ndarray, side: np.ndarray, cut: np.ndar
 
 
 def _halves(part: np.ndarray, free: np.ndarray, axis: Axis) -> list[np.ndarray]:
-    """Sides of every part about the median of one coordinate: with what lies there on either side, or,
-    where nothing but the median does, on the first."""
+    """Sides of every part about the median of one coordinate, with the unknowns at the median on the one or on the
+    other side; only on the first side if no part has more than one unknown there."""
     order = axis.order[free[axis.order]]
     order = order[np.argsort(part[order], kind="stable")]
     sizes = np.bincount(part[order], minlength=int(part.max()) + 1)
@@ -120,8 +120,8 @@ def _halves(part: np.ndarray, free: np.ndarray, axis: Axis) -> list[np.ndarray]:
 def _least_covers(side: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
     """The fewest unknowns that touch every edge between the sides, taken from one side or the other.
 
-    König's theorem: given a maximum matching, let Z be what alternating paths reach from the unmatched
-    unknowns of one side; a cover is that side without Z and the other within Z.
+    König's theorem: given a maximum matching, let Z be the unknowns that alternating paths reach from the
+    unmatched unknowns of one side; a cover is that side without Z and the other within Z.
     """
     crossing = edges[:, side[edges[0]] != side[edges[1]]]
     ends, places = np.unique(crossing, return_inverse=True)
@@ -140,7 +140,7 @@ def _least_covers(side: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
 
 
 def _alternating_reach(graph: csr_array, mate: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Everything on alternating paths from start: any edge to the other side, its matched edge back."""
+    """Unknowns on alternating paths from ``start``: any edge to the other side, the matched edge back."""
     reached, frontier = start.copy(), np.flatnonzero(start)
     while frontier.size:
         beyond = np.unique(graph[frontier].indices)

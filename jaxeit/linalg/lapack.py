@@ -1,13 +1,13 @@
 """Dense factors and solves that are safe under `jax.vmap`.
 
 jaxlib 0.10 spreads a stack of matrices that is given to LAPACK over the threads of XLA's pool, while the caller, one of
-those threads, waits for them. A program that comes to as many such stacks at once as there are threads waits for ever:
-on two cores two chains of a Cholesky factor and a product, each of two matrices of 156 rows, do in most runs. A
-`jax.vmap` makes such stacks of single matrices. Here it makes one, however many vmaps there are, and on a CPU gives it
-to LAPACK in portions too small to be spread. On other devices the stack stays whole.
+those threads, waits for them. A program that reaches as many such stacks at once as there are threads never ends: on
+two cores, two chains of a Cholesky factor and a product, each of two matrices of 156 rows, hang in most runs. A
+`jax.vmap` makes such stacks of single matrices. The functions here make one stack for any number of vmaps, and on a CPU
+pass it to LAPACK in portions too small to be spread. On other devices the stack stays whole.
 
 The repair upstream (commit 859992407d of 2026-07-21) came after jaxlib 0.10.2. From `FIRST_SAFE_JAXLIB` on,
-`jax.vmap` treats these functions as JAX treats its own, and no stack is cut. Derivatives are the same with any version.
+`jax.vmap` treats these functions like those of JAX, and no stack is cut. Derivatives are the same with any version.
 
 The functions have the names and meanings of those of `jax.scipy.linalg` and `jax.numpy.linalg`, for one real matrix,
 and have derivatives of any order in both directions.
@@ -31,9 +31,9 @@ from jaxtyping import Array, Float
 Stacks = tuple[Array, ...]
 Linear = Callable[[Array], Array]
 
-FIRST_SAFE_JAXLIB = (0, 11)  # the first release that certainly has the repair
+FIRST_SAFE_JAXLIB = (0, 11)  # the first release that is known to have the repair
 
-# Operations up to which jaxlib does a stack of LAPACK calls on the calling thread, as it counts them.
+# Largest work, in jaxlib's count of operations, for which jaxlib runs a stack of LAPACK calls on the calling thread.
 SEQUENTIAL_OPERATIONS = 200_000
 
 
@@ -47,11 +47,11 @@ CUTS_STACKS = spreads_stacks(version("jaxlib"))
 
 
 def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[..., Any]:
-    """For stacks of matrices, in portions that jaxlib does in place.
+    """``function`` of stacks of matrices, in portions that jaxlib computes on the calling thread.
 
     Args:
-        function: of stacks (m, ...) of matrices; its results take the places of its last arguments.
-        operations: how many it takes for each matrix, per product of its rows squared and its columns.
+        function: a function of stacks (m, ...) of matrices; its results replace its last arguments.
+        operations: operations for each matrix, divided by its rows squared times its columns.
     """
 
     def whole(*stacks: Array) -> Stacks:
@@ -94,7 +94,7 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
 
 
 def portion_of(count: int, rows: int, columns: int, operations: int = 1) -> int:
-    """How many of so many matrices are done at once, see `portioned`."""
+    """Number of matrices in a portion of `portioned`; it divides ``count``."""
     if not CUTS_STACKS:
         return count
     work = max(1, operations * rows**2 * max(rows, columns))
@@ -102,15 +102,15 @@ def portion_of(count: int, rows: int, columns: int, operations: int = 1) -> int:
 
 
 def _spread(size: int, batched: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
-    """All with the new axis in front."""
+    """The arrays, all with the batch axis in front."""
     return [a if b else jnp.broadcast_to(a, (size, *a.shape)) for a, b in zip(arrays, batched, strict=True)]
 
 
 def cholesky(a: Float[Array, "n n"], lower: bool = False) -> Float[Array, "n n"]:
-    """The factor of a positive matrix, of which only the triangle named is read; not finite where it is not positive.
+    """Cholesky factor of a matrix, of which only one triangle is read; not finite if it is not positive definite.
 
     Args:
-        lower: L with L L^T = a, else U with U^T U = a.
+        lower: L with L L^T = a, from the lower triangle; else U with U^T U = a, from the upper one.
     """
     return _lower(a) if lower else _lower(a.T).T
 
@@ -129,7 +129,7 @@ def cho_solve(c_and_lower: tuple[Float[Array, "n n"], bool], b: Float[ArrayLike,
 def solve_triangular(
     a: Float[Array, "n n"], b: Float[ArrayLike, "n ..."], trans: int = 0, lower: bool = False
 ) -> Float[Array, "n ..."]:
-    """x with a x = b, or with a^T x = b where ``trans`` is 1, of which only the triangle named is read."""
+    """x with a x = b, or with a^T x = b where ``trans`` is 1, of which only one triangle is read."""
 
     def product(x: Array) -> Array:
         part = jnp.tril(a) if lower else jnp.triu(a)
@@ -144,12 +144,12 @@ def solve(a: Float[Array, "n n"], b: Float[ArrayLike, "n ..."]) -> Float[Array, 
 
 
 def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues from the smallest on, and their vectors as columns, of a symmetric matrix."""
+    """Eigenvalues, ascending, and eigenvectors as columns, of a symmetric matrix."""
     return _eigh(0.5 * (a + a.T))
 
 
 def svd(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"], Float[Array, "n n"]]:
-    """U, singular values from the largest on, and V^T, of a square matrix."""
+    """U, singular values, descending, and V^T, of a square matrix."""
     return _svd(a)
 
 
@@ -232,8 +232,9 @@ def _one_over(apart: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return 1 / (apart + eye) - eye
 
 
-def _of_one(function: Callable[[Array], Stacks], operations: int = 1) -> Callable[[Array], Stacks]:
-    """``function`` of a matrix, safe under `jax.vmap`; its results are matrices, the last as large as its argument."""
+def _safe_factorisation(function: Callable[[Array], Stacks], operations: int = 1) -> Callable[[Array], Stacks]:
+    """``function`` of a matrix, safe under `jax.vmap`; its results are matrices, the last one of
+    the shape of its argument."""
     if not CUTS_STACKS:
         return function
     one = custom_vmap(function)
@@ -248,28 +249,31 @@ def _of_one(function: Callable[[Array], Stacks], operations: int = 1) -> Callabl
     return one
 
 
-def _with_vectors(a: Float[Array, "n n"]) -> tuple[Float[Array, "n 1"], Float[Array, "n n"]]:
+# The factorisations with all results as matrices, the one of the argument's shape last, as `_safe_factorisation` needs.
+
+
+def _eigen_matrices(a: Float[Array, "n n"]) -> tuple[Float[Array, "n 1"], Float[Array, "n n"]]:
     vectors, left = lax.linalg.eigh(a, symmetrize_input=False)
     return left[:, None], vectors
 
 
-def _with_both(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n 1"], Float[Array, "n n"]]:
+def _singular_matrices(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n 1"], Float[Array, "n n"]]:
     u, s, vt = lax.linalg.svd(a)
     return u, s[:, None], vt
 
 
-def _with_triangle(a: Float[Array, "m n"]) -> tuple[Float[Array, "n n"], Float[Array, "m n"]]:
+def _orthogonal_matrices(a: Float[Array, "m n"]) -> tuple[Float[Array, "n n"], Float[Array, "m n"]]:
     q, r = lax.linalg.qr(a, full_matrices=False)
     return r, q
 
 
-_orthogonal = _of_one(_with_triangle)
-_factored = _of_one(lambda a: (lax.linalg.cholesky(a, symmetrize_input=False),))
-_eigen = _of_one(_with_vectors, operations=5)
-_singular = _of_one(_with_both, operations=10)
+_orthogonal = _safe_factorisation(_orthogonal_matrices)
+_factored = _safe_factorisation(lambda a: (lax.linalg.cholesky(a, symmetrize_input=False),))
+_eigen = _safe_factorisation(_eigen_matrices, operations=5)
+_singular = _safe_factorisation(_singular_matrices, operations=10)
 
 
-def _beside(function: Callable[..., Any]) -> Callable[..., Any]:
+def _safe_solve(function: Callable[..., Any]) -> Callable[..., Any]:
     """``function`` of a matrix and right-hand sides, (n, n) and (n, k), safe under `jax.vmap`."""
     if not CUTS_STACKS:
         return function
@@ -279,7 +283,7 @@ def _beside(function: Callable[..., Any]) -> Callable[..., Any]:
     def _(size: int, batched: Sequence[bool], a: Array, b: Array) -> tuple[Array, bool]:
         if batched[0]:
             return many(*_spread(size, batched, (a, b)))[-1], True
-        beside = jnp.moveaxis(b, 0, 2)  # one matrix for all: all are its right-hand sides
+        beside = jnp.moveaxis(b, 0, 2)  # one matrix for the whole batch takes the batch as right-hand sides
         return jnp.moveaxis(one(a, beside.reshape(len(a), -1)).reshape(beside.shape), 2, 0), True
 
     return one
@@ -287,8 +291,8 @@ def _beside(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @cache
 def _solved(trans: bool, lower: bool) -> Callable[[Array, Array], Array]:
-    """One triangular solve."""
-    return _beside(partial(lax.linalg.triangular_solve, left_side=True, lower=lower, transpose_a=trans))
+    """The triangular solve with these options, safe under `jax.vmap`."""
+    return _safe_solve(partial(lax.linalg.triangular_solve, left_side=True, lower=lower, transpose_a=trans))
 
 
-_general = _beside(jnp.linalg.solve)
+_general = _safe_solve(jnp.linalg.solve)

@@ -1,7 +1,7 @@
 """Sparse Cholesky in pure JAX: multifrontal, one batch for each level of a nested dissection.
 
-The host finds a tree of separators (George 1973, `_dissection`) and where every number of the
-multifrontal method (Duff and Reid 1983) goes (`_fronts`).  On the device all fronts of one level
+The host finds a tree of separators (George 1973, `dissection`) and the place of every number of the
+multifrontal method (Duff and Reid 1983, `symbolic`).  On the device all fronts of one level
 are one batch.  With a front F over pivots 1 and boundary 2,
 
     F11 = U^T U,    W = U^-T F12,    update of the parent: F22 - W^T W,
@@ -10,7 +10,7 @@ a level keeps U and W for the sweeps of a solve:
 
     forward  y = U^-T r1, update = -W^T y,    backward  x1 = U^-1 (y - W x2).
 
-`corner`, the inverse on the unknowns of the root, needs neither sweep: the last front holds it.
+`corner`, the inverse on the unknowns of the root, needs no sweep, since the last front determines it.
 """
 
 from collections.abc import Sequence
@@ -32,24 +32,24 @@ from .lapack import portion_of, portioned
 from .small_matrices import stacked_product
 from .symbolic import Level, lay_out
 
-# Pivots eliminated at once.  Beyond it LAPACK's own threads and XLA's get in each other's way (a
-# hundredfold on a busy machine); halving moves the work into matrix products, which XLA spreads.
-_WIDEST = 72
+# Largest number of pivots eliminated at once.  For more, the threads of LAPACK and of XLA compete (a factor of
+# a hundred on a busy machine); halving moves the work into matrix products, which XLA runs in parallel.
+MAX_PANEL_PIVOTS = 72
 
-# Unknowns of a subtree whose fronts stay in a processor's cache.
-_SUBTREE = 6000
+# Number of unknowns of a subtree whose fronts fit in a processor's cache.
+SUBTREE_UNKNOWNS = 6000
 
-# Parts of a level that are written out one after the other; more are done in a loop, which copies in and out.
-_MOST_PARTS = 8
+# Largest number of parts of a level that are unrolled; more run in a loop, which copies its arrays in and out.
+MAX_UNROLLED_PARTS = 8
 
 
 T = TypeVar("T")
 
 
 class LevelPlan(eqx.Module):
-    """One level of m fronts with p pivots and b boundary places; see `_fronts.Level`.
+    """One level of m fronts with p pivots and b boundary places; see `symbolic.Level`.
 
-    The entries are those among the pivots, and those beside them.
+    ``among`` holds the entries between pivots, ``beside`` those between pivots and boundary.
     """
 
     up: Integer[Array, "m b"]
@@ -59,6 +59,7 @@ class LevelPlan(eqx.Module):
 
     @property
     def pivots(self) -> int:
+        """Number p of pivot places of each front."""
         return self.among.shape[1]
 
 
@@ -83,12 +84,12 @@ class NestedDissectionPlan(AbstractPlan):
 
     @property
     def panel_shapes(self) -> list[tuple[int, int, int]]:
-        """Fronts, places of a front, and pivots, of each level."""
+        """Number of fronts, of places in a front, and of pivots, for each level."""
         return [(level.down.shape[0], level.down.shape[2], level.pivots) for level in self.levels]
 
 
 class Panel(NamedTuple):
-    """What a level keeps of up to `_WIDEST` of its pivots: U and W, of which b counts later pivots too."""
+    """Factor of a level for up to `MAX_PANEL_PIVOTS` pivots: U and W, whose b places include the later pivots."""
 
     upper: Float[Array, "m p p"]
     beside: Float[Array, "m p b"]
@@ -123,7 +124,7 @@ class NestedDissection(AbstractLinearSolver):
             scatter=_index(scatter),
             levels=tuple(_level_plan(level) for level in levels),
             n=pattern.n,
-            subtrees=max(0, min(depth, round(np.log2(pattern.n / _SUBTREE)))),
+            subtrees=max(0, min(depth, round(np.log2(pattern.n / SUBTREE_UNKNOWNS)))),
         )
 
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
@@ -160,7 +161,7 @@ def _level_plan(level: Level) -> LevelPlan:
 
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
-    """What is kept of the fronts, from the root down; of the root only, unless ``keep``."""
+    """The factors of all fronts, from the root down; of the root only, unless ``keep``."""
     padded = jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
     top = max(plan.subtrees, 1)
     update, low = lax.platform_dependent(
@@ -193,7 +194,7 @@ def _in_subtrees(
 def _swept(
     levels: tuple[LevelPlan, ...], values: Array, update: Float[Array, "children q q"], keep: bool
 ) -> tuple[Float[Array, "m b b"], tuple[Front, ...]]:
-    """Eliminate these levels, the last one first: the update of what is above, and what is kept."""
+    """Eliminate these levels, the last one first: the update of the level above, and the factors if ``keep``."""
     fronts: list[Front] = []
     for level in reversed(levels):
         parts = _parts(level)
@@ -207,35 +208,35 @@ def _swept(
 
 
 def _parts(level: LevelPlan) -> int:
-    """Into how many parts to cut a level, so that no part needs a loop (`portioned`); 1 if these were too many."""
+    """Number of parts of a level such that no part needs a loop (`portioned`); 1 if that number is too large."""
     count, pivots, boundary = level.beside.shape
     parts = count // portion_of(count, pivots, boundary)
-    return parts if pivots <= _WIDEST and parts <= _MOST_PARTS else 1
+    return parts if pivots <= MAX_PANEL_PIVOTS and parts <= MAX_UNROLLED_PARTS else 1
 
 
 def _panels(
     level: LevelPlan, values: Array, update: Float[Array, "children q q"], parts: int
 ) -> tuple[Float[Array, "m p b"], Front]:
-    """W of every front of a level, and what is to be kept: gathered and eliminated part by part."""
+    """W of every front of a level, and the level's factor; fronts are assembled and eliminated part by part."""
     if parts > 1:
         cut = partial(_cut, parts=parts)
         done = [_panels(*piece, 1) for piece in zip(cut(level), [values] * parts, cut(update), strict=True)]
         found: tuple[Float[Array, "m p b"], Front] = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *done)
         return found
     pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
-    among = _taken(values, level.among) + jnp.sum(_spread(level, update, pivots, pivots), 1)
-    beside = _taken(values, level.beside) + jnp.sum(_spread(level, update, pivots, boundary), 1)
+    among = _values_at(values, level.among) + jnp.sum(_spread(level, update, pivots, pivots), 1)
+    beside = _values_at(values, level.beside) + jnp.sum(_spread(level, update, pivots, boundary), 1)
     return _eliminate(among, beside)
 
 
 def _cut(tree: T, parts: int) -> list[T]:
-    """Every array of the tree along its leading axis."""
+    """The tree in ``parts`` pieces: every array is cut along its leading axis."""
     arrays, structure = jax.tree.flatten(tree)
     pieces = zip(*(jnp.split(array, parts) for array in arrays), strict=True)
     return [jax.tree.unflatten(structure, piece) for piece in pieces]
 
 
-def _taken(values: Array, places: Integer[Array, "..."]) -> Array:
+def _values_at(values: Array, places: Integer[Array, "..."]) -> Array:
     return values.at[places].get(mode="promise_in_bounds")
 
 
@@ -244,8 +245,8 @@ def _spread(
 ) -> Float[Array, "m c i j"]:
     """The children's updates, each at its places, in these rows and columns of the fronts.
 
-    To be summed over the children by `jnp.sum`: XLA does that once, where it would do a sum of two terms anew for each
-    that looks something up in it, and so three times as many when the terms are looked up in turn.
+    The caller sums over the children by `jnp.sum`, which XLA computes once. XLA would recompute a sum written as two
+    terms for every use of its result.
     """
     places, size = level.down, updates.shape[1]
     fronts, children, _ = places.shape
@@ -256,14 +257,15 @@ def _spread(
     return updates.at[at].get(mode="promise_in_bounds")
 
 
-def _along(array: Array, places: Integer[Array, "..."], axis: int) -> Array:
+def _gather(array: Array, places: Integer[Array, "..."], axis: int) -> Array:
+    """Entries of the array at places along one axis; the places are known to be in bounds, so XLA need not check."""
     return jnp.take_along_axis(array, places, axis, mode="promise_in_bounds")
 
 
 def _eliminate(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> tuple[Float[Array, "m p b"], Front]:
-    """W of every front, and what is to be kept; wide fronts in two halves."""
+    """W of every front, and the level's factor; wide fronts are eliminated in two halves."""
     p = among.shape[2]
-    if p <= _WIDEST:
+    if p <= MAX_PANEL_PIVOTS:
         panel = Panel(*_panel(among, beside))
         return panel.beside, (panel,)
     h = (p + 1) // 2
@@ -275,13 +277,13 @@ def _eliminate(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> t
     return jnp.concatenate([beyond, w2], 1), first + second
 
 
-# LAPACK takes a matrix by columns, XLA by rows: what is lower to the one is upper to the other, so that
-# nothing is copied between them.  The barriers keep XLA from moving the transposition elsewhere.
+# LAPACK stores a matrix by columns, XLA by rows: the lower triangle of the one is the upper triangle of the other,
+# so that a transposed argument needs no copy.  The barriers keep XLA from moving the transposition elsewhere.
 
 
 @portioned
 def _panel(among: Float[Array, "m p p"], beside: Float[Array, "m p b"]) -> Panel:
-    """U, and W = U^-T F12; of ``among`` the upper triangle is read."""
+    """U, and W = U^-T F12; only the upper triangle of ``among`` is read."""
     among, beside = lax.optimization_barrier((among, beside))
     lower = lax.linalg.cholesky(_transposed(among), symmetrize_input=False)
     w = lax.linalg.triangular_solve(lower, _transposed(beside), left_side=False, lower=True, transpose_a=True)
@@ -317,11 +319,13 @@ def _root_loads(plan: NestedDissectionPlan, front: Front) -> list[Float[Array, "
     """U^-T of the unit loads on the unknowns of the root, panel by panel."""
     size = sum(panel.upper.shape[1] for panel in front) + front[-1].beside.shape[2]
     unit = jnp.arange(size)[:, None] == plan.scatter[plan.root]
-    return _through(front, unit[None].astype(front[0].upper.dtype))[0]
+    return _forward_front(front, unit[None].astype(front[0].upper.dtype))[0]
 
 
-def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Array, "m _ k"]], Float[Array, "m b k"]]:
-    """y = U^-T r of every panel, and what is left for the boundary."""
+def _forward_front(
+    front: Front, load: Float[Array, "m q k"]
+) -> tuple[list[Float[Array, "m _ k"]], Float[Array, "m b k"]]:
+    """y = U^-T r of every panel, and the update of the boundary."""
     ys = []
     for panel in front:
         p = panel.upper.shape[1]
@@ -332,19 +336,20 @@ def _through(front: Front, load: Float[Array, "m q k"]) -> tuple[list[Float[Arra
 
 
 def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "_ _ k"]]) -> list[list[Float[Array, "_ _ k"]]]:
-    """y = U^-T r from the leaves up; every front hands what its boundary gained to its parent."""
+    """y = U^-T r from the leaves up; every front passes the update of its boundary to its parent."""
     ys = []
     handed = jnp.zeros_like(loads[0], shape=(0, 1, loads[0].shape[2]))
     for level, front, load in reversed(list(zip(factor.plan.levels, factor.levels, loads, strict=True))):
         padded = jnp.pad(load, [(0, 0), (0, level.up.shape[1]), (0, 0)])
-        y, handed = _through(front, padded + _gained(level, handed))
+        y, handed = _forward_front(front, padded + _from_children(level, handed))
         ys.append(y)
     return ys[::-1]
 
 
-def _gained(level: LevelPlan, handed: Float[Array, "mc b k"]) -> Float[Array, "m q k"]:
+def _from_children(level: LevelPlan, handed: Float[Array, "mc b k"]) -> Float[Array, "m q k"]:
+    """The sum of the children's boundary updates, at the places of their parent's front."""
     by_child = handed.reshape(*level.down.shape[:2], *handed.shape[1:])
-    return _along(by_child, level.down[..., None], 2).sum(1)
+    return _gather(by_child, level.down[..., None], 2).sum(1)
 
 
 def _backward(
@@ -358,7 +363,7 @@ def _backward(
     x = jnp.zeros_like(factor.scale, shape=(1, 1, columns))
     xs = []
     for level, front, y in zip(factor.plan.levels, factor.levels, ys, strict=True):
-        x = _inherited(level, x)
+        x = _from_parents(level, x)
         for k in reversed(range(len(front))):
             rest = stacked_product(_transposed(front[k].beside), x)
             _, own = _ascended(front[k].upper, rest if y is None else rest - y[k])
@@ -368,6 +373,7 @@ def _backward(
     return jnp.concatenate(xs)
 
 
-def _inherited(level: LevelPlan, front: Float[Array, "mp qp k"]) -> Float[Array, "m b k"]:
+def _from_parents(level: LevelPlan, front: Float[Array, "mp qp k"]) -> Float[Array, "m b k"]:
+    """x of every front's boundary, from the front of its parent."""
     by_parent = level.up.reshape(front.shape[0], -1, 1)
-    return _along(front, by_parent, 1).reshape(*level.up.shape, front.shape[2])
+    return _gather(front, by_parent, 1).reshape(*level.up.shape, front.shape[2])

@@ -1,4 +1,4 @@
-"""Symbolic multifrontal factorisation, on the host: where every number goes.
+"""Symbolic multifrontal factorisation, on the host: the place of every number.
 
 Each node of the dissection tree has a *front*, a small dense matrix over its own unknowns (pivots)
 and those of its ancestors that its elimination will fill (boundary).  Eliminating the pivots leaves
@@ -17,7 +17,7 @@ from .base import SparsityPattern
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of m fronts, which have two children each on the level below, the leaves none.
+    """One level of m fronts; each has two children on the level below, except the leaves.
 
     | meaning                                                              | shape       |
     |----------------------------------------------------------------------|-------------|
@@ -43,7 +43,7 @@ class _Tree:
         self.rank, self.pivots = self._ranked(depth)
 
     def _ranked(self, depth: int) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Place of each unknown among its front's pivots, and the reverse for each level."""
+        """Place of each unknown among its front's pivots, and for each level the unknown at each place."""
         rank, tables = np.zeros(self.level.size, np.int64), []
         for level in range(depth + 1):
             mine = np.flatnonzero(self.level == level)
@@ -63,7 +63,7 @@ def _ranks(groups: np.ndarray, count: int) -> tuple[np.ndarray, int]:
 
 
 class _Boundaries:
-    """Boundary lists of one level as sorted keys, front * n + unknown; answers where one stands."""
+    """Boundary lists of one level as sorted keys, front * n + unknown; `find` gives the place of an unknown."""
 
     def __init__(self, fronts: np.ndarray, unknowns: np.ndarray, count: int, n: int) -> None:
         self.n, self.keys = n, np.unique(fronts * n + unknowns)
@@ -88,7 +88,7 @@ def lay_out(pattern: SparsityPattern, owner: np.ndarray, depth: int) -> tuple[Le
 
 
 def _boundaries(pattern: SparsityPattern, tree: _Tree) -> list[_Boundaries]:
-    """Bottom up: what the entries couple a front to, and what its children hand on."""
+    """Boundaries of all fronts, bottom up: unknowns coupled by entries, and unknowns that children pass up."""
     n, below = pattern.n, np.concatenate([pattern.rows, pattern.cols])
     above = np.concatenate([pattern.cols, pattern.rows])
     upward = tree.level[above] < tree.level[below]
@@ -100,11 +100,11 @@ def _boundaries(pattern: SparsityPattern, tree: _Tree) -> list[_Boundaries]:
         direct = np.stack([tree.index[below[mine]], above[mine]])
         fronts, unknowns = np.concatenate([direct, handed], 1)
         found.append(_Boundaries(fronts, unknowns, 1 << level, n))
-        handed = _handed(tree, found[-1], level)
+        handed = _passed_up(tree, found[-1], level)
     return found[::-1]
 
 
-def _handed(tree: _Tree, bound: _Boundaries, level: int) -> np.ndarray:
+def _passed_up(tree: _Tree, bound: _Boundaries, level: int) -> np.ndarray:
     """Boundary unknowns that the parents do not eliminate, with the parents' indices."""
     keep = tree.level[bound.unknowns] < level - 1
     unknowns = bound.unknowns[keep]
@@ -137,7 +137,7 @@ def _place(tree: _Tree, bounds: list[_Boundaries], level: int, fronts: np.ndarra
 
 
 def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: int) -> np.ndarray:
-    """The reverse of the children's `up`; what a child lacks points to its padding."""
+    """The inverse of the children's `up`; an unknown that a child lacks points to its padding."""
     fronts, size = 1 << level, _front_size(tree, bounds, level)
     if level + 1 == len(bounds):
         return np.zeros((fronts, 0, size), np.int64)
@@ -148,7 +148,7 @@ def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: 
 
 
 def _entries(pattern: SparsityPattern, tree: _Tree, bounds: list[_Boundaries]) -> list[np.ndarray]:
-    """Each entry stands in the row of whichever of its unknowns is eliminated first."""
+    """Number of the entry at each place; an entry is in the row of the one of its unknowns that is eliminated first."""
     first, second = _elimination_order(pattern, tree)
     tables = []
     for level, pivots in enumerate(tree.pivots):

@@ -10,7 +10,7 @@ of an element, of which its stiffness is the square:
 
     integral of grad(phi_i) . grad(phi_j) dA = sum_r slopes_ir slopes_jr.
 
-The same lines serve flat and curved sheets.
+The same code serves flat and curved sheets.
 """
 
 from collections.abc import Callable
@@ -56,9 +56,9 @@ _P2: list[_Poly] = [
     {(0, 1, 1): 4.0},
     {(1, 0, 1): 4.0},
 ]
-_EDGE = {1: [0, 1], 2: [0, 1, 3]}  # the functions that do not vanish on edge 01
-# Barycentric points of equal weight, exact for products of two slopes.
-_POINTS = {1: np.full((1, 3), 1 / 3), 2: np.array([[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]])}
+EDGE_FUNCTIONS = {1: [0, 1], 2: [0, 1, 3]}  # the functions that do not vanish on edge 01
+# Barycentric points of equal weight: these rules are exact for products of two slopes.
+QUADRATURE_POINTS = {1: np.full((1, 3), 1 / 3), 2: np.array([[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]])}
 
 
 def _product(p: _Poly, q: _Poly) -> _Poly:
@@ -70,7 +70,7 @@ def _product(p: _Poly, q: _Poly) -> _Poly:
     return out
 
 
-def _along(p: _Poly, axis: int) -> _Poly:
+def _derivative(p: _Poly, axis: int) -> _Poly:
     """Derivative with respect to x (axis 0) or y (axis 1): d/dl_(axis+1) - d/dl_0."""
     out: _Poly = {}
     for powers, coefficient in p.items():
@@ -84,25 +84,26 @@ def _along(p: _Poly, axis: int) -> _Poly:
 
 
 def _value(p: _Poly, at: np.ndarray) -> float:
+    """The polynomial at a point with barycentric coordinates (3,)."""
     return float(sum(x * np.prod(at ** np.array(key)) for key, x in p.items()))
 
 
 def _integral(p: _Poly) -> float:
-    """Over the reference triangle: integral of l0^a l1^b l2^c = a! b! c! / (a + b + c + 2)!."""
+    """Integral over the reference triangle, from the integral of l0^a l1^b l2^c = a! b! c! / (a + b + c + 2)!."""
     return float(sum(x * np.prod(factorial(key)) / factorial(sum(key) + 2) for key, x in p.items()))
 
 
 def _edge_integral(p: _Poly) -> float:
-    """Along edge 01 of unit length: integral of l0^a l1^b = a! b! / (a + b + 1)!."""
+    """Integral along edge 01 of unit length, from the integral of l0^a l1^b = a! b! / (a + b + 1)!."""
     return float(sum(x * factorial(a) * factorial(b) / factorial(a + b + 1) for (a, b, c), x in p.items() if c == 0))
 
 
 def _lagrange(order: int, functions: list[_Poly]) -> Lagrange:
-    points = _POINTS[order]
-    derivatives = [[[_value(_along(p, axis), at) for p in functions] for axis in (0, 1)] for at in points]
+    points = QUADRATURE_POINTS[order]
+    derivatives = [[[_value(_derivative(p, axis), at) for p in functions] for axis in (0, 1)] for at in points]
     weights = np.full(len(points), 1 / len(points))
     mass = [[2.0 * _integral(_product(p, q)) for q in functions] for p in functions]
-    ends = [functions[i] for i in _EDGE[order]]
+    ends = [functions[i] for i in EDGE_FUNCTIONS[order]]
     edge_mass = [[_edge_integral(_product(p, q)) for q in ends] for p in ends]
     return Lagrange(order, np.array(derivatives), weights, np.array(mass), np.array(edge_mass))
 

@@ -1,6 +1,6 @@
-"""What a mesh must follow at each electrode: the interface of an outline, and how outlines are placed side by side.
+"""The constraints of electrodes on the mesh: the interface of an outline, and checks of several outlines together.
 
-Distances between outlines need no knowledge of their kinds: an outline states points on its border (`corners`), the
+Distances between outlines do not depend on their kinds: an outline states points on its border (`corners`), the
 radius of what is meshed around each of them (`reach`), and its own distance from any point.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from ..geometry.shapes import Domain, cross
 
 RIM_MARGIN = 1.02
-"""Least distance of a round outline from the rim, over the radius of what is meshed: triangles between need room."""
+"""Least distance of a round outline from the rim, over its meshed radius: triangles need room between the two."""
 
 NO_POINTS = np.zeros((0, 2))
 NO_EDGES = np.zeros((0, 2), int)
@@ -34,56 +34,56 @@ class AbstractFootprint(ABC):
     (`features`, `nodes` and what else it needs of the rest, for which there are defaults).
     """
 
-    # --- where it is --------------------------------------------------------------------------------------------------
+    # --- place of the outline -----------------------------------------------------------------------------------------
 
     @property
     @abstractmethod
     def label(self) -> str:
-        """Its kind and place, for messages."""
+        """Kind and place of the outline, for messages."""
 
     @property
     @abstractmethod
     def corners(self) -> np.ndarray:
-        """Points (k, 2) m by which its distance from other outlines is measured; none for what is part of the rim."""
+        """Points (k, 2) m from which distances to other outlines are measured; (0, 2) for a part of the rim."""
 
     @property
     def reach(self) -> float:
-        """Radius in m of what is meshed around each of its `corners`."""
+        """Radius in m of the meshed area around each of the `corners`."""
         return 0.0
 
     @property
     def is_closed(self) -> bool:
-        """Whether straight sides join its `corners` in a ring."""
+        """Whether straight sides join the `corners` in a ring."""
         return False
 
     @abstractmethod
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance of points (n, 2) from it, below zero inside; (n,) m, infinite for what is part of the rim."""
+        """Distance of points (n, 2) m from the outline, negative inside; (n,) m, infinite for a part of the rim."""
 
     @abstractmethod
     def require_inside(self, domain: Domain, name: str) -> None:
-        """Raise ValueError, beginning with ``name``, unless it lies inside the domain or on its rim."""
+        """Raise ValueError, beginning with ``name``, unless the outline lies inside the domain or on its rim."""
 
     def rim_positions(self, domain: Domain) -> list[float]:
         """Arc lengths in m at which the rim must have a node."""
         return []
 
     def covers_rim(self, domain: Domain, s: float) -> bool:
-        """Whether it covers the rim at arc length ``s``, m."""
+        """Whether the outline covers the rim at arc length ``s``, m."""
         return False
 
     def gap(self, other: "AbstractFootprint") -> float:
-        """Distance in m to another outline, below zero where one is in the other; infinite for parts of the rim."""
+        """Distance in m to another outline, negative if one lies in the other; infinite for parts of the rim."""
         mine = other.distance(self.corners).min(initial=np.inf) - self.reach
         return float(min(mine, self.distance(other.corners).min(initial=np.inf) - other.reach))
 
     def rim_gap(self, domain: Domain) -> float:
-        """Distance in m to the rim of a domain that it does not cross."""
+        """Distance in m to the rim of a domain that the outline does not cross."""
         mine = domain.boundary_distance(self.corners).min(initial=np.inf) - self.reach
         return float(min(mine, self.distance(domain.boundary_point(domain.corners)).min(initial=np.inf)))
 
     def overlaps(self, other: "AbstractFootprint", domain: Domain) -> bool:
-        """Whether two outlines have a place in common, or so little between them that no triangles fit."""
+        """Whether two outlines overlap, or are so close that no triangles fit between them."""
         on_rim = any(self.covers_rim(domain, s) for s in other.rim_positions(domain))
         if on_rim or any(other.covers_rim(domain, s) for s in self.rim_positions(domain)):
             return True
@@ -92,22 +92,22 @@ class AbstractFootprint(ABC):
             return True
         return self.is_closed and other.is_closed and sides_cross(self.corners, other.corners)
 
-    # --- what the mesh gets -------------------------------------------------------------------------------------------
+    # --- constraints on the mesh --------------------------------------------------------------------------------------
 
     def subdivided(
         self, domain: Domain, others: Sequence["AbstractFootprint"], edge_length: float, slope: float
     ) -> "AbstractFootprint":
-        """The same outline with more edges where ``edge_length`` or what is near asks for them; by default itself.
+        """The same outline with more edges where ``edge_length`` or a neighbour requires them; by default itself.
 
         Args:
-            others: outlines nearer than ``edge_length``, and perhaps further ones.
+            others: at least all outlines nearer than ``edge_length``.
             slope: growth of edges per distance.
         """
         return self
 
     @abstractmethod
     def features(self, domain: Domain, longest: float, shortest: float) -> list[Feature]:
-        """What the mesh is graded around.
+        """The sources of the mesh's grading.
 
         Args:
             longest: edge length away from everything, m.
@@ -115,11 +115,11 @@ class AbstractFootprint(ABC):
         """
 
     def nodes(self, domain: Domain) -> np.ndarray:
-        """Nodes (k, 2) m that it adds to those of the rim; by default its corners."""
+        """Nodes (k, 2) m that the outline adds to those of the rim; by default its corners."""
         return self.corners
 
     def edges(self) -> np.ndarray:
-        """Edges (e, 2) between its own nodes, by their numbers, that the mesh must have."""
+        """Edges (e, 2) that the mesh must have, as pairs of row numbers of `nodes`."""
         return NO_EDGES
 
     def leaves_room(self, points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -143,7 +143,7 @@ def require_centre_inside(domain: Domain, name: str, position: tuple[float, floa
 
 
 def require_disc_inside(domain: Domain, name: str, position: tuple[float, float], radius: float, reach: float) -> None:
-    """Raise ValueError, beginning with ``name``, unless a disc that is meshed as far as ``reach`` keeps off the rim."""
+    """Raise ValueError, beginning with ``name``, unless a disc, meshed to the radius ``reach`` m, clears the rim."""
     room = require_centre_inside(domain, name, position)
     if room <= RIM_MARGIN * reach:
         raise ValueError(
@@ -159,7 +159,7 @@ def cycle(count: int) -> np.ndarray:
 
 
 def sides_cross(p: np.ndarray, q: np.ndarray) -> bool:
-    """Whether any straight sides of two polygons cross within both; merely to touch is not to cross."""
+    """Whether any sides of two polygons cross; sides that only touch do not cross."""
     along_p, along_q = np.roll(p, -1, 0) - p, np.roll(q, -1, 0) - q
     offset = q - p[:, None]
     beside_p, beside_q = cross(along_p[:, None], offset), cross(offset, along_q)
@@ -181,24 +181,24 @@ def require_placed(domain: Domain, footprints: Sequence[AbstractFootprint]) -> N
 
 
 def neighbours(footprints: Sequence[AbstractFootprint], distance: float) -> list[list[AbstractFootprint]]:
-    """For each outline the others that are at most this far away, m; some of them may be further."""
+    """For each outline, at least all others within ``distance`` m; bounding circles add some that are further away."""
     near = _may_be_within(footprints, distance)
     return [[footprints[j] for j in np.flatnonzero(row).tolist()] for row in near]
 
 
 def _close_pairs(footprints: Sequence[AbstractFootprint], tolerance: float) -> list[list[int]]:
-    """Pairs, each once and in order, that may be too close for triangles between them."""
+    """Pairs, lower number first, that may be too close for triangles between them."""
     reach = np.array([footprint.reach for footprint in footprints])
     margin = (RIM_MARGIN - 1) * (reach[:, None] + reach) + 2 * tolerance
     return np.argwhere(np.triu(_may_be_within(footprints, margin), 1)).tolist()
 
 
 def _may_be_within(footprints: Sequence[AbstractFootprint], distance: float | np.ndarray) -> np.ndarray:
-    """Which pairs are not further apart than this by their bounding circles; (n, n) bool, no outline with itself."""
+    """Whether the bounding circles of each pair are within ``distance`` m; (n, n) bool, False on the diagonal."""
     corners = [footprint.corners for footprint in footprints]
     centres = np.array([c.mean(0) if len(c) else np.zeros(2) for c in corners]).reshape(-1, 2)
     spread = (np.linalg.norm(c - m, axis=1).max(initial=0.0) for c, m in zip(corners, centres, strict=True))
-    # Whatever is part of the rim is near everything.
+    # A part of the rim has no corners and so no bounding circle: it counts as near to every outline.
     radii = [s + f.reach if len(f.corners) else np.inf for s, f in zip(spread, footprints, strict=True)]
     radius = np.array(radii)
     near = np.linalg.norm(centres[:, None] - centres, axis=2) - radius[:, None] - radius <= distance

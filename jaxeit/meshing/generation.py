@@ -1,10 +1,10 @@
 """Meshes of the sheet: graded around its electrodes, or regular.
 
-A mesh keeps two positions per node: where it is in space, and where it is on the flat sheet (its
-*chart*), in which electrodes and pixels are laid out.  `triangulate` makes graded meshes that
-follow every electrode's footprint; `structured` makes regular ones that others can rebuild node by
-node.  The module `triangles` holds and checks a mesh, `footprints` and `outlines` state what it must
-follow, `sizes` states how fine it is where, and `smoothing` makes its triangles good.
+A mesh keeps two positions per node: in space, and on the flat sheet (its *chart*), in which electrodes
+and pixels are laid out.  `triangulate` makes graded meshes that
+follow every electrode's footprint; `structured` makes regular ones that other programs can
+rebuild node by node.  The module `triangles` holds and checks a mesh, `footprints` and `outlines` state the
+constraints of electrodes, `sizes` states the wanted edge lengths, and `smoothing` raises the triangles' angles.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from .smoothing import Problem, missing_edges, relax
 from .triangles import Mesh, MeshError, place
 
 START_SPACING = 0.72
-"""Least distance of the nodes to start from, over the wanted edge length."""
+"""Least distance between the initial nodes, over the wanted edge length."""
 
 RIM_SPACING = 0.45
 """Least distance of free nodes from the rim, over the wanted edge length."""
@@ -45,13 +45,13 @@ def triangulate(
     | electrode_edge: edges at points and arc ends; edge_length / 4 if not given | m |
 
     Edges at a disc or polygon are its circumference / segments; a disc gets twice, four times ... its
-    segments where edge_length or the gap to a neighbour is shorter than that.  Near anything narrow
-    (gaps, short arcs, thin polygons, waists of the domain) edges shrink to fit.  The rim is followed
+    segments where edge_length or the gap to a neighbour is shorter than that.  In narrow
+    places (gaps, short arcs, thin polygons, waists of the domain) edges shrink to fit.  The rim is followed
     exactly where it is straight, and by chords where it is round.  Nodes: the rim counter-clockwise,
     then the footprints' in their order, then the rest.
 
     Raises ValueError for footprints that overlap or leave the domain, naming the electrodes by
-    their place in ``footprints``, and MeshError if the mesh reached does not pass `Mesh.check`.
+    their place in ``footprints``, and MeshError if the resulting mesh does not pass `Mesh.check`.
     """
     fine = _lengths(domain, edge_length, growth, electrode_edge)
     nodes = expected_nodes(domain, footprints, edge_length, growth, fine)
@@ -78,7 +78,7 @@ def expected_nodes(
     growth: float,
     electrode_edge: float | None = None,
 ) -> float:
-    """About how many nodes `triangulate` will make, within a fifth where electrodes are spread over the domain.
+    """Estimated number of nodes of `triangulate`, within 20 % where electrodes are spread over the domain.
 
     The integral of the nodes per area, ``1 / (sqrt(3)/2 h^2)``, over the sheet. Around a feature of radius r the edges
     grow as ``h = s + k d`` with the distance d, as far as the next feature. No edge is longer than the sheet is wide.
@@ -109,7 +109,7 @@ def _require_followed(problem: Problem, triangles: np.ndarray) -> None:
 
 
 def _lengths(domain: Domain, edge_length: float, growth: float, edge: float | None) -> float:
-    """The edge length at points and arc ends, after looking at all three values."""
+    """The edge length at points and arc ends, m; raises ValueError for a value out of range."""
     fine = edge_length / 4 if edge is None else edge
     for name, value in {"edge_length": edge_length, "electrode_edge": fine}.items():
         if not (np.isfinite(value) and value > 0):
@@ -123,13 +123,13 @@ def _rim_positions(domain: Domain, footprints: list[AbstractFootprint]) -> np.nd
     """Arc lengths in [0, perimeter), ascending, where the rim must have a node: corners, arc ends
     and points on the rim; those that coincide are given once."""
     asked = [s for footprint in footprints for s in footprint.rim_positions(domain)]
-    # Corners come first, so that a coinciding arc end gives way and the corner stays exact.
+    # Corners come first, so that of a corner and an arc end that coincide the exact corner is kept.
     s = np.concatenate([domain.corners, np.mod(asked, domain.perimeter)])
     return np.sort(s[_first_of_each(domain.boundary_point(s), domain.tolerance)])
 
 
 def _first_of_each(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Which points (n, 2) do not coincide with an earlier one; (n,) bool."""
+    """Whether each of points (n, 2) coincides with no earlier one; (n,) bool."""
     kept = np.ones(len(points), bool)
     if len(points):
         pairs = cKDTree(points).query_pairs(4 * tolerance, output_type="ndarray")
@@ -145,7 +145,7 @@ def _size_field(
     slope: float,
     fine: float,
 ) -> SizeField:
-    # No edge is longer than a sixteenth of the rim: the coarsest mesh still has a shape.
+    # No edge is longer than a sixteenth of the rim, so that the coarsest mesh still follows a round rim.
     cap = min(edge_length, domain.perimeter / 16)
     features = [Feature(node, 0.0, cap) for node in domain.boundary_point(rim)]
     features += [feature for footprint in footprints for feature in footprint.features(domain, cap, fine)]
@@ -168,7 +168,7 @@ def _fitted(features: list[Feature], domain: Domain) -> list[Feature]:
     centres = np.array([f.centre for f in features])
     radii = np.array([f.radius for f in features])
     gaps = np.linalg.norm(centres[:, None] - centres, axis=2) - radii - radii[:, None]
-    gaps[gaps <= 4 * domain.tolerance] = np.inf  # itself, or the same place named twice
+    gaps[gaps <= 4 * domain.tolerance] = np.inf  # a feature itself, or another one at the same place
     rim = domain.boundary_distance(centres) - radii
     rim[rim <= 4 * domain.tolerance] = np.inf
     room = np.minimum(gaps.min(1), rim)
@@ -176,7 +176,7 @@ def _fitted(features: list[Feature], domain: Domain) -> list[Feature]:
 
 
 def _problem(domain: Domain, footprints: list[AbstractFootprint], rim: np.ndarray, size: SizeField) -> Problem:
-    """Fixed nodes and the edges between them: the rim, then each footprint's own."""
+    """Fixed nodes and the edges between them: those of the rim, then those of each footprint."""
     around = domain.boundary_point(divide_rim(domain, rim, size))
     own = [footprint.nodes(domain) for footprint in footprints]
     first = len(around) + np.cumsum([0, *map(len, own)])
@@ -192,7 +192,7 @@ def _problem(domain: Domain, footprints: list[AbstractFootprint], rim: np.ndarra
 
 
 def _is_open(domain: Domain, footprints: list[AbstractFootprint], size: SizeField, points: np.ndarray) -> np.ndarray:
-    """Whether a free node may be put at each of points: inside, off the rim and out of the outlines' way."""
+    """Whether a free node may start at each of points: inside, away from the rim and from the outlines; (n,) bool."""
     wanted = size(points)
     allowed = domain.contains(points) & (domain.boundary_distance(points) > RIM_SPACING * wanted)
     for footprint in footprints:
@@ -204,11 +204,11 @@ def _is_open(domain: Domain, footprints: list[AbstractFootprint], size: SizeFiel
 
 
 class TrianglePattern(Enum):
-    """How the cells of a structured mesh are cut.
+    """How the cells of a structured mesh are divided into triangles.
 
     RISING: by the diagonal from lower left to upper right.
     ALTERNATING: by either diagonal in turn (union jack); mirror-symmetric for even nx and ny.
-    CROSSED: by both, with a node at the middle of each cell; has all symmetries of the rectangle.
+    CROSSED: by both diagonals, with a node at the middle of each cell; has all symmetries of the rectangle.
     """
 
     RISING = "rising"

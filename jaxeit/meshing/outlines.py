@@ -1,4 +1,4 @@
-"""The outlines of electrodes: a point, a disc or a polygon in the sheet, a stretch of its rim; each is one class."""
+"""The outlines of electrodes: a point, a disc or a polygon in the sheet, a part of its rim; each is one class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,10 +21,10 @@ from .sizes import SizeField, divide_rim, narrow_places
 from .triangles import MeshError, place
 
 MAX_OUTLINE_EDGES = 2000
-"""Around one polygon; checks of an outline compare all pairs of its sides."""
+"""Largest number of edges around one polygon: checks of an outline compare all pairs of its sides."""
 
 MAX_EDGE_EXCESS = 1.3
-"""Edge of a round outline, over the wanted length, from which on it gets twice as many edges."""
+"""Largest edge of a round outline, over the wanted length; above it the number of edges is doubled."""
 
 
 DISC_SPACING = 0.4
@@ -127,13 +127,13 @@ class DiscFootprint(AbstractFootprint):
         return [Feature(self.corners[0], self.reach, min(2 * np.pi * self.radius / self.segments, longest))]
 
     def nodes(self, domain: Domain) -> np.ndarray:
-        """Rings from the polygon inward, each with half the nodes of the one around it, and a hub."""
+        """Rings from the polygon inward, each with half the nodes of the ring around it, and a node at the centre."""
         count, radius, rings = self.segments, self.reach, []
         while True:
             rings.append(radius * _regular_polygon(count))
             if count <= 8 or count % 2:
                 break
-            # A gap as wide as the ring's own edge balances the two kinds of triangle.
+            # A gap as wide as an edge of the ring balances the angles of the triangles on either side.
             radius, count = radius * (1 - 2.0 * np.sin(np.pi / count)), count // 2
         return np.asarray(np.asarray(self.position) + np.concatenate([*rings, np.zeros((1, 2))]))
 
@@ -165,7 +165,7 @@ def _regular_polygon(count: int) -> np.ndarray:
 
 
 def enough_segments(radius: float, segments: int, edge: float) -> int:
-    """This number of segments, doubled until those of a circle are about as short as ``edge``; lengths in m."""
+    """The number of segments, doubled until those of a circle are about as short as ``edge``; lengths in m."""
     while 2 * np.pi * radius / segments > MAX_EDGE_EXCESS * edge:
         segments *= 2
     return segments
@@ -209,12 +209,12 @@ class ArcFootprint(AbstractFootprint):
         return [self.start, self.stop]
 
     def covers_rim(self, domain: Domain, s: float) -> bool:
-        """Ends are included: electrodes that touch would share a node."""
+        """Ends are included, since electrodes that touch would share a node."""
         slack = 2 * domain.tolerance
         return (s - self.start + slack) % domain.perimeter <= self.stop - self.start + 2 * slack
 
     def features(self, domain: Domain, longest: float, shortest: float) -> list[Feature]:
-        # Two edges or more under an arc: the current crowds at its ends.
+        # At least two edges lie under an arc, because the current crowds at its ends.
         size = min(shortest, 0.5 * (self.stop - self.start))
         return [Feature(end, 0.0, size) for end in domain.boundary_point([self.start, self.stop])]
 
@@ -223,8 +223,8 @@ class ArcFootprint(AbstractFootprint):
 class PolygonFootprint(AbstractFootprint):
     """Edges along the sides of ``outline``, m, nodes at its corners, and triangles inside.
 
-    ``segments`` is how many edges go around it, shared out by length; they may be more, and each side has one or
-    more.  Raises ValueError unless it is positive.
+    ``segments`` is the least number of edges around the polygon, distributed by length; each side has at least
+    one.  Raises ValueError unless it is positive.
     """
 
     outline: Polygon
@@ -262,8 +262,8 @@ class PolygonFootprint(AbstractFootprint):
     def subdivided(
         self, domain: Domain, others: Sequence[AbstractFootprint], edge_length: float, slope: float
     ) -> "PolygonFootprint":
-        """The polygon with a corner wherever the mesh gets a node."""
-        among = _Among(self.outline.vertices, domain, others)
+        """The polygon with a corner at each node that the mesh has on it."""
+        among = _CrowdedPolygon(self.outline.vertices, domain, others)
         longest = min(edge_length, self.outline.perimeter / self.segments)
         places, widths = narrow_places(among, longest, slope)
         size = SizeField(places, np.zeros(len(widths)), widths, slope, longest)
@@ -285,8 +285,8 @@ class PolygonFootprint(AbstractFootprint):
 
 
 @dataclass(frozen=True)
-class _Among(Polygon):
-    """A polygon whose clearance counts the rim of the domain and other outlines too."""
+class _CrowdedPolygon(Polygon):
+    """A polygon whose clearance includes the distances to the rim of the domain and to other outlines."""
 
     domain: Domain
     others: Sequence[AbstractFootprint]

@@ -1,8 +1,8 @@
-"""How fine a graded mesh is where, and the nodes to start it from.
+"""The wanted edge length of a graded mesh as a function of position, and its initial nodes.
 
 The wanted edge length is ``h(x) = min(cap, min_i size_i + slope * distance(x, source_i))``, so that
 layers around a source grow by the factor ``1 + slope``.  Hexagonal lattices of stepped spacing fill
-the plane, and a greedy pass thins them where steps meet; `smoothing` does the rest.
+the plane, and a greedy pass thins them where steps meet; `smoothing` then moves the nodes.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,8 @@ from ..geometry.shapes import Domain
 STEPS_PER_OCTAVE = 3
 """Lattice spacings between a length and its half."""
 
-_QUARTERS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
+QUARTER_CENTRES = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
+"""Centres of the four quarters of a square of side 1 around the origin, (4, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class SizeField:
 def narrow_places(domain: Domain, cap: float, slope: float) -> tuple[np.ndarray, np.ndarray]:
     """Sources that keep edges shorter than the domain is wide: points (k, 2) and sizes (k,), m.
 
-    Sampled along the rim, at most 4000 places; those that another one already implies are left out.
+    Sampled along the rim, at most 4000 places; those that another source already implies are left out.
     """
     coarse = domain.clearance(_along_rim(domain, domain.perimeter / 500))
     if coarse.min() >= cap:
@@ -106,17 +107,17 @@ def _divide(domain: Domain, start: float, stop: float, size: SizeField, samples:
     per_length = 1.0 / size(domain.boundary_point(s))
     steps = 0.5 * (per_length[1:] + per_length[:-1]) * np.diff(s)
     edges_to = np.concatenate([[0.0], np.cumsum(steps)])
-    # A touch of slack: 1.3 edges' worth is one edge, not two.
+    # The slack makes one edge, not two, of up to 1.3 wanted edges.
     count = max(1, int(np.ceil(edges_to[-1] - 0.3)))
     require("mesh_nodes", count, "triangulate: rim")
     return np.asarray(np.interp(np.arange(count) / count * edges_to[-1], edges_to, s))
 
 
 def fill(domain: Domain, size: SizeField) -> np.ndarray:
-    """Candidate nodes (n, 2) over the domain's bounding box, finest lattices first.
+    """Candidate nodes (n, 2) m over the domain's bounding box, finest lattices first.
 
-    Lattices are laid from the middle of the box, and the order depends on nothing but positions, so
-    that equal input gives equal meshes.
+    Lattices start at the middle of the box, and the order depends on positions only, so that equal
+    input gives equal meshes.
     """
     low, high = np.asarray(domain.bounds)
     middle = 0.5 * (low + high)
@@ -127,7 +128,7 @@ def fill(domain: Domain, size: SizeField) -> np.ndarray:
 
 
 def _lattice_points(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[tuple[int, np.ndarray]]:
-    """Points of each lattice where its level is the wanted one: (level, points (n, 2))."""
+    """Points of each lattice where its level is the wanted one: level, and points (n, 2) m."""
     for side, centres, wanted in _cells(extent, middle, size):
         reach = size.slope * side / np.sqrt(2)
         coarsest = size.level(np.minimum(wanted + reach, size.cap))
@@ -152,7 +153,7 @@ def _cells(extent: np.ndarray, middle: np.ndarray, size: SizeField) -> Iterator[
         if not split.all():
             yield side, centres[~split], wanted[~split]
         require("mesh_nodes", 4 * int(split.sum()), "triangulate: narrow places")
-        centres = (centres[split][:, None] + side * _QUARTERS).reshape(-1, 2)
+        centres = (centres[split][:, None] + side * QUARTER_CENTRES).reshape(-1, 2)
         side /= 2
 
 
@@ -171,8 +172,8 @@ def _hexagonal(corners: np.ndarray, side: float, spacing: float) -> np.ndarray:
 
 
 def thin(candidates: np.ndarray, fixed: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """The candidates (n, 2), first come first served, that keep ``radii`` (n,) from every fixed
-    point and from those taken before them."""
+    """The candidates (n, 2), in order, that keep ``radii`` (n,) m from every fixed point and from the
+    candidates taken before them."""
     near = cKDTree(fixed).query(candidates)[0] if len(fixed) else np.full(len(candidates), np.inf)
     candidates, radii = candidates[near > radii], radii[near > radii]
     if not len(candidates):

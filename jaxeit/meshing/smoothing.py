@@ -2,7 +2,7 @@
 
 Free nodes move to the weighted mean of their triangles' circumcentres (optimal Delaunay
 triangulation, Chen and Holst 2011), nodes that crowd are removed and gaps are filled, and last
-the nodes of the poorest triangles are moved, each to where the smallest angle around it is largest.
+the nodes of the poorest triangles are moved, each to the place at which the smallest angle around it is largest.
 Triangles are (m, 3) indices, counter-clockwise; points are (n, 2) m with the fixed ones first.
 """
 
@@ -16,23 +16,23 @@ from ..geometry.shapes import Domain, cross
 from .sizes import SizeField, thin
 
 GOOD_ANGLE = 30.0
-"""Smallest angle, degrees, at which no further improvement is tried."""
+"""Smallest angle, degrees, above which a mesh is not improved further."""
 
 WEIGHT_POWER = 3
-"""Weight of a triangle is area / size^power: small triangles pull as hard as large ones."""
+"""Power p in the weight area / size^p of a triangle, by which small and large triangles count alike."""
 
 MAX_CIRCUMRADIUS = 0.85
-"""A triangle whose circumradius is larger, relative to the wanted edge, gets a new node."""
+"""Largest circumradius, over the wanted edge length; a triangle with a larger one gets a new node."""
 
 MIN_MEAN_EDGE = 0.72
-"""A node whose mean edge is shorter, relative to the wanted edge, is removed."""
+"""Smallest mean edge of a node, over the wanted edge length; a node with a smaller one is removed."""
 
 ROUNDS, SWEEPS, POLISHES = 3, 2, 8
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What `relax` must respect.
+    """The constraints on `relax`.
 
     | meaning                                                      | shape  | unit |
     |--------------------------------------------------------------|--------|------|
@@ -50,7 +50,7 @@ class Problem:
 
 
 def relax(problem: Problem, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The best triangulation met on the way from ``free`` (n, 2): points and triangles."""
+    """Points and triangles of the best triangulation found, starting from the free nodes (n, 2) m."""
     points = np.concatenate([problem.fixed, free])
     triangles = delaunay(points, problem.domain)
     best = (quality(problem, points, triangles), points, triangles)
@@ -78,10 +78,10 @@ def quality(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> floa
 
 
 def missing_edges(problem: Problem, triangles: np.ndarray) -> np.ndarray:
-    """Edges (k, 2) of the rim and the rings that no triangle has, or of the rim with triangles
-    beyond them."""
+    """Edges (k, 2) of the rim and the rings that no triangle has, and edges of the rim with
+    triangles outside the domain."""
     directed = directed_edges(triangles)
-    # Only edges between fixed nodes can be among those looked for.
+    # Edges that must appear join fixed nodes, so that only such edges are compared.
     present = edge_keys(directed[(directed < len(problem.fixed)).all(1)])
     wanted = np.concatenate([problem.rim, problem.rings])
     absent = wanted[~np.isin(edge_keys(wanted), present)]
@@ -147,7 +147,7 @@ def _sweep(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.nd
     corners = points[triangles]
     centroids = corners.mean(1)
     centres, radii = _circles(corners)
-    # A flat triangle's circumcentre is far away: follow it no further than half its radius.
+    # The circumcentre of a flat triangle is far away; the limit keeps nodes from leaving their surroundings.
     pull = centres - centroids
     length = np.linalg.norm(pull, axis=1)
     pull *= np.minimum(1.0, 0.5 * radii / np.maximum(length, 1e-300))[:, None]
@@ -166,9 +166,9 @@ def _vertex_means(triangles: np.ndarray, values: np.ndarray, weights: np.ndarray
 
 
 def _adapt(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Points with crowded and encroaching free nodes removed and gaps filled."""
+    """The points without crowded or misplaced free nodes, and with new nodes in gaps."""
     new = _gap_nodes(problem, points, triangles)
-    keep = ~_crowded(problem, points, triangles) & ~_astray(problem, points)
+    keep = ~_crowded(problem, points, triangles) & ~_misplaced(problem, points)
     return np.concatenate([points[keep], new])
 
 
@@ -212,8 +212,8 @@ def _independent(wanted: np.ndarray, order: np.ndarray, triangles: np.ndarray) -
     return chosen
 
 
-def _astray(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Free nodes outside the domain or in the way of an edge that must appear; (n,) bool."""
+def _misplaced(problem: Problem, points: np.ndarray) -> np.ndarray:
+    """Free nodes outside the domain or so near to an edge that must appear that they block it; (n,) bool."""
     fixed = len(problem.fixed)
     astray = np.zeros(len(points), bool)
     if len(points) == fixed:
@@ -228,7 +228,7 @@ def _astray(problem: Problem, points: np.ndarray) -> np.ndarray:
 
 
 def _polish(problem: Problem, angle: float, points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Raise the smallest angles by moving single nodes; never makes the smallest one smaller."""
+    """Raise the smallest angles by moving single nodes; the smallest angle never decreases."""
     for _ in range(POLISHES):
         if angle >= GOOD_ANGLE:
             break
@@ -274,7 +274,7 @@ def _best_places(points: np.ndarray, triangles: np.ndarray, nodes: np.ndarray, r
 
 
 def _star_angles(places: np.ndarray, own: np.ndarray, others: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Smallest angle around each node if put at ``places`` (k, 2); -1 where a triangle flips."""
+    """Smallest angle, degrees, around each node at ``places`` (k, 2) m; -1 where a triangle flips."""
     corners = np.concatenate([places[own, None], others], axis=1)
     angles = np.where(doubled_areas(corners) > 0, corner_angles(corners).min(1), -1.0)
     return np.minimum.reduceat(angles, starts)

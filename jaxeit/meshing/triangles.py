@@ -1,4 +1,4 @@
-"""Triangle meshes as values, in the plane or on a surface in space, and what makes one unusable."""
+"""Triangle meshes as values, in the plane or on a surface in space, and checks of their validity."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ class Mesh:
     | triangles: node numbers, int32, counter-clockwise in the chart | (m, 3) |  |
     | chart: positions on the flat sheet; nodes if not given and nodes are plane | (n, 2) | m |
 
-    Raises MeshError for wrong shapes; `check` looks at the values.
+    Raises MeshError for wrong shapes; `check` tests the values.
     """
 
     nodes: np.ndarray
     triangles: np.ndarray
-    chart: np.ndarray = None  # type: ignore[assignment]  # filled in below, never None afterwards
+    chart: np.ndarray = None  # type: ignore[assignment]  # `__post_init__` replaces None
 
     def __post_init__(self) -> None:
         chart = self.nodes if self.chart is None else self.chart
@@ -80,9 +80,9 @@ class Mesh:
         return np.asarray(corner_angles(self.nodes[self.triangles]).min(1))
 
     def check(self, min_angle: float = 20.0) -> "Mesh":
-        """This mesh, or MeshError naming its worst fault, where it is, and what to do.
+        """This mesh; raises MeshError with its worst fault, the place of the fault, and what to do.
 
-        Looks for values that are not finite, indices out of range, nodes that coincide or belong
+        Tests for values that are not finite, indices out of range, nodes that coincide or belong
         to no triangle, flipped triangles, edges of more than two triangles, separate pieces, and
         angles below ``min_angle`` degrees.
         """
@@ -100,10 +100,10 @@ class Mesh:
         return Mesh(_on_surface(surface, self.chart), self.triangles, self.chart)
 
     def refine(self, surface: Surface | None = None) -> "Mesh":
-        """Every triangle cut into four at the middles of its edges; old nodes keep their numbers.
+        """The mesh with every triangle divided into four at the midpoints of its edges; old nodes keep their numbers.
 
         New nodes are at the middle of their edge, in space and on the chart; with ``surface``, as
-        in `lift`, they are put on the curved sheet instead.
+        in `lift`, new nodes are on the curved sheet instead.
         """
         chart = self.chart[self.edges].mean(1)
         nodes = _on_surface(surface, chart) if surface else self.nodes[self.edges].mean(1)
@@ -148,7 +148,7 @@ def _quartered(mesh: Mesh) -> np.ndarray:
     return np.concatenate([np.stack(part, axis=1) for part in parts])
 
 
-# What `check` looks for, in the order in which one fault would hide the next.
+# The tests of `check`; each assumes that a mesh has passed the tests before it.
 
 
 def place(position: np.ndarray) -> str:

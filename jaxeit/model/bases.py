@@ -1,4 +1,4 @@
-"""Image bases: what the coefficients of an image stand for."""
+"""Image bases: the meaning of the coefficients of an image."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class BasisError(ValueError):
 
 
 class Picture(eqx.Module):
-    """Where the coefficients of an image lie.
+    """The places of the coefficients of an image.
 
     | meaning                                               | shape       | unit |
     |-------------------------------------------------------|-------------|------|
@@ -47,7 +47,7 @@ class Picture(eqx.Module):
 
 
 class AbstractPictured(eqx.Module):
-    """Whatever has coefficients that lie on a `Picture`."""
+    """An object with coefficients that lie on a `Picture`."""
 
     picture: eqx.AbstractVar[Picture]
 
@@ -58,29 +58,29 @@ class AbstractPictured(eqx.Module):
 
     @property
     def centres(self) -> Float[Array, "basis 2"]:
-        """See `Picture`."""
+        """Centres in the sheet's flat coordinates, (basis, 2) m."""
         return self.picture.centres
 
     @property
     def areas(self) -> Float[Array, " basis"]:
-        """See `Picture`."""
+        """Areas on the sheet, (basis,) m^2; zero for a pixel that misses it."""
         return self.picture.areas
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """See `Picture`."""
+        """Rows and columns of the picture, row 0 at low y; empty without a picture."""
         return self.picture.shape
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """See `Picture`."""
+        """x0, x1, y0 and y1 of the picture, m."""
         return self.picture.extent
 
 
 class BasisMap(AbstractPictured):
     """A basis laid over one model: conductivity change = sparse matrix times coefficients.
 
-    The matrix is kept in lines of c entries; a coefficient has as many lines as it needs.
+    The matrix is stored in lines of c entries; a coefficient has one line or more.
 
     | meaning                                               | shape       | unit |
     |-------------------------------------------------------|-------------|------|
@@ -100,7 +100,7 @@ class BasisMap(AbstractPictured):
     single: bool = eqx.field(static=True)
 
     def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
-        """Values on the elements, from those of the coefficients."""
+        """Values on the elements, (elements,), from the coefficients of an image, (basis,)."""
         spread = self.weight * image[self.coefficient][:, None]
         return jnp.zeros(self.elements, spread.dtype).at[self.element].add(spread)
 
@@ -111,20 +111,20 @@ class BasisMap(AbstractPictured):
 
 
 class AbstractBasis(ABC):
-    """A choice of image; `on` lays it over a model, on the host."""
+    """A kind of image; `on` lays the basis over a model, on the host."""
 
     @abstractmethod
     def on(self, model: Model) -> BasisMap:
         """The basis for this model.
 
         Raises:
-            BasisError: under jit, where the model's geometry is not known.
+            BasisError: under jit, where the values of the model's geometry are unknown.
         """
 
 
 @dataclass(frozen=True)
 class Elements(AbstractBasis):
-    """One coefficient per element: the finest image the mesh can carry, and not a picture."""
+    """One coefficient per element: the finest image on the mesh, which is not a picture."""
 
     def on(self, model: Model) -> BasisMap:
         areas = _host(model.areas)
@@ -183,10 +183,10 @@ class Pixels(AbstractBasis):
 
 @dataclass(frozen=True)
 class Bumps(AbstractBasis):
-    """Overlapping Gaussian bumps on a regular grid: what a round contact does to the sheet (physics of a soft tip).
+    """Overlapping Gaussian bumps on a regular grid: the conductivity change under a soft round tip.
 
-    The paper samples 41 x 41 of them and calls the response J: its second reading.  A coefficient is the height of its
-    bump; a bump is cut at four widths.
+    The paper samples 41 x 41 bumps and calls the response J (the second interpretation of its text).  A
+    coefficient is the height of its bump; a bump ends at four widths.
 
     | meaning                                                  | default | unit |
     |----------------------------------------------------------|---------|------|
@@ -265,7 +265,7 @@ def _basis_map(
     (x0, y0), (x1, y1) = (chart.min(0) - margin).tolist(), (chart.max(0) + margin).tolist()
     element, weight, coefficient = _lines(entries, len(areas), _host(model.centroids))
     system = model.system
-    with jax.ensure_compile_time_eval():  # so that the basis is known inside a compiled function too
+    with jax.ensure_compile_time_eval():  # so that the values of the basis are known inside a compiled function too
         return BasisMap(
             element=jnp.asarray(element, jnp.int32),
             weight=jnp.asarray(weight, model.dtype),
@@ -289,8 +289,8 @@ def _basis_map(
 def _lines(
     entries: tuple[np.ndarray, np.ndarray, np.ndarray], size: int, places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Entries in lines as long as half the coefficients need, so that little is padding; each of neighbours, which
-    share their nodes."""
+    """Entries in lines of the median length, so that there is little padding; the entries of a line are neighbours,
+    which share nodes."""
     element, coefficient, weight = entries
     turn = np.empty(len(places), int)
     turn[cKDTree(places).indices] = np.arange(len(places))
@@ -331,21 +331,22 @@ def _candidates(corners: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np
 def overlap_areas(polygons: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Areas that polygons share with axis-parallel boxes, exactly.
 
-    Each edge is split where it crosses the box's lines and what lies outside is pushed onto them;
-    the pushed parts enclose nothing, so the shoelace formula gives the area inside.
+    Each edge is split where it crosses the lines of the box, and the parts outside are moved onto the
+    lines; moved parts enclose no area, so the shoelace formula gives the area inside.
 
     Args:
         polygons: (pairs, corners, 2), counter-clockwise, convex or not.
         low, high: corners of the boxes, (pairs, 2).
     """
     for axis in (0, 1):
-        polygons = _push(polygons, axis, low[:, axis], high[:, axis])
+        polygons = _clamped(polygons, axis, low[:, axis], high[:, axis])
     x, y = np.moveaxis(polygons, -1, 0)
     areas: np.ndarray = 0.5 * np.sum(x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1), 1)
     return areas
 
 
-def _push(polygons: np.ndarray, axis: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _clamped(polygons: np.ndarray, axis: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The polygons, split at the lines ``low`` and ``high`` and clamped between them along one axis."""
     start = polygons
     step = np.roll(polygons, -1, 1) - start
     lines = np.stack([low, high], -1)[:, None, :]

@@ -1,4 +1,4 @@
-"""How accurately to compute; `jaxeit.accuracy` tabulates what accuracy costs in time."""
+"""The accuracy of a computation; `jaxeit.accuracy` tabulates its cost in time."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,7 +16,7 @@ class FidelityError(ValueError):
 
 @dataclass(frozen=True)
 class Fidelity:
-    """Everything that trades accuracy for time.  It knows nothing of physics.
+    """All settings that trade accuracy for time, independent of the physics.
 
     | meaning                                                                | unit             |
     |------------------------------------------------------------------------|------------------|
@@ -59,17 +59,17 @@ class Fidelity:
 
     @classmethod
     def draft(cls, **changes: Any) -> "Fidelity":
-        """For a first look: coarse and linear."""
+        """A coarse, linear fidelity for first results; ``changes`` replace fields."""
         return replace(cls(edge_length=0.06, electrode_segments=8, growth=1.6), **changes)
 
     @classmethod
     def standard(cls, **changes: Any) -> "Fidelity":
-        """For calibration and images."""
+        """The fidelity for calibration and images; ``changes`` replace fields."""
         return replace(cls(), **changes)
 
     @classmethod
     def reference(cls, **changes: Any) -> "Fidelity":
-        """For judging the others: fine and quadratic."""
+        """A fine, quadratic fidelity that shows the errors of the others; ``changes`` replace fields."""
         return replace(cls(edge_length=0.015, order=2, electrode_segments=32), **changes)
 
 
@@ -81,7 +81,7 @@ def _float(dtype: Any) -> np.dtype:
 
 
 def require_dtype(dtype: np.dtype) -> None:
-    """Refuse a precision that JAX would silently lower.
+    """Raise an error for a precision that JAX would silently lower.
 
     Raises:
         FidelityError: for float64 while JAX's x64 mode is off.

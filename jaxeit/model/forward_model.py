@@ -1,7 +1,7 @@
 """The forward model: from sheet conductivity to voltages.
 
 All readings are differences of the entries of one small symmetric matrix, the transfer matrix
-``Z[a, b]``: the potential of electrode a per ampere driven into electrode b (and out at a ground amid the
+``Z[a, b]``: the potential of electrode a per ampere driven into electrode b (and out at a ground inside the
 sheet, which cancels).  With x_a the field of a unit current into electrode a, and
 ``A(theta; x, y) = integral of sigma grad x . grad y + sum_l g_l integral over E_l of (x - X_l)(y - Y_l)``,
 
@@ -9,7 +9,7 @@ sheet, which cancels).  With x_a the field of a unit current into electrode a, a
 
 since A is linear in theta = (sigma, g) and the fields are stationary.  The derivative needs no
 further solve (the adjoint identity; Geselowitz 1971, Lehr 1972).  Where a metal coat touches the sheet
-(`coat`), A has its two terms as well, and all else stays.
+(`metal_sheet`), A has two more terms; the rest is the same.
 """
 
 from dataclasses import replace
@@ -40,7 +40,7 @@ from .system import System
 
 
 class CoatedSheet(NamedTuple):
-    """What current sees of a sheet pressed against a metal coat.
+    """The conductivities of a sheet pressed against a metal coat.
 
     | meaning                                 | shape       | unit  |
     |-----------------------------------------|-------------|-------|
@@ -55,8 +55,8 @@ class CoatedSheet(NamedTuple):
 
 
 class Coefficients(NamedTuple):
-    """What the physics is linear in: conductivity of the elements, S; contact conductances; those of a
-    coat, where it touches the sheet."""
+    """The coefficients in which the energy A is linear: conductivity of the elements, S; contact conductances;
+    coefficients of a coat, if it touches the sheet."""
 
     sigma: Float[Array, " elements"]
     contact: Float[Array, " electrodes"]
@@ -71,7 +71,7 @@ class Fields(NamedTuple):
     | potential of the sheet at its unknowns         | (unknowns, electrodes)      |
     | drop from sheet to electrode, where under one  | (unknowns, electrodes)      |
     | terminal: potential of each electrode          | (electrodes, electrodes)    |
-    | coat: fields of the coat, if that touches      |                             |
+    | coat: fields of the coat, if it touches        |                             |
     """
 
     potential: Float[Array, "unknowns electrodes"]
@@ -87,15 +87,15 @@ def forward(
 
     Args:
         model: from `discretise`.
-        sigma: sheet conductivity of each element, S, or what `conductivity` returns; default: that of
+        sigma: sheet conductivity of each element, S, or a result of `conductivity`; default: that of
             the untouched sheet.
 
     Returns:
         (readings,) V, in the order of the protocol; none of them finite if ``sigma`` is negative anywhere, or
-        zero all around a place.  Where parts of the sheet hardly touch, digits are lost: `rounding` says how many.
+        zero all around a place.  If parts of the sheet hardly touch, digits are lost: see `rounding`.
 
     Raises:
-        ValueError: if ``sigma`` has another shape or precision than the model, or the model no coat.
+        ValueError: if ``sigma`` has another shape or precision than the model, or has a coat and the model none.
     """
     return _forward(model, sigma if sigma is None or isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
 
@@ -107,12 +107,14 @@ def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None
 
 @verb
 def rounding(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None = None) -> Float[Array, " readings"]:
-    """About what rounding has done to each reading of `forward`, (readings,) V.
+    """Estimated rounding error of each reading of `forward`, (readings,) V.
 
-    A reading is a potential and, of the same fields, an energy.  With fields off by e the potential is off by
-    ``A(x, e)``, and the energy by twice that and a square: they differ by the error, and by what matters less.
-    The energy is that of differences of potentials, from which a part of the sheet that hardly touches the ground
-    may be lifted as a whole.  Takes a few times as long as `forward`, whose arguments these are.
+    A reading is a potential difference and also an energy of the same fields.  If the fields have an error e, the
+    potential has the error ``A(x, e)``, and the energy twice that and a square: the difference of the two is the
+    error, to first order.  The energy depends on differences of potentials only, so that it is exact for a part of
+    the sheet whose potential is off as a whole because it hardly touches the ground.
+
+    Arguments as for `forward`; it takes a few times as long.
     """
     theta = coefficients(model, sigma)
     x = fields(model, theta)
@@ -120,7 +122,7 @@ def rounding(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None
 
 
 def voltages(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
-    """Voltages of the protocol from the transfer matrix in ohm, as source and amplifiers of the scene make them."""
+    """Voltages of the protocol from the transfer matrix in ohm, with errors of the scene's source and amplifiers."""
     circuit = Circuit(z, model.pattern, model.current)
     found: Array = fold(model.effects, AbstractTerminalEffect, readings(model, z), circuit)
     return found
@@ -144,8 +146,8 @@ def conductivity(
 ) -> Float[Array, " elements"] | CoatedSheet:
     """Sheet conductivity, (elements,) S, under the scene's material effects.
 
-    Where the scene has a metal coat and ``pressure`` is given, the two sheets and their contact: a
-    `CoatedSheet`.  Without pressure nothing touches the coat.
+    If the scene has a metal coat and ``pressure`` is given, the result is a `CoatedSheet`: both sheets and
+    their contact.  Without pressure the coat does not touch the sheet.
 
     Args:
         pressure: on the sheet, (elements,) Pa; default: none.
@@ -153,7 +155,7 @@ def conductivity(
     """
     touched = pressure is not None
     if not any(isinstance(effect, AbstractSheetEffect) for effect in model.effects):
-        return model.background  # nothing to compute: the program is that of the ideal sensor
+        return model.background  # no effect changes it: the program is that of the ideal sensor
     pressure = jnp.zeros_like(model.background) if pressure is None else pressure
     warmer = jnp.asarray(temperature, model.dtype)
     sheet = Sheet(model.background, pressure, model.centroids, jnp.sqrt(model.areas), warmer)
@@ -167,7 +169,7 @@ def load_spread(
 ) -> Float[Array, " elements"]:
     """Pressure on the sheet per unit load of a flat round tip, (elements,) 1/m^2.
 
-    The ideal tip presses evenly on its own area; effects of the scene may spread that.
+    The ideal tip presses evenly on its own area; effects of the scene may spread the load.
 
     Args:
         centre: of the tip, (2,) m in the sheet's flat coordinates.
@@ -181,25 +183,25 @@ def load_spread(
 
 
 def coefficients(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Coefficients:
-    """The conductivity given, or the scene's own, with the contact conductances."""
+    """The coefficients for this conductivity, by default the scene's own; raises ValueError if it does not fit."""
     if sigma is None:
         sigma = conductivity(model)
     contact = fold(model.effects, AbstractContactEffect, model.contact)
     if not isinstance(sigma, CoatedSheet):
-        return Coefficients(_fitting(model, "sigma", sigma), contact)
+        return Coefficients(_checked_values(model, "sigma", sigma), contact)
     if model.coat is None:
         raise ValueError("this model has no metal coat; discretise a scene whose effects have one")
-    sheet, coupling = _fitting(model, "sigma", sigma.sigma), _fitting(model, "coupling", sigma.coupling)
+    sheet, coupling = _checked_values(model, "sigma", sigma.sigma), _checked_values(model, "coupling", sigma.coupling)
     return Coefficients(sheet, contact, CoatCoefficients(jnp.asarray(sigma.metal, model.dtype), coupling))
 
 
-def _fitting(model: Model, name: str, values: Float[Array, " elements"]) -> Float[Array, " elements"]:
+def _checked_values(model: Model, name: str, values: Float[Array, " elements"]) -> Float[Array, " elements"]:
     if values.shape != model.background.shape or values.dtype != model.dtype:
         raise ValueError(
             f"{name} is {values.dtype}{list(values.shape)}; this model needs "
             f"{model.dtype}{list(model.background.shape)}, one value per element"
         )
-    # A little below zero the matrix stays positive definite, and the voltages look like any others.
+    # With small negative values the matrix remains positive definite, and the voltages would look valid.
     return jnp.where(values < 0, jnp.nan, values)
 
 
@@ -215,7 +217,7 @@ class DerivativeError(ValueError):
 
 @jax.custom_jvp
 def _without_derivative(geometry: dict[str, Any]) -> dict[str, Any]:
-    """The same arrays. JAX asks for the rule below only if it differentiates with respect to one of them."""
+    """The same arrays. JAX calls the rule below only if it differentiates with respect to one of them."""
     return geometry
 
 
@@ -230,7 +232,7 @@ def _(_: Any, __: Any) -> NoReturn:
 
 @jax.custom_jvp
 def _perfect_contact(contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
-    """The same array, of a skin none of whose electrodes has a contact resistance."""
+    """The same array, for a skin without contact resistances; the rule below refuses its derivative."""
     return contact
 
 
@@ -245,7 +247,7 @@ def _(_: Any, __: Any) -> NoReturn:
 def _parameters_only(model: Model, theta: Coefficients) -> tuple[Model, Coefficients]:
     """Model and coefficients that refuse derivatives which would be zero without a reason.
 
-    The derivative rule of the transfer matrix knows the coefficients alone, and nodes or areas do not occur in it.
+    The derivative rule of the transfer matrix contains the coefficients only, not the nodes or areas.
     """
     names = ("nodes", "chart", "centroids", "areas", "system", "coat")
     fixed = _without_derivative({name: getattr(model, name) for name in names})
@@ -260,7 +262,7 @@ def transfer(model: Model, theta: Coefficients) -> Float[Array, "electrodes elec
     """The transfer matrix Z in ohm; its derivatives of first order cost no further solve.
 
     Raises:
-        DerivativeError: where JAX differentiates with respect to the mesh of the model or what is made of it.
+        DerivativeError: if JAX differentiates with respect to the mesh of the model or arrays made of it.
     """
     model, theta = _parameters_only(model, theta)
     z: Array = _transfer(theta, model) + jnp.diag(series_resistance(model.system, theta))
@@ -276,7 +278,7 @@ def series_resistance(system: System, theta: Coefficients) -> Float[Array, " ele
     near = system.near_share * theta.sigma[system.near_element]
     sigma = jnp.zeros_like(theta.contact).at[system.near_electrode].add(near)
     lumped = system.lumped > 0
-    # Electrodes without a closed form take harmless numbers, so that no NaN enters a gradient.
+    # Electrodes without a closed form have the value 1 here, so that no NaN enters a gradient.
     radius, sigma, contact = (jnp.where(lumped, v, 1.0) for v in (system.lumped, sigma, theta.contact))
     x = radius * jnp.sqrt(contact / sigma)
     resistance = i0e(x) / i1e(x) / (2 * jnp.pi * radius * jnp.sqrt(sigma * contact))
@@ -333,7 +335,7 @@ class Matrix(NamedTuple):
     | meaning                                                            | shape         | unit |
     |--------------------------------------------------------------------|---------------|------|
     | values of its lower triangle                                       | (nnz,)        | S    |
-    | share, rest: s and 1 - s of `discretise`                           | (electrodes,) | 1    |
+    | share, rest: s and 1 - s of the module `unknowns`                  | (electrodes,) | 1    |
     | lift: potential of the grounded unknown per ampere into the sheet  | ()            | ohm  |
     """
 
@@ -344,7 +346,7 @@ class Matrix(NamedTuple):
 
 
 def _matrix(model: Model, theta: Coefficients) -> tuple[AbstractPlan, Matrix]:
-    """The matrix of the sheet, or of both where a coat touches it."""
+    """The plan and the matrix of the sheet, or of sheet and coat if the coat touches."""
     matrix = assemble(model.system, theta)
     if model.coat and theta.coat:
         both = assemble_coat(model.coat, theta.coat, matrix.values, matrix.share)
@@ -360,8 +362,8 @@ def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, 
 def assemble(system: System, theta: Coefficients) -> Matrix:
     """The matrix for (w, U).
 
-    The shares only choose the unknowns, and the ground the constant: no difference of potentials depends on
-    them, nor its derivatives.
+    The shares determine the unknowns only, and the ground the constant: no difference of potentials depends
+    on them, nor do its derivatives.
     """
     sigma, contact = theta.sigma, theta.contact
     chi, electrode = system.rim_chi, system.rim_electrode
@@ -387,9 +389,10 @@ def assemble(system: System, theta: Coefficients) -> Matrix:
 
 
 def _grounded(system: System, values: Float[Array, " nnz"]) -> tuple[Float[Array, " nnz"], Float[Array, ""]]:
-    """With the unknown that conducts best, of those fit, tied to zero by as much again; and what lifts it.
+    """The matrix with one unknown grounded, and the potential of that unknown per ampere into the sheet, ohm.
 
-    All current leaves there, so the unknown's potential is one over that conductance, whatever the rest.
+    The ground is the unknown with the largest weighted conductance on the diagonal; a conductance as large joins it
+    to zero volts.  All current leaves there, so its potential depends on this conductance only.
     """
     own = jax.lax.stop_gradient(values[system.plan.diagonal[system.ground]])
     best = jnp.argmax(own * system.ground_weight)

@@ -1,19 +1,19 @@
-"""A metal coat: a second conducting sheet, which touches the first where it is pressed.
+"""A metal coat: a second conducting sheet, which touches the first under pressure.
 
 With u and m the potentials of sheet and metal, g the conductance of their contact per area, and no
 current through the metal's rim,
 
     -div(sigma grad u) + g (u - m) = 0,        -div(s grad m) + g (m - u) = 0.
 
-The metal conducts a thousand times better, so that nearly all of its potential is one constant: it
-has linear elements on a mesh of its own, which no electrode refines.  It floats: the contacts alone
-decide that constant, and where they are light they do so in the last digits of a matrix for m.  So
-``m = v + c`` is solved for, with v zero at one node.  The row of c holds contact conductances only,
-and nothing is lost beside larger numbers; where nothing touches, c is held at zero, which no reading
-feels.
+The metal conducts a thousand times better, so that its potential is nearly constant: the metal has
+linear elements on a mesh of its own, which is not refined at electrodes.  The metal floats: the contacts
+alone determine the constant, and light contacts would do so in the last digits of a matrix for m.  The
+unknowns are therefore v and c with ``m = v + c``, and v is zero at one node.  The row of c holds contact
+conductances only and loses no digits to larger numbers.  Without any contact c is set to zero, which no
+reading depends on.
 
 The contact is integrated at the sheet's nodes (at midpoints of edges for P2): each exchanges current
-with the metal at its own place only.  So nothing oscillates on a mesh that does not resolve the
+with the metal at its own place only.  This avoids oscillations on a mesh that does not resolve the
 transfer length ``(g / sigma)^-1/2``, which is below a millimetre.
 """
 
@@ -30,14 +30,16 @@ from ..linalg import AbstractLinearSolver, AbstractPlan, SparsityPattern
 from ..meshing.elements import Space
 from ..meshing.triangles import Mesh
 
-_NEAREST = 16  # triangles among which the one around a point is looked for
+# The triangle around a point is searched among this many with the nearest centroids: in a graded mesh the nearest
+# centroid may be that of another triangle.
+CANDIDATE_TRIANGLES = 16
 
 
 class Coat(eqx.Module):
     """The matrix of sheet and metal with its numbers left out; unknowns and entries of the sheet come first.
 
     Index ``unknowns`` of both stands for the v that is held at zero, and for no electrode.  A contact node
-    joins six unknowns: w of the sheet and U of the electrode above (`discretise`), v at the corners of the
+    joins six unknowns: w of the sheet and U of the electrode above (`unknowns`), v at the corners of the
     triangle of metal around it, and c.
 
     | meaning                                                                   | shape            |
@@ -45,13 +47,13 @@ class Coat(eqx.Module):
     | dofs: the v of each triangle of the metal                                 | (triangles, 3)   |
     | slopes of each triangle, weighted (`elements`)                            | (triangles, 3, r)|
     | stiffness: entries of the metal at unit conductivity                      | (entries,)       |
-    | areas of an element that its contact nodes stand for, m^2                 | (elements, q)    |
+    | areas of the parts of an element at its contact nodes, m^2                | (elements, q)    |
     | touching: those nodes, among all contact nodes                            | (elements, q)    |
     | sides: the unknowns that a contact node joins                             | (contacts, 6)    |
     | corners: weights of the v                                                 | (contacts, 3)    |
     | under: the complete electrode above                                       | (contacts,)      |
     | slots: place in the matrix of what each pair of those six adds            | (contacts, 21)   |
-    | plan for both                                                             |                  |
+    | plan for sheet and metal                                                  |                  |
     """
 
     dofs: Int[Array, "triangles 3"]
@@ -67,7 +69,7 @@ class Coat(eqx.Module):
 
 
 class CoatCoefficients(NamedTuple):
-    """What is linear in the coat: conductivity of the metal, S; conductance of the contact, S/m^2."""
+    """The coefficients of the coat: conductivity of the metal, S; conductance of the contact, S/m^2."""
 
     metal: Float[Array, ""]
     coupling: Float[Array, " elements"]
@@ -107,12 +109,12 @@ def lay_coat(
     end = sheet.n + len(metal.points)
     v = np.append(end, np.arange(sheet.n, end - 1))
     nodes, areas, touching = _contact_nodes(space)
-    triangle, corners = _around(metal.mesh, space.chart[nodes])
+    triangle, corners = _containing_triangles(metal.mesh, space.chart[nodes])
     potential = np.append(electrode_dof, end)[above[nodes]]
     common = np.full(len(nodes), end - 1)
     sides = np.column_stack([index[nodes], potential, v[metal.dofs[triangle]], common])
     entries, stiffness = _metal(v[metal.dofs], metal.stiffness, end)
-    entries, slots = _joined(np.append(_key(sheet.rows, sheet.cols, end), entries), sides, end)
+    entries, slots = _with_contact_entries(np.append(_key(sheet.rows, sheet.cols, end), entries), sides, end)
     coords = np.concatenate([sheet.coords, metal.chart[1:], np.full((1, 2), np.nan)])
     return Coat(
         dofs=put(v[metal.dofs]),
@@ -136,9 +138,9 @@ def _contact_nodes(space: Space) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return nodes, space.mesh.areas[:, None] * share[used], touching.reshape(-1, np.count_nonzero(used))
 
 
-def _around(mesh: Mesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle around each place and the weights of its corners; beyond the rim, the nearest there is."""
-    _, near = cKDTree(mesh.chart_centroids).query(places, min(_NEAREST, len(mesh.triangles)))
+def _containing_triangles(mesh: Mesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The triangle around each place, and the weights of its corners; beyond the rim, the nearest triangle."""
+    _, near = cKDTree(mesh.chart_centroids).query(places, min(CANDIDATE_TRIANGLES, len(mesh.triangles)))
     first, *others = np.moveaxis(mesh.chart[mesh.triangles[near]], 2, 0)
     edges = np.stack([corner - first for corner in others], -1)
     inner = np.linalg.solve(edges, (places[:, None] - first)[..., None])[..., 0]
@@ -149,15 +151,15 @@ def _around(mesh: Mesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _metal(dofs: np.ndarray, stiffness: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the metal's own matrix has entries, and what they are at unit conductivity."""
+    """Places of the entries of the metal's own matrix, as keys, and their values at unit conductivity."""
     rows, cols = np.repeat(dofs, 3, 1).ravel(), np.tile(dofs, (1, 3)).ravel()
     kept = (rows >= cols) & (rows < end)
     entries, entry = np.unique(_key(rows[kept], cols[kept], end), return_inverse=True)
     return entries, np.bincount(entry, stiffness.ravel()[kept])
 
 
-def _joined(entries: np.ndarray, sides: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """These entries and then those that the contact adds; the place of all that it adds."""
+def _with_contact_entries(entries: np.ndarray, sides: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """The keys of all entries, those of the contact last; and the position of each contribution of the contact."""
     low, high = np.sort(sides[:, np.stack(_pairs())], 1).transpose(1, 0, 2)
     kept = high < end
     wanted = _key(high[kept], low[kept], end)
@@ -197,19 +199,20 @@ def coat_fields(
     """Fields of the metal from the unknowns of both."""
     potential = jnp.pad(x, ((0, 1), (0, 0)))
     drop = jnp.einsum("ck,cka->ca", _jump(coat, share), potential[coat.sides])
-    # Where nothing touches the metal's potential is nobody's, and a first touch gives it that of the sheet.
+    # Without any contact the metal's potential is arbitrary. The drop is then zero, since the metal takes the potential
+    # of the sheet at the first contact.
     return CoatFields(potential, jnp.where(_touches(_conductance(coat, theta)), drop, 0.0))
 
 
 def coat_energy(coat: Coat, theta: CoatCoefficients, x: CoatFields) -> Float[Array, "a b"]:
-    """The part of ``A(theta; x_a, x_b)`` (`forward`) in metal and contact, in ohm."""
+    """The part of ``A(theta; x_a, x_b)`` (`forward_model`) in metal and contact, in ohm."""
     slopes = jnp.einsum("tkr,tka->tra", coat.slopes, x.potential[coat.dofs])
     contact = jnp.einsum("c,ca,cb->ab", _conductance(coat, theta), x.drop, x.drop)
     return theta.metal * jnp.einsum("tra,trb->ab", slopes, slopes) + contact
 
 
 def _conductance(coat: Coat, theta: CoatCoefficients) -> Float[Array, " contacts"]:
-    """Of each contact node, S."""
+    """Conductance of each contact node, S."""
     none = jnp.zeros_like(theta.coupling, shape=coat.under.shape)
     return none.at[coat.touching].add(theta.coupling[:, None] * coat.areas)
 
@@ -219,7 +222,7 @@ def _touches(conductance: Float[Array, " contacts"]) -> Bool[Array, ""]:
 
 
 def _jump(coat: Coat, share: Float[Array, " electrodes"]) -> Float[Array, "contacts 6"]:
-    """u - m of each contact node is this combination of the unknowns that it joins."""
+    """Coefficients of the six unknowns at each contact node whose sum is u - m, (contacts, 6)."""
     one = jnp.ones_like(share, shape=(len(coat.under), 1))
     above = jnp.append(share, 0)[coat.under][:, None]
     return jnp.concatenate([one, above, -coat.corners, -one], 1)

@@ -10,14 +10,14 @@ from ..skin.description import Skin
 from .discretisation import Model
 
 CUTS_PER_SIDE = 8
-"""Each triangle is sampled at the square of this many places, so that the outline of a pad may cut through it."""
+"""Sides of a triangle are cut into this many parts: samples resolve triangles that the outline of a pad crosses."""
 
 
 def pad_response(skin: Skin, model: Model) -> Float[Array, "pads elements"]:
     """Gage pressure in each pad per unit of pressure on each element, without unit.
 
     An ideal pad feels the load on its footprint divided by its area; the scene's pad effects change
-    how strongly it feels each place.  ``pad_response(skin, model) @ pressure`` is (pads,) Pa.
+    the response to each place.  ``pad_response(skin, model) @ pressure`` is (pads,) Pa.
     """
     corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
     places = np.einsum("sc,ecd->esd", _barycentric(CUTS_PER_SIDE), corners)

@@ -1,10 +1,10 @@
 """The Jacobian of the readings with respect to an image of the conductivity.
 
-`forward` gives the derivative rule of the transfer matrix, ``dZ[a, b] = -A(dtheta; x_a, x_b)``: no
-further solve.  As A is a sum over elements, the derivative for one coefficient of an image is that
+The derivative rule of the transfer matrix, ``dZ[a, b] = -A(dtheta; x_a, x_b)`` (`forward_model`), needs
+no further solve.  As A is a sum over elements, the derivative for one coefficient of an image is that
 sum over its few elements, a product of the L fields at their nodes (`stiffness`).  All readings are
 differences of these L(L+1)/2 products, which are formed for a batch of coefficients at a time:
-nothing of the size elements times readings exists unless it is asked for.
+no array of the size elements times readings exists unless the caller asks for it.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model
 from .forward_model import CoatedSheet, Coefficients, coefficients, fields, series_resistance, transfer, voltages
 
-_BATCH = 512  # elements at once: their slopes and products stay in a core's cache
+BATCH_ELEMENTS = 512  # elements in a batch, whose slopes and products fit in a core's cache
 
 
 def jacobian(
@@ -56,7 +56,7 @@ def scaled_jacobian(
     image: BasisMap,
     scale: Float[Array, " elements"] | None = None,
 ) -> Float[Array, "readings basis"]:
-    """`jacobian`, of coefficients that change each element's conductivity by ``scale`` times what the basis says."""
+    """`jacobian`, for coefficients that change the elements' conductivity by ``scale`` times the basis."""
     first, second = np.triu_indices(model.electrodes)
     # dZ is symmetric: `pair` finds an unordered pair of electrodes among the columns.
     number = np.zeros((model.electrodes, model.electrodes), np.int32)
@@ -123,10 +123,10 @@ def _by_elements(
     pairs: tuple[Int[Array, " k"], Int[Array, " k"]],
     scale: Float[Array, " elements"],
 ) -> Float[Array, "basis k"]:
-    """What `Stiffness.products` returns, where each element counts ``scale`` times; batch after batch of lines."""
+    """The result of `Stiffness.products` with elements weighted by ``scale``, one batch of lines after another."""
     system, (first, second) = model.system, pairs
     weights = image.weight * scale[image.element]
-    size = min(len(weights), max(1, _BATCH // image.element.shape[1]))
+    size = min(len(weights), max(1, BATCH_ELEMENTS // image.element.shape[1]))
 
     def line(element: Int[Array, " e"], weight: Float[Array, " e"]) -> Float[Array, " k"]:
         slopes = jnp.einsum("ekr,eka->era", system.slopes[element], potential[system.dofs[element]])
@@ -139,7 +139,7 @@ def _by_elements(
 def _series_slopes(
     model: Model, theta: Coefficients, image: BasisMap, scale: Float[Array, " elements"] | None
 ) -> Float[Array, "electrodes basis"]:
-    """Derivative of the contact resistances in closed form, each of which knows few elements."""
+    """Derivative of the contact resistances in closed form, each of which depends on few elements."""
     if not model.system.near_element.size:
         return jnp.zeros((model.electrodes, image.size), model.dtype)
     slopes = jax.jacrev(lambda sigma: series_resistance(model.system, theta._replace(sigma=sigma)))(theta.sigma)

@@ -1,10 +1,10 @@
 """The sheet's stiffness, coefficient by coefficient of an image.
 
-What one coefficient contributes to the energy of two fields is ``A_p(x, y) = x^T K_p y`` with K_p the sum of its
-elements' stiffnesses at unit conductivity.  K_p only knows differences: with potentials taken from those of the first
-node, that node drops out.  Of the rest half is kept, ``K_p = H + H^T``, with few entries in each row of H, so that
-``x^T K_p y = x^T H y + (y^T H x)^T`` takes a row of products per node, where a sum over elements takes two per triangle
-(six on P2 elements), of which there are twice as many.
+The contribution of one coefficient to the energy of two fields is ``A_p(x, y) = x^T K_p y`` with K_p the sum of its
+elements' stiffnesses at unit conductivity.  K_p depends on differences of potentials only: with potentials relative to
+the first node, that node drops out.  Half of the rest is stored, ``K_p = H + H^T``, with few entries in each row of H.
+``x^T K_p y = x^T H y + (y^T H x)^T`` then takes a row of products per node, while a sum over elements takes two per
+triangle (six on P2 elements), and there are twice as many triangles as nodes.
 """
 
 from functools import partial
@@ -19,9 +19,11 @@ from scipy import sparse
 
 from ..linalg.small_matrices import stacked_product
 
-_ROWS = 4096  # of H at once: the potentials of their nodes stay in a core's cache
-_FEW = 40  # entries of H; of more, XLA's own loops make H x anew for each field and take twice as long as a library
-_ENTRIES = 1 << 18  # elements of lines that the host puts together at once
+BATCH_ROWS = 4096  # rows of H in a batch, whose potentials fit in a core's cache
+HOST_BATCH_ELEMENTS = 1 << 18  # elements whose H the host computes at once: this bounds its memory
+# Entries of H up to which XLA's loops are faster than a library: for more, they recompute H x for each field and take
+# twice as long.
+MAX_LOOPED_ENTRIES = 40
 
 
 class Stiffness(eqx.Module):
@@ -45,19 +47,21 @@ class Stiffness(eqx.Module):
         coefficient: Integer[Array, " lines"] | None,
         size: int,
     ) -> Float[Array, "size r"]:
-        """``x_a^T K_p x_b`` for each coefficient p and these pairs (a, b) of fields, batch after batch of lines.
+        """``x_a^T K_p x_b`` for each coefficient p and these pairs (a, b) of fields, in batches of lines.
 
         Args:
-            coefficient: of each line; None if line p is the one of p.
+            coefficient: the coefficient of each line; None if line p belongs to coefficient p.
         """
         lines, rows, width = self.entry.shape
-        batch = max(1, min(-(-lines // 2), _ROWS // rows))  # a loop of one step XLA would make part of its surroundings
+        # At least two batches, since XLA would unroll a loop of one step and fuse it with the code around it.
+        batch = max(1, min(-(-lines // 2), BATCH_ROWS // rows))
         here = jnp.arange(batch)
-        product = stacked_product if rows * width <= _FEW else partial(jnp.einsum, "lna,lnb->lab")
+        product = stacked_product if rows * width <= MAX_LOOPED_ENTRIES else partial(jnp.einsum, "lna,lnb->lab")
         first, second = pairs
 
         def add(i: Int[Array, ""], sums: Float[Array, "size pairs"]) -> Float[Array, "size pairs"]:
-            start = jnp.minimum(i * batch, lines - batch)  # the last batch has lines of the one before
+            # The last batch repeats lines of the one before, so that all batches have one size.
+            start = jnp.minimum(i * batch, lines - batch)
 
             def cut(table: Shaped[Array, "lines ..."]) -> Shaped[Array, "batch ..."]:
                 return jax.lax.dynamic_slice_in_dim(table, start, batch)
@@ -89,13 +93,13 @@ def stiffness(
     unknowns: int,
     dtype: np.dtype,
 ) -> Stiffness:
-    """H of the elements of each line, times their weights; those of weight zero do not count.
+    """H of each line, from its elements times their weights; elements of weight zero do not count.
 
     Args:
         dofs, slopes, unknowns: of a `System`.
-        dtype: of the entries; what rounding to it leaves of a right angle is no entry.
+        dtype: precision of the entries; an entry that is rounding error of a right angle is left out.
     """
-    lines, step = len(element), max(1, _ENTRIES // element.shape[1])
+    lines, step = len(element), max(1, HOST_BATCH_ELEMENTS // element.shape[1])
     cuts = [slice(start, start + step) for start in range(0, lines, step)]
     rounding = 4 * float(np.finfo(dtype).eps)
     parts = [_halves(element[cut], weight[cut], dofs, slopes, unknowns, rounding) for cut in cuts]
@@ -111,7 +115,7 @@ def stiffness(
 
 
 class _Halves(NamedTuple):
-    """H of some lines: where its entries belong."""
+    """H of some lines: each entry with its line, row, column and slot in the row."""
 
     dofs: np.ndarray  # (lines, nodes)
     line: np.ndarray
@@ -129,7 +133,7 @@ def _halves(
     chosen, width = element[line, place], dofs.shape[1]
     root = slopes[chosen]
     own = weight[line, place, None, None] * (root @ root.swapaxes(1, 2))
-    # Every line has rows of its own, one for each unknown, in one sparse matrix of all.
+    # One sparse matrix holds all lines; every line has its own rows, one for each of its unknowns.
     known, row = np.unique(line[:, None] * unknowns + dofs[chosen], return_inverse=True)
     row = row.reshape(-1, width)
     owner, count = known // unknowns, len(known)
@@ -141,28 +145,28 @@ def _halves(
 
     i, j = np.tril_indices(width)
     places = np.maximum(row[:, i], row[:, j]), np.minimum(row[:, i], row[:, j])
-    # A corner that two nodes of an element share (an electrode) has the entry between them twice.
+    # Two nodes of an element may be one unknown (an electrode); the entry between them then counts twice.
     twice = (row[:, i] == row[:, j]) & (i != j)
     values = np.where(twice, 2, 1) * own[:, i, j]
     lower = sparse.coo_array((values.ravel(), tuple(place.ravel() for place in places)), (count, count))
-    lower = lower.tocsr().tocoo()  # sums what elements share
+    lower = lower.tocsr().tocoo()  # sums entries of several elements
     first, second = lower.row, lower.col
     value = np.where(first == second, 0.5, 1) * lower.data
     largest = np.zeros(lines)
     np.maximum.at(largest, owner[first], np.abs(value))
     kept = (local[first] > 0) & (local[second] > 0) & (np.abs(value) > rounding * largest[owner[first]])
     first, second, value = first[kept], second[kept], value[kept]
-    first, second = _shared_out(first, second, count)
+    first, second = _balanced(first, second, count)
     order = np.argsort(first, kind="stable")
     first, second, value = first[order], second[order], value[order]
     slot = np.arange(len(first)) - np.searchsorted(first, first)
     return _Halves(table, owner[first], local[first] - 1, local[second] - 1, slot, value)
 
 
-def _shared_out(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs turned around until no row of so many has two entries more than one that it shares a pair with.
+def _balanced(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs, exchanged until no row has two entries more than a row that it shares a pair with.
 
-    The longest row decides the width of the table: in meshes it goes down from 8 to 4, all but that of the mean.
+    The longest row determines the width of the table: in meshes it decreases from 8 to 4, nearly the mean.
     """
     while True:
         entries = np.bincount(first, minlength=count)
@@ -171,7 +175,7 @@ def _shared_out(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.n
         if not len(turned):
             return first, second
         turned = turned[np.argsort(-excess[turned], kind="stable")]
-        for end in (first, second):  # one pair of a row at a time, so that none overshoots
+        for end in (first, second):  # exchange one pair of a row at a time, so that no row overshoots
             turned = turned[np.sort(np.unique(end[turned], return_index=True)[1])]
         first, second = first.copy(), second.copy()
         first[turned], second[turned] = second[turned], first[turned]

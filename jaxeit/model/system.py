@@ -1,6 +1,6 @@
-"""The matrix of a model with its numbers left out: which coefficient goes where.
+"""The structure of a model's matrix: the place of every coefficient, without the values.
 
-Everything here is computed once, on the host; `forward_model.assemble` fills the numbers in.
+This module computes once, on the host; `forward_model.assemble` adds the values.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,9 +25,9 @@ class Entries(eqx.Module):
 
 
 class System(eqx.Module):
-    """The assembled problem with its numbers left out: which coefficient goes where.
+    """The structure of the assembled problem: the place of every coefficient, without the values.
 
-    An electrode of index ``electrodes`` stands for none.
+    The index ``electrodes`` stands for no electrode.
 
     | meaning                                                                 | shape           |
     |-------------------------------------------------------------------------|-----------------|
@@ -35,7 +35,7 @@ class System(eqx.Module):
     | slopes of each element, weighted (`elements`)                           | (elements, k, r)|
     | sheet: the matrix at unit contact, in the order of its entries          |                 |
     | contact_dofs, contact_mass (m^2 or m): pieces under complete electrodes | (p, k), (p, k, k)|
-    | contact_electrode: whose piece it is                                    | (p,)            |
+    | contact_electrode: electrode of each piece                              | (p,)            |
     | rim_element, rim_electrode: elements around an electrode                | (e,), (e,)      |
     | rim_chi, rim_flux: chi at their nodes, and their stiffness times chi    | (e, k), (e, k)  |
     | bridge_element, bridge_electrodes: elements between two electrodes      | (b,), (b, 2)    |
@@ -45,7 +45,7 @@ class System(eqx.Module):
     | electrode_dof: the unknown that is each electrode's potential           | (electrodes,)   |
     | electrode_root: its place in the root of the plan                       | (electrodes,)   |
     | ground: unknowns that may be grounded                                   | (g,)            |
-    | ground_weight: how fit each is on a sheet without tears                 | (g,)            |
+    | ground_weight: suitability of each on a sheet without tears             | (g,)            |
     | slots: place in the matrix of what contacts add (`forward_model.assemble`)    | (contributions,)|
     | lumped: radius of discs whose contact is in closed form, else 0, m      | (electrodes,)   |
     | near_element, near_electrode, near_share: elements under those discs,   | (q,), (q,), (q,)|
@@ -85,7 +85,7 @@ class System(eqx.Module):
 
 
 class _Contacts(NamedTuple):
-    """Pieces under complete electrodes: their unknowns (p, k), masses (p, k, k), and whose they are (p,)."""
+    """Pieces under complete electrodes: their unknowns (p, k), masses (p, k, k), and electrodes (p,)."""
 
     dofs: np.ndarray
     mass: np.ndarray
@@ -93,7 +93,7 @@ class _Contacts(NamedTuple):
 
 
 class _Rims(NamedTuple):
-    """Elements around an electrode, whose they are, chi at their nodes and their stiffness times chi."""
+    """Elements around an electrode, their electrodes, chi at their nodes and their stiffness times chi."""
 
     element: np.ndarray
     electrode: np.ndarray
@@ -136,7 +136,7 @@ def system_arrays(
         "bridge_element": bridges.element,
         "bridge_electrodes": bridges.electrodes,
         "bridge_flux": bridges.flux,
-        "measure": measure.astype(float),  # NumPy counts no pieces in integers, whatever their weights
+        "measure": measure.astype(float),  # `np.bincount` of no pieces is an integer array, also with weights
         "under": under,
         "electrode_dof": unknowns.electrode,
         "electrode_root": np.searchsorted(roots, unknowns.electrode),
@@ -156,7 +156,7 @@ def system_of(arrays: dict[str, Any], plan: AbstractPlan, put: Callable[[np.ndar
 
 
 def _under_discs(space: Space, touched: Sequence[Touched]) -> dict[str, np.ndarray]:
-    """Elements under discs in closed form, whose mean conductivity the closed form takes."""
+    """Elements under discs with a closed form, which uses their mean conductivity."""
     areas = [space.mesh.areas[electrode.elements] for electrode in touched]
     owners = [np.full(len(part), number) for number, part in enumerate(areas)]
     return {
@@ -188,7 +188,7 @@ def _electrode_above(contacts: _Contacts, unknowns: Unknowns) -> np.ndarray:
 
 
 def _rims(dofs: np.ndarray, stiffness: np.ndarray, under: np.ndarray, electrodes: int) -> _Rims:
-    """Elements with some nodes under an electrode: K chi vanishes where all are."""
+    """Elements with some nodes under an electrode; K chi vanishes for elements with all nodes under it."""
     above = under[dofs]
     element, corner = np.nonzero(above < electrodes)
     pairs = np.unique(np.stack([element, above[element, corner]], 1), axis=0)
@@ -199,7 +199,7 @@ def _rims(dofs: np.ndarray, stiffness: np.ndarray, under: np.ndarray, electrodes
 
 
 def _bridges(rims: _Rims) -> _Bridges:
-    """Elements around two electrodes: they stand twice in the ascending list of elements around one."""
+    """Elements around two electrodes, which occur twice in the ascending list of elements around one."""
     element = rims.element
     first, second = np.concatenate(
         [np.stack([np.arange(len(element) - k), np.arange(k, len(element))]) for k in (1, 2)], 1
@@ -217,8 +217,8 @@ def _contact_places(
     rows, cols = _blocks(contacts.dofs)
     nodes = np.concatenate([dofs[rims.element], contacts.dofs])
     potential = np.repeat(electrode_dof[np.concatenate([rims.electrode, contacts.electrode])], dofs.shape[1])
-    # A node and the electrode over it make one entry, which the lower triangle holds once; a block
-    # makes each of its entries twice, and the upper one is dropped.
+    # A node and the electrode over it have one entry, which the lower triangle holds once; a block
+    # contributes each of its entries twice, and the upper one is dropped.
     low, high = np.sort([nodes.ravel(), potential], axis=0)
     left, right = np.sort(electrode_dof[bridges.electrodes], axis=1).T
     return np.concatenate([rows, high, electrode_dof, right]), np.concatenate([cols, low, electrode_dof, left])
@@ -232,11 +232,11 @@ def _blocks(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _matrix(
     dofs: np.ndarray, stiffness: np.ndarray, added: tuple[np.ndarray, np.ndarray], unknowns: int
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """What elements contribute to each entry of the lower triangle; where the contacts contribute;
+    """Contributions of elements to each entry of the lower triangle; places of the contributions of contacts;
     rows and columns of the entries.
 
-    Entries are ordered by how many elements meet in them, to the next power of two, so that those
-    alike can be summed as one table.
+    Entries are ordered by the number of elements that contribute, rounded up to a power of two, so that
+    entries of one number are summed as one table.
     """
     rows, cols = (np.concatenate(pair) for pair in zip(_blocks(dofs), added, strict=True))
     kept = rows >= cols

@@ -1,21 +1,21 @@
-"""Which unknown is where: the numbering of the potentials of sheet and electrodes.
+"""The numbering of the unknowns, which are potentials of sheet and electrodes.
 
-The unknowns are the potentials ``u`` of the sheet and ``U`` of the complete electrodes.  Solving
-for them as they stand fails at both ends: at small contact resistance u and U differ by less than
-rounding, at large resistance the reverse substitution subtracts.  So under each electrode
+The potentials are ``u`` of the sheet and ``U`` of the complete electrodes.  Solving for u and U
+directly fails for extreme contacts: at small contact resistance u and U differ by less than rounding,
+and at large resistance the reverse substitution subtracts.  Under each electrode we substitute
 
     u = w + s U chi,        s = G_c / (G_c + G_s)
 
-is solved for ``w`` and ``U`` instead, chi being one on the nodes under the electrode, G_c its contact
+and solve for ``w`` and ``U``, where chi is one on the nodes under the electrode, G_c its contact
 conductance and G_s = chi^T K chi that of the sheet around it.  The diagonal entry of U becomes the
 conductance of the two in series, no entry is formed by subtraction, and after diagonal scaling the
 matrix is well conditioned from a perfect contact to none.  (Derived here; a congruence, so the
 matrix stays symmetric positive definite.)
 
-Potentials are known but for a constant, so one unknown is grounded: through a conductance as large as its
-own, which decides nothing but the constant.  The conductivities decide which one, as all potentials are
-then differences from that place (`forward_model.assemble`): one in a tear of the sheet would see the rest
-through what the tear still conducts, and readings would be the last digits of far larger numbers.
+Potentials are determined up to a constant, so one unknown is grounded, through a conductance as large as
+its own, which affects the constant only.  The conductivities determine which one, since all potentials are
+then relative to that place (`forward_model.assemble`): from a ground in a tear of the sheet, which hardly
+conducts, readings would be the last digits of far larger numbers.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,8 @@ from ..meshing.elements import Space
 from ..skin.electrodes import ElectrodeError, Touched
 
 RIM_PENALTY = 10.0
-"""How much less fit for the ground a place is at the sheet's size from its middle: it sees more resistance there."""
+"""Sets the fall of the ground weight with the distance from the middle of the sheet: the resistance to the rest of the
+sheet grows with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class Unknowns:
     | coords: places of the unknowns, m; NaN for electrodes         | (unknowns, 2)          |
     | electrode: unknown that is each electrode's potential         | (electrodes,)          |
     | ground: unknowns that may be grounded                         | (g,)                   |
-    | ground_weight: how fit each is                                | (g,)                   |
+    | ground_weight: suitability of each                            | (g,)                   |
     | complete: electrodes with unknown contact, by their numbers   |                        |
     """
 
@@ -71,7 +72,7 @@ def number_unknowns(space: Space, touched: Sequence[Touched], ground: int | None
         _claim(owner, patch, number)
         if electrode.contact > 0 and not electrode.lumped:
             complete.append(number)
-        else:  # a perfect contact, or one in series: one potential under the whole electrode
+        else:  # a perfect contact, or one in series: the whole electrode has one potential
             alias[patch] = alias[dofs + number] = patch[0]
     names, index = np.unique(alias, return_inverse=True)
     places = np.concatenate([space.chart, np.full((len(touched), 2), np.nan)])
@@ -90,8 +91,8 @@ def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
 
 
 def _grounds(space: Space, covered: np.ndarray, electrodes: int, ground: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Which dofs may be grounded, and how fit each is: none that a complete electrode covers, and best those amid
-    the sheet; where electrodes cover all dofs, the electrodes themselves."""
+    """Unknowns that may be grounded, and the suitability of each: dofs that no complete electrode covers, best in the
+    middle of the sheet; if electrodes cover all dofs, the electrodes."""
     if ground is None:
         if covered.all():
             return len(covered) + np.arange(electrodes), np.ones(electrodes)

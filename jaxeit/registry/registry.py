@@ -1,9 +1,9 @@
 """Classes of one kind by the names that files and the command line use.
 
-A registry does not list its classes: it collects them from the room that defines them, so that a new class is known as
-soon as its module is imported.  Other packages add classes by entry points, and users name a class of their own by its
-import path, ``my_package.my_module:MyEffect``.  A TOML table (``type = "Creep"`` and its settings) and a word of the
-command line (``greit:width=0.01,radius=0.02``) go through the same reader.
+A registry does not list its classes: it collects them from the package that defines them, so that a new class is known
+as soon as its module is imported.  Other packages add classes by entry points, and users name a class of their own by
+its import path, ``my_package.my_module:MyEffect``.  One reader serves TOML tables (``type = "Creep"`` and its settings)
+and words of the command line (``greit:width=0.01,radius=0.02``).
 """
 
 import difflib
@@ -24,21 +24,21 @@ T = TypeVar("T")
 
 
 class RegistryError(ValueError):
-    """A name that stands for no class of the kind that is asked for; the message says what to do."""
+    """An unknown name, or a class of another kind; the message says what to do."""
 
 
 class Registry(Mapping[str, type[T]], Generic[T]):
     """Classes that can be chosen by name: a mapping from names to classes.
 
-    Shipped classes are the concrete classes derived from ``base`` in its room.  A class states its name as
-    ``name: ClassVar[str]``; without it, ``spell`` makes the name from the class's own.
+    Shipped classes are the concrete classes derived from ``base`` in its package.  A class states its name as
+    ``name: ClassVar[str]``; without it, ``spell`` makes the name from that of the class.
 
     Args:
-        base: from which all classes of this kind derive.
-        kind: what such a class is called in messages, such as "effect".
-        group: of entry points by which other packages add classes.
+        base: the class from which all classes of this kind derive.
+        kind: the noun for such a class in messages, such as "effect".
+        group: the group of entry points by which other packages add classes.
         spell: makes the name of a class that states none; default: `TotalVariation` is "total-variation".
-        parts: registries of the choices that settings hold in turn.
+        parts: registries of the objects that settings may hold.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
 
     @property
     def shipped(self) -> dict[str, type[T]]:
-        """The classes of the room by name, in the order in which they are defined."""
+        """The classes of the package by name, in the order in which they are defined."""
         modules = [module for name, module in list(sys.modules.items()) if name.startswith(self._room)]
         classes = [(thing, module) for module in modules for thing in vars(module).values() if isclass(thing)]
         own = [cast(type[T], kind) for kind, module in classes if kind.__module__ == module.__name__]
@@ -87,11 +87,11 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         """The class of a name: a shipped class, an installed class, or one named by its import path.
 
         Args:
-            allow_import: whether the module of an import path may be imported, which runs its code.  Set it for what
-                the user wrote, not for what a session or calibration file holds.
+            allow_import: whether the module of an import path may be imported, which runs its code.  Set it for text
+                that the user wrote, not for text that a session or calibration file holds.
 
         Raises:
-            RegistryError: for an unknown name, naming the nearest; for an import path that gives no such class.
+            RegistryError: for an unknown name, naming the nearest one; for an import path that leads to no such class.
         """
         shipped, installed = self.shipped, _entry_points(self.group)
         if name in shipped:
@@ -106,7 +106,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         raise RegistryError(f"no {self.kind} {name!r}; {hint}")
 
     def name_of(self, thing: T | type[T]) -> str:
-        """The name of a class or of an object's class; for a class that is neither shipped nor installed its path."""
+        """The name of a class or of an object's class; its import path if it is neither shipped nor installed."""
         kind: type = thing if isinstance(thing, type) else type(thing)
         stated = self._stated_name(kind)
         if self.shipped.get(stated) is kind:
@@ -173,13 +173,13 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return _made(kind, table, given, self.parts)
 
     def settings(self, thing: T) -> dict[str, Any]:
-        """What `read` needs to make the object again: ``type``, and settings as numbers, texts, lists and tables."""
+        """The table from which `read` makes the object again: ``type``, and numbers, texts, lists and tables."""
         known = settings_of(type(thing), self.parts).values()
         values = {setting.name: setting.plain(getattr(thing, setting.name)) for setting in known}
         return {"type": self.name_of(thing)} | {name: value for name, value in values.items() if value is not None}
 
     def text(self, thing: T) -> str:
-        """What `make` needs to make the object again: its name, and the settings that are not the default ones."""
+        """The word from which `make` makes the object again: its name, and settings that differ from their defaults."""
         known = settings_of(type(thing), self.parts).values()
         values = {setting: getattr(thing, setting.name) for setting in known}
         words = [f"{s.name}={word(s.plain(value))}" for s, value in values.items() if not s.is_default(value)]
@@ -196,7 +196,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _made(kind: type[T], table: TomlTable, given: Mapping[str, Any], parts: tuple[Part, ...]) -> T:
-    """An object of this class with the settings of the table; all other keys are refused."""
+    """An object of this class with the settings of the table; refuses all other keys."""
     known = settings_of(kind, parts)
     own = fields(cast(Any, kind))
     required = {f.name for f in own if f.default is MISSING and f.default_factory is MISSING}

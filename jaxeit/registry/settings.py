@@ -26,9 +26,14 @@ class Part(Protocol):
     base: type
     kind: str
 
-    def make(self, text: str, allow_import: bool = False) -> Any: ...
-    def read(self, table: TomlTable) -> Any: ...
-    def settings(self, thing: Any) -> dict[str, Any]: ...
+    def make(self, text: str, allow_import: bool = False) -> Any:
+        """The object that a word of the command line describes."""
+
+    def read(self, table: TomlTable) -> Any:
+        """The object that a TOML table describes."""
+
+    def settings(self, thing: Any) -> dict[str, Any]:
+        """The values of the TOML table from which `read` makes the object again."""
 
 
 def computed() -> Any:
@@ -37,7 +42,7 @@ def computed() -> Any:
 
 
 class Form(NamedTuple):
-    """One form that a value may have in text: what is accepted, in words, and the value that is made of it."""
+    """One form that a value may have in text: a test of the value, its description for messages, and its conversion."""
 
     accepts: Callable[[Any], bool]
     meaning: str
@@ -54,12 +59,12 @@ INTEGER = Form(lambda v: type(v) is int and 0 <= v <= LARGEST_INT, "a whole numb
 NUMBER = Form(_is_number, "a number", float)
 LIMIT = Form(lambda v: type(v) is float and math.isinf(v), "inf", float)
 TEXT = Form(lambda v: isinstance(v, str), "a text", str)
-_OF_ARRAY = {"Bool": BOOLEAN, "Int": INTEGER, "Integer": INTEGER, "UInt": INTEGER}
-_OF_TYPE = {bool: BOOLEAN, int: INTEGER, float: NUMBER, str: TEXT}
+FORM_OF_DTYPE = {"Bool": BOOLEAN, "Int": INTEGER, "Integer": INTEGER, "UInt": INTEGER}
+FORM_OF_TYPE = {bool: BOOLEAN, int: INTEGER, float: NUMBER, str: TEXT}
 
 
 def _list_of(form: Form, rank: int, length: int | None) -> Form:
-    """Lists of this form, in lists, and so on, ``rank`` deep; made into tuples."""
+    """Lists of values of this form, nested ``rank`` deep; the values become tuples."""
     if rank == 0:
         return form
     inner = _list_of(form, rank - 1, None)
@@ -77,7 +82,7 @@ def _choice_of(kind: type[enum.Enum]) -> Form:
 
 
 def _forms(hint: Any, default: Any) -> list[Form]:
-    """The forms of values that an annotation allows; none: text cannot give such a value."""
+    """The forms of values that an annotation allows; empty if text cannot give such a value."""
     if get_origin(hint) in (Union, UnionType):
         every = [form for part in get_args(hint) for form in _forms(part, default)]
         return sorted(every, key=lambda form: form.meaning.count("["))  # single values before lists
@@ -91,20 +96,20 @@ def _forms(hint: Any, default: Any) -> list[Form]:
         return _forms_of_array(hint)
     if hint in (jax.Array, np.ndarray) and default is not MISSING:
         values = np.asarray(default)
-        return [_list_of(_OF_TYPE[type(values.ravel()[0].item())], values.ndim, None)] if values.size else []
-    return [_OF_TYPE[hint]] if hint in _OF_TYPE else []
+        return [_list_of(FORM_OF_TYPE[type(values.ravel()[0].item())], values.ndim, None)] if values.size else []
+    return [FORM_OF_TYPE[hint]] if hint in FORM_OF_TYPE else []
 
 
 def _forms_of_tuple(parts: tuple[Any, ...]) -> list[Form]:
-    if not parts or parts[0] not in _OF_TYPE:
+    if not parts or parts[0] not in FORM_OF_TYPE:
         return []
-    return [_list_of(_OF_TYPE[parts[0]], 1, None if parts[-1] is Ellipsis else len(parts))]
+    return [_list_of(FORM_OF_TYPE[parts[0]], 1, None if parts[-1] is Ellipsis else len(parts))]
 
 
 def _forms_of_array(hint: Any) -> list[Form]:
     if "..." in hint.dim_str or "*" in hint.dim_str:
         return []
-    kind = _OF_ARRAY.get(hint.dtype.__name__, NUMBER)
+    kind = FORM_OF_DTYPE.get(hint.dtype.__name__, NUMBER)
     return [_list_of(kind, len(hint.dims), None)]
 
 
@@ -112,8 +117,8 @@ def _forms_of_array(hint: Any) -> list[Form]:
 class Setting:
     """A field of a class that text can give.
 
-    ``default`` is `MISSING` where the class has none; ``description`` is what the docstring says; ``part`` is the
-    registry of the choices that the field holds, if it holds one.
+    ``default`` is `MISSING` if the class has none; ``description`` is what the docstring says; ``part`` is the
+    registry of the object that the field holds, if it holds one.
     """
 
     name: str
@@ -149,7 +154,7 @@ class Setting:
             raise table.error(self.name, str(error)) from None
 
     def plain(self, value: Any) -> Any:
-        """A value as TOML writes it; None for a value that is left open."""
+        """A value as TOML writes it; None for a field without a value."""
         if value is None or isinstance(value, str):
             return value
         if isinstance(value, enum.Enum):
@@ -157,12 +162,12 @@ class Setting:
         return _plain_numbers(np.asarray(value)) if self.part is None else self.part.settings(value)
 
     def is_default(self, value: Any) -> bool:
-        """Whether the class takes this value if it is given none."""
+        """Whether this value is the default of the class."""
         return self.default is not MISSING and self.plain(value) == self.plain(self.default)
 
 
 def _plain_numbers(array: np.ndarray) -> Any:
-    """Numbers as Python's own, in lists; those of single precision with the digits that they have."""
+    """An array as Python numbers in lists; float32 values keep their short decimal form, 0.1 and not 0.10000000149."""
     if array.dtype == np.float32:
         return np.array([str(number) for number in array.ravel()], dtype=float).reshape(array.shape).tolist()
     return array.tolist()
@@ -206,7 +211,7 @@ def _default(field: "Field[Any]") -> Any:
 
 
 def _descriptions(kind: type) -> dict[str, str]:
-    """What the table in a class's docstring says of each field: its meaning, range and unit.
+    """The meaning, range and unit of each field, from the table in the docstring of the class.
 
     A row begins with the field's name, as in ``| length of correlation | 30 | 10 to 60 | mm |``.
     """

@@ -1,10 +1,10 @@
-"""What the prior expects of a scan's readings, in units of their noise: the input of every choice of readings.
+"""The covariance of a scan's readings under the prior, in units of their noise: the input of every choice of readings.
 
-How much a subset S of the readings tells of an image with prior covariance G is, in units of the readings' noise,
+With readings in units of their noise, the information of a subset S about an image with prior covariance G is
 
     log det(1 + K_SS) = log det(G^-1 + J_S^T J_S) - log det(G^-1),        K = J G J^T,
 
-so that K, readings by readings, is all that a choice needs.
+so that a choice needs only K, (readings, readings).
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ def signal_covariance(
     sigma: Float[Array, " elements"] | None = None,
     region: Float[ArrayLike, "... basis"] | None = None,
 ) -> Float[Array, "... readings readings"]:
-    """Covariance K of the readings that the prior expects, in units of their noise.
+    """Covariance K of the readings under the prior, in units of their noise.
 
     It works under jit, vmap and grad with respect to ``noise``, ``hyperparameter``, ``sigma`` and ``region``; traced
     noise is not checked.
@@ -46,9 +46,9 @@ def signal_covariance(
         basis: default `Pixels`, 40 along x.  Under jit pass a `BasisMap`.
         noise: standard deviation of each reading, (readings,) V; default: equal for all readings.
         sigma: conductivity to linearise at, (elements,) S; default: the untouched sheet.
-        region: where changes are expected, (basis,) 0 to 1 (`around`, or the weights of `pad_masks`): the prior's
-            variances are multiplied by it.  The strength of the prior remains that of the whole sheet.  Leading axes
-            hold several regions.
+        region: weights of the places where changes are expected, (basis,) 0 to 1 (`around`, or the weights of
+            `pad_masks`), which multiply the prior's variances.  The strength of the prior remains that of the whole
+            sheet.  Leading axes hold several regions.
 
     Raises:
         InverseError: if the noise is not one positive number per reading.

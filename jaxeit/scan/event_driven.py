@@ -1,4 +1,4 @@
-"""Event-driven scans: pressure and the last contacts say which readings to take next."""
+"""Event-driven scans: pressure and the last contacts select the next readings."""
 
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ class ScanState(eqx.Module):
 
 
 class EventScan(eqx.Module):
-    """A scan that pressure directs: few readings at rest, and those around the contact while there is one.
+    """A scan directed by pressure: few readings at rest, and the readings around the contact during a contact.
 
     `step` is pure and has fixed shapes, so that it runs under jit and `jax.lax.scan`.
 
@@ -79,13 +79,13 @@ class EventScan(eqx.Module):
         pressure = jnp.asarray(pressure, self.onset.dtype)
         limit = jnp.where(state.pressed, self.release, self.onset)
         pressed = ~(pressure <= limit)
-        known, placed = self._around(places)
+        known, placed = self._readings_around(places)
         unknown = jnp.any(self.by_pad & (pressed & ~placed)[:, None], 0)
         whole = state.since >= self.every - 1
         readings = whole | self.idle | (jnp.any(pressed) & known) | unknown
         return ScanState(jnp.where(whole, 0, state.since + 1), pressed), readings
 
-    def _around(
+    def _readings_around(
         self, places: Float[ArrayLike, "contacts 2"] | None
     ) -> tuple[Bool[Array, " readings"], Bool[Array, " pads"]]:
         """Readings around the contacts, and the pads that the contacts lie on."""
@@ -101,7 +101,7 @@ class EventScan(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class EventScanSettings:
-    """What an event-driven scan reads, and when.
+    """The settings of an event-driven scan.
 
     | meaning                                                                          | default       | unit     |
     |----------------------------------------------------------------------------------|---------------|----------|
@@ -112,10 +112,10 @@ class EventScanSettings:
     | every: frames from one whole scan to the next                                    | 50            |          |
     | radius: of the surroundings of a contact (`around`)                              | 0.03          | m        |
     | switch: cost of a change of the driven pair, as for `choose_readings`            | 0             | readings |
-    | selection: what makes a reading the next one                                     | `DOptimal`    |          |
+    | selection: rule that ranks the readings                                          | `DOptimal`    |          |
 
-    The onset must be well above the noise of the pressure sensors. Centres of surroundings lie on a grid whose pitch is
-    the radius or less.
+    The onset must be well above the noise of the pressure sensors. Regions have their centres on a grid with a
+    pitch of at most the radius.
 
     Raises:
         ProtocolError: for a value out of range.
@@ -165,9 +165,9 @@ def prepare_event_scan(
     """Compute the tables of an `EventScan` for a skin with pads, on the host.
 
     Args:
-        model: of the whole scan.
-        skin: with pads.
-        settings: what is read when.
+        model: the model of the whole scan.
+        skin: the skin, which needs pads.
+        settings: numbers of readings, limits of pressure and radius.
         basis: an image of pixels; default `Pixels`, 20 along x.
         noise, hyperparameter, sigma: as for `signal_covariance`.
 
@@ -212,7 +212,7 @@ def prepare_event_scan(
 
 
 def _grid(domain: Domain, pitch: float) -> Float[np.ndarray, "regions 2"]:
-    """Those centres of equal cells, with sides of at most ``pitch``, that lie on the sheet."""
+    """Centres of equal cells, with sides of at most ``pitch`` m, that lie on the sheet."""
     low, high = np.asarray(domain.bounds)
     cells = np.ceil((high - low) / pitch).astype(int)
     axes = [lo + (hi - lo) * (np.arange(n) + 0.5) / n for lo, hi, n in zip(low, high, cells, strict=True)]

@@ -1,9 +1,9 @@
-"""Fewer readings a frame: which of a scan's readings tell the most.
+"""Choice of the most informative readings of a scan, for frames with fewer readings.
 
 A frame costs time for each of its readings and for each change of the driven pair. `choose_readings` takes readings
-one by one, each time the one that adds most to what the readings taken so far tell; what these already tell is removed
-from the signal covariance (`jaxeit.scan.covariance`). As log det is submodular, the readings chosen tell at least
-1 - 1/e of what the best set of equal size would (Nemhauser, Wolsey and Fisher 1978).
+one by one, each time the one that adds most information to those taken; the information already known is removed from
+the signal covariance (`jaxeit.scan.covariance`). As log det is submodular, the chosen readings have at least 1 - 1/e of
+the information of the best set of equal size (Nemhauser, Wolsey and Fisher 1978).
 """
 
 from abc import abstractmethod
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer
 from .._compile import is_traced, require_known
 from ..skin.protocol import Protocol, ProtocolError
 
-# A gain below this part of the largest one is rounding: the readings taken before span all that K holds.
+# A gain below this part of the largest one is rounding error: the readings taken before span the range of K.
 ROUNDING_FRACTION = 1e-11
 
 
@@ -28,7 +28,7 @@ class AbstractSelection(eqx.Module):
 
     @abstractmethod
     def gain(self, left: Float[Array, " readings"]) -> Float[Array, " readings"]:
-        """Worth of each reading, zero or more, from the variance that the readings taken leave unexplained."""
+        """Gain of each reading, (readings,), zero or more, from its variance given the readings taken."""
 
     @abstractmethod
     def pivot(self, left: Float[Array, ""]) -> Float[Array, ""]:
@@ -46,7 +46,7 @@ class DOptimal(AbstractSelection):
 
 
 class Volume(AbstractSelection):
-    """Greedy on ``det K_SS``, the volume that the rows of sensitivity span (arXiv 2111.01397), whatever the noise.
+    """Greedy on ``det K_SS``, the volume that the rows of sensitivity span (arXiv 2111.01397), at any noise.
 
     It can choose no more readings than the rank of K.
     """
@@ -59,9 +59,9 @@ class Volume(AbstractSelection):
 
 
 class Sensitive(AbstractSelection):
-    """The largest of ``sum_e J_me^2`` (times the prior's variance), each reading for itself.
+    """The largest of ``sum_e J_me^2`` (times the prior's variance), each reading alone.
 
-    It ignores what the other readings tell, so that many of its choices are redundant.
+    It ignores the information of the other readings, so that many of its choices are redundant.
     """
 
     def gain(self, left: Float[Array, " readings"]) -> Float[Array, " readings"]:
@@ -92,7 +92,7 @@ def choose_readings(
     pattern: Integer[ArrayLike, "readings 4"] | None = None,
     switch: float = 0.0,
 ) -> Chosen:
-    """Choose the ``count`` readings that tell the most, one by one.
+    """Choose the ``count`` most informative readings, one by one.
 
     Under jit and grad the rows are those of the greedy choice and the gains have derivatives; the rank is not checked.
 
@@ -102,7 +102,7 @@ def choose_readings(
         selection: default `DOptimal`.
         pattern: rows of the scan; needed with ``switch``.
         switch: cost of a change of the driven pair, in readings (settling time over reading time).  The next reading
-            is then the one with the largest gain over its cost; a pair that is driven already costs nothing more.
+            is then the one with the largest gain over its cost; a pair that is already driven has no extra cost.
 
     Raises:
         ProtocolError: if the scan has fewer readings, or (for `Volume`) K has a lower rank.
@@ -122,7 +122,7 @@ def choose_readings(
 
 
 def _spans_less(chosen: Chosen) -> bool:
-    """Whether the last reading adds nothing but rounding; not known of traced gains."""
+    """Whether the gain of the last reading is only rounding error; False for traced gains."""
     known = not is_traced(chosen.gain)
     return known and float(chosen.gain[-1]) <= ROUNDING_FRACTION * float(jnp.max(chosen.gain))
 

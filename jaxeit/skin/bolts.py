@@ -26,10 +26,10 @@ class AreaPatch(AbstractAreaElectrode):
     The current passes within the transfer length ``sqrt(contact / sheet resistance)`` of the rim,
     0.08 mm for the default.  Where triangles under the bolt are larger, the bolt is a perfect
     contact in series with the closed form `disc_resistance`; where they are smaller, the area
-    integral over ``(u - U) / contact`` is resolved.  Four-terminal readings feel neither.
+    integral over ``(u - U) / contact`` is resolved.  Four-terminal readings depend on neither.
 
-    The mesh generator needs it wholly inside the sheet.  On a mesh of your own the rim may cut off less than
-    half of it: what is left is what conducts.
+    The mesh generator needs the bolt wholly inside the sheet.  On a mesh of your own the rim may cut off less
+    than half of it; the part on the sheet conducts.
     """
 
     name: ClassVar[str] = "bolt"
@@ -55,8 +55,8 @@ class AreaPatch(AbstractAreaElectrode):
     def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
         inside = self.elements(space)
         distance = np.linalg.norm(space.mesh.chart_centroids[inside] - np.asarray(self.position), axis=1)
-        rim = inside[distance >= np.quantile(distance, 0.75)]  # where the current passes
-        edge = np.sqrt(4 / np.sqrt(3) * space.mesh.areas[rim].mean())  # of equilateral triangles
+        rim = inside[distance >= np.quantile(distance, 0.75)]  # the outer quarter, where the current passes
+        edge = np.sqrt(4 / np.sqrt(3) * space.mesh.areas[rim].mean())  # edge of an equilateral triangle
         transfer = np.sqrt(self.contact / sheet_resistance)
         return self.radius if 0 < transfer < edge / space.element.order else 0.0
 

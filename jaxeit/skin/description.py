@@ -26,7 +26,7 @@ class Pad:
 
     @property
     def area(self) -> float:
-        """In m^2."""
+        """Area in m^2."""
         return Polygon(self.outline).area
 
 
@@ -41,7 +41,7 @@ class PressureSensor:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A skin's hardware.  It knows nothing of physics or meshes.
+    """A skin's hardware, without physics or meshes.
 
     | meaning                                   | unit           |
     |-------------------------------------------|----------------|
@@ -51,7 +51,7 @@ class Skin:
     | protocol: one scan                        |                |
     | pads, in the order of pressure channels   |                |
     | surface: its shape in space; None: flat   |                |
-    | toml: the text that describes all this    |                |
+    | toml: the text of the skin file           |                |
     """
 
     name: str
@@ -74,7 +74,7 @@ class Skin:
 
 
 def shipped_skins() -> tuple[str, ...]:
-    """Names that `load_skin` knows."""
+    """Names of the shipped skins, which `load_skin` accepts."""
     files = resources.files(__package__).joinpath("skins").iterdir()
     return tuple(sorted(f.name[:-5] for f in files if f.name.endswith(".toml")))
 
@@ -89,7 +89,7 @@ def load_skin(name_or_path: str | Path) -> Skin:
         shipped = resources.files(__package__).joinpath("skins", f"{name_or_path}.toml")
         return parse_skin(shipped.read_text(encoding="utf-8"), str(name_or_path))
     path = Path(name_or_path)
-    if not os.path.isfile(path):  # False, too, for a name that no file can have
+    if not os.path.isfile(path):  # also False for a name that no file can have
         raise TomlError(
             f"{name_or_path}: no such file, and not a shipped skin; shipped are {', '.join(shipped_skins())}"
         )
@@ -101,8 +101,8 @@ def parse_skin(text: str, source: str = "skin", allow_import: bool = False) -> S
 
     Args:
         source: the name used in error messages.
-        allow_import: whether the text may name electrodes of your own by an import path, which runs their code; not
-            for text that a session or calibration file holds.
+        allow_import: whether the text may name electrodes of your own by an import path, which runs their code.  Do
+            not set it for text that a session or calibration file holds.
 
     Raises:
         TomlError: naming ``source``, the key and the reason.

@@ -1,7 +1,7 @@
-"""Electrode models: how a terminal of the instrument meets the sheet.
+"""Electrode models: the contact between a terminal of the instrument and the sheet.
 
-Every model states what the mesh must follow (`footprint`), which pieces of the mesh it touches
-(`pieces`), and how a skin file describes it (`read`).  A complete electrode has a contact conductance
+Every model states the outline that the mesh must follow (`footprint`), the pieces of the mesh that it touches
+(`pieces`), and its form in a skin file (`read`).  A complete electrode has a contact conductance
 ``g`` per unit of its measure (area for a bolt, length for an edge electrode) and obeys, with u the
 sheet potential and U its own,
 
@@ -32,7 +32,7 @@ class ElectrodeError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Where one electrode touches a function space.
+    """The part of a function space that one electrode touches.
 
     | meaning                                         | shape  | unit   |
     |-------------------------------------------------|--------|--------|
@@ -55,18 +55,18 @@ class AbstractElectrode(ABC):
 
     @abstractmethod
     def footprint(self, segments: int) -> AbstractFootprint:
-        """What the mesh must follow, discs as polygons of ``segments`` sides."""
+        """The outline that the mesh must follow, with ``segments`` sides for a disc."""
 
     @abstractmethod
     def pieces(self, space: Space, domain: Domain) -> Pieces:
-        """The parts of the space that it touches.
+        """The parts of the space that the electrode touches.
 
         Raises:
-            ElectrodeError: where the mesh does not follow it.
+            ElectrodeError: if the mesh does not follow the electrode.
         """
 
     def elements(self, space: Space) -> np.ndarray:
-        """Numbers of the triangles under it; none for an electrode without area."""
+        """Numbers of the triangles under the electrode; none for an electrode without area."""
         return np.zeros(0, int)
 
     def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
@@ -76,7 +76,7 @@ class AbstractElectrode(ABC):
 
     @abstractmethod
     def centre(self, domain: Domain) -> np.ndarray:
-        """Its middle in the sheet's flat coordinates, (2,) m."""
+        """Middle of the electrode in the sheet's flat coordinates, (2,) m."""
 
     @classmethod
     @abstractmethod
@@ -93,7 +93,7 @@ class AbstractAreaElectrode(AbstractElectrode):
 
     @abstractmethod
     def elements(self, space: Space) -> np.ndarray:
-        """Numbers of the triangles under it."""
+        """Numbers of the triangles under the electrode."""
 
     def pieces(self, space: Space, domain: Domain) -> Pieces:
         inside = self.elements(space)
@@ -105,11 +105,11 @@ ELECTRODES = Registry(AbstractElectrode, "electrode", "jaxeit.electrodes")
 
 
 class Touched(NamedTuple):
-    """What one electrode is on a function space.
+    """One electrode on a function space.
 
     | meaning                                                      | shape | unit |
     |--------------------------------------------------------------|-------|------|
-    | pieces that it touches                                       |       |      |
+    | pieces that the electrode touches                            |       |      |
     | lumped: radius of the disc whose contact is in closed form, or 0 | () | m   |
     | elements: triangles under that disc                          | (n,)  |      |
     | contact: specific contact resistance                         | ()    | ohm m^2 or ohm m |
@@ -124,10 +124,10 @@ class Touched(NamedTuple):
 def touched(
     electrodes: Sequence[AbstractElectrode], space: Space, domain: Domain, sheet_resistance: float
 ) -> list[Touched]:
-    """What each of these electrodes is on a function space.
+    """Each of these electrodes on a function space.
 
     Raises:
-        ElectrodeError: where the mesh does not follow an electrode.
+        ElectrodeError: if the mesh does not follow an electrode.
     """
     out = []
     for electrode in electrodes:
@@ -138,7 +138,7 @@ def touched(
 
 
 def require_positive(**values: float) -> None:
-    """Raise ElectrodeError, naming it, for a value that is not a positive number."""
+    """Raise ElectrodeError, with the name of the value, unless every value is a positive number."""
     for name, value in values.items():
         if not (np.isfinite(value) and value > 0):
             raise ElectrodeError(f"an electrode's {name} is {value}; give a positive number")

@@ -1,4 +1,4 @@
-"""Keys that several kinds of electrodes share in a skin file: where they are, and their contact."""
+"""Keys that several kinds of electrodes share in a skin file: their places and their contact resistance."""
 
 import numpy as np
 

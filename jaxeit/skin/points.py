@@ -15,8 +15,8 @@ from .places import read_positions_inside
 
 @dataclass(frozen=True)
 class PointElectrode(AbstractElectrode):
-    """The ideal limit: a node of the mesh.  Its own drive resistance is infinite in the limit of
-    fine meshes (the potential is logarithmic there); four-terminal readings are not affected.
+    """A node of the mesh, as the limit of a small electrode.  Its drive resistance has no limit for fine
+    meshes, since the potential is logarithmic there; four-terminal readings are not affected.
 
     | meaning  | shape | unit |
     |----------|-------|------|

@@ -25,9 +25,9 @@ class PolygonPatch(AbstractAreaElectrode):
     | outline: its shape on the flat sheet    | `Polygon`    | m       |
     | contact: specific contact resistance    | ()           | ohm m^2 |
 
-    The mesh generator needs it wholly inside the sheet; on a mesh of your own whose edges follow it, it
-    may reach the rim or run from rim to rim.  There is no closed form: the mesh must resolve the
-    transfer length along its sides where its own resistance matters.
+    The mesh generator needs the electrode wholly inside the sheet; on a mesh of your own whose edges follow
+    the electrode, it may reach the rim or run from rim to rim.  There is no closed form: the mesh must resolve the
+    transfer length along the sides if the resistance of the electrode matters.
     """
 
     name: ClassVar[str] = "polygon"
@@ -69,7 +69,7 @@ class PolygonPatch(AbstractAreaElectrode):
 
     @classmethod
     def _inside(cls, table: TomlTable, key: str, outlines: list[Polygon], domain: Domain) -> tuple["PolygonPatch", ...]:
-        """Electrodes of these outlines, which must be on the sheet."""
+        """Electrodes with these outlines; raises TomlError for a corner outside the sheet."""
         for number, outline in enumerate(outlines):
             outside = ~domain.contains(outline.corner_points)
             if outside.any():
@@ -98,7 +98,7 @@ class RectanglePatch(PolygonPatch):
 
 
 def _is_outline(value: Any) -> bool:
-    """Whether a value of a TOML file is rows of two numbers; `Polygon` judges the numbers."""
+    """Whether a value of a TOML file is a list of rows of two numbers; `Polygon` checks the numbers."""
     rows = value if isinstance(value, list) else [None]
     return all(isinstance(row, list) and len(row) == 2 and all(type(x) in (int, float) for x in row) for row in rows)
 

@@ -62,7 +62,7 @@ class Protocol:
         return self.readings * self.reading_time
 
     def check(self, electrodes: int) -> "Protocol":
-        """This protocol, if every row names one of ``electrodes`` electrodes; else an error."""
+        """This protocol; raises ProtocolError if a row names an electrode outside 0 to ``electrodes`` - 1."""
         wrong = (self.pattern < 0) | (self.pattern >= electrodes)
         if wrong.any():
             row = int(np.argmax(wrong.any(1)))
@@ -96,8 +96,7 @@ def adjacent(electrodes: int) -> np.ndarray:
 def reciprocal_rows(pattern: np.ndarray) -> np.ndarray:
     """For each row, the row with drive and sense exchanged, or -1 where there is none: (readings,).
 
-    Only exchanges without a change of sign are looked for; reciprocity (Z symmetric) says that the
-    two readings agree.
+    Only exchanges without a change of sign count; by reciprocity (Z is symmetric) the two readings agree.
     """
     rows = {tuple(row): index for index, row in enumerate(pattern.tolist())}
     swapped = pattern[:, [2, 3, 0, 1]].tolist()

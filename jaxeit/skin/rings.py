@@ -24,14 +24,14 @@ from .places import read_area_contact, read_positions_inside
 
 @dataclass(frozen=True)
 class RingFootprint(AbstractFootprint):
-    """Two concentric regular polygons of the circles' exact areas, with triangles between them and inside.
+    """Two concentric regular polygons of the circles' exact areas, with triangles between and inside them.
 
     | meaning                                                                | shape | unit |
     |------------------------------------------------------------------------|-------|------|
     | position of the centre                                                 | (2,)  | m    |
     | inner, outer: radii of the circles                                     | ()    | m    |
     | inner_segments, outer_segments: sides; 6 to 12 times a power of two    | ()    |      |
-    | fills_hole: whether the hole is meshed like a disc; else it is left to what lies inside | () | |
+    | fills_hole: whether the hole is meshed like a disc; else an electrode inside meshes it  | () | |
     """
 
     position: tuple[float, float]
@@ -44,7 +44,7 @@ class RingFootprint(AbstractFootprint):
     def __post_init__(self) -> None:
         if not 0 < self.inner < self.outer < np.inf:
             raise ValueError(f"RingFootprint: radii are {self.inner} and {self.outer} m; give 0 < inner < outer")
-        _ = self._hole, self._whole  # discs refuse what cannot be meshed
+        _ = self._hole, self._whole  # the constructors raise ValueError for discs that cannot be meshed
 
     @property
     def _hole(self) -> DiscFootprint:
@@ -64,10 +64,11 @@ class RingFootprint(AbstractFootprint):
 
     @property
     def is_closed(self) -> bool:
-        return True  # the two sides that this adds between the polygons lie on the ring itself
+        return True  # the two sides that join the polygons lie on the ring itself
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        within = self._hole.reach * np.cos(np.pi / self.inner_segments)  # the middles of the polygon's sides
+        # The sides of the polygon are nearest to the centre at their midpoints, the apothem away.
+        within = self._hole.reach * np.cos(np.pi / self.inner_segments)
         return np.asarray(
             np.maximum(self._whole.distance(points), within - np.linalg.norm(points - self.position, axis=1))
         )
@@ -114,8 +115,8 @@ class RingPatch(AbstractAreaElectrode):
     | inner_radius, outer_radius              | ()    | m       |
     | contact: specific contact resistance    | ()    | ohm m^2 |
 
-    Another electrode may lie inside.  There is no closed form: the mesh must resolve the transfer length
-    ``sqrt(contact / sheet resistance)`` along both circles where the ring's own resistance matters.
+    Another electrode may lie in the hole.  There is no closed form: the mesh must resolve the transfer length
+    ``sqrt(contact / sheet resistance)`` along both circles if the resistance of the ring matters.
     """
 
     name: ClassVar[str] = "ring"
