@@ -77,6 +77,7 @@ def press_evidence(
 
 
 def press_summary(presses: PressColumns | None, source: str) -> PressSummary:
+    """Source of the presses, number of accepted ones, and index and reason of each rejected one."""
     if presses is None:
         return PressSummary("none", 0, ())
     reasons = enumerate(presses.reason)

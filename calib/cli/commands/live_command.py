@@ -10,10 +10,10 @@ from ..signals import orderly_end
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """A calibration, the URLs of its streams, and who is shown the results."""
+    """A calibration, the URLs of its streams, and the outputs of the results."""
     parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
-    parser.add_argument("--eit", required=True, metavar="URL", help="as for jaxeit record")
-    parser.add_argument("--pressure", required=True, metavar="URL")
+    parser.add_argument("--eit", required=True, metavar="URL", help="URL of the EIT stream, as for jaxeit record")
+    parser.add_argument("--pressure", required=True, metavar="URL", help="URL of the pressure stream")
     parser.add_argument("--rest", type=above_zero, default=2.0, metavar="S", help="untouched at first; default: 2")
     parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help="for devices to begin; default: 10")
     parser.add_argument("--seconds", type=above_zero, help="how long; default: until Ctrl-C")
