@@ -14,7 +14,7 @@ except ImportError:
 else:
     Client = distributed.Client
 
-_PATIENCE = 10  # s, for a scheduler to answer
+_ANSWER_TIMEOUT = 10  # s: a scheduler in the same network answers within this time
 
 
 @contextlib.contextmanager
@@ -33,7 +33,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     if Client is None:
         raise ImportError("a Dask scheduler needs dask: pip install 'jaxeit[dask]'")
     try:
-        client = Client(address, timeout=_PATIENCE)
+        client = Client(address, timeout=_ANSWER_TIMEOUT)
     except (OSError, ValueError) as error:
         why = " ".join(str(error).split())
         raise SessionError(f"{address}: no Dask scheduler answers there ({why}); start one: dask scheduler") from error

@@ -41,7 +41,7 @@ except ImportError:  # a system without it
     fcntl = None  # type: ignore[assignment]
 
 _DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
-_RENEWED = 16  # sessions after which a worker is replaced, so that its memory stays bounded
+_SESSIONS_PER_WORKER = 16  # then a worker is replaced, because its memory grows by megabytes per session
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def calibrate_many(
         tell(outcome)
 
     if executor is None:
-        _in_own_pools(tasks, jobs or os.cpu_count() or 1, note)
+        _run_in_pools(tasks, jobs or os.cpu_count() or 1, note)
     else:
         for task in _run(executor, tasks, note):
             note(_failed(task, _DIED))
@@ -145,7 +145,7 @@ def _tasks(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
-    mark = _digest(recipe.to_toml(), _described(skin), str(ignore_errors), je.__version__, jax.__version__)
+    mark = _digest(recipe.to_toml(), _describe(skin), str(ignore_errors), je.__version__, jax.__version__)
     shared: dict[str, Any] = {
         "report": report,
         "choices": pickle.dumps((skin, recipe, ignore_errors)),
@@ -168,17 +168,17 @@ def _tasks(
     return tasks
 
 
-def _described(value: Any) -> str:
+def _describe(value: Any) -> str:
     """Describe an object completely, arrays bit by bit: equal texts mean equal objects, on every run."""
     if isinstance(value, Mapping):
-        return _described(sorted(value.items()))
+        return _describe(sorted(value.items()))
     if isinstance(value, (list, tuple)):
-        return f"[{','.join(map(_described, value))}]"
+        return f"[{','.join(map(_describe, value))}]"
     if isinstance(value, (np.ndarray, jax.Array)):
         array = np.asarray(value)
         return f"{array.dtype}{array.shape}{array.tobytes().hex()}"
     if is_dataclass(value) and not isinstance(value, type):
-        parts = (f"{f.name}={_described(getattr(value, f.name))}" for f in fields(value))
+        parts = (f"{f.name}={_describe(getattr(value, f.name))}" for f in fields(value))
         return f"{type(value).__qualname__}({','.join(parts)})"
     return repr(value)
 
@@ -215,11 +215,11 @@ def _pool(jobs: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=begin)
 
 
-def _in_own_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
+def _run_in_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
     """Run the tasks in pools of processes; a session whose worker died is tried once more in a process of its own."""
     left = list(tasks)
     while left:
-        now, later = left[: jobs * _RENEWED], left[jobs * _RENEWED :]
+        now, later = left[: jobs * _SESSIONS_PER_WORKER], left[jobs * _SESSIONS_PER_WORKER :]
         with _pool(min(jobs, len(now))) as pool:
             broken = _run(pool, now, note)
         suspects = [task for task in broken if _lock_of(task.calibration).exists()] or broken[:1]
@@ -246,13 +246,13 @@ def _run(executor: Executor, tasks: Sequence[_Task], note: Callable[[Outcome], N
                 outcome = future.result()
             except BrokenExecutor:
                 continue
-            except Exception as error:  # the scheduler's own
-                outcome = _failed(task, _said(error))
+            except Exception as error:  # errors of the scheduler itself, of any type
+                outcome = _failed(task, _error_text(error))
             broken.remove(task)
             note(outcome)
     finally:
         for future in futures:
-            future.cancel()  # those not begun, when interrupted
+            future.cancel()  # after an interruption, the tasks that have not begun
     return broken
 
 
@@ -260,7 +260,7 @@ def _failed(task: _Task, reason: str, seconds: float = 0.0) -> Outcome:
     return Outcome(task.session, task.calibration, reason, seconds=seconds)
 
 
-def _said(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """The message of an error, on one line."""
     text = " ".join(str(error).split())
     return text if isinstance(error, (ValueError, OSError)) and text else f"{type(error).__name__}: {text}"
@@ -277,26 +277,26 @@ def calibrate_one(task: _Task) -> Outcome:
     with _ONE_AT_A_TIME:
         take_over(task.settings)
         try:
-            with _claimed(task.calibration):
-                return replace(_done(task), seconds=time.perf_counter() - start)
+            with _exclusive(task.calibration):
+                return replace(_do_task(task), seconds=time.perf_counter() - start)
         except Exception as error:
-            reason = _said(error).removeprefix(f"{Path(task.session).name}: ")
+            reason = _error_text(error).removeprefix(f"{Path(task.session).name}: ")
             return _failed(task, reason, time.perf_counter() - start)
 
 
-def _done(task: _Task) -> Outcome:
+def _do_task(task: _Task) -> Outcome:
     """Do a task and return its outcome; a session without EIT is a log, which gets a curve and no report."""
     with open_session(task.session) as session:
         mark = _digest(session.hash, task.mark)
         if "eit" not in session.streams:
-            return _fitted_log(task, session, mark)
-        calibration, skipped = _calibrated(task, session, mark)
-    skipped &= not _reported(task, calibration)
+            return _ensure_log_fit(task, session, mark)
+        calibration, skipped = _ensure_calibration(task, session, mark)
+    skipped &= not _ensure_report(task, calibration)
     summary = calibration.evaluation.summary()
     return Outcome(task.session, task.calibration, "", skipped, calibration.simulated, summary=summary)
 
 
-def _fitted_log(task: _Task, session: Session, mark: str) -> Outcome:
+def _ensure_log_fit(task: _Task, session: Session, mark: str) -> Outcome:
     outcome = Outcome(task.session, task.calibration, simulated=session.simulated)
     if summary := log_summary(task.calibration, mark):
         return replace(outcome, skipped=True, summary=summary)
@@ -304,7 +304,7 @@ def _fitted_log(task: _Task, session: Session, mark: str) -> Outcome:
     return replace(outcome, summary=fit_log_into(task.calibration, session, recipe, mark, ignore_errors))
 
 
-def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
+def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
     """The calibration of a task, and whether it existed already."""
     with contextlib.suppress(SessionError):
         found = load_calibration(task.calibration)
@@ -318,7 +318,7 @@ def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, 
     return made, False
 
 
-def _reported(task: _Task, calibration: Calibration) -> bool:
+def _ensure_report(task: _Task, calibration: Calibration) -> bool:
     """Write the report unless it exists; returns whether it was written. The page is the last of its files."""
     if not task.report or _page_of(task).exists():
         return False
@@ -336,13 +336,13 @@ def _lock_of(calibration: str) -> Path:
 
 
 @contextlib.contextmanager
-def _claimed(calibration: str) -> Iterator[None]:
+def _exclusive(calibration: str) -> Iterator[None]:
     """Hold the lock of a task while others wait, remove their unfinished files, and remove the lock file at the end.
 
     A worker that dies leaves the file, but not the lock.
     """
     lock = _lock_of(calibration)
-    file = _locked(lock)
+    file = _open_locked(lock)
     try:
         own = re.compile(rf"\.{re.escape(Path(calibration).stem)}(\.h5|\.html|_[a-z]+\.png)\.[0-9a-f]+\.tmp")
         for name in filter(own.fullmatch, os.listdir(lock.parent)):
@@ -353,13 +353,13 @@ def _claimed(calibration: str) -> Iterator[None]:
         os.close(file)
 
 
-def _locked(path: Path) -> int:
+def _open_locked(path: Path) -> int:
     """Open and lock the lock file; the result is the file of that name, not one that its last owner has removed."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         if fcntl is None:
             return file
-        with contextlib.suppress(OSError):  # some file systems know no locks
+        with contextlib.suppress(OSError):  # some file systems have no locks
             fcntl.flock(file, fcntl.LOCK_EX)
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file), os.stat(path)):

@@ -46,8 +46,8 @@ class ForceEstimate(NamedTuple):
     | contact_force: its shares of the forces on pads that it lies on          | (n, K)       | N    |
 
     Contacts are found by a calibration with a correction by location; otherwise K is 0. The force of a pad is divided
-    among contacts by the parts of their fitted bumps on the pad. Forces of pads without a contact are noise or crosstalk
-    and belong to no contact.
+    among contacts by the parts of their fitted bumps on the pad. Forces of pads without a contact are noise or
+    crosstalk and belong to no contact.
     """
 
     map: je.ForceMap

@@ -38,7 +38,7 @@ class Loops:
         return len(pressure) > 0 and top > 0 and bool((pressure[top:] < 0.5 * pressure[top]).any())
 
     def width(self, pad: int) -> float:
-        """Mean of force on loading minus force on unloading at equal pressure, N; NaN if the two have no common range."""
+        """Mean of force on loading minus force on unloading at equal pressure, N; NaN without a common range."""
         if not self.unloads(pad):
             return float("nan")
         pressure, force, top = self.of(pad)

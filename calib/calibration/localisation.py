@@ -49,7 +49,7 @@ class CentroidLocator(AbstractLocator):
 
 
 class ContactLocator(AbstractLocator):
-    """Contacts fitted to the readings; contacts on one pad are weighted by the integrals of their bumps over its mask."""
+    """Contacts fitted to the readings; contacts on a pad are weighted by the integrals of their bumps over its mask."""
 
     finder: je.ContactFinder
 

@@ -134,7 +134,9 @@ def _disk() -> Iterator[Line]:
         yield Line("folder", f"{here} cannot be written to", "record into another folder", note=True)
         return
     longest = max(_sync_times(here))
-    remedy = "" if longest < _MAX_SYNC_TIME else "record to a local disk: a power cut loses the time of a sync in addition"
+    remedy = (
+        "" if longest < _MAX_SYNC_TIME else "record to a local disk: a power cut loses the time of a sync in addition"
+    )
     yield Line("sync", f"{1e3 * longest:.1f} ms at most to bring a record to the disk", remedy, note=True)
 
 

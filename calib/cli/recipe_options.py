@@ -44,7 +44,13 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     text = "correction by location: gain over the estimated place of the contact; the paper's recipe has none"
     _choice(group, "--location", (NONE, *FIELDS, AUTO), text, default=NONE)
     _choice(group, "--locator", LOCATORS, "estimator of the place of a contact", default="fitted-contact")
-    _choice(group, "--loss", LOSSES, "loss function of the curve fit, which limits the influence of outliers", default="soft-l1")
+    _choice(
+        group,
+        "--loss",
+        LOSSES,
+        "loss function of the curve fit, which limits the influence of outliers",
+        default="soft-l1",
+    )
     text = "folds of the cross-validation over places; with K of at least the number of places, "
     group.add_argument("--folds", type=count, metavar="K", help=text + "one place is left out at a time; default: 5")
     _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
@@ -55,7 +61,9 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_low_pass_argument(parser: Any) -> None:
     """The option of the low-pass filter."""
-    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cutoff of the low-pass filter; default: 50, or none at slow rates")
+    parser.add_argument(
+        "--low-pass", type=float, metavar="HZ", help="cutoff of the low-pass filter; default: 50, or none at slow rates"
+    )
 
 
 def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
