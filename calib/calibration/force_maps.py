@@ -117,7 +117,7 @@ def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
     """Earlier pressures (m, pads) after rows of NaN, which have no effect; None for curves without memory."""
     if before is None or not law.remembers:
         return None
-    # Only a few lengths occur, so that the program is compiled only a few times.
+    # Lengths are rounded up to a few sizes, because each new length compiles the program again.
     first = bucket(len(before))
     rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
     return rows.astype(law.curves.parameters.dtype)

@@ -61,9 +61,8 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_low_pass_argument(parser: Any) -> None:
     """The option of the low-pass filter."""
-    parser.add_argument(
-        "--low-pass", type=float, metavar="HZ", help="cutoff of the low-pass filter; default: 50, or none at slow rates"
-    )
+    text = "cutoff of the low-pass filter; default: 50, or no filter for streams of 100 Hz or slower"
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help=text)
 
 
 def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:

@@ -70,7 +70,7 @@ def test_two_threads_never_wait_for_each_other_for_ever(root, hard):
     hard(
         "two threads of Python",
         "300 calls, at most 20 s, of images, forward solves, contacts and fits",
-        beyond="no call hangs, each result has the bits of a single thread; your own large stacks of QR or SVD may hang",
+        beyond="no call hangs, results have the bits of one thread; your own large stacks of QR or SVD may hang",
     )
 
 
