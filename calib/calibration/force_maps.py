@@ -165,7 +165,7 @@ def _of_contacts(
     """Force of each contact: its shares of the forces on the pads that it lies on; 0 for an absent contact."""
     weight = places.weight
     if shares is not None:
-        beside_all = jnp.all(shares.lies <= _MIN_PART_ON_PAD, -1, keepdims=True)  # then by its shares alone
+        beside_all = jnp.all(shares.lies <= _MIN_PART_ON_PAD, -1, keepdims=True)  # such a contact keeps its shares
         on = (shares.lies > _MIN_PART_ON_PAD) | beside_all
         weight = jnp.where(on, weight, 0)
     return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)

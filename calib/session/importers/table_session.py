@@ -72,8 +72,8 @@ def import_tables(
         open_table: opens a file of the format.
         files: descriptions of the files and of the columns to import.
         output: the session file.
-        about: facts that the user states about the recording. ``about.skin`` is what the stream eit was recorded on, with one
-            column for each reading in the order of its protocol, and the stream pressure, with one for each pad.
+        about: facts that the user states about the recording. ``about.skin`` is the recorded skin: the stream eit has
+            one column for each reading in the order of its protocol, and the stream pressure one for each pad.
         sort: allow rows that go back in time.
 
     The same files and options give the same bytes. Raises `SessionError` for what cannot be read or understood, and
