@@ -1,5 +1,6 @@
 """Convert a calibration to the attributes and arrays of its file, and back."""
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -68,7 +69,31 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         arrays[f"presses/{name}"] = value
     if cal.loops is not None:
         arrays |= {f"loops/{name}": value for name, value in cal.loops.arrays().items()}
-    return attrs, {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
+    given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
+    return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
+
+
+SEAL = "seal_sha256"
+_OF_THE_FORMAT = (SEAL, "format", "format_version", "Conventions", "complete")
+
+
+def seal(attrs: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    """A hash of all words and numbers. No other check can tell numbers of one pad from those of another."""
+    digest = hashlib.sha256()
+    for name in sorted(attrs.keys() - set(_OF_THE_FORMAT)):
+        digest.update(f"{name}={attrs[name]}\n".encode())
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        words = array.ravel().tolist() if array.dtype.kind == "U" else None
+        digest.update(f"{name} {array.dtype.kind} {array.shape}\n".encode())
+        digest.update(repr(words).encode() if words is not None else array.tobytes())
+    return digest.hexdigest()
+
+
+def _require_sealed(archive: Archive) -> None:
+    """Refuse a calibration that was changed since it was saved; one of before has no seal."""
+    if SEAL in archive.attrs and archive.attrs[SEAL] != seal(archive.attrs, archive.arrays):
+        raise ValueError("they were changed after the calibration was saved")
 
 
 def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: Choice) -> dict[str, str]:
@@ -165,7 +190,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     fitted = _fitted(arrays, "pads/", len(skin.pads), kind())
     _require_possible(arrays)
     located = provenance.get("location", "none") != "none"
-    return {
+    parts = {
         "skin": skin,
         "recon": recon,
         "masks": je.PadMasks(
@@ -183,6 +208,8 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "loops": Loops.restore(arrays, "loops/"),
         "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
     }
+    _require_sealed(archive)  # last: what does not fit is named by the checks above
+    return parts
 
 
 def _field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:

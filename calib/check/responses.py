@@ -16,6 +16,7 @@ PRESSURE = "/streams/pressure"
 RESPONSES = ((0.5, 1.2), (0.95, 4.0))
 MIN_PAD_RESPONSE = 0.05  # of the usual change of pressure per newton: a press below it is not felt
 MIN_PRESSES_PER_PAD = 3  # from so many presses on, each pad should have been pressed
+MIN_FALLING = 2  # presses that all lower the pressure of their pad, from which its sign is wrong
 MIN_STRONGER = 3.0  # times its own pad's response: another column that responds so is that pad's
 
 
@@ -62,9 +63,22 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin) -> Iterator[Fi
         what = f"pressure falls on pressing, in {(largest < 0).sum()} of {len(largest)} presses"
         yield Finding(Severity.ERROR, PRESSURE, what, "negate the columns at import, or exchange the sensor's ports")
         return
+    yield from _falling_findings(skin, strongest, largest)
     under = pads_under(skin, evidence.site)
     if under.size:
         yield from _order_findings(skin, under, np.nan_to_num(pressure), strongest)
+
+
+def _falling_findings(skin: je.Skin, strongest: np.ndarray, largest: np.ndarray) -> Iterator[Finding]:
+    """Single columns whose pressure falls whenever they respond most; `largest` (presses,) is their change in Pa."""
+    for column, pad in enumerate(skin.pads):
+        change = largest[strongest == column]
+        clear = np.abs(change) > MIN_PAD_RESPONSE * np.median(np.abs(largest))
+        if clear.sum() >= MIN_FALLING and (change[clear] < 0).all():
+            what = f"column {column}, pad {pad.name!r}, falls on pressing, in {clear.sum()} of {clear.sum()} presses"
+            yield Finding(
+                Severity.ERROR, PRESSURE, what, "negate this column at import, or exchange its sensor's ports"
+            )
 
 
 def _unfelt_findings(evidence: PressEvidence, response: np.ndarray) -> Iterator[Finding]:

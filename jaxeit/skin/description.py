@@ -174,6 +174,9 @@ def _protocol(table: TomlTable, electrodes: int) -> Protocol:
     return Protocol(rows, current, frequency, reading_time)
 
 
+_PAD_REACH = 1.0  # of the sheet's width and height: a pad may jut out, but not by a sheet's size
+
+
 def _pad(table: TomlTable, domain: Domain) -> Pad:
     name = table.get("name", lambda v: isinstance(v, str), "the pad's name as text")
     if table.has("rectangle"):
@@ -183,6 +186,11 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
         outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     else:
         outline = Polygon(table.array("polygon", 2, "corners [[x, y], ...] in m")).corner_points
+    low, high = np.asarray(domain.bounds)
+    beyond = np.maximum(low - np.min(outline, 0), np.max(outline, 0) - high)
+    if (beyond > _PAD_REACH * (high - low)).any():
+        key = "rectangle" if table.has("rectangle") else "polygon"
+        raise table.error(key, f"reaches {beyond.max():.3g} m beyond the sheet; give its corners in m")
     table.done()
     return Pad(name, np.asarray(outline, float))
 

@@ -20,7 +20,7 @@ from calib.calibration.evaluation import render_table
 from calib.calibration.force_maps import fused, law_of, remembered
 from calib.calibration.localisation import locator_from_numbers, locator_numbers
 from calib.calibration.press_images import fit_untouched_sheet
-from calib.calibration.storage import to_archive
+from calib.calibration.storage import SEAL, to_archive
 from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play
 from calib.fitting.fields import Places, geometry_of
@@ -156,7 +156,8 @@ def test_a_calibration_of_before_is_still_read(calibration, folder):
     """Written without the arrays that came later."""
     attrs, arrays = to_archive(calibration)
     old = {k: v for k, v in arrays.items() if not k.startswith(("baseline/", "presses/force_"))}
-    attrs = {k: v for k, v in attrs.items() if k not in ("image_gain", "provenance_location", "evaluation_recipe")}
+    later = ("image_gain", "provenance_location", "evaluation_recipe", SEAL)
+    attrs = {k: v for k, v in attrs.items() if k not in later}
     calib.session.write_archive(folder / "old.h5", "skin-calibration", attrs, old)
     loaded = calib.load_calibration(folder / "old.h5")
     assert loaded.field is None
@@ -165,6 +166,16 @@ def test_a_calibration_of_before_is_still_read(calibration, folder):
     calib.session.write_archive(folder / "old.h5", "skin-calibration", attrs, arrays)
     with pytest.raises(calib.SessionError, match="pads/parameters: missing"):
         calib.load_calibration(folder / "old.h5")
+
+
+def test_a_calibration_whose_pads_were_exchanged_is_refused(calibration, folder):
+    """Well-formed numbers of one pad in the place of another's: only the seal tells."""
+    attrs, arrays = to_archive(calibration)
+    values, *about = arrays["pads/parameters"]
+    changed = arrays | {"pads/parameters": (values[::-1], *about)}
+    calib.session.write_archive(folder / "changed.h5", "skin-calibration", attrs, changed)
+    with pytest.raises(calib.SessionError, match="changed after the calibration was saved"):
+        calib.load_calibration(folder / "changed.h5")
 
 
 @pytest.mark.slow

@@ -255,6 +255,11 @@ LIES = {
         lambda r: stage_for_table(scaled("force", -1)(r)), ERROR, ("negative while pressing",)
     ),
     "pressure falls on pressing": Lie(scaled("pressure", -1), ERROR, ("falls on pressing", "16 of 16")),
+    "one pad falls on pressing": Lie(
+        lambda r: r.change("pressure", r.values("pressure") * [1, 1, -1, 1]),
+        ERROR,
+        ("column 2, pad 'upper left', falls on pressing", "4 of 4"),
+    ),
     "voltages reversed": Lie(scaled("eit", -1), ERROR, ("every sign is reversed",)),
     "magnitudes": Lie(lambda r: r.change("eit", np.abs(r.values("eit"))), ERROR, ("magnitudes without sign",)),
     # order

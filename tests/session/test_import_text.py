@@ -276,3 +276,19 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     with pytest.raises(SessionError, match="is not a regular file"):
         CsvFile(tmp_path / "pipe.csv")
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("time (ms),force", "--time time: read in s, but the header says ms ('time (ms)')"),
+        ("time,force (mN)", "--stream force: read in N, but the header says mN ('force (mN)')"),
+        ("time (s),force [N]", None),
+        ("time,force_m", None),  # not a unit of force
+    ],
+)
+def test_a_header_that_contradicts_the_command_is_named(header, said, tmp_path, capsys):
+    path = written(tmp_path, header + "\n" + "".join(f"{i},{i}.5\n" for i in range(9)))
+    brought(path, "--time", "time:s", "--stream", "force=1:N" if "_m" in header else "force=force:N")
+    text = capsys.readouterr().out
+    assert (f"warning: log.csv: {said}" in text) if said else ("header says" not in text)

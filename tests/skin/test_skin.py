@@ -47,6 +47,7 @@ def test_a_copied_and_edited_file(tmp_path):
         ("version = 1", "version = 2", "version: is 2"),
         ('format = "jaxeit-skin"', 'format = "other"', "format"),
         ("rectangle = [0.0, 0.0, 0.1, 0.1]", "rectangle = [0.1, 0.0, 0.0, 0.1]", r"\[\[pads\]\] number 1"),
+        ("rectangle = [0.0, 0.0, 0.1, 0.1]", "rectangle = [0.0, 0.0, 100.0, 0.1]", "reaches 99.8 m beyond the sheet"),
         ("[sheet]", "[sheet", "not valid TOML"),
         ("maximum = 34474.0", "maximum = -1.0", r"\[pressure_sensor\]: maximum"),
     ],

@@ -7,7 +7,7 @@ filled in; what is left out or looks suspicious is counted in the report.
 import hashlib
 import os
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +45,7 @@ class _Part:
     places: dict[str, list[int]]
     units: dict[str, str]
     counted: str
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ def import_tables(
             streams = [_write_stream(writer, one, stream, zero) for stream in one.spec.streams]
             reports += [_file_report(part, ()) for part in one.parts[:-1]]
             reports.append(_file_report(one.parts[-1], streams))
-    return ImportReport(Path(output), start, known, tuple(reports))
+    notes = tuple(note for one in loaded for part in one.parts for note in part.notes)
+    return ImportReport(Path(output), start, known, tuple(reports), notes)
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -119,17 +121,19 @@ def _load(
 
 
 def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About, used: int) -> _Part:
-    path, wanted, places, units = file.path, [], {}, {}
+    path, wanted, places, units, notes = file.path, [], {}, {}, list[str]()
     if spec.rate_hz is None:
         wanted = column_indices(path, spec.time, file.header, file.columns)
         if len(wanted) > 1:
             raise problem(path, f"--time {printable(spec.time)}", f"names {len(wanted)} columns", "name one")
         time_unit = spec.time_unit or _unit_of(path, f"--time {printable(spec.time)}", wanted, file.header, "s")
+        notes += _contradictions(path, f"--time {printable(spec.time)}", time_unit, wanted, file.header)
     for stream in spec.streams:
         found = [i for text in stream.columns for i in column_indices(path, text, file.header, file.columns)]
         places[stream.name] = list(range(len(wanted), len(wanted) + len(found)))
         where = f"--stream {printable(stream.name)}"
         units[stream.name] = stream.unit or _unit_of(path, where, found, file.header)
+        notes += _contradictions(path, where, units[stream.name], found, file.header)
         wanted = [*wanted, *found]
     if len(wanted) > MAX_COLUMNS:
         raise problem(path, "--stream", f"{len(wanted):,} columns are too many", "name fewer")
@@ -138,7 +142,17 @@ def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About
         clock = clock_of(path, table, spec.time, UNITS[time_unit], sort, file.counted)
     else:
         clock = clock_of_rate(path, len(table.line), spec.rate_hz, spec.start)
-    return _Part(path, table, clock, places, units, file.counted)
+    return _Part(path, table, clock, places, units, file.counted, tuple(notes))
+
+
+def _contradictions(path: Path, where: str, unit: str, indices: Sequence[int], header: Sequence[str]) -> Iterator[str]:
+    """A note if a header states a unit that measures the same in another size, such as mN where N was given."""
+    for head in (header[i] for i in indices if i < len(header)):
+        said = name_and_unit(head)[1]
+        known, given = UNITS.get(said), UNITS[unit]
+        if known and known.si == given.si and (known.factor, known.offset) != (given.factor, given.offset):
+            yield f"{printable(path.name)}: {where}: read in {unit}, but the header says {said} ({printable(head)!r})"
+            return
 
 
 def _unit_of(path: Path, where: str, indices: Sequence[int], header: Sequence[str], si: str = "") -> str:
