@@ -1,6 +1,6 @@
-"""The table of hard cases: tests say what they reached, and ``pytest --hard-cases PATH`` writes it down.
+"""The table of hard cases: tests record the severity they reached, and ``pytest --hard-cases PATH`` writes the table.
 
-Each test carries its rows with its report, so that they come home from parallel workers too.
+The report of each test carries its rows, so that rows from parallel workers are collected too.
 """
 
 import math
@@ -16,19 +16,20 @@ PROPERTY = "hard case"
 INTRODUCTION = """\
 # Hard cases
 
-How far jaxeit has been taken, how wrong its numbers were at worst, and what a user sees there or beyond. The tests
-write this table, the slow ones too:
+Each row is an extreme input that the tests compute with: how extreme it was, the largest error, and what a user sees
+at that severity or beyond it. Rows "fault" are faults of devices, disks and processes. Rows "lie" are recordings with
+wrong data, and quote the message of `jaxeit check`. The tests write this table; the command runs the slow ones too:
 
     python -m pytest --hard-cases docs/hard-cases.md
 
-If all the tests of a run pass, it replaces the rows of the cases it came to; the other rows stay, so that the files
-may be run one by one. A run that picks its tests by `-m` or `-k` only adds rows, as it may tell less of a case than the
-row that is there. `python -m tests.mutations` breaks the guards behind these rows one at a time, in a copy, and names
-those that no test holds.
+If all tests of a run pass, their rows replace the rows of the same cases. All other rows stay, so test files may be
+run one at a time. A run that selects tests by `-m` or `-k` only adds rows of new cases, because it may omit some tests
+of a known case. `python -m tests.mutations` removes the checks behind these rows one at a time, in a copy of the
+repository, and names those whose removal no test detects.
 
-Errors are the largest found over the whole severity reached, relative to the largest of the values compared unless the
-case says otherwise. "Naive" is the textbook form of the same computation, which the test keeps to show that it
-fails. A dash: not asked there.
+Each error is the largest over all severities reached, relative to the largest of the compared values unless the case
+says otherwise. "Naive" is the textbook form of the same computation; the test keeps it to show that it fails. A dash
+means that this error is not measured.
 
 """
 HEADER = ("case", "severity reached", "error, float64", "error, float32", "error, naive form", "what the user sees")
@@ -36,7 +37,7 @@ HEADER = ("case", "severity reached", "error, float64", "error, float32", "error
 
 @dataclass(frozen=True)
 class Row:
-    """What one test says of one hard case; several rows of a case become one, with the worst errors."""
+    """Result of one test for one hard case; the rows of a case are merged to one, with the worst errors."""
 
     case: str
     reached: str
@@ -71,9 +72,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class _Collector:
-    """Rows of the tests that passed, written once all have, in the place of what the file says of the same cases.
+    """Collects the rows of tests that passed; at the end they replace the rows of the same cases in the file.
 
-    Of ``picked`` tests only those of other cases.
+    If the tests were ``picked`` by an option, only rows of cases that are not in the file are added.
     """
 
     def __init__(self, path: Path, picked: bool) -> None:
@@ -101,7 +102,7 @@ class _Collector:
 
 
 def merge(rows: list[Row]) -> list[Row]:
-    """One row per case, sorted: the worst error of each kind, and all that is said, once each."""
+    """Merge to one row per case, sorted: the worst error of each kind, and every distinct text once."""
     alike = defaultdict(list)
     for row in rows:
         alike[row.case].append(row)
@@ -115,20 +116,20 @@ def _merged(case: str, rows: list[Row]) -> Row:
 
 
 def worst(errors: list[float | None]) -> float | None:
-    """The largest of those that are known; what is not a number is worse than any."""
+    """The largest known error; NaN counts as infinite."""
     known = [math.inf if math.isnan(e) else e for e in errors if e is not None]
     return max(known, default=None)
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown."""
+    """The rows as a table in Markdown."""
     lines = [HEADER, ("---",) * len(HEADER)]
     lines += [(r.case, r.reached, *map(_number, (r.float64, r.float32, r.naive)), r.beyond) for r in rows]
     return "".join("| " + " | ".join(_cell(text) for text in line) + " |\n" for line in lines)
 
 
 def lines_of(text: str) -> dict[str, str]:
-    """The rows of a table in Markdown, by what their first cell says."""
+    """The rows of a table in Markdown, by the text of their first cell."""
     lines = [line for line in text.splitlines(keepends=True) if line.startswith("| ")][2:]
     return {line.split(" | ")[0]: line for line in lines}
 

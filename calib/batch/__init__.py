@@ -1,1 +1,1 @@
-"""Many sessions at once, on several processes or a cluster."""
+"""Calibrate many sessions in parallel, by several processes or a cluster."""

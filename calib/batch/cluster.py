@@ -1,4 +1,4 @@
-"""A cluster's workers as an executor, for `calib.calibrate_many`; Dask is an extra."""
+"""The workers of a cluster as an executor for `calib.calibrate_many`; Dask is an optional dependency."""
 
 import contextlib
 from collections.abc import Iterator
@@ -14,16 +14,17 @@ except ImportError:
 else:
     Client = distributed.Client
 
-_PATIENCE = 10  # s, for a scheduler to answer
+_ANSWER_TIMEOUT = 10  # s: a scheduler in the same network answers within this time
 
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler; start them with ``dask worker ADDRESS --nthreads 1``, one a core.
+    """The workers of a Dask scheduler; start them with ``dask worker ADDRESS --nthreads 1``, one per core.
 
-    Memory of a worker grows by some megabytes a session, and Dask does not renew workers as the pool of
-    `calib.calibrate_many` does. Have its nanny do it: ``--lifetime 30m --lifetime-stagger 5m --lifetime-restart``
-    starts one anew after so long, ``--memory-limit 2GB`` one that passes 95 % of that. What it was at is done again.
+    The memory of a worker grows by some megabytes per session, and Dask does not replace workers as the pool of
+    `calib.calibrate_many` does. Options of the worker do this: ``--lifetime 30m --lifetime-stagger 5m
+    --lifetime-restart`` restarts a worker after that time, ``--memory-limit 2GB`` at 95 % of that memory. A session
+    that the restart interrupted is calibrated again.
 
     Raises:
         ImportError: Dask is not installed.
@@ -32,7 +33,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     if Client is None:
         raise ImportError("a Dask scheduler needs dask: pip install 'jaxeit[dask]'")
     try:
-        client = Client(address, timeout=_PATIENCE)
+        client = Client(address, timeout=_ANSWER_TIMEOUT)
     except (OSError, ValueError) as error:
         why = " ".join(str(error).split())
         raise SessionError(f"{address}: no Dask scheduler answers there ({why}); start one: dask scheduler") from error

@@ -1,4 +1,4 @@
-"""Sessions without EIT in a batch: one curve of force for each, as `calib.calibration.logs` fits it."""
+"""Sessions without EIT in a batch: one pressure-force curve each, fitted by `calib.calibration.logs`."""
 
 import contextlib
 from collections.abc import Mapping
@@ -10,11 +10,11 @@ from ..fitting.curves import CURVES, AbstractCurve
 from ..session import Session, SessionError, read_archive
 
 SUMMARY = ("samples", "force_rmse", "force_rmse_percent_full_scale")
-"""What is told of a log: figures of its second half, which the fit has not seen."""
+"""Statistics in the summary of a log, computed on its held-out second half."""
 
 
 def log_summary(path: str, mark: str) -> dict[str, float]:
-    """The summary of a log that was fitted with this mark; empty if there is none."""
+    """The summary of a log that was fitted with this mark; empty if no such fit exists."""
     with contextlib.suppress(SessionError):
         attributes = read_archive(path, FORMAT).attrs
         if attributes.get("batch") == mark:
@@ -39,7 +39,7 @@ def fit_log_into(
 
 
 def _curves(recipe: Recipe) -> tuple[AbstractCurve, ...]:
-    """The curves of the recipe; of the choice "auto" all shipped ones, as a log has samples enough to choose."""
+    """The curves of the recipe; for "auto" all shipped curves, because a log has enough samples to choose."""
     automatic = [type(CURVES.make(name)) for name in AUTO_CURVES]
     if [type(curve) for curve in recipe.curves] == automatic:
         return tuple(CURVES.make(name) for name in CURVES.shipped)

@@ -1,9 +1,9 @@
-"""Many sessions at once: a calibration, and a report if wanted, of each, by any `concurrent.futures.Executor`.
+"""Calibrate each of many sessions, and write its report on request, by any `concurrent.futures.Executor`.
 
 A session is done when its calibration lies in the output folder and names, by their hash, the session's bytes, the
-recipe, the skin and the version it was made with.  So a batch that was killed goes on where it was.  Each result
-appears whole or not at all, and is made by whoever holds the lock file beside it: two batches into one folder share
-the work.
+recipe, the skin and the version it was made with. A batch that was killed therefore resumes where it stopped. Each
+result appears whole or not at all, and is made by the process that holds the lock file beside it, so two batches into
+one folder share the work.
 """
 
 import contextlib
@@ -41,20 +41,20 @@ except ImportError:  # a system without it
     fcntl = None  # type: ignore[assignment]
 
 _DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
-_RENEWED = 16  # sessions after which a worker is replaced, so that its memory stays bounded
+_SESSIONS_PER_WORKER = 16  # then a worker is replaced, because its memory grows by megabytes per session
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one session.
+    """Result of one session.
 
     | meaning                                                              |
     |----------------------------------------------------------------------|
-    | session, calibration: their files                                    |
-    | reason: why it failed, in one line; empty: the calibration is there  |
-    | skipped: it was there already                                        |
-    | simulated: so its calibration says                                   |
-    | seconds: that it took                                                |
+    | session, calibration: paths of the files                             |
+    | reason: why the session failed, in one line; empty: it succeeded     |
+    | skipped: whether the calibration existed already                     |
+    | simulated: whether the session was simulated                         |
+    | seconds: duration of the calibration, s                              |
     | summary: of the evaluation, or of a log's second half; empty: failed |
     """
 
@@ -98,18 +98,19 @@ def calibrate_many(
     """Calibrate every session by itself: ``out/NAME.h5`` for ``NAME.h5``, in the order given.
 
     Args:
-        paths: of session files.
-        out: a folder, made if need be; sessions that are done there already are skipped.
+        paths: paths of the session files.
+        out: output folder, created if necessary; sessions that are done there already are skipped.
         recipe, skin, ignore_errors: as for `calibrate`.
-        executor: what runs the work; default: a pool of spawned processes with one thread of computation each.
-            `distributed.Client(address).get_executor(pure=False)` is one too; its workers must see the same files.
-        jobs: processes of the default pool; default: one a core.
-        report: write ``out/NAME.html`` too.
-        tell: told of each session as it ends.
+        executor: default: a pool of spawned processes with one thread of computation each. Another example is
+            `distributed.Client(address).get_executor(pure=False)`; its workers must see the same files.
+        jobs: number of processes of the default pool; default: one per core.
+        report: whether to write ``out/NAME.html`` too.
+        tell: called with the outcome of each session when the session ends.
 
     A session without EIT is a log of force and pressure: it gets a curve, as `jaxeit calibrate` fits it, and no page.
-    A session that fails is named in its outcome and the rest complete; so is one that kills its worker, if the pool is
-    the default one. Call it below ``if __name__ == "__main__":``, as spawned processes import the main module.
+    The outcome of a session that fails names the reason, and the other sessions complete. The default pool also
+    survives a session that kills its worker. Call this function below ``if __name__ == "__main__":``, because spawned
+    processes import the main module.
 
     Raises:
         SessionError: two sessions would have one result, or the folder cannot be made.
@@ -125,7 +126,7 @@ def calibrate_many(
         tell(outcome)
 
     if executor is None:
-        _in_own_pools(tasks, jobs or os.cpu_count() or 1, note)
+        _run_in_pools(tasks, jobs or os.cpu_count() or 1, note)
     else:
         for task in _run(executor, tasks, note):
             note(_failed(task, _DIED))
@@ -144,7 +145,7 @@ def _tasks(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
-    mark = _digest(recipe.to_toml(), _described(skin), str(ignore_errors), je.__version__, jax.__version__)
+    mark = _digest(recipe.to_toml(), _describe(skin), str(ignore_errors), je.__version__, jax.__version__)
     shared: dict[str, Any] = {
         "report": report,
         "choices": pickle.dumps((skin, recipe, ignore_errors)),
@@ -167,17 +168,17 @@ def _tasks(
     return tasks
 
 
-def _described(value: Any) -> str:
-    """All that an object says, arrays bit by bit: equal texts mean equal objects, on every run."""
+def _describe(value: Any) -> str:
+    """Describe an object completely, arrays bit by bit: equal texts mean equal objects, on every run."""
     if isinstance(value, Mapping):
-        return _described(sorted(value.items()))
+        return _describe(sorted(value.items()))
     if isinstance(value, (list, tuple)):
-        return f"[{','.join(map(_described, value))}]"
+        return f"[{','.join(map(_describe, value))}]"
     if isinstance(value, (np.ndarray, jax.Array)):
         array = np.asarray(value)
         return f"{array.dtype}{array.shape}{array.tobytes().hex()}"
     if is_dataclass(value) and not isinstance(value, type):
-        parts = (f"{f.name}={_described(getattr(value, f.name))}" for f in fields(value))
+        parts = (f"{f.name}={_describe(getattr(value, f.name))}" for f in fields(value))
         return f"{type(value).__qualname__}({','.join(parts)})"
     return repr(value)
 
@@ -214,11 +215,11 @@ def _pool(jobs: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=begin)
 
 
-def _in_own_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
-    """In pools that are renewed; sessions whose worker died are tried once more, each in a process of its own."""
+def _run_in_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
+    """Run the tasks in pools of processes; a session whose worker died is tried once more in a process of its own."""
     left = list(tasks)
     while left:
-        now, later = left[: jobs * _RENEWED], left[jobs * _RENEWED :]
+        now, later = left[: jobs * _SESSIONS_PER_WORKER], left[jobs * _SESSIONS_PER_WORKER :]
         with _pool(min(jobs, len(now))) as pool:
             broken = _run(pool, now, note)
         suspects = [task for task in broken if _lock_of(task.calibration).exists()] or broken[:1]
@@ -232,7 +233,7 @@ def _in_own_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], N
 
 
 def _run(executor: Executor, tasks: Sequence[_Task], note: Callable[[Outcome], None]) -> list[_Task]:
-    """Hand over all tasks and note what comes of them; those that a broken executor did not do are given back."""
+    """Submit all tasks and collect their outcomes; returns the tasks that a broken executor did not do."""
     futures: dict[Future[Outcome], _Task] = {}
     broken = list(tasks)
     try:
@@ -245,13 +246,13 @@ def _run(executor: Executor, tasks: Sequence[_Task], note: Callable[[Outcome], N
                 outcome = future.result()
             except BrokenExecutor:
                 continue
-            except Exception as error:  # the scheduler's own
-                outcome = _failed(task, _said(error))
+            except Exception as error:  # errors of the scheduler itself, of any type
+                outcome = _failed(task, _error_text(error))
             broken.remove(task)
             note(outcome)
     finally:
         for future in futures:
-            future.cancel()  # those not begun, when interrupted
+            future.cancel()  # after an interruption, the tasks that have not begun
     return broken
 
 
@@ -259,8 +260,8 @@ def _failed(task: _Task, reason: str, seconds: float = 0.0) -> Outcome:
     return Outcome(task.session, task.calibration, reason, seconds=seconds)
 
 
-def _said(error: Exception) -> str:
-    """One line."""
+def _error_text(error: Exception) -> str:
+    """The message of an error, on one line."""
     text = " ".join(str(error).split())
     return text if isinstance(error, (ValueError, OSError)) and text else f"{type(error).__name__}: {text}"
 
@@ -271,31 +272,31 @@ _ONE_AT_A_TIME = threading.Lock()  # compiled linear algebra called by two threa
 
 
 def calibrate_one(task: _Task) -> Outcome:
-    """Do one task, unless it is done; never raises for a session that cannot be calibrated."""
+    """Do one task, unless it is done already; does not raise for a session that cannot be calibrated."""
     start = time.perf_counter()
     with _ONE_AT_A_TIME:
         take_over(task.settings)
         try:
-            with _claimed(task.calibration):
-                return replace(_done(task), seconds=time.perf_counter() - start)
+            with _exclusive(task.calibration):
+                return replace(_do_task(task), seconds=time.perf_counter() - start)
         except Exception as error:
-            reason = _said(error).removeprefix(f"{Path(task.session).name}: ")
+            reason = _error_text(error).removeprefix(f"{Path(task.session).name}: ")
             return _failed(task, reason, time.perf_counter() - start)
 
 
-def _done(task: _Task) -> Outcome:
-    """What became of a task; a session without EIT is a log, which has a curve and no page."""
+def _do_task(task: _Task) -> Outcome:
+    """Do a task and return its outcome; a session without EIT is a log, which gets a curve and no report."""
     with open_session(task.session) as session:
         mark = _digest(session.hash, task.mark)
         if "eit" not in session.streams:
-            return _fitted_log(task, session, mark)
-        calibration, skipped = _calibrated(task, session, mark)
-    skipped &= not _reported(task, calibration)
+            return _ensure_log_fit(task, session, mark)
+        calibration, skipped = _ensure_calibration(task, session, mark)
+    skipped &= not _ensure_report(task, calibration)
     summary = calibration.evaluation.summary()
     return Outcome(task.session, task.calibration, "", skipped, calibration.simulated, summary=summary)
 
 
-def _fitted_log(task: _Task, session: Session, mark: str) -> Outcome:
+def _ensure_log_fit(task: _Task, session: Session, mark: str) -> Outcome:
     outcome = Outcome(task.session, task.calibration, simulated=session.simulated)
     if summary := log_summary(task.calibration, mark):
         return replace(outcome, skipped=True, summary=summary)
@@ -303,8 +304,8 @@ def _fitted_log(task: _Task, session: Session, mark: str) -> Outcome:
     return replace(outcome, summary=fit_log_into(task.calibration, session, recipe, mark, ignore_errors))
 
 
-def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
-    """The calibration of a task, and whether it was there."""
+def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
+    """The calibration of a task, and whether it existed already."""
     with contextlib.suppress(SessionError):
         found = load_calibration(task.calibration)
         if found.provenance.get("batch") == mark:
@@ -317,8 +318,8 @@ def _calibrated(task: _Task, session: Session, mark: str) -> tuple[Calibration, 
     return made, False
 
 
-def _reported(task: _Task, calibration: Calibration) -> bool:
-    """Whether a report had to be written; its page is the last of its files."""
+def _ensure_report(task: _Task, calibration: Calibration) -> bool:
+    """Write the report unless it exists; returns whether it was written. The page is the last of its files."""
     if not task.report or _page_of(task).exists():
         return False
     write_report(calibration, _page_of(task))
@@ -335,13 +336,13 @@ def _lock_of(calibration: str) -> Path:
 
 
 @contextlib.contextmanager
-def _claimed(calibration: str) -> Iterator[None]:
-    """While others wait, and without what they left half made; the lock file goes with a clean end.
+def _exclusive(calibration: str) -> Iterator[None]:
+    """Hold the lock of a task while others wait, remove their unfinished files, and remove the lock file at the end.
 
     A worker that dies leaves the file, but not the lock.
     """
     lock = _lock_of(calibration)
-    file = _locked(lock)
+    file = _open_locked(lock)
     try:
         own = re.compile(rf"\.{re.escape(Path(calibration).stem)}(\.h5|\.html|_[a-z]+\.png)\.[0-9a-f]+\.tmp")
         for name in filter(own.fullmatch, os.listdir(lock.parent)):
@@ -352,13 +353,13 @@ def _claimed(calibration: str) -> Iterator[None]:
         os.close(file)
 
 
-def _locked(path: Path) -> int:
-    """The lock file, open and ours: it is the one under that name, not one that its last owner has removed."""
+def _open_locked(path: Path) -> int:
+    """Open and lock the lock file; the result is the file of that name, not one that its last owner has removed."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         if fcntl is None:
             return file
-        with contextlib.suppress(OSError):  # some file systems know no locks
+        with contextlib.suppress(OSError):  # some file systems have no locks
             fcntl.flock(file, fcntl.LOCK_EX)
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file), os.stat(path)):

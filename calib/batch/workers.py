@@ -1,4 +1,4 @@
-"""What a worker process sets up before it imports anything heavy: this module imports the standard library only."""
+"""Set up a worker process before it imports large libraries; this module imports the standard library only."""
 
 import contextlib
 import os

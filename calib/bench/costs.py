@@ -43,7 +43,7 @@ def measure_costs(bench: Bench, fidelity: je.Fidelity | None = None) -> tuple[Pa
 
 
 def render_costs(bench: Bench, parts: tuple[PartCost, ...]) -> str:
-    """The table that `jaxeit simulate --measure_costs` prints."""
+    """The table that `jaxeit simulate --explain` prints."""
     whole = sum(part.total for part in parts)
     width = max(len(part.name) for part in parts)
     lines = [f"{'stage':10}  {'effect':{width}}  share of the time", "-" * (30 + width)]

@@ -45,7 +45,7 @@ class SampleBlock(NamedTuple):
 
 
 class AbstractSimulatedStream(ABC):
-    """One simulated stream of a bench."""
+    """One simulated stream of a bench; `rate` is its number of samples per second, Hz."""
 
     kind: fx.StreamKind
     rate: float

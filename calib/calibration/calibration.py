@@ -34,16 +34,16 @@ class Calibration:
     | recon: frames to images, by a matrix or by an iterative method           |
     | masks: which pad carries which pixel                                     |
     | curves: the fitted pressure-force curve of each pad, with covariance     |
-    | evaluation: of the presses fitted, forces held out by location           |
+    | evaluation: results on the fitted presses, forces held out by location   |
     | provenance: sessions, their hashes, versions, recipe, date               |
-    | simulated: some session it rests on was simulated                        |
-    | notes: what a person should know                                         |
-    | field: of gain over the place pressed; None: no correction by location   |
-    | locator: tells that place from a frame; None with no field               |
-    | baseline: the paper's curves, one slope a pad, for comparison            |
+    | simulated: whether any of the sessions was simulated                     |
+    | notes: remarks for the reader of the results                             |
+    | field: gain as a function of the place pressed; None: no such correction |
+    | locator: estimates the place of a contact from a frame; None: no field   |
+    | baseline: the paper's curves, one slope per pad, for comparison          |
     | image_gain: force over the integral of the image, N / (S m^2), likewise  |
-    | loops: a whole press of each pad, loading and unloading                  |
-    | tried: the curves and fields that were chosen from, with held-out errors |
+    | loops: one complete press of each pad, loading and unloading             |
+    | tried: candidate curves and fields, with their held-out errors           |
     """
 
     skin: je.Skin
@@ -63,12 +63,12 @@ class Calibration:
 
     @property
     def hybrid(self) -> Hybrid:
-        """Curves and field together."""
+        """The fitted curves and the field as one estimator of pad forces."""
         return Hybrid(self.curves, self.field)
 
     @property
     def recipe(self) -> Recipe | None:
-        """The recipe that this calibration was made by; None for one of before recipes were kept.
+        """The recipe of this calibration; None for a file of an early version, which kept no recipe.
 
         Raises:
             ValueError: if the recipe names a class that is not installed.
@@ -77,7 +77,7 @@ class Calibration:
 
     @property
     def processing(self) -> Processing:
-        """How sessions were cut and corrected, which others that are evaluated or mapped by it should be too."""
+        """How the sessions were cut into presses and corrected; process sessions to evaluate or map alike."""
         return recorded_processing(self.provenance)
 
     def pad_forces(
@@ -85,15 +85,18 @@ class Calibration:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Force on each pad, its standard error (N) and validity from pressures (n, pads) Pa.
 
-        With a correction by location, `places` (from `locate`) say where; left out, the gain is 1 and the standard
-        error says how much that may be wrong. Not valid: outside the range that was calibrated, or a failed fit.
+        A correction by location uses `places` (from `locate`). Without them the gain is 1, and the standard error
+        includes the uncertainty of the gain. A force is not valid outside the calibrated range of pressure or after a
+        failed fit.
         """
         return self.hybrid.pad_forces(pressures, places)
 
     def locate(self, frames: ArrayLike, image: Array | None = None, *, single: bool = False) -> Places | None:
-        """Where difference frames (n, readings) V are touched; None without a correction by location.
+        """Places of the contacts in difference frames (n, readings) V; None without a correction by location.
 
-        `single`: each frame is known to hold one contact, as a press on a bench does.
+        Args:
+            image: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
+            single: whether each frame holds exactly one contact, as presses on a bench do.
         """
         if self.locator is None:
             return None

@@ -1,8 +1,7 @@
-"""What a calibration is worth: localisation and evenness over the presses of a session.
+"""Evaluation of a calibration: errors of place and force, and evenness of sensitivity, over the presses of a session.
 
-The figures are the paper's: figure 5, true and estimated positions; figure 6, sensitivity (estimated
-over true force, up to a constant for the image alone) at every place, and its coefficient of
-variation.
+The quantities are those of the paper: true and estimated positions (figure 5); sensitivity, which is estimated over
+true force (up to a constant for the image alone), at every place, and its coefficient of variation (figure 6).
 """
 
 import json
@@ -24,18 +23,19 @@ METHODS = {
     CALIBRATED: "calibrated",
     "true_place": "true place",
 }
-"""Ways to a total force, and what they are called: the image's integral alone, the paper's recipe (one number per
-pad), the calibration itself, and the same with the true place put in for the estimated one, for comparison."""
+"""Methods of estimating the total force, and their names in reports: the integral of the image alone, the paper's
+recipe (one slope per pad), the calibration itself, and the calibration given the true place, for comparison."""
 
 
-class Worth(NamedTuple):
-    """One way to a total force: its evenness with the standard error, and its errors; NaN where not known.
+class MethodErrors(NamedTuple):
+    """Evenness and errors of one method of estimating the total force; NaN where not known.
 
     | meaning                                                              | unit |
     |----------------------------------------------------------------------|------|
     | label: the method in words, the calibration's with its recipe        |      |
-    | cv, cv_error: coefficient of variation of the sensitivity, ddof 1    | 1    |
-    | rmse, mean_absolute, worst                                           | N    |
+    | cv: coefficient of variation of the sensitivity, ddof 1              | 1    |
+    | cv_error: standard error of cv                                       | 1    |
+    | rmse, mean_absolute, worst: errors of the total force                | N    |
     | percent: rmse of the largest force                                   | %    |
     """
 
@@ -50,7 +50,7 @@ class Worth(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Press by press.
+    """Results of an evaluation, press by press.
 
     | meaning                                                            | shape           | unit |
     |--------------------------------------------------------------------|-----------------|------|
@@ -59,13 +59,13 @@ class Evaluation:
     | force: true, from the load cell                                    | (presses,)      | N    |
     | pressure: change of each pad's pressure over the hold              | (presses, pads) | Pa   |
     | pad_force: estimated for each pad, by a fit that had not seen it   | (presses, pads) | N    |
-    | image_sum: integral of the image, what the image alone tells       | (presses,)      | S m^2|
+    | image_sum: integral of the image                                   | (presses,)      | S m^2|
     | centre of the sheet                                                | (2,)            | m    |
     | held_out_by: what the fit had not seen, "location" or "session"    |                 |      |
     | others: total force by other methods of `METHODS`, held out alike  | (presses,) each | N    |
     | recipe: curve and location of the calibration, in words            |                 |      |
-    | splits: what is left out otherwise than by place, and what comes of it |             |      |
-    | notes                                                              |                 |      |
+    | splits: errors with pads, indenters or sessions held out           |                 |      |
+    | notes: remarks for the reader of the results                       |                 |      |
     """
 
     position: np.ndarray
@@ -88,7 +88,7 @@ class Evaluation:
 
     @property
     def sensitivity_eit(self) -> np.ndarray:
-        """Image sum per newton over its own mean, (presses,)."""
+        """Image sum per newton, divided by its mean over the presses, (presses,)."""
         ratio = self.image_sum / self.force
         return np.asarray(ratio / ratio.mean())
 
@@ -99,7 +99,7 @@ class Evaluation:
 
     @property
     def forces(self) -> dict[str, np.ndarray]:
-        """Total force by method, (presses,) N each, the calibration's own last but for the comparison."""
+        """Total force by method, (presses,) N each; the calibration's own is last, or followed by `true_place`."""
         last = {k: v for k, v in self.others.items() if k == "true_place"}
         return {k: v for k, v in self.others.items() if k not in last} | {CALIBRATED: self.total_force} | last
 
@@ -108,7 +108,7 @@ class Evaluation:
         return np.asarray(self.forces[method] / self.force)
 
     def summary(self) -> dict[str, float]:
-        """The numbers a person would read; lengths in m, forces in N, each CV with its ddof."""
+        """Summary statistics by name: lengths in m, forces in N, each CV with its ddof."""
         out: dict[str, float] = {"presses": len(self.force)}
         for name, estimate in self.estimated.items():
             out |= {f"localisation_{name}_{k}": v for k, v in self._localisation(estimate).items()}
@@ -130,28 +130,28 @@ class Evaluation:
 
     @cached_property
     def _draws(self) -> np.ndarray:
-        """(draws, presses) how often a press is drawn when places are."""
+        """How often each press is drawn when places are drawn with replacement, (draws, presses)."""
         return place_draws(np.unique(np.round(self.position, 6), axis=0, return_inverse=True)[1].ravel())
 
     def _spread(
         self, values: np.ndarray, statistic: Callable[[np.ndarray, np.ndarray], np.ndarray]
     ) -> dict[str, float]:
-        """Standard error and 90 % interval of a statistic over places drawn again."""
+        """Standard error and 90 % interval of a statistic, by the bootstrap over places."""
         drawn = statistic(values, self._draws)
         low, high = interval(drawn)
         return {"se": float(drawn.std(ddof=1)), "low": low, "high": high}
 
-    def by_method(self) -> list[Worth]:
-        """What each way to a total force is worth: EIT only, then as in `forces`."""
+    def by_method(self) -> list[MethodErrors]:
+        """Evenness and errors of each method: EIT only, then the methods in the order of `forces`."""
         s = self.summary()
-        return [self._worth(name, s) for name in dict.fromkeys(["eit", *self.forces])]
+        return [self._method_errors(name, s) for name in dict.fromkeys(["eit", *self.forces])]
 
-    def _worth(self, name: str, s: Mapping[str, float]) -> Worth:
+    def _method_errors(self, name: str, s: Mapping[str, float]) -> MethodErrors:
         recipe = f" ({self.recipe})" if name == CALIBRATED and self.recipe else ""
         mark = "" if name == CALIBRATED else f"{name}_"
         keys = [f"cv_{name}_ddof1", f"cv_{name}_se"]
         keys += [f"force_{mark}{k}" for k in ("rmse", "rmse_percent_full_scale", "mean_absolute", "worst")]
-        return Worth(METHODS[name] + recipe, *(float(s.get(key, np.nan)) for key in keys))
+        return MethodErrors(METHODS[name] + recipe, *(float(s.get(key, np.nan)) for key in keys))
 
     def _errors(self, total: np.ndarray) -> dict[str, float]:
         error = total - self.force
@@ -176,7 +176,7 @@ class Evaluation:
         }
 
     def attributes(self) -> dict[str, str]:
-        """What `restore` needs beside the arrays."""
+        """Attributes of the file that `restore` needs beside the arrays."""
         splits = json.dumps([split._asdict() for split in self.splits])
         return {
             "held_out_by": self.held_out_by,
@@ -186,7 +186,7 @@ class Evaluation:
         }
 
     def arrays(self) -> dict[str, tuple[np.ndarray, str, str]]:
-        """Name -> values, units, meaning."""
+        """Arrays of the file: name to values, unit and meaning."""
         out = {
             "position": (self.position, "m", "true position of the tip"),
             "force": (self.force, "N", "load cell"),
@@ -228,7 +228,7 @@ def centre_of(skin: je.Skin) -> np.ndarray:
 
 
 def _mean(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(draws,) of values (presses,) that are drawn so often, (draws, presses)."""
+    """Means (draws,) of values (presses,) with weights (draws, presses)."""
     return np.asarray(weight @ values / weight.sum(1))
 
 
@@ -237,8 +237,9 @@ def _rms(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _cv(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Coefficient of variation with ddof 1; drawn presses of one value have none."""
+    """Coefficients of variation (draws,) with ddof 1 of values (presses,) with weights (draws, presses)."""
     mean, count = _mean(values, weight), weight.sum(1)
+    # The variance is taken about the mean of all presses, because the difference of raw moments would cancel.
     about = np.maximum(_mean((values - values.mean()) ** 2, weight) - (mean - values.mean()) ** 2, 0)
     return np.asarray(np.sqrt(about * count / np.maximum(count - 1, 1)) / mean)
 
@@ -272,7 +273,7 @@ def _force_lines(evaluation: Evaluation) -> list[str]:
 
 
 def _split_lines(evaluation: Evaluation) -> list[str]:
-    """What comes of leaving out more than a place."""
+    """One row per split: errors with one pad, indenter or session left out at a time."""
     if not evaluation.splits:
         return []
     out = ["", "  one left out at a time    parts  presses   RMSE, N   (90 % interval)   worst part, N"]

@@ -27,7 +27,7 @@ from .localisation import AbstractLocator
 
 FORMAT = "skin-forcemap"
 _BLOCK = 512  # frames held in memory at once
-USED = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session that forces are made of
+USED = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session from which forces are computed
 _MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
@@ -45,8 +45,9 @@ class ForceEstimate(NamedTuple):
     | position of each contact found; NaN: none                                | (n, K, 2)    | m    |
     | contact_force: its shares of the forces on pads that it lies on          | (n, K)       | N    |
 
-    Contacts are found by a calibration with a correction by location; K is 0 without. A pad shares its force between
-    them by the parts of their fitted bumps on it; what pads beside all contacts seem to bear is noise or crosstalk.
+    Contacts are found by a calibration with a correction by location; otherwise K is 0. The force of a pad is divided
+    among contacts by the parts of their fitted bumps on the pad. Forces of pads without a contact are noise or
+    crosstalk and belong to no contact.
     """
 
     map: je.ForceMap
@@ -58,7 +59,7 @@ class ForceEstimate(NamedTuple):
 
 
 class ForceLaw(eqx.Module):
-    """What of a calibration turns numbers into forces, as one pytree for compiled programs; see `Calibration`."""
+    """The parts of a `Calibration` from which forces are computed, as one pytree for compiled programs."""
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
     masks: je.PadMasks
@@ -73,7 +74,7 @@ class ForceLaw(eqx.Module):
 
 
 def law_of(calibration: Calibration) -> ForceLaw:
-    """What of a calibration turns numbers into forces."""
+    """The parts of a calibration from which forces are computed."""
     c = calibration
     return ForceLaw(c.recon, c.masks, c.curves, c.field, c.locator)
 
@@ -86,7 +87,7 @@ def force_map(
     gate: float = 0.6,
     before: np.ndarray | None = None,
 ) -> ForceEstimate:
-    """Force maps of frames and pad pressures, each less its value without contact.
+    """Force maps from changes of frames and pad pressures against the skin without contact.
 
     Args:
         frames: change of the readings, (n, readings) V.
@@ -113,9 +114,10 @@ def force_map(
 
 
 def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
-    """Earlier pressures (m, pads) after rows that move nothing, so that lengths recur; None for curves that forget."""
+    """Earlier pressures (m, pads) after rows of NaN, which have no effect; None for curves without memory."""
     if before is None or not law.remembers:
         return None
+    # Lengths are rounded up to a few sizes, because each new length compiles the program again.
     first = bucket(len(before))
     rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
     return rows.astype(law.curves.parameters.dtype)
@@ -139,7 +141,7 @@ def fused(
     before: Float[Array, "m pads"] | None,
     gate: float,
 ) -> ForceEstimate:
-    """`force_map` from images and places that are known (None: nothing known); pure."""
+    """`force_map` from known images and places (None: places are not estimated); pure."""
     force, error, valid = _pad_forces(law, pressures, places, before)
     error = jnp.hypot(error, law.curves.residual_rms)
     numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
@@ -152,22 +154,25 @@ def fused(
     return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places, shares))
 
 
-_BESIDE = 0.1  # part of a contact on a pad up to which it lies beside the pad
+# Part of a contact's bump: a pad with less of it on its area does not bear that contact. A fitted bump has tails, and
+# at the border of a pad they reach over to the neighbour.
+_MIN_PART_ON_PAD = 0.1
 
 
 def _of_contacts(
     force: Float[Array, "n pads"], places: Places, shares: je.fusion.ContactShares | None
 ) -> Float[Array, "n K"]:
-    """Each contact's part of the forces of pads that it lies on; 0 where there is none."""
+    """Force of each contact: its shares of the forces on the pads that it lies on; 0 for an absent contact."""
     weight = places.weight
     if shares is not None:
-        on = (shares.lies > _BESIDE) | jnp.all(shares.lies <= _BESIDE, -1, keepdims=True)
+        beside_all = jnp.all(shares.lies <= _MIN_PART_ON_PAD, -1, keepdims=True)  # such a contact keeps its shares
+        on = (shares.lies > _MIN_PART_ON_PAD) | beside_all
         weight = jnp.where(on, weight, 0)
     return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)
 
 
 def _pad_forces(law: ForceLaw, pressures: Array, places: Places | None, before: Array | None) -> Iterable[Array]:
-    """Forces, errors and validity (n, pads), of curves that remember after what came `before`."""
+    """Forces, errors and validity (n, pads); curves with memory start from the pressures `before`."""
     if before is None:
         return pad_forces(law.curves, law.field, pressures, places)
     first, whole = len(before), jnp.concatenate([before, pressures])
@@ -176,18 +181,18 @@ def _pad_forces(law: ForceLaw, pressures: Array, places: Places | None, before: 
     return (part[first:] for part in pad_forces(law.curves, law.field, whole, places))
 
 
-_LOADED = 3.0  # times the scatter of single samples: pads below are taken as idle, and their frames not searched
+_LOADED_MULTIPLE = 3.0  # of the residual scatter of a curve: noise rarely exceeds it, so that idle pads stay idle
 
 
 def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
-    """Whether a pad carries more than its pressure's scatter, wherever it is touched; pure."""
-    return pad_forces(law.curves, None, pressures).force > _LOADED * law.curves.residual_rms
+    """Whether the force on a pad, without correction by location, exceeds the scatter of single samples; pure."""
+    return pad_forces(law.curves, None, pressures).force > _LOADED_MULTIPLE * law.curves.residual_rms
 
 
 def remembered(pressures: np.ndarray) -> np.ndarray:
-    """The turns (m, pads) of pressures (n, pads) that a curve with hysteresis still remembers; NaN fills up.
+    """The turning points (m, pads) of pressures (n, pads) that a curve with hysteresis remembers, padded by NaN.
 
-    A turn is forgotten as soon as a later excursion goes back beyond it (Preisach's wiping out), so that few are left.
+    A later excursion beyond a turning point wipes it out (wiping-out property of the Preisach model), so few remain.
     """
     turns = [_turns(column) for column in np.asarray(pressures).T]
     longest = max(map(len, turns), default=0)
@@ -198,8 +203,10 @@ def _turns(column: np.ndarray) -> list[float]:
     kept: list[float] = [0.0]  # at rest
     for value in column[np.isfinite(column)].tolist():
         kept.append(value)
+        # An excursion at least as large as the one before closes that inner loop, which has no further effect.
         while len(kept) > 3 and abs(kept[-1] - kept[-2]) >= abs(kept[-2] - kept[-3]):
             del kept[-3:-1]
+        # A value that continues in the same direction makes the value before it no turning point.
         while len(kept) > 2 and (kept[-1] - kept[-2]) * (kept[-2] - kept[-3]) >= 0:
             del kept[-2]
     return kept
@@ -219,9 +226,9 @@ def apply(
     The file, format skin-forcemap, appears only when complete.
 
     Args:
-        processing: how the session is corrected; default: as those that were calibrated from.
-        ignore_errors: apply also to a session whose frames or pressures `check_session` finds an error in; the file
-            then names the errors.
+        processing: how the session is corrected; default: as the sessions of the calibration.
+        ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
+            file then names the errors.
 
     Raises:
         SessionError: if the session was recorded on another skin, lacks a stream, or holds no frame.
@@ -268,7 +275,7 @@ def apply(
 
 
 def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str, str]]:
-    """What a force map file says of every frame: shape, unit, meaning and type."""
+    """Arrays of a force map file with one row per frame: shape of a row, unit, meaning and type."""
     pixels, pads = calibration.recon.areas.shape, (len(calibration.skin.pads),)
     rows = {
         "time": ((), "ns", "since time_epoch_utc", "i8"),

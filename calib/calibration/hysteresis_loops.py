@@ -1,4 +1,4 @@
-"""One whole press of each pad, loading and unloading: what shows the hysteresis that a curve has or lacks."""
+"""One complete press of each pad, loading and unloading, which shows the pad's hysteresis beside its fitted curve."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,19 +7,19 @@ import numpy as np
 
 from ..presses.pooled import PooledPresses, PressSeries, thinned
 
-POINTS = 96  # means that stand for a press
-FULL_FORCE = 0.9  # of a pad's largest force: presses from there on show the whole range
+POINTS = 96  # means per press: a smooth line in the report at a negligible size in the file
+FULL_FORCE = 0.9  # fraction of a pad's largest force: presses above it cover nearly the whole range
 
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Of each pad its most typical full press; a row of NaN: no press was the pad's alone.
+    """The most typical full press of each pad; a row is NaN if no press belongs to that pad alone.
 
     | field    | meaning                                                     | shape     | unit |
     |----------|-------------------------------------------------------------|-----------|------|
-    | pressure | along the press, change of the pad's own; NaN fills up      | (pads, n) | Pa   |
-    | force    | from the load cell, at the same times                       | (pads, n) | N    |
-    | gain     | what a correction by location multiplies the curve with     | (pads,)   | 1    |
+    | pressure | change of the pad's pressure along the press; padded by NaN | (pads, n) | Pa   |
+    | force    | force of the load cell at the same times                    | (pads, n) | N    |
+    | gain     | factor of the correction by location at that press          | (pads,)   | 1    |
     """
 
     pressure: np.ndarray
@@ -27,18 +27,18 @@ class Loops:
     gain: np.ndarray
 
     def of(self, pad: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """Pressure (m,) Pa and force (m,) N along a pad's press, and where its pressure is largest."""
+        """Pressure (m,) Pa and force (m,) N along a pad's press, and the index of the largest pressure."""
         known = np.isfinite(self.pressure[pad]) & np.isfinite(self.force[pad])
         pressure, force = self.pressure[pad][known], self.force[pad][known]
         return pressure, force, int(np.argmax(pressure)) if len(pressure) else 0
 
     def unloads(self, pad: int) -> bool:
-        """Whether the press was recorded on the way back too, below half its largest pressure."""
+        """Whether the recording of the press includes unloading to below half of its largest pressure."""
         pressure, _, top = self.of(pad)
         return len(pressure) > 0 and top > 0 and bool((pressure[top:] < 0.5 * pressure[top]).any())
 
     def width(self, pad: int) -> float:
-        """Mean force at equal pressure on loading over that on unloading, N, where both were recorded; NaN: nowhere."""
+        """Mean of force on loading minus force on unloading at equal pressure, N; NaN without a common range."""
         if not self.unloads(pad):
             return float("nan")
         pressure, force, top = self.of(pad)
@@ -48,7 +48,7 @@ class Loops:
         return float(np.mean(np.interp(at, *up) - np.interp(at, *down))) if high > low else float("nan")
 
     def arrays(self) -> dict[str, tuple[np.ndarray, str, str]]:
-        """Name -> values, units, meaning."""
+        """Arrays of the file: name to values, unit and meaning."""
         return {
             "pressure": (self.pressure, "Pa", "along each pad's most typical full press"),
             "force": (self.force, "N", "load cell, at the same times"),
@@ -57,22 +57,22 @@ class Loops:
 
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray], prefix: str) -> "Loops | None":
-        """The loops that `arrays` described, found under this prefix; None of a file from before there were any."""
+        """The loops that `arrays` described, found under this prefix; None for a file of an early version."""
         names = ("pressure", "force", "gain")
         return cls(**{n: arrays[prefix + n] for n in names}) if prefix + "pressure" in arrays else None
 
 
 def _rising(pressure: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Force over pressure where pressure is larger than ever before."""
+    """The samples at which the pressure exceeds all earlier ones, because `np.interp` needs increasing pressures."""
     new = np.r_[True, pressure[1:] > np.maximum.accumulate(pressure)[:-1]]
     return pressure[new], force[new]
 
 
 def typical_loops(presses: PooledPresses, gain: np.ndarray | None = None) -> Loops:
-    """Each pad's most typical press: of those at nearly its largest force, that of the median stiffness.
+    """The most typical press of each pad: of the presses near the pad's largest force, the one of median stiffness.
 
     Args:
-        gain: of the correction by location at each press, (presses, pads); default: 1 everywhere.
+        gain: factor of the correction by location at each press, (presses, pads); default: 1.
     """
     data, series = presses.data, presses.series
     pads = data.pressure.shape[1]
@@ -87,7 +87,7 @@ def typical_loops(presses: PooledPresses, gain: np.ndarray | None = None) -> Loo
 
 
 def _typical(rows: np.ndarray, force: np.ndarray, pressure: np.ndarray) -> int:
-    """One of the presses `rows`; -1 if there are none."""
+    """Index of the full press of median stiffness among the presses `rows`; -1 if there are none."""
     if not len(rows):
         return -1
     full = rows[force[rows] >= FULL_FORCE * force[rows].max()]

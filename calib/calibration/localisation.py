@@ -1,6 +1,7 @@
-"""Where a frame is touched, from its readings alone: choices of estimator, and what they become once prepared.
+"""Estimators of the places of contacts in a frame, from its EIT readings alone.
 
-A choice (`FittedContact`, `ImageCentroid`) is prepared with a model into a locator that needs neither mesh nor solver.
+A choice of estimator (`FittedContact`, `ImageCentroid`) is prepared with a model. The result is a locator, which needs
+neither mesh nor solver.
 """
 
 import abc
@@ -22,7 +23,7 @@ from ..fitting.fields import Places, single_places
 
 
 class AbstractLocator(eqx.Module):
-    """Frames to `Places`."""
+    """Estimates the `Places` of the contacts in frames."""
 
     @abc.abstractmethod
     def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
@@ -30,16 +31,16 @@ class AbstractLocator(eqx.Module):
 
     @property
     def contacts(self) -> int:
-        """Most contacts it finds in a frame."""
+        """Largest number of contacts that the locator finds in a frame."""
         return 1
 
     def single(self) -> "AbstractLocator":
-        """The same for frames that are known to hold one contact: presses of a bench."""
+        """The same locator for frames that hold exactly one contact, as presses on a bench do."""
         return self
 
 
 class CentroidLocator(AbstractLocator):
-    """One contact a frame, where an estimator of `jaxeit.metrics.ESTIMATORS` puts it."""
+    """One contact per frame, at the position that an estimator of `jaxeit.metrics.ESTIMATORS` gives."""
 
     estimator: str = eqx.field(static=True)
 
@@ -48,7 +49,7 @@ class CentroidLocator(AbstractLocator):
 
 
 class ContactLocator(AbstractLocator):
-    """Contacts fitted to the readings; a pad's contacts weigh by the integrals of their bumps inside its mask."""
+    """Contacts fitted to the readings; contacts on a pad are weighted by the integrals of their bumps over its mask."""
 
     finder: je.ContactFinder
 
@@ -63,7 +64,7 @@ class ContactLocator(AbstractLocator):
         return self.placed(self.finder(dv), recon, masks)
 
     def placed(self, found: je.Contacts, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
-        """`Places` of contacts that were found."""
+        """Convert fitted contacts to `Places`; position and width of absent contacts are NaN."""
         position = jnp.where(found.present[..., None], found.position, jnp.nan)
         width = jnp.where(found.present, found.width, jnp.nan)
         if self.finder.most == 1:
@@ -80,7 +81,7 @@ def _located(
 
 
 class AbstractLocatorChoice(abc.ABC):
-    """How the place of a contact is to be estimated; `looks_through_sheet`: `prepare` makes use of `sigma`."""
+    """Choice of an estimator of the place of a contact. `looks_through_sheet`: whether `prepare` uses `sigma`."""
 
     looks_through_sheet: ClassVar[bool] = True
 
@@ -88,15 +89,20 @@ class AbstractLocatorChoice(abc.ABC):
     def prepare(
         self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
     ) -> AbstractLocator:
-        """The locator for this model; `noise` (readings,) V of a frame, `channels` that are used, `sigma` (elements,) S
-        of the untouched sheet (default: even)."""
+        """Prepare the locator for a model.
+
+        Args:
+            noise: standard deviation of the readings of a frame, (readings,) V.
+            channels: which readings are used, (readings,) bool.
+            sigma: conductivity of the untouched sheet, (elements,) S; default: uniform.
+        """
 
 
 @dataclass(frozen=True)
 class ImageCentroid(AbstractLocatorChoice):
-    """A named estimator of the image: quick to prepare, 5 mm off on a simulated testbed with "half".
+    """A named estimator of the image: quick to prepare; "half" has a mean error of 5 mm on the simulated testbed.
 
-    Raises: `ValueError` for a name that `jaxeit.metrics.ESTIMATORS` has not.
+    Raises: `ValueError` for a name that is not in `jaxeit.metrics.ESTIMATORS`.
     """
 
     looks_through_sheet: ClassVar[bool] = False
@@ -115,11 +121,11 @@ class ImageCentroid(AbstractLocatorChoice):
 
 @dataclass(frozen=True)
 class FittedContact(AbstractLocatorChoice):
-    """Contacts fitted through the forward map (`jaxeit.prepare_contacts`), on the sheet that the untouched frame shows.
+    """Contacts fitted through the forward map (`jaxeit.prepare_contacts`), with the sheet of the untouched frames.
 
     | meaning                                                              | default    | unit |
     |----------------------------------------------------------------------|------------|------|
-    | most: contacts looked for in use; presses of a bench hold one        | 2          |      |
+    | most: largest number of contacts per frame; 1 for presses of a bench | 2          |      |
     | columns: nodes of the table along x                                  | 31         |      |
     | widths: smallest and largest standard deviation of a contact         | 0.006, 0.03 | m   |
     """
@@ -140,12 +146,14 @@ LOCATORS = Registry(AbstractLocatorChoice, "locator", "calib.locators")
 """Choices of locator by the names that the command line and recipes use."""
 
 
-_LARGE = 1 << 18  # numbers from which an array is rounded
+# Arrays of at least this many numbers are stored in single precision. Only the table of a contact finder is so large,
+# and it makes up most of a calibration file.
+_SINGLE_PRECISION_SIZE = 1 << 18
 
 
 def _rounded(leaf: Array) -> Array:
-    """Large tables to single precision, as they are stored: a loaded calibration gives the same numbers."""
-    single = leaf.ndim > 0 and leaf.size >= _LARGE and jnp.issubdtype(leaf.dtype, jnp.floating)
+    """Round large tables to single precision, as they are stored, so that a loaded calibration gives equal numbers."""
+    single = leaf.ndim > 0 and leaf.size >= _SINGLE_PRECISION_SIZE and jnp.issubdtype(leaf.dtype, jnp.floating)
     return leaf.astype(jnp.float32).astype(leaf.dtype) if single else leaf
 
 
@@ -156,7 +164,10 @@ def locate(
     masks: je.PadMasks,
     image: Array | None = None,
 ) -> Places:
-    """`Places` of difference frames (n, readings) V; `image`, if it is there already, is not made again."""
+    """`Places` of the contacts in difference frames (n, readings) V.
+
+    `image`: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
+    """
     frames = jnp.asarray(dv, recon.dtype)
     return _located(locator, frames, recon(frames) if image is None else image, recon, masks)
 
@@ -165,7 +176,7 @@ def locate(
 
 
 def locator_numbers(locator: AbstractLocator) -> dict[str, np.ndarray]:
-    """Every array and setting of a locator by a path of names."""
+    """Every array and setting of a locator, by its path of field names joined by hyphens."""
     if isinstance(locator, CentroidLocator):
         return {"estimator": np.array([locator.estimator])}
     return dict(_numbers(locator))
@@ -178,12 +189,12 @@ def _numbers(module: eqx.Module, at: str = "") -> Iterator[tuple[str, np.ndarray
             yield from _numbers(value, f"{at}{part.name}-")
         else:
             array = np.asarray(value)
-            large = array.dtype == np.float64 and array.size >= _LARGE
+            large = array.dtype == np.float64 and array.size >= _SINGLE_PRECISION_SIZE
             yield at + part.name, array.astype(np.float32) if large else array
 
 
 def locator_from_numbers(numbers: dict[str, np.ndarray], dtype: Any) -> AbstractLocator:
-    """The locator that `locator_numbers` described; raises KeyError for what is missing."""
+    """The locator that `locator_numbers` described; raises KeyError for a missing array."""
     if "estimator" in numbers:
         return CentroidLocator(str(numbers["estimator"][0]))
     locator: ContactLocator = _module(ContactLocator, numbers, "", dtype)

@@ -1,4 +1,4 @@
-"""Logs of force and a signal without EIT: one curve per log, tested on what it has not seen."""
+"""Logs of force and a signal, without EIT: one curve per log, fitted on its first half and tested on its second."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,19 +19,24 @@ from ..presses.streams import resample
 from ..session import Session, Stream, write_archive
 
 Way = BlendChannels | SmoothChannels | None
-"""To make one signal of several channels; None: there is but one."""
+"""Method that combines several channels into one signal; None for a single channel."""
 
 FORMAT = "pressure-force-curves"
 _NOT_SIGNALS = ("force", "stage", "temperature", "barometer")
 _WAYS = {"blend": BlendChannels(), "Gaussian process": SmoothChannels()}  # one signal, in N, of several channels
-_STRETCHES = 10  # of time, over which errors are compared
+_STRETCHES = 10  # stretches of time with a mean error each, because neighbouring samples are correlated
 
 
 @dataclass(frozen=True, eq=False)
 class SessionFit:
-    """The fit of a session's log, the unit of the signal that its curve turns into force, and why this curve.
+    """The fit of a session's log.
 
-    `note` names the channels that were left out because they carry no information.
+    | meaning                                                                |
+    |------------------------------------------------------------------------|
+    | fit: curve and held-out errors                                         |
+    | unit: of the signal that the curve maps to force                       |
+    | why: reason for the choice of channels and curve; empty: no choice     |
+    | note: ignored errors, and channels left out for lack of information    |
     """
 
     fit: LogFit
@@ -41,7 +46,7 @@ class SessionFit:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the curve's parameters."""
+        """Units of the curve's parameters."""
         return tuple(unit.replace("Pa", self.unit) for unit in self.fit.fitted.curve.units)
 
 
@@ -54,11 +59,11 @@ def fit_session(
 ) -> SessionFit:
     """Fit force against the session's signal on its first half; the second half is held out.
 
-    The signal is the stream "pressure", or the only one that is not a force, a place or the weather;
-    it is interpolated to the times of the force. Of several curves one is chosen (see `simplest`) by how each, fitted
-    on the first half of the first half, predicts stretches of the rest of it: the second half has no say. So is before
-    it, of several channels, the way to make one signal of them: a static blend, or a Gaussian process that knows of
-    creep. Channels of a wide array that are dead, stuck or silent on the first half are left out of both.
+    The signal is the stream "pressure", or the only stream besides force, stage, temperature and barometer. It is
+    interpolated to the times of the force. If several curves are given, each is fitted on the first quarter of the log,
+    and one is chosen by the errors on the second quarter (see `simplest`); the held-out second half has no influence.
+    For several channels, the method that combines them is chosen in the same way first: a static blend, or a Gaussian
+    process that models creep. Channels of a wide array that are dead, stuck or silent on the first half are left out.
 
     Args:
         ignore_errors: fit also a session in which `check_session` finds an error, and note it.
@@ -124,12 +129,12 @@ class _Log:
     loss: AbstractLoss
 
     def first(self) -> "_Log":
-        """Its first half."""
+        """The first half of the log."""
         rows, _ = time_split(self.time)
         return _Log(self.time[rows], self.values[rows], self.force[rows], self.loss)
 
     def signal(self, way: Way) -> tuple[np.ndarray, str]:
-        """One of all channels, made of the first half, and what it is made of."""
+        """Combine all channels into one signal, fitted on the first half; returns the signal and its description."""
         if way is None:
             return self.values, "channel 0"
         rows, _ = time_split(self.time)
@@ -137,7 +142,7 @@ class _Log:
         return way(self.time, self.values, np.where(known, self.force, np.nan), Linear())
 
     def errors(self, curve: AbstractCurve, signal: np.ndarray) -> np.ndarray:
-        """Mean square errors on stretches of its second half, N^2, of a curve fitted on the first; NaN: no fit."""
+        """Mean square errors (stretches,) N^2 on the second half of a curve fitted on the first; NaN without a fit."""
         fit = fit_log(curve, self.time, signal, self.force, loss=self.loss)
         if not _converged(fit):
             return np.full(_STRETCHES, np.nan)
@@ -148,7 +153,7 @@ class _Log:
 
 
 def _chosen(log: _Log, curves: Sequence[AbstractCurve]) -> tuple[LogFit, str]:
-    """By the second half of the first half, and then fitted on the whole of it; and why."""
+    """Choose channels and curve on the first half of the log, then fit them on all of it; returns the fit and why."""
     half = log.first()
     ways = _WAYS if log.values.shape[1] > 1 else {"channel": None}
     made = cache(lambda way: half.signal(way)[0])

@@ -1,4 +1,4 @@
-"""Presses seen by EIT: the model and the images made of it, and where the images say that the presses are."""
+"""Images of the frames of presses, and the places of the presses estimated from these frames."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,14 +15,14 @@ from .recipe import Recipe
 
 
 class PressImages(NamedTuple):
-    """Images of presses, and what they say of the places.
+    """Images of presses, with estimated places.
 
     | meaning                                                       | shape                | unit  |
     |---------------------------------------------------------------|----------------------|-------|
     | image                                                         | (presses, pixels)    | S     |
     | integral of the image over the sheet                          | (presses,)           | S m^2 |
     | estimated: positions by each named estimator of the image     | (presses, 2) each    | m     |
-    | places that a locator finds; None: without a locator          |                      |       |
+    | places estimated by the locator; None: without a locator      |                      |       |
     """
 
     image: np.ndarray
@@ -33,14 +33,14 @@ class PressImages(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Imager:
-    """Frames to images and places, prepared for one skin.
+    """Computes images and places from frames, prepared for one skin.
 
     | meaning                                                              |
     |----------------------------------------------------------------------|
     | recon: frames to images                                              |
     | masks: which pad carries which pixel                                 |
-    | locator: where a frame is touched; None: no place is asked for       |
-    | notes: what a person should know                                     |
+    | locator: estimator of places; None: no place is needed               |
+    | notes: remarks for the reader of the results                         |
     """
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
@@ -62,7 +62,7 @@ class Imager:
 
 
 def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Imager:
-    """The imager of a recipe, with the channels, the noise and the untouched sheet of the presses.
+    """The imager of a recipe, prepared with channels, noise and untouched frames of the presses.
 
     Raises:
         InverseError, HyperparameterError: if no image can be made with these choices.
@@ -85,7 +85,7 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
 def _prepare_locator(
     choice: AbstractLocatorChoice, model: je.Model, presses: PooledPresses
 ) -> tuple[AbstractLocator, str]:
-    """The locator on the sheet that the untouched frames show, and a note where an even one had to be assumed."""
+    """The locator, prepared with the sheet of the untouched frames, and a note if a uniform sheet was assumed."""
     sigma, note = None, ""
     if choice.looks_through_sheet:
         sigma, note = fit_untouched_sheet(model, presses.untouched, presses.channels)
@@ -93,7 +93,7 @@ def _prepare_locator(
 
 
 def fit_untouched_sheet(model: je.Model, untouched: np.ndarray, channels: np.ndarray) -> tuple[Any, str]:
-    """Conductivity of the untouched sheet (elements,) S; or None, and a note that an even sheet is assumed."""
+    """Conductivity of the untouched sheet (elements,) S; or None, and a note that a uniform sheet is assumed."""
     try:
         return je.fit_background(model, np.where(channels, untouched, np.nan)), ""
     except je.imaging.InverseError as error:

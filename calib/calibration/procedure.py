@@ -1,4 +1,4 @@
-"""The procedure: sessions to a calibration, and a calibration judged on another session."""
+"""The calibration procedure: from sessions to a calibration, and its evaluation on another session."""
 
 import platform
 from collections.abc import Callable, Sequence
@@ -39,10 +39,10 @@ def calibrate(
     Args:
         sessions: recorded on one skin, from `open_session`.
         skin: default: the one described in the first session.
-        recipe: all choices on the way; default: those of the paper.
+        recipe: all choices of the procedure; default: those of the paper.
         ignore_errors: calibrate also from sessions in which `check_session` finds an error; the errors are then kept in
             the calibration's notes and provenance.
-        progress: told the name of each of the `STAGES` as it begins.
+        progress: called with the name of each of the `STAGES` when the stage begins.
 
     Raises:
         SessionError: a session cannot be used, or was recorded on another skin.
@@ -124,10 +124,10 @@ def evaluate(
     *,
     ignore_errors: bool = False,
 ) -> Evaluation:
-    """How well a calibration does on the presses of another session.
+    """Evaluate a calibration on the presses of another session.
 
     Args:
-        processing: how the session is cut and corrected; default: as those that were calibrated from.
+        processing: how the session is cut and corrected; default: as the sessions of the calibration.
         ignore_errors: evaluate also on a session in which `check_session` finds an error, and note it.
 
     Raises:
@@ -149,7 +149,7 @@ def evaluate(
         centre=centre_of(calibration.skin),
         held_out_by="session",
         notes=(*ignored, *found.notes),
-        others=_by_others(calibration, found, images.integral),
+        others=_compared_forces(calibration, found, images.integral),
         recipe=calibration.evaluation.recipe,
     )
 
@@ -163,8 +163,10 @@ def _require_channels(calibration: Calibration, found: PressMeasurements) -> Non
         )
 
 
-def _by_others(calibration: Calibration, found: PressMeasurements, image_sum: np.ndarray) -> dict[str, np.ndarray]:
-    """Total force by the methods to compare with; none for a calibration of before they were kept."""
+def _compared_forces(
+    calibration: Calibration, found: PressMeasurements, image_sum: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Total force by the methods of comparison, (presses,) N each; empty for a file of an early version."""
     if calibration.baseline is None:
         return {}
     papers = Hybrid(calibration.baseline).pad_forces(found.pressure)[0].sum(1)

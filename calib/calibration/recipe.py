@@ -16,7 +16,7 @@ from .recipe_text import recipe_fields, recipe_to_toml
 
 
 class RecipeError(ValueError):
-    """Choices that do not make a recipe; the message says which, and what to give."""
+    """Choices that do not fit together; the message names them and says what to give."""
 
 
 @dataclass(frozen=True)
@@ -25,20 +25,20 @@ class Recipe:
 
     | meaning                                                                                     | default          |
     |---------------------------------------------------------------------------------------------|------------------|
-    | curve: the law of force from pressure; of several, one is chosen by cross-validation        | `Linear`         |
-    | location: the field of gain over the place pressed, or None; of several, one is chosen      | None             |
-    | locator: how the place is told from a frame, if there is a field                            | `FittedContact`  |
+    | curve: pressure-force curve; of several curves, cross-validation chooses one                | `Linear`         |
+    | location: gain as a function of the place, or None; of several, cross-validation chooses    | None             |
+    | locator: estimator of the place of a contact, used if there is a field                      | `FittedContact`  |
     | loss: of the curve fits                                                                     | `SoftL1`         |
     | processing: how sessions are cut into presses and corrected                                 | `Processing`     |
     | folds: parts into which the places are divided; each is predicted from the others           | 5                |
-    | imaging: how images are made of frames                                                      | `jaxeit.Imaging` |
-    | fidelity: how well the model is computed that images are made with                          | standard         |
+    | imaging: how images are computed from frames                                                | `jaxeit.Imaging` |
+    | fidelity: accuracy of the finite-element model from which images are computed               | standard         |
 
     The default is the recipe of the paper (arXiv 2605.28468). Sequences of curves and locations become tuples.
 
     Raises:
-        RecipeError: for no curve or location at all, fewer than one fold, a basis without pixels, or a hyperparameter
-            that has frames of its own: those to choose by are the presses of the sessions.
+        RecipeError: if no curve or location is given, if there is less than one fold, if the basis has no pixels, or
+            if the hyperparameter has frames of its own, because the frames of the presses are used to choose it.
     """
 
     curve: AbstractCurve | Sequence[AbstractCurve] = field(default_factory=Linear)
@@ -73,8 +73,8 @@ class Recipe:
         """The recipe that a TOML text describes.
 
         Args:
-            source: what the text is called in messages.
-            base: gives what the text leaves out; default: `Recipe()`.
+            source: name of the text in error messages.
+            base: recipe whose choices apply where the text gives none; default: `Recipe()`.
             allow_import: whether the text may name classes of the user's own by import path, whose modules are then
                 imported; not for a text that a data file holds.
 
@@ -90,7 +90,7 @@ class Recipe:
         return cls.from_toml(read_text(Path(path)), str(path), allow_import=True)
 
     def to_toml(self) -> str:
-        """The recipe as TOML, from which `from_toml` makes it again."""
+        """The recipe as TOML, which `from_toml` reads."""
         return recipe_to_toml(self)
 
     @property
@@ -105,5 +105,5 @@ class Recipe:
 
     @property
     def locates(self) -> bool:
-        """Whether the place of a press is needed."""
+        """Whether any of the `locations` needs the place of a press."""
         return any(location is not None for location in self.locations)

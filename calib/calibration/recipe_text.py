@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 AUTO = "auto"
 AUTO_CURVES = ("linear", "power", "polynomial", "spline")
-"""Curves that ``auto`` stands for: those that are zero at zero, so that idle pads add nothing, and forget the past."""
+"""Curves that ``auto`` stands for: zero at zero pressure, so that idle pads add nothing, and without memory."""
 NONE = "none"
 LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
     "draft": je.Fidelity.draft,

@@ -1,4 +1,4 @@
-"""A calibration as attributes and arrays, for its file."""
+"""Convert a calibration to the attributes and arrays of its file, and back."""
 
 import hashlib
 import json
@@ -97,7 +97,7 @@ def _require_sealed(archive: Archive) -> None:
 
 
 def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: Choice) -> dict[str, str]:
-    """What a calibration's provenance says of its recipe, and of what was chosen by it."""
+    """Provenance of a calibration: its recipe, and the choices that were made by cross-validation."""
     return {
         "curve": CURVES.name_of(choice.curve),
         "location": "none" if choice.field is None else FIELDS.name_of(choice.field),
@@ -110,13 +110,13 @@ def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: Ch
 
 
 def recorded_recipe(provenance: Mapping[str, str]) -> Recipe | None:
-    """The recipe that `describe` wrote down; None of a calibration of before."""
+    """The recipe that `describe` recorded; None for a file of an early version."""
     text = provenance.get("recipe")
     return None if text is None else Recipe.from_toml(text, "calibration: recipe")
 
 
 def recorded_processing(provenance: Mapping[str, str]) -> Processing:
-    """How the sessions were cut and corrected; the default of a calibration of before."""
+    """How the sessions were cut and corrected; the default for a file of an early version."""
     return _part(provenance, "processing", lambda table: read_processing(table, Processing()), Processing())
 
 
@@ -125,7 +125,7 @@ def _imaging(provenance: Mapping[str, str]) -> je.Imaging | None:
 
 
 def _part(provenance: Mapping[str, str], key: str, read: Callable[[TomlTable], T], otherwise: T) -> T:
-    """A part of the recipe by itself: whoever needs it does not need the classes that other parts name."""
+    """Read one table of the recorded recipe alone, because other tables may name classes that are not installed."""
     if "recipe" not in provenance:
         return otherwise
     return parse_toml(provenance["recipe"], "calibration: recipe", lambda table: read(table.table(key)))
@@ -181,6 +181,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     imaging = _imaging(provenance) if "jacobian" in numbers else None
     recon = je.imaging.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])), None, imaging)
     kind = CURVES.find(provenance["curve"])
+    # Early versions stored the reference pressure of the power law under another name.
     old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
     choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
     for name, array in choices.items():
@@ -224,7 +225,7 @@ def _locator_from(arrays: Mapping[str, np.ndarray], dtype: Any) -> AbstractLocat
 
 
 def _baseline_from(arrays: Mapping[str, np.ndarray], pads: int) -> FittedCurve | None:
-    """None: a calibration written before the paper's recipe was kept beside it."""
+    """The paper's curves; None for a file of an early version."""
     if "baseline/parameters" not in arrays:
         return None
     return FittedCurve(curve=Linear(), **_fitted(arrays, "baseline/", pads, Linear()))
@@ -241,7 +242,7 @@ def _fitted(arrays: Mapping[str, np.ndarray], where: str, pads: int, curve: Abst
 
 
 def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray:
-    """An array that is used as it is, once it has been looked at."""
+    """The named array; raises ValueError unless it has this shape and one of these kinds of type."""
     array = arrays[name]
     if array.shape != shape or array.dtype.kind not in kinds or array.dtype == np.float16:
         raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not numbers of shape {shape}")
@@ -261,7 +262,7 @@ _COVARIANCES = ("pads/covariance", "baseline/covariance", "location/covariance")
 
 
 def _require_possible(arrays: Mapping[str, np.ndarray]) -> None:
-    """Refuse numbers that no fit gives: sizes below zero, ranges turned round, covariances that are none."""
+    """Refuse numbers that no fit can give: negative sizes, reversed ranges, matrices that are no covariances."""
     given = {name: np.asarray(array) for name, array in arrays.items()}
     for name in filter(given.__contains__, _NOT_NEGATIVE):
         if (given[name] < 0).any():

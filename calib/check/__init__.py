@@ -1,4 +1,4 @@
-"""`jaxeit check`: what is wrong with a recording, where, and what to do about it."""
+"""Checks of a recording for `jaxeit check`: what is wrong, where, and what to do."""
 
 from .acceptance import RecordingError, accept
 from .reading_order import transfer_matrix

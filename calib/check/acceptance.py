@@ -1,4 +1,4 @@
-"""Whether a session may be used: what `check_session` calls an error is refused, or noted if a person says so."""
+"""Decide whether a session may be used: an error of `check_session` is refused, or noted if the user allows it."""
 
 from collections.abc import Sequence
 
@@ -12,17 +12,17 @@ from .session import check_session
 
 
 class RecordingError(SessionError):
-    """A recording holds what cannot be true, so that numbers made from it would be wrong."""
+    """A recording contains values that cannot be true, so that results computed from it would be wrong."""
 
 
 def accept(
     sessions: Sequence[Session], skin: je.Skin | None, *, ignore_errors: bool = False, where: Sequence[str] = ("",)
 ) -> tuple[str, ...]:
-    """Check sessions before they are used; returns their errors as notes, which is none unless errors are ignored.
+    """Check sessions before they are used; returns their errors as notes if errors are ignored, otherwise no notes.
 
     Args:
-        skin: that they are used with; None: their own.
-        ignore_errors: go on in spite of errors.
+        skin: the skin with which the sessions are used; None: the skin of each session.
+        ignore_errors: return errors as notes instead of raising.
         where: beginnings of the places in a file whose errors count, such as "/streams/eit"; default: all.
 
     Raises:

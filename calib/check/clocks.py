@@ -1,4 +1,4 @@
-"""Check the clocks of the streams against each other: all of them see the same presses."""
+"""Compare the clocks of the streams with each other, because all streams record the same presses."""
 
 from collections.abc import Iterator, Mapping
 
@@ -24,7 +24,7 @@ MIN_CORRELATION, MIN_GAIN = 0.7, 0.3  # of the streams when moved by the lag, an
 def compare_clocks(
     streams: Mapping[str, Stream], evidence: PressEvidence, findings: list[Finding]
 ) -> tuple[tuple[str, OnsetDelay], ...]:
-    """Delays of the other streams after the force at the beginning of the presses; a wrong clock is a finding."""
+    """Delays of the other streams after the force at the beginning of the presses; adds a finding for a wrong clock."""
     if "force" not in streams:
         return ()
     presses, windows = evidence.compared()
@@ -39,7 +39,7 @@ def compare_clocks(
 
 
 def lag_findings(statistics: Mapping[str, StreamStatistics], known: list[Finding]) -> Iterator[Finding]:
-    """Streams that resemble the force when moved by seconds, and not otherwise; not those that are known to be late."""
+    """Findings for streams that resemble the force only when shifted by seconds, except streams known to be late."""
     force = statistics.get("force")
     if force is None or len(force.time) < 2 or not force.finite.any():
         return

@@ -1,4 +1,4 @@
-"""What the streams of a recording show of its presses, for the checks that compare them with each other."""
+"""Changes of all streams during the presses of a recording, for the checks that compare streams with each other."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -65,7 +65,7 @@ def gather_evidence(streams: Mapping[str, Stream], presses: PressColumns, window
 
 
 def _chosen(presses: PressColumns, windows: PressWindows, rows: np.ndarray) -> tuple[PressColumns, PressWindows]:
-    """Some of the presses, with their windows as they are among all presses."""
+    """Some of the presses, with windows that take all presses into account."""
     parts = {name: getattr(windows, name)[rows] for name in windows.__dataclass_fields__}
     return select(presses, rows), replace(windows, **parts)
 

@@ -54,7 +54,7 @@ def _correlation_with_pressure(
 
 
 def negative_force(severity: Severity = Severity.ERROR) -> Finding:
-    """The finding that the load cell is the wrong way round."""
+    """The finding that the sign of the force is reversed."""
     remedy = "pressing is positive: negate the column at import, or turn the load cell over"
     return Finding(severity, WHERE, "the force is negative while pressing", remedy)
 

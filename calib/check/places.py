@@ -27,7 +27,7 @@ MAX_STAGE_ERROR = 0.005  # m between the table and the stage
 def place_findings(
     evidence: PressEvidence, skin: je.Skin, pattern: np.ndarray | None, streams: Mapping[str, Stream]
 ) -> Iterator[Finding]:
-    """Places off the sheet, or other than the stage, the pads or the readings say."""
+    """Findings for places off the sheet, and places that contradict the stage, the pads or the readings."""
     site, presses = evidence.site, evidence.presses
     if site is None:
         return
@@ -98,7 +98,7 @@ def estimate_places(change: WindowMeans, pattern: np.ndarray, electrodes: np.nda
 
 
 def _moves(middle: np.ndarray) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
-    """What may have happened to places (n, 2), by name."""
+    """Possible mistakes in places (n, 2) by name, each with the function that undoes it."""
     flip = np.array([-1.0, 1.0])
     return {
         "x and y are exchanged": lambda p: p[:, ::-1],

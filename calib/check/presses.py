@@ -1,4 +1,4 @@
-"""Check the presses of a recording: list them, and compare what the streams show of them."""
+"""Check the presses of a recording: list them, and gather the changes of the streams during each press."""
 
 from ..presses.detection import find_presses
 from ..presses.streams import PressError, recording_end
@@ -50,7 +50,7 @@ def _detected(statistics: dict[str, StreamStatistics], findings: list[Finding]) 
 def press_evidence(
     statistics: dict[str, StreamStatistics], presses: PressColumns | None, findings: list[Finding]
 ) -> PressEvidence | None:
-    """What the streams show of the presses that have samples; None if there is no such press."""
+    """Changes of the streams during the presses that have samples; None if there is no such press."""
     if presses is None or not len(presses):
         return None
     streams = {name: s.stream for name, s in statistics.items()}
@@ -77,6 +77,7 @@ def press_evidence(
 
 
 def press_summary(presses: PressColumns | None, source: str) -> PressSummary:
+    """Source of the presses, number of accepted ones, and index and reason of each rejected one."""
     if presses is None:
         return PressSummary("none", 0, ())
     reasons = enumerate(presses.reason)

@@ -1,4 +1,4 @@
-"""The `jaxeit` command.  Each command is a module of its own, imported when it is called, so that --help is quick."""
+"""The `jaxeit` command. Each subcommand is a separate module, imported when it is called, so that --help is quick."""
 
 import argparse
 import os
@@ -15,15 +15,15 @@ from .terminal import one_line
 COMMANDS = {
     "simulate": "simulate a bench session from a scene file",
     "check": "validate a recording; say what is wrong and where",
-    "import": "bring foreign recordings into a session file",
+    "import": "convert recordings in other formats to a session file",
     "calibrate": "fit a calibration to recorded sessions",
-    "evaluate": "judge a calibration on other sessions",
+    "evaluate": "evaluate a calibration on other sessions",
     "apply": "write the force map of every frame of a session",
     "bench": "measure what accuracy costs in time, for a skin on this machine",
     "record": "record devices into a session file; nothing that arrived is lost",
-    "live": "show the force map as frames arrive, on a page of its own",
+    "live": "show force maps on a web page as frames arrive",
     "doctor": "examine this machine: versions, device, threads, cache, disk, ports",
-    "recover": "make a session of what a crash left of a recording",
+    "recover": "make a session from the journal that a crash left",
 }
 """What each command does; ``name`` is the module ``commands/name_command.py`` with `add_arguments` and `run`."""
 
@@ -53,7 +53,7 @@ OUT_OF_MEMORY = "this machine has too little memory for it; use less data, a coa
 
 
 def _run(argv: list[str]) -> int:
-    """The status of one command, once what it printed has been written."""
+    """Run one command, flush its output and return its exit status."""
     try:
         args = _parser(argv).parse_args(argv)
         status: int = args.command(args)
@@ -63,7 +63,7 @@ def _run(argv: list[str]) -> int:
 
 
 def _nobody_reads() -> bool:
-    """Whether standard output is a pipe that its reader has closed; what is left in its buffer is then dropped."""
+    """Whether standard output is a pipe that its reader has closed; the rest of its buffer is then discarded."""
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)  # a closed pipe is reported without being asked for
     if not any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0)):
@@ -73,12 +73,12 @@ def _nobody_reads() -> bool:
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether an error is Python's or JAX's way to say that memory could not be allocated."""
+    """Whether an error of Python or JAX means that memory could not be allocated."""
     return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error)
 
 
 def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
-    """All commands by name; the arguments only of the one that is called, as its module costs imports."""
+    """The parser of all commands, with the arguments of the called command only, because each module costs imports."""
     chosen = next((word for word in argv if not word.startswith("-")), None)
     parser = argparse.ArgumentParser(
         prog="jaxeit",

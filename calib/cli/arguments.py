@@ -33,7 +33,7 @@ def skin_of(name: str | None) -> "je.Skin | None": ...
 
 
 def skin_of(name: str | None) -> "je.Skin | None":
-    """A shipped skin by its name, or that of a TOML file; None for None."""
+    """Load a shipped skin by its name, or the skin of a TOML file; None for None."""
     if name is None:
         return None
     import jaxeit as je
@@ -42,7 +42,7 @@ def skin_of(name: str | None) -> "je.Skin | None":
 
 
 def prepare_outputs(*paths: str | None) -> None:
-    """Make the folders of what will be written, and say before the work begins if that cannot be."""
+    """Create the folders of output files; raises ValueError before the work begins if a file cannot be written."""
     for path in map(Path, filter(None, paths)):
         if path.is_dir():
             raise ValueError(f"{path}: is a folder; give a file name")
@@ -52,7 +52,7 @@ def prepare_outputs(*paths: str | None) -> None:
 
 
 def require_matplotlib_for(option: str) -> None:
-    """Say before the work begins that an option needs matplotlib, if it is not installed."""
+    """Raise ImportError before the work begins if matplotlib, which the option needs, is not installed."""
     from importlib.util import find_spec
 
     if find_spec("matplotlib") is None:

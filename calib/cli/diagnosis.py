@@ -1,6 +1,6 @@
-"""`jaxeit doctor`: what this machine has, each line ok or with its mend.
+"""Checks of `jaxeit doctor`: each examines one property of this machine, and says ok or what to do.
 
-Every check stands alone: what is broken must not keep the others from being told.
+The checks are independent, so that a broken installation still gets the results of all other checks.
 """
 
 import importlib
@@ -22,33 +22,33 @@ from serial.tools import list_ports
 
 from ..record.priority import refusal
 
-_FREE = 2e9  # bytes; an hour of 928 readings at 100 Hz takes 1.4 GB
-_SLOW_SYNC = 0.1  # s
+_MIN_FREE_BYTES = 2e9  # an hour of 928 readings at 100 Hz takes 1.4 GB
+_MAX_SYNC_TIME = 0.1  # s: the recorder syncs its journal at this interval
 _REQUIREMENT = re.compile(r"([A-Za-z0-9_.\-]+)\s*>=\s*([0-9.]+)")
 
 
 @dataclass(frozen=True)
 class Line:
-    """One finding: ``mend`` says what to do, and is empty where all is well; a ``note`` breaks nothing."""
+    """One finding: ``remedy`` says what to do, or is empty; a ``note`` does not make the machine unusable."""
 
     name: str
     text: str
-    mend: str = ""
+    remedy: str = ""
     note: bool = False
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is broken."""
-        return not self.mend or self.note
+        """Whether the machine can be used as it is."""
+        return not self.remedy or self.note
 
     def render(self) -> str:
-        """One line, two if there is something to do."""
-        mark = "ok  " if not self.mend else "note" if self.note else "BAD "
-        return f"{mark}  {self.name}: {self.text}" + (f"\n      -> {self.mend}" if self.mend else "")
+        """The finding as one line of text, and its remedy as a second line."""
+        mark = "ok  " if not self.remedy else "note" if self.note else "BAD "
+        return f"{mark}  {self.name}: {self.text}" + (f"\n      -> {self.remedy}" if self.remedy else "")
 
 
 def examine() -> list[Line]:
-    """All checks, one after the other."""
+    """Run all checks in order and return their findings."""
     return [line for check in _CHECKS for line in _guarded(check)]
 
 
@@ -56,7 +56,7 @@ def _guarded(check: Callable[[], Iterator[Line]]) -> list[Line]:
     name = check.__name__.strip("_")
     try:
         return list(check())
-    except Exception as error:  # the patient may have anything
+    except Exception as error:  # a broken installation may raise any error
         return [Line(name, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}", "install jaxeit again")]
 
 
@@ -100,15 +100,15 @@ def _device() -> Iterator[Line]:
 
 def _threads() -> Iterator[Line]:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Line("processors", str(count), "" if count > 1 else "recording and live want two", note=True)
+    yield Line("processors", str(count), "" if count > 1 else "recording and live need two", note=True)
     pinned = any(os.environ.get(name) == "1" for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"))
-    mend = "" if pinned else "for jaxeit live on a busy machine: export OPENBLAS_NUM_THREADS=1"
-    yield Line("BLAS threads", "one" if pinned else "as many as processors", mend, note=True)
+    remedy = "" if pinned else "for jaxeit live on a busy machine: export OPENBLAS_NUM_THREADS=1"
+    yield Line("BLAS threads", "one" if pinned else "as many as processors", remedy, note=True)
 
 
 def _priority() -> Iterator[Line]:
     refused = refusal()
-    found = "refused; only jaxeit live --realtime wants it" if refused else "allowed, for jaxeit live --realtime"
+    found = "refused; only jaxeit live --realtime needs it" if refused else "allowed, for jaxeit live --realtime"
     yield Line("real-time priority", found, refused or "", note=bool(refused))
 
 
@@ -128,14 +128,16 @@ def _cache() -> Iterator[Line]:
 def _disk() -> Iterator[Line]:
     here = Path.cwd()
     free = shutil.disk_usage(here).free
-    mend = "" if free > _FREE else "free some space: an hour of 928 readings at 100 Hz takes 1.4 GB"
-    yield Line("disk", f"{free / 1e9:.1f} GB free in {here}", mend)
+    remedy = "" if free > _MIN_FREE_BYTES else "free some space: an hour of 928 readings at 100 Hz takes 1.4 GB"
+    yield Line("disk", f"{free / 1e9:.1f} GB free in {here}", remedy)
     if not os.access(here, os.W_OK):
         yield Line("folder", f"{here} cannot be written to", "record into another folder", note=True)
         return
     longest = max(_sync_times(here))
-    mend = "" if longest < _SLOW_SYNC else "record to a disk of this machine: a power cut costs as much more"
-    yield Line("sync", f"{1e3 * longest:.1f} ms at most to bring a record to the disk", mend, note=True)
+    remedy = (
+        "" if longest < _MAX_SYNC_TIME else "record to a local disk: a power cut loses the time of a sync in addition"
+    )
+    yield Line("sync", f"{1e3 * longest:.1f} ms at most to bring a record to the disk", remedy, note=True)
 
 
 def _sync_times(folder: Path) -> Iterator[float]:
@@ -154,8 +156,8 @@ def _ports() -> Iterator[Line]:
         yield Line("serial ports", "none is plugged in")
     for port in ports:
         mine = os.name == "nt" or os.access(port.device, os.R_OK | os.W_OK)
-        mend = "" if mine else "sudo usermod -aG dialout $USER, then log in again"
-        yield Line("serial port", f"{port.device} ({port.description})", mend)
+        remedy = "" if mine else "sudo usermod -aG dialout $USER, then log in again"
+        yield Line("serial port", f"{port.device} ({port.description})", remedy)
 
 
 def _network() -> Iterator[Line]:

@@ -1,7 +1,7 @@
 """Options that name the choices of a recipe, and the recipe that they make.
 
-Names come from the registries, so that a new class is known here at once.  An option overrides the recipe file, and the
-recipe file the defaults.
+Names come from the registries, so a new class needs no change here. An option overrides the recipe file, and the recipe
+file overrides the defaults.
 """
 
 import argparse
@@ -35,42 +35,49 @@ IMAGING = ("method", "prior", "hyperparameter", "pixels", "basis", "noise")
 
 def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     """Options for every choice of a recipe."""
-    about = "a choice is a name, or a name with settings such as power:reference=900; module:Class is a class of yours"
+    about = "a choice is a name, or a name with settings such as power:reference=900; module:Class is your own class"
     group = parser.add_argument_group("recipe", about)
     text = "take the choices from a TOML file; options given beside it override the file"
     group.add_argument("--recipe", metavar="RECIPE.toml", help=text)
-    text = "force from pressure; with auto it is chosen by cross-validation over locations"
+    text = "curve of force against pressure; auto chooses it by cross-validation over places"
     _choice(group, "--curve", (*CURVES, AUTO), text, default="linear")
-    text = "correction by the place pressed, as the image tells it; the paper's recipe has none"
+    text = "correction by location: gain over the estimated place of the contact; the paper's recipe has none"
     _choice(group, "--location", (NONE, *FIELDS, AUTO), text, default=NONE)
-    _choice(group, "--locator", LOCATORS, "how that place is found in a frame", default="fitted-contact")
-    _choice(group, "--loss", LOSSES, "how much a bad sample counts in the fit of a curve", default="soft-l1")
-    text = "parts into which the places are divided, each predicted from the others; from the number of places on, "
-    group.add_argument("--folds", type=count, metavar="K", help=text + "one place at a time; default: 5")
-    _choice(group, "--fidelity", LEVELS, "how well the model is computed", default="standard")
-    _choice(group, "--baseline", BASELINES, "what is taken off a press", default="two-sided")
+    _choice(group, "--locator", LOCATORS, "estimator of the place of a contact", default="fitted-contact")
+    _choice(
+        group,
+        "--loss",
+        LOSSES,
+        "loss function of the curve fit, which limits the influence of outliers",
+        default="soft-l1",
+    )
+    text = "folds of the cross-validation over places; with K of at least the number of places, "
+    group.add_argument("--folds", type=count, metavar="K", help=text + "one place is left out at a time; default: 5")
+    _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
+    _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")
     add_low_pass_argument(group)
     add_imaging_arguments(parser)
 
 
 def add_low_pass_argument(parser: Any) -> None:
     """The option of the low-pass filter."""
-    parser.add_argument("--low-pass", type=float, metavar="HZ", help="cut-off; default: 50 if it fits")
+    text = "cutoff of the low-pass filter; default: 50, or no filter for streams of 100 Hz or slower"
+    parser.add_argument("--low-pass", type=float, metavar="HZ", help=text)
 
 
 def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
     """Options for how images are made."""
     group = parser.add_argument_group("images")
     imaging = je.imaging
-    _choice(group, "--method", imaging.METHODS, "how data and prior are weighed", default="one-step")
-    _choice(group, "--prior", imaging.PRIORS, "what is expected of an image", default="noser")
-    text = "weight of the prior, or a way to choose it such as noise-figure:0.5"
+    _choice(group, "--method", imaging.METHODS, "reconstruction method", default="one-step")
+    _choice(group, "--prior", imaging.PRIORS, "prior of the image", default="noser")
+    text = "weight of the prior, or a method to choose it, such as noise-figure:0.5"
     names = ("a number", *imaging.HYPERPARAMETERS)
     _choice(group, "--hyperparameter", names, text, default="0.1")
     either = group.add_mutually_exclusive_group()
     either.add_argument("--pixels", type=count, metavar="N", help="pixels along x; default: 40")
-    _choice(either, "--basis", je.model.BASES, "what an image consists of", default="pixels")
-    text = "how readings are weighed: alike, by their noise at rest, or by the covariance of that noise"
+    _choice(either, "--basis", je.model.BASES, "basis functions of the image", default="pixels")
+    text = "weights of the readings: equal, by their noise at rest, or by the covariance of that noise"
     _choice(group, "--noise", imaging.NOISES, text, default="equal")
 
 

@@ -1,4 +1,4 @@
-"""Signals that end a command: its temporary files are removed, and a recording is finished."""
+"""Handle signals that end a command, so that temporary files are removed and a recording is finished."""
 
 import signal
 import threading
@@ -15,7 +15,7 @@ ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") i
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal asked the program to end; handled like Ctrl-C, so that nothing half-written stays."""
+    """A signal asked the program to end; handled like Ctrl-C, so that no incomplete file stays."""
 
     def __init__(self, number: int):
         super().__init__(f"ended by {signal.Signals(number).name}")
@@ -29,7 +29,7 @@ def interruption_status(interrupt: KeyboardInterrupt) -> int:
 
 @contextmanager
 def termination_raised() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise `Terminated` meanwhile, unless they are ignored; in the main thread only."""
+    """Within this context SIGTERM and SIGHUP raise `Terminated`, unless ignored; in the main thread only."""
 
     def terminate(number: int, _frame: FrameType | None) -> None:
         raise Terminated(number)
@@ -37,7 +37,7 @@ def termination_raised() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # as nohup has it
+    numbers = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # ignored by nohup
     before = {number: signal.signal(number, terminate) for number in numbers}
     try:
         yield
@@ -48,7 +48,10 @@ def termination_raised() -> Iterator[None]:
 
 @contextmanager
 def orderly_end(orders: "StopRequest", planned: bool) -> Iterator[None]:
-    """The first signal ends a recording in order, a second one at once; Ctrl-C is how one without end is ended."""
+    """Within this context the first signal ends a recording in order, and a second signal ends it at once.
+
+    Ctrl-C is the normal end of a recording without a `planned` duration, so its exit status is then 0.
+    """
 
     def tell(number: int, _frame: FrameType | None) -> None:
         if orders.stop.is_set():
@@ -58,7 +61,8 @@ def orderly_end(orders: "StopRequest", planned: bool) -> Iterator[None]:
             "" if expected else f"stopped by {signal.Signals(number).name}", 0 if expected else 128 + number
         )
 
-    numbers = [n for n in (signal.SIGINT, *ENDING_SIGNALS) if signal.getsignal(n) != signal.SIG_IGN]  # as nohup has it
+    # nohup, for example, ignores SIGHUP, and the recording must then survive it.
+    numbers = [n for n in (signal.SIGINT, *ENDING_SIGNALS) if signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, tell) for number in numbers}
     try:
         yield

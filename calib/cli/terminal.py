@@ -1,4 +1,4 @@
-"""What commands show on a terminal while they work."""
+"""Progress and messages that commands show on a terminal."""
 
 import os
 import sys
@@ -11,21 +11,21 @@ if TYPE_CHECKING:
     import jaxeit as je
 
 LONG_NODES = 5000
-"""Nodes of a mesh that take about 10 s from the skin to the first voltages, compilation included."""
+"""Number of mesh nodes with which the first voltages take about 10 s, including mesh and compilation."""
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, on one line."""
+    """The message of an error, on one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def title(names: str, simulated: bool) -> str:
-    """The title of a table of results; it says first if they rest on a simulation."""
+    """The title of a table of results; it begins with SIMULATED if the data were simulated."""
     return ("SIMULATED, " if simulated else "") + names
 
 
 def progress_bar(text: str) -> Callable[[Iterable[Any]], Iterable[Any]]:
-    """A wrapper of an iterable that shows how far it is; it shows nothing where nobody watches."""
+    """A wrapper of an iterable that shows a progress bar; no bar if standard error is no terminal."""
     from tqdm import tqdm
 
     return partial(tqdm, desc=text, disable=None, leave=False)
@@ -33,7 +33,7 @@ def progress_bar(text: str) -> Callable[[Iterable[Any]], Iterable[Any]]:
 
 @contextmanager
 def stage_bar(count: int) -> Iterator[Callable[[str], None]]:
-    """A bar that is told the name of each stage as it begins."""
+    """A progress bar of `count` stages; call its value with the name of each stage when the stage begins."""
     from tqdm import tqdm
 
     with tqdm(total=count, disable=None, leave=False) as bar:
@@ -47,7 +47,7 @@ def stage_bar(count: int) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def status_line() -> Iterator[Callable[[str], None]]:
-    """A line on the terminal that is written over; nothing where nobody watches."""
+    """A status line that overwrites itself; no output if standard error is no terminal."""
     if not sys.stderr.isatty():
         yield lambda line: None
         return
@@ -74,7 +74,7 @@ def file_size(path: str) -> int:
 
 @contextmanager
 def byte_bar(total: int, text: str) -> Iterator[Callable[[int], object]]:
-    """A bar that is told how many bytes more are done."""
+    """A progress bar of `total` bytes; call its value with the number of bytes done since the last call."""
     from tqdm import tqdm
 
     with tqdm(total=total, desc=text, unit="B", unit_scale=True, disable=None, leave=False) as bar:

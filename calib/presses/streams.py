@@ -18,12 +18,19 @@ class ReadableStream(Protocol):
     """The interface of a stream; `calib.session.Stream` and `ArrayStream` implement it."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the stream, such as "eit"."""
+
     @property
-    def channels(self) -> int: ...
+    def channels(self) -> int:
+        """Number of channels."""
+
     @property
-    def time(self) -> np.ndarray: ...
-    def read(self, start: int = 0, stop: int | None = None) -> np.ndarray: ...
+    def time(self) -> np.ndarray:
+        """Time stamps (n,) int64 ns since the epoch of the session."""
+
+    def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Values (samples, channels) of the samples from `start` to before `stop`, in SI units, NaN where missing."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,18 +47,31 @@ class PressColumns(Protocol):
     """The columns that windows, means and samples are computed from."""
 
     @property
-    def t_press(self) -> np.ndarray: ...
+    def t_press(self) -> np.ndarray:
+        """Beginning of the contact, (presses,) ns."""
+
     @property
-    def t_hold0(self) -> np.ndarray: ...
+    def t_hold0(self) -> np.ndarray:
+        """Beginning of the full load, (presses,) ns."""
+
     @property
-    def t_hold1(self) -> np.ndarray: ...
+    def t_hold1(self) -> np.ndarray:
+        """Beginning of the unloading, (presses,) ns."""
+
     @property
-    def t_release(self) -> np.ndarray: ...
+    def t_release(self) -> np.ndarray:
+        """End of the contact, (presses,) ns."""
+
     @property
-    def accepted(self) -> np.ndarray: ...
+    def accepted(self) -> np.ndarray:
+        """Whether a press can be used, (presses,) bool."""
+
     @property
-    def reason(self) -> tuple[str, ...]: ...
-    def __len__(self) -> int: ...
+    def reason(self) -> tuple[str, ...]:
+        """Why a press cannot be used; an empty text for an accepted press."""
+
+    def __len__(self) -> int:
+        """Number of presses."""
 
 
 P = TypeVar("P", bound=PressColumns)

@@ -23,8 +23,8 @@ def ladder_figure(ladders: Sequence[Mapping[str, Any]]) -> "Figure":
     """A panel per ladder: difference error against time per forward solve.
 
     Args:
-        ladders: from `jaxeit.accuracy.Ladder.summary`; where its rungs say ``least_ms``, the least time that the
-            machine's arithmetic and memory allow the factorisation, a line tells which error takes how long at least.
+        ladders: from `jaxeit.accuracy.Ladder.summary`. If its rungs have ``least_ms``, the shortest time of the
+            factorisation that the arithmetic and memory of the machine allow, a line shows this bound.
 
     Raises:
         ReportError: where matplotlib is not installed.

@@ -1,4 +1,4 @@
-"""What the figures of a report show: for who cannot see a figure, and what to look for in it."""
+"""Alternative texts and captions of the figures of a report."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A calibration as one HTML page that needs nothing else, with the paper's figures beside it."""
+"""The report of a calibration: one self-contained HTML page, and the paper's figures as files beside it."""
 
 import base64
 from collections.abc import Iterable, Mapping
@@ -73,7 +73,7 @@ def _write(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class _Picture:
-    """A PNG file with its title, what it shows for who cannot see it, and what to look for; `single`: of one panel."""
+    """A PNG file with its title, alternative text and caption; `single`: whether the figure has one panel."""
 
     name: str
     title: str
@@ -185,22 +185,22 @@ def _all(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> dic
 
 
 def _method_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
-    """What each way to a total force is worth on one session."""
+    """Evenness and errors of each method of estimating the total force on one session."""
     return [
         (
-            worth.label,
-            with_error(worth.cv, worth.cv_error, 3),
-            number_text(worth.rmse, 2),
-            number_text(worth.percent, 1),
-            number_text(worth.mean_absolute, 2),
-            number_text(worth.worst, 2),
+            method.label,
+            with_error(method.cv, method.cv_error, 3),
+            number_text(method.rmse, 2),
+            number_text(method.percent, 1),
+            number_text(method.mean_absolute, 2),
+            number_text(method.worst, 2),
         )
-        for worth in evaluation.by_method()
+        for method in evaluation.by_method()
     ]
 
 
 def _left_out(evaluation: Evaluation) -> str:
-    """What comes of leaving out a pad, an indenter or a session; of those there is only one of, a sentence."""
+    """Errors with a pad, an indenter or a session left out; a sentence where there is only one of a kind."""
     rows = [
         (
             split.by,
@@ -223,7 +223,7 @@ def _left_out(evaluation: Evaluation) -> str:
 
 
 def _choice(calibration: Calibration) -> str:
-    """Why this curve and this field, where there was something to choose from."""
+    """Reason for the choice of curve and field, if there were several candidates."""
     why = calibration.provenance.get("choice", "")
     if not why:
         return ""
@@ -235,7 +235,7 @@ _PARTS = {"location": "correction by location, with the first curve", "curve": "
 
 
 def _tried(calibration: Calibration) -> str:
-    """All candidates and their errors; calibrations of before have none to show."""
+    """Table of all candidates and their errors; empty for a file of an early version."""
     parts = dict.fromkeys(candidate.part for candidate in calibration.tried)
     groups = {_PARTS.get(p, p): [_candidate(c) for c in calibration.tried if c.part == p] for p in parts}
     head = ["candidate", "coefficients", "held-out RMSE, N", "one standard error about, N", ""]

@@ -38,7 +38,7 @@ ESTIMATOR_MEANING: Mapping[str, str] = MappingProxyType(
         "fitted": "place that the correction by location goes by",
     }
 )
-"""What each named estimator of an evaluation takes as the position, for a person."""
+"""The position that each named estimator of an evaluation takes, in words."""
 
 
 class ReportError(ValueError):
@@ -52,7 +52,7 @@ def require_matplotlib() -> None:
 
 
 def plain_numbers(axes: Any) -> None:
-    """Numbers as people write them along logarithmic axes; on axes of little more than a decade also 2 and 5."""
+    """Label logarithmic axes with plain numbers, without powers of ten; on axes of about one decade also 2 and 5."""
 
     def between(axis: Any, value: float) -> str:
         low, high = axis.get_view_interval()
@@ -82,8 +82,8 @@ def localisation_figure(evaluation: Evaluation, skin: je.Skin, *estimators: str,
     Args:
         evaluation: of the presses.
         skin: for its outline, electrodes (green) and pads.
-        estimators: of ``evaluation.estimated``, each in a panel of its own; left out, "quarter".
-        simulated: say so in the picture.
+        estimators: names in ``evaluation.estimated``, one panel each; default: "quarter".
+        simulated: whether to write SIMULATED above the figure.
 
     Raises:
         ReportError: no such estimator, or matplotlib is not installed.
@@ -126,8 +126,8 @@ def _localisation_title(evaluation: Evaluation, estimator: str) -> str:
 def sensitivity_figure(evaluation: Evaluation, skin: je.Skin, *, simulated: bool = False) -> "Figure":
     """The paper's figure 6: sensitivity over its mean at every place, EIT only and hybrid.
 
-    The calibration itself has a third panel where it is more than the paper's recipe. All maps have one colour scale,
-    symmetric about 1.
+    A calibration that is more than the paper's recipe has a third panel. All maps share one colour scale, symmetric
+    about 1.
 
     Raises:
         ReportError: matplotlib is not installed.
@@ -148,7 +148,7 @@ def sensitivity_figure(evaluation: Evaluation, skin: je.Skin, *, simulated: bool
 
 
 def sensitivity_maps(evaluation: Evaluation) -> dict[str, np.ndarray]:
-    """What figure 6 shows by method, (presses,) each over its mean."""
+    """Sensitivity by method as in figure 6, (presses,) each, divided by its mean."""
     maps = {"eit": evaluation.sensitivity_eit, "hybrid": evaluation.sensitivity_hybrid}
     calibrated = evaluation.sensitivity(CALIBRATED)
     if not np.array_equal(calibrated, maps["hybrid"]):
@@ -175,6 +175,7 @@ def _sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
 
 
 def new_figure(width: float, height: float, simulated: bool) -> "Figure":
+    """An empty figure of this size in inches; titled SIMULATED if it shows simulated data."""
     require_matplotlib()
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
@@ -184,20 +185,20 @@ def new_figure(width: float, height: float, simulated: bool) -> "Figure":
 
 
 def plain_label(text: str, limit: int = 24) -> str:
-    """A name from a file as a label: on one line, never read as mathematics, in letters of the font."""
+    """Convert a name from a file to a label: one line, no mathematical notation, only letters of the font."""
     known = "".join(c if c.isprintable() and c <= LAST_IN_FONT else "?" for c in text)
     short = known if len(known) <= limit else known[: limit - 3] + "..."
     return short.replace("\\", "/").replace("$", r"\$")
 
 
 def colour_reach(deviation: np.ndarray) -> float:
-    """Half the span of a symmetric colour scale: nearly all values, so that one cannot wash out the rest."""
+    """Half the span of a symmetric colour scale that covers nearly all values, so that one outlier does not set it."""
     size = np.abs(deviation[np.isfinite(deviation)])
     return float(max(np.percentile(size, 98), 1e-6)) if size.size else 1.0
 
 
 def draw_sheet(axes: Any, skin: je.Skin) -> None:
-    """The outlines of the sheet and its pads, and axes in mm."""
+    """Draw the outlines of the sheet and its pads, and label the axes in mm."""
     rim = np.union1d(np.linspace(0, skin.domain.perimeter, 181), skin.domain.corners)
     axes.plot(*(skin.domain.boundary_point(rim) * MM).T, color=GREY, lw=1.2, zorder=1)
     for pad in skin.pads:
@@ -208,7 +209,7 @@ def draw_sheet(axes: Any, skin: je.Skin) -> None:
 
 
 def draw_electrodes(axes: Any, skin: je.Skin) -> None:
-    """Polygons as they are, all others as circles of one size, for most are too small to see."""
+    """Draw polygons to scale, all other electrodes as circles of one size, because most are too small to see."""
     shapes = [e.outline.corner_points * MM for e in skin.electrodes if isinstance(e, je.PolygonPatch)]
     round_ones = [not isinstance(e, je.PolygonPatch) for e in skin.electrodes]
     place = skin.electrode_positions[round_ones] * MM
@@ -219,13 +220,13 @@ def draw_electrodes(axes: Any, skin: je.Skin) -> None:
 
 
 def label_y_once(panels: Any) -> None:
-    """Panels that share their axes: y is named once."""
+    """Label the y axis of the first panel only, for panels that share it."""
     for axes in panels[1:]:
         axes.set_ylabel("")
 
 
 def value_map(axes: Any, position: np.ndarray, values: np.ndarray, low: float, high: float, colours: str) -> Any:
-    """Values at places as coloured cells where the places form a grid, else as coloured marks."""
+    """Draw values at places as coloured cells if the places form a grid, otherwise as coloured marks."""
     options = {"vmin": low, "vmax": high, "cmap": colours}
     place, index = np.unique(np.round(position, 6), axis=0, return_inverse=True)
     index = index.ravel()

@@ -1,4 +1,4 @@
-"""The figure of forces over time beside the truth."""
+"""The figure of true and estimated forces over time."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,20 +12,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SERIES = (BLUE, RED, GREEN, "#7b3fa0", "#d9730d")
-"""Colours of the contacts or pads, in turn."""
+"""Colours of the contacts or pads, repeated in this order."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceSeries:
-    """Forces over time beside the truth.
+    """True and estimated forces over time.
 
     | meaning                                  | shape     | unit |
     |------------------------------------------|-----------|------|
-    | title: what happens                      |           |      |
+    | title of the figure                      |           |      |
     | names of the contacts or pads            | (k,)      |      |
     | time                                     | (n,)      | s    |
     | true and estimated forces                | (n, k)    | N    |
-    | events: name -> when                     |           | s    |
+    | events: name to time                     |           | s    |
     """
 
     title: str
@@ -37,7 +37,7 @@ class ForceSeries:
 
 
 def force_series_figure(series: Sequence[ForceSeries], *, simulated: bool = False) -> "Figure":
-    """The paper's figure 8: force over time of contacts that come and go one by one, and below it the error.
+    """The paper's figure 8: forces over time while contacts begin and end in turn, and their errors below.
 
     Raises:
         ReportError: matplotlib is not installed.

@@ -6,7 +6,7 @@ from html import escape
 
 
 def html_table(head: Sequence[str], groups: Mapping[str, Iterable[Sequence[str]]], kind: str = "numbers") -> str:
-    """A table from plain texts in groups of rows under their names, if any; the first column names the row."""
+    """A table of plain texts; groups of rows have an optional heading, and the first column names the row."""
     top = "".join(f"<th scope='col'>{escape(cell)}</th>" for cell in head)
     body = "".join(_group(name, rows, len(head)) for name, rows in groups.items())
     return f"<div class='wide'><table class='{kind}'><thead><tr>{top}</tr></thead>\n{body}</table></div>"
@@ -25,17 +25,17 @@ PLUS_MINUS = "\u00a0±\u00a0"  # never broken over two lines
 
 
 def number_text(value: float, digits: int) -> str:
-    """A number with so many decimals; a dash for one that is not known."""
+    """A number with this many decimals; a dash if it is not finite."""
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "—"
 
 
 def significant_text(value: float, digits: int) -> str:
-    """A number with so many significant digits; a dash for one that is not known."""
+    """A number with this many significant digits; a dash if it is not finite."""
     return f"{value:.{digits}g}".replace("-", "−") if math.isfinite(value) else "—"
 
 
 def with_error(value: float, error: float, digits: int) -> str:
-    """A value and its standard error, which gets one digit more where it would be lost."""
+    """A value and its standard error, with one more digit if the error would be rounded to zero."""
     shown = number_text(error, digits + (error < 10.0**-digits))
     return f"{number_text(value, digits)}{PLUS_MINUS}{shown}" if math.isfinite(error) else number_text(value, digits)
 

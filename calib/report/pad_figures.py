@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 
 
 def curves_figure(calibration: Calibration, evaluations: Mapping[str, Evaluation] = MappingProxyType({})) -> "Figure":
-    """Each pad's curve and 95 % band with the presses it carried; residuals by place, by force and over time.
+    """Curve and 95 % band of each pad with its presses; residuals by place, by force and over time.
 
-    Residuals are estimated minus true force of presses that the fit had not seen; those of other
-    sessions (``evaluations``, by name) join the last two panels. Time is the number of the press.
+    Residuals are estimated minus true force of held-out presses. The last two panels also show other sessions
+    (``evaluations``, by name). Time is the number of the press.
 
     Raises:
         ReportError: matplotlib is not installed.
@@ -116,7 +116,7 @@ def _residual_map(figure: Any, axes: Any, calibration: Calibration) -> None:
 def _residuals_by(
     axes: Any, cause: Callable[[Evaluation], np.ndarray], own: Evaluation, evaluations: Mapping[str, Evaluation]
 ) -> None:
-    """Force errors over what may explain them, (presses,) of each evaluation."""
+    """Force errors over a quantity that may explain them, (presses,) of each evaluation."""
     axes.axhline(0, color=GREY, lw=1)
     axes.plot(
         cause(own),
@@ -135,9 +135,9 @@ def _residuals_by(
 
 
 def loops_figure(calibration: Calibration) -> "Figure":
-    """Force against pressure along one whole press of each pad, loading and unloading, with the fitted law.
+    """Force against pressure along one complete press of each pad, loading and unloading, with the fitted curve.
 
-    The law is that of the pad times the gain at the place of the press; of a law with hysteresis, the law's own loop.
+    The curve is multiplied by the gain at the place of the press. A curve with hysteresis is drawn as a loop.
 
     Raises:
         ReportError: the calibration holds no presses with unloading, or matplotlib is not installed.
@@ -166,7 +166,7 @@ def loops_figure(calibration: Calibration) -> "Figure":
 
 
 def has_loops(calibration: Calibration) -> bool:
-    """Whether there is a press with loading and unloading to be drawn."""
+    """Whether the calibration holds a press with loading and unloading."""
     loops = calibration.loops
     return loops is not None and any(map(loops.unloads, range(len(calibration.skin.pads))))
 
@@ -188,7 +188,7 @@ def _loop_panel(axes: Any, calibration: Calibration, number: int) -> None:
 
 
 def gain_figure(calibration: Calibration) -> "Figure":
-    """Each pad's gain over the place pressed, and its standard error with the places from which it was fitted.
+    """Maps of each pad's gain over the place pressed, and of its standard error with the fitted places.
 
     Raises:
         ReportError: the calibration has no correction by location, or matplotlib is not installed.
@@ -226,7 +226,7 @@ def _pad_gain(field: FittedField, number: int, outline: np.ndarray) -> tuple[np.
 
 
 def symmetric_limit(deviation: np.ndarray) -> float:
-    """The end of a colour scale for all values; a field of none still has one."""
+    """Upper end of a symmetric colour scale for all values; not zero even if all values are."""
     return max(float(np.abs(deviation).max()), 0.01)
 
 

@@ -1,4 +1,4 @@
-"""What a session file says of itself and of its streams, apart from their samples."""
+"""Facts about a session and its streams, apart from the samples."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -13,7 +13,7 @@ class SessionFacts:
     | field             | meaning                                                                    | unit |
     |-------------------|----------------------------------------------------------------------------|------|
     | epoch             | zero of the time axis, with a time zone                                    |      |
-    | title, license    | a line to know the session by; its licence                                 |      |
+    | title, license    | title of the session, one line; its licence                                 |      |
     | skin_name         | name of the skin that was recorded                                         |      |
     | skin_toml         | its description                                                            |      |
     | pattern           | zero-based electrodes drive+, drive-, sense+, sense- of each reading, (M, 4) |    |
@@ -24,7 +24,7 @@ class SessionFacts:
     | scene, seed       | TOML text of the simulated scene, and seed of its noise                    |      |
     | creator           | name and version of the program that made it; default: this one            |      |
     | session_id        | default: a new one                                                         |      |
-    | complete          | false: the recording broke off                                             |      |
+    | complete          | false: the recording ended early                                           |      |
     | recovered         | true: made whole from what a crash left                                    |      |
     """
 

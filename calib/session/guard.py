@@ -36,7 +36,7 @@ DAMAGED = "the file is damaged; take another copy, or record it again"
 
 @dataclass
 class Claims:
-    """Bytes that the arrays of one file claim together, as far as they have been looked at."""
+    """Total size in bytes that the headers of the arrays of one file state, for the arrays accessed so far."""
 
     path: Path
     claimed: int = 0

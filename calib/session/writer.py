@@ -1,4 +1,4 @@
-"""Writing a session file: streams row by row, whole or not at all."""
+"""Write a session file, streams row by row; the file appears whole or not at all."""
 
 import os
 import re
@@ -72,12 +72,12 @@ class _Stream:
 class SessionWriter(FileWriter):
     """Write a session file; use it as a context manager.
 
-    The file appears only when the block ends without an error, complete and synced to disk; after an error nothing is
-    left, and an existing file is as it was. Two sessions of equal content, `session_id` and `epoch` are equal byte by
+    The file appears only when the block ends without an error, complete and synced to disk. After an error no file is
+    left, and an existing file is unchanged. Two sessions of equal content, `session_id` and `epoch` are equal byte by
     byte.
 
     Raises:
-        SessionError: for what the format cannot hold.
+        SessionError: for data that the format cannot hold.
     """
 
     def __init__(self, path: str | os.PathLike[str], facts: SessionFacts):
@@ -316,11 +316,11 @@ class SessionWriter(FileWriter):
     # --- tables --------------------------------------------------------------------------------
 
     def set_presses(self, table: PressTable) -> None:
-        """The table of presses, one row each."""
+        """Write the table of presses, one row per press."""
         self._presses = table
 
     def set_truth(self, truth: Mapping[str, tuple[ArrayLike, str]]) -> None:
-        """What was simulated: name -> (numbers, units). Only a simulated session has a truth."""
+        """Write the simulated quantities: name to (numbers, units). Only a simulated session has them."""
         if not self._facts.simulated:
             raise self._problem("/truth", "is for simulated sessions", "give simulated=True")
         for name, (values, units) in truth.items():
@@ -332,7 +332,7 @@ class SessionWriter(FileWriter):
             self._truth[name] = (array, units)
 
     def add_events(self, time_ns: ArrayLike, code: ArrayLike, label: Sequence[str]) -> None:
-        """Marks: times (n,) in ns since the epoch, codes (n,) 0..65535, n short texts."""
+        """Add marks: times (n,) in ns since the epoch, codes (n,) 0..65535, n short texts."""
         times, label = np.atleast_1d(np.asarray(time_ns, "i8")), tuple(label)
         codes = np.atleast_1d(np.asarray(code, "u2"))
         if not times.shape == codes.shape == (len(label),):
@@ -340,7 +340,7 @@ class SessionWriter(FileWriter):
         self._events.append(Events(times, codes, label))
 
     def set_clock(self, name: str, table: ClockTable) -> None:
-        """How the clock of the device behind the stream `name` was laid on the session's."""
+        """Write how the clock of the device of the stream `name` was aligned with the clock of the session."""
         if name not in self._streams:
             raise self._problem(f"/clocks/{printable(name)}", "no such stream", "add_stream first")
         self._clocks[name] = table
@@ -401,7 +401,7 @@ class SessionWriter(FileWriter):
 
 
 def _truth_axis(group: h5py.Group, name: str, axis: int, size: int) -> h5py.Dataset:
-    """The index along one axis of a truth array: each array has axes of its own."""
+    """The index along one axis of a truth array; no two arrays share an axis."""
     return make_index(group, f"{name}.{axis}", size)
 
 

@@ -172,7 +172,7 @@ def test_the_command_of_a_cluster_without_dask_is_one_line(sessions, tmp_path, c
 
 def test_equal_options_are_told_alike_and_others_apart():
     told = [
-        batch._described(options)
+        batch._describe(options)
         for options in (
             {"a": calib.PowerLaw(900.0), "b": None},
             {"b": None, "a": calib.PowerLaw(900.0)},
@@ -297,7 +297,7 @@ def logs(tmp_path):
 
 
 def test_logs_without_eit_get_the_curves_that_they_get_singly(logs, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(batch, "_in_own_pools", lambda tasks, jobs, note: batch._run(Here(), tasks, note))
+    monkeypatch.setattr(batch, "_run_in_pools", lambda tasks, jobs, note: batch._run(Here(), tasks, note))
     words = ["calibrate", *logs, "-o", str(tmp_path / "out"), "--jobs", "2", "--json"]
     capsys.readouterr()
     assert main(words) == 2

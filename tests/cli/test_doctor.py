@@ -1,4 +1,4 @@
-"""The doctor: every line ok, or with its mend."""
+"""The doctor: every line says ok or what to do."""
 
 import warnings
 from contextlib import nullcontext
@@ -39,8 +39,8 @@ def test_every_part_is_named(capsys):
 def test_an_old_or_missing_package_is_told_how_to_mend(monkeypatch):
     monkeypatch.setattr(doctor.metadata, "requires", lambda name: ["numpy>=999.1", "nonesuch>=1", "x>=1; extra == 'y'"])
     lines = {line.name: line for line in examine()}
-    assert lines["numpy"].mend == "pip install --upgrade 'numpy>=999.1'"
-    assert lines["nonesuch"].mend == "pip install 'nonesuch>=1'"
+    assert lines["numpy"].remedy == "pip install --upgrade 'numpy>=999.1'"
+    assert lines["nonesuch"].remedy == "pip install 'nonesuch>=1'"
     assert "x" not in lines
     assert not lines["numpy"].ok
 
@@ -65,13 +65,13 @@ def test_real_time_priority_is_allowed_or_the_way_to_it_told(monkeypatch):
     assert line.ok
     assert "add a line" in line.render()
     monkeypatch.setattr(priority, "real_time", nullcontext)
-    assert found("real-time priority").mend == ""
+    assert found("real-time priority").remedy == ""
 
 
 def test_ports_without_permission(monkeypatch):
     port = SimpleNamespace(device="/dev/ttyX9", description="a board")
     monkeypatch.setattr(doctor.list_ports, "comports", lambda: [port])
-    assert "dialout" in found("serial port").mend
+    assert "dialout" in found("serial port").remedy
     monkeypatch.setattr(doctor.list_ports, "comports", list)
     assert found("serial ports").ok
 
@@ -89,11 +89,11 @@ def test_a_full_disk(monkeypatch):
     assert not found("disk").ok
 
 
-@pytest.mark.parametrize(("value", "mend"), [("1", False), ("", True)])
-def test_threads(monkeypatch, value, mend):
+@pytest.mark.parametrize(("value", "remedy"), [("1", False), ("", True)])
+def test_threads(monkeypatch, value, remedy):
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
         monkeypatch.setenv(name, value)
-    assert bool(found("BLAS threads").mend) == mend
+    assert bool(found("BLAS threads").remedy) == remedy
 
 
 def test_a_line_reads_well():

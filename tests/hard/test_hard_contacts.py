@@ -26,7 +26,7 @@ def test_no_digit_is_lost_to_the_contacts(contacts, solver, hard):
         float64=double,
         float32=single,
         naive=worst(by_schur_and_pinv(SIGMA, contacts), right),
-        beyond="zero is a perfect contact; what is negative or not finite, an error that names it",
+        beyond="zero is a perfect contact; a value that is negative or not finite: an error that names it",
     )
 
 

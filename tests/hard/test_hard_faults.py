@@ -70,7 +70,7 @@ def test_two_threads_never_wait_for_each_other_for_ever(root, hard):
     hard(
         "two threads of Python",
         "300 calls, at most 20 s, of images, forward solves, contacts and fits",
-        beyond="no call hangs, every result has the same bits as alone; your own large stacks of QR or SVD may hang",
+        beyond="no call hangs, results have the bits of one thread; your own large stacks of QR or SVD may hang",
     )
 
 
@@ -121,7 +121,7 @@ def test_without_network_the_same_input_gives_the_same_json(root, bundled, tmp_p
     hard(
         "no network, the same input twice",
         "calibrate, evaluate and check in processes that cannot connect",
-        beyond="the same JSON byte for byte; a report that asks nothing of others",
+        beyond="the same JSON byte for byte; a report that requests nothing from a network",
     )
 
 

@@ -103,7 +103,7 @@ def test_hopeless_samples_are_told_and_sound_ones_beside_them_fitted(name, dtype
         "pads without a response beside good ones",
         "no sample, one, identical ones, dead, stuck, upside down; forces of 1e-9 to 1e9",
         **{"float64" if dtype == "f8" else "float32": error},
-        beyond="that pad's result and its reason, covariance NaN, predictions not valid; its neighbours the same bits",
+        beyond="that pad: result code with reason, covariance NaN, predictions not valid; other pads: the same bits",
     )
 
 
@@ -143,7 +143,7 @@ def test_outliers_up_to_a_half(hard):
         "45 % of the samples (Cauchy; 30 % with the default loss)",
         float64=max(errors[Cauchy][:4]),
         naive=errors[Squared][3],
-        beyond="at half the samples the curve follows either half; `scale` is that of the outliers",
+        beyond="with half of the samples outliers, the curve follows either half; `scale` is that of the outliers",
     )
 
 

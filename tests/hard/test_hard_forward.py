@@ -99,7 +99,7 @@ def test_a_tear_in_the_middle_costs_nothing(decades, hard):
         float64=double,
         float32=single,
         naive=error,
-        beyond="no end found; zero all around a place, or negative anywhere: no reading is finite",
+        beyond="no limit found; zero all around a place, or a negative value: no reading is finite",
     )
 
 
@@ -116,7 +116,7 @@ def test_between_halves_that_hardly_touch_digits_are_lost_and_told(hard):
             "1e-12 of the rest, of each reading",
             float64=double,
             naive=worst(by_inverse(sigma, CONTACTS), right),
-            beyond="`rounding` says how wrong each reading is; below rounding nothing is finite",
+            beyond="`rounding` estimates the error of each reading; below rounding no reading is finite",
         )
 
 
@@ -141,7 +141,7 @@ def test_what_contrast_costs_is_told(dtype, hard):
     hard(
         "what rounding has done to a reading",
         "contrast up to 1e18, in either precision",
-        beyond="`rounding` tells the error in V: not below a tenth of the worst, nor above a hundred times it",
+        beyond="`rounding` estimates the error in V: from a tenth to a hundred times the largest error",
     )
 
 
@@ -234,5 +234,5 @@ def test_small_changes_in_float32_are_linearised(hard):
         "by its derivative; naive: by the difference of two readings",
         float32=linear,
         naive=naive,
-        beyond="the derivative's own second order, 1e-4 here",
+        beyond="the second-order term that a derivative neglects, 1e-4 here",
     )

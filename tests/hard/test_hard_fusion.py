@@ -113,7 +113,7 @@ def test_a_sensor_saturated_or_dead_is_its_own_affair(hard, pixels, masks, pad, 
     assert np.isfinite(others).all()
     assert np.abs(others).max() > 0
     assert not np.isfinite(equation_4(image, masks, forces)).any()
-    said = "NaN on that pad's pixels, not valid; other pads to the last bit"
+    said = "NaN on that pad's pixels, not valid; other pads: the same bits"
     hard("pad sensor dead or saturated", "NaN, Inf", float64=0, naive=np.inf, beyond=said)
 
 
@@ -194,7 +194,7 @@ def test_overlapping_pads_share_and_only_the_overlap_dies_with_one(hard, skin, p
     twice = replace(masks, weights=jnp.concatenate([masks.weights, masks.weights]) / 2)  # the same two, once more
     same = je.fuse(image, twice, jnp.array([3.0, 2.0, 3.0, 2.0]))
     np.testing.assert_allclose(same.force, whole.force, rtol=1e-12, atol=1e-15)
-    said = "pixels shared by halves; NaN only on the pixels of the dead pad"
+    said = "each pad gets half of a shared pixel; NaN only on the pixels of the dead pad"
     hard("overlapping pads", "a fifth of the sheet; pads twice", float64=error, beyond=said)
 
 

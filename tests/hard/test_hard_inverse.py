@@ -112,7 +112,7 @@ def naive(problem, y):
 # --- lambda ------------------------------------------------------------------------------------------------------
 
 
-BELOW = "an error that names the range; provenance['rank'] says what the image follows"
+BELOW = "an error that names the range; provenance['rank'] counts the directions that the image follows"
 
 
 @extended
@@ -212,7 +212,7 @@ def test_lambda_to_infinity_is_back_projection_through_the_prior(hard, dtype, ro
     assert _error(exact, j.T @ y / (b**2).sum() * 40 / h**2 / np.asarray(problem.precision().values)) < 1e-5
     assert not np.asarray(_imaged(je.TruncatedSvd(), problem, jnp.asarray(y, dtype))).any()
     assert np.abs(_imaged(je.Greit(), problem, jnp.asarray(y, dtype))).max() < 1e-4
-    said = "an image that fades as back projection through the prior; an error above 1e4"
+    said = "the image of back projection through the prior, fading to zero; above 1e4 an error"
     hard("hyperparameter to infinity", "1e1 to 1e4", **{dtype: error}, beyond=said)
 
 
@@ -492,7 +492,7 @@ def test_all_channels_dead_but_few(hard, recon, jac, pixels, left):
     )
     assert error < 1e-8
     assert zeroed > 100 * error
-    said = "the image of the readings left; none left: zero. Digits are lost as 1 / hyperparameter^2"
+    said = "the image of the remaining readings; none remains: zero. Digits are lost as 1 / hyperparameter^2"
     hard("channels not finite", "1 to 549 of 550 dead", float64=error, naive=zeroed, beyond=said)
 
 
@@ -512,7 +512,7 @@ def test_what_is_applied_in_single_precision_is_mended_in_double(hard, model, ja
         "12 of 40 readings that tell of different things, hyperparameter 1e-2 to 1e-5",
         float32=error,
         naive=rounded,
-        beyond="by `on_host` the image of the readings left; naive: a reconstructor that is in float32 altogether",
+        beyond="`on_host`: the image of the remaining readings; naive: all of the reconstructor in float32",
     )
 
 
@@ -572,7 +572,7 @@ def test_covariances_wildly_scaled_and_singular(hard, model, pixels, weighed):
     common = np.abs(matrix @ np.ones(550)).max() / np.abs(matrix).max()
     assert np.isfinite(matrix).all()
     assert common < 1e-3
-    said = "an error where it is singular; provenance['rank'] where few readings say it all"
+    said = "an error where it is singular; provenance['rank'] where few readings hold all information"
     hard("noise covariance singular or wildly scaled", "condition 5e14; units 1e-30 to 1e30", beyond=said)
 
 

@@ -154,7 +154,7 @@ def test_electrodes_may_cover_every_node(hard):
         "two patches on three cells; naive: what a triangle joins only through its nodes",
         float64=error,
         naive=naive,
-        beyond="no end found",
+        beyond="no limit found",
     )
 
 

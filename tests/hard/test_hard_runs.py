@@ -94,7 +94,7 @@ def followed(count, hard):
         float64=errors[jnp.float64],
         float32=errors[jnp.float32],
         naive=wound_up,
-        beyond="a frame that says nothing changes nothing; the covariance stays capped (naive: how far it grows)",
+        beyond="a frame without information changes nothing; the covariance stays bounded (naive: its growth)",
     )
 
 

@@ -687,7 +687,7 @@ def test_everything_listens_on_this_machine_only(calibration, hard):
         )
     assert len(set(found)) == 4  # page, lines, two streams of the device
     assert all(address.startswith("0100007F:") for address in found)
-    told = "127.0.0.1 only; with --host another address, and a line that says who can look"
+    told = "127.0.0.1 only; with --host another address, and a line that warns who can see the results"
     hard("fault 14: what listens", "page, JSON lines, simulated device", beyond=told)
 
 

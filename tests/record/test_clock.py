@@ -260,7 +260,7 @@ def test_pings_tell_the_smallest_latency(name, hard):
     found = smallest_latency(clock.fit(), known.bits, *pings(known, MS // 10))
     assert found.rtt < 3 * MS
     assert abs(found.ns - 3 * MS) < found.rtt / 2 + CASES[name][1]
-    told = f"found to {abs(found.ns - 3 * MS) / MS:.1f} ms, stated as known to {found.rtt / 2 / MS:.1f} ms"
+    told = f"known to {abs(found.ns - 3 * MS) / MS:.1f} ms, stated uncertainty {found.rtt / 2 / MS:.1f} ms"
     if name == "jitter":
         hard("fault 11: latency of 3 ms of every frame", "pings of up to 10 ms", beyond=told)
 

@@ -720,8 +720,8 @@ def test_two_hundred_killed_recorders_leave_sessions(device, tmp_path, hard):
         for path in tmp_path.iterdir():
             path.unlink()
     taken, decoded = max(kill.taken for kill in found), max(kill.decoded for kill in found)
-    told = f"all opened, marked not complete; lost of a stream at most {taken} frame in work, {decoded} read with it, "
-    told += f"of at most {MAX_READ_BYTES >> 10} KiB that one read brings; the last one left had come "
+    told = f"all opened, marked not complete; lost per stream: at most {taken} frame in work and {decoded} of "
+    told += f"the same read of at most {MAX_READ_BYTES >> 10} KiB; the last kept frame arrived "
     told += f"{np.median([kill.age for kill in found]):.0f} ms before the kill (median)"
     hard("fault 1: kill -9 of the recorder", "200 kills at random moments", beyond=told)
 
@@ -774,7 +774,7 @@ def test_a_kill_while_the_session_is_made_costs_nothing(tmp_path):
 @pytest.mark.slow
 def test_a_hundred_kills_while_the_session_is_made_cost_nothing(tmp_path, hard):
     new = kills_while_finishing(tmp_path, 100)
-    told = f"the old file {100 - new} times, the whole new one {new} times; made anew from the journal"
+    told = f"the old file {100 - new} times, the whole new one {new} times; written again from the journal"
     hard("fault 3: kill -9 while the session is made", "100 kills at random moments", beyond=told)
 
 
@@ -793,7 +793,7 @@ def test_a_signal_ends_a_recording_in_order(device, tmp_path, name, planned, sta
         assert session.complete == (status == 0)
         assert not session.recovered
         assert sound(session)["eit"] > 0
-    told = "a session; where more was planned not complete and exit not 0; a second signal: recovered"
+    told = "a session; if it was to last longer: not complete, exit not 0; after a second signal: recovered"
     hard("fault 4: signals while recording", "SIGINT, SIGTERM, SIGINT twice", beyond=told)
 
 

@@ -363,7 +363,7 @@ def test_a_device_that_comes_back_is_heard_within_two_seconds():
 def test_a_device_that_comes_back_fifty_times(hard):
     slowest = slowest_return(50)
     assert slowest < 2
-    told = f"heard again within {slowest:.1f} s, gaps flagged and counted to the frame"
+    told = f"received again within {slowest:.1f} s, gaps flagged and counted to the frame"
     hard("fault 8: TCP device unplugged and plugged", "50 times", beyond=told)
 
 
@@ -398,7 +398,7 @@ def test_a_serial_port_may_be_unplugged(tmp_path):
 def test_a_serial_port_may_be_unplugged_fifty_times(tmp_path, hard):
     slowest = slowest_return_of_a_port(tmp_path / "tty", 50)
     assert slowest < 2
-    told = f"heard again within {slowest:.1f} s, flagged where it was away"
+    told = f"received again within {slowest:.1f} s, flagged where frames are missing"
     hard("fault 8: serial device unplugged and plugged", "50 times, restarted each time", beyond=told)
 
 
@@ -461,7 +461,7 @@ def test_a_slow_drip_is_cut_off(hard):
         peer.accept().sendall(frames(9))
         until(lambda: run.counters.frames == 6)
     assert any("no frame" in text for _, text in run.kept.notes)
-    told = f"opened anew after three periods, but not before {MIN_TIMEOUT} s, as TCP itself repeats after 0.2 s"
+    told = f"opened again after three periods, but not before {MIN_TIMEOUT} s: TCP repeats lost packets after 0.2 s"
     hard("fault 9: bytes that never become a frame", "50 a second", beyond=told)
 
 
@@ -490,7 +490,7 @@ def test_repeated_and_reordered_frames_are_kept_once_in_order(hard):
     assert run.kept.seq == [0, 1, 2, 5, 6, 7, 8]
     assert np.flatnonzero(run.kept.flags & Status.gap_before).tolist() == [3]
     assert (run.counters.lost, run.counters.rejected) == (2, 6)
-    told = "kept once, in order; what comes after a later one is counted as lost, and flagged"
+    told = "kept once, in order; a frame that arrives after a later one is counted as lost, and flagged"
     hard("fault 9: frames repeated and reordered", "up to 64 behind", beyond=told)
 
 

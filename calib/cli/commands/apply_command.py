@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("session", metavar="SESSION.h5")
     parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
-    text = "go on in spite of what `jaxeit check` calls an error; the results say so"
+    text = "continue despite errors that `jaxeit check` finds; the results name them"
     parser.add_argument("--force", action="store_true", help=text)
     add_low_pass_argument(parser)
 

@@ -19,11 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to study, and what to recommend."""
     text = "a shipped skin or scene by its name, or the TOML file of your own; default: testbed"
     parser.add_argument("what", nargs="?", default="testbed", metavar="SKIN|SCENE.toml", help=text)
-    text = "recommend the most accurate rung that solves in this time"
+    text = "recommend the most accurate setting that solves within this time"
     parser.add_argument("--budget-ms", type=above_zero, metavar="MS", help=text)
-    text = "recommend the quickest rung whose error of a touch is no more than this, such as 2e-3"
+    text = "recommend the fastest setting whose error of a touch is at most this, such as 2e-3"
     parser.add_argument("--error", type=above_zero, metavar="E", help=text)
-    parser.add_argument("--smoke", action="store_true", help="a few coarse rungs, within a minute")
+    parser.add_argument("--smoke", action="store_true", help="measure a few coarse settings only, within a minute")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     parser.add_argument("-o", "--output", metavar="FIGURE.png", help="draw error against time")
     add_imaging_arguments(parser)
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     rungs, budget = _rungs(args), 0.1 if args.smoke else 0.5
     scene = bench_scene(args.what)
     announce_model(scene.skin, je.Fidelity.draft() if args.smoke else je.Fidelity.reference())
-    with jax.enable_x64(True):  # and no cache of programs: how long they take to compile is measured
+    with jax.enable_x64(True):  # without a cache of compiled programs, because compilation is measured too
         found = je.ladder(scene, rungs, budget=budget, progress=progress_bar("rungs"))
     if args.output:
         _write_ladder_figure(found, Path(args.output))
@@ -58,13 +58,13 @@ def run(args: argparse.Namespace) -> int:
     try:
         if wanted:
             report["recommended"] = found.recommend(**wishes).choice.label
-    finally:  # what was measured is told even where no rung is good enough
+    finally:  # print the measurements even if no setting is good enough
         print(json.dumps(report, indent=2))
     return 0
 
 
 def _rungs(args: argparse.Namespace) -> tuple["Choice", ...] | None:
-    """The usual rungs, with the images that the options choose; None: the usual images."""
+    """The default settings with the imaging of the options; None: the defaults of `jaxeit.ladder`."""
     import jaxeit as je
 
     imaging = imaging_of(args, je.Imaging())
@@ -81,7 +81,7 @@ def _rungs(args: argparse.Namespace) -> tuple["Choice", ...] | None:
 
 
 def bench_scene(what: str) -> "Scene":
-    """A scene by name or file; of a skin, the ideal sensor."""
+    """Load a scene by name or file; for a skin, the scene without effects."""
     import re
 
     import jaxeit as je

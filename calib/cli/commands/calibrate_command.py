@@ -19,26 +19,26 @@ from ..terminal import announce_model, stage_bar, title
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sessions, outputs, and every choice of a recipe."""
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
-    text = "one calibration of all sessions together; with --jobs or --scheduler the folder for one of each"
+    text = "one calibration from all sessions; with --jobs or --scheduler the folder of one calibration per session"
     parser.add_argument("-o", "--output", required=True, metavar="CALIBRATION.h5", help=text)
-    text = "write a page with figures; with --jobs or --scheduler without a name, one beside each calibration"
+    text = "write an HTML report with figures; with --jobs or --scheduler give no name: one report per calibration"
     parser.add_argument("--report", nargs="?", const="", metavar="REPORT.html", help=text)
-    text = "sessions the fit does not see, to judge it on"
+    text = "sessions that are left out of the fit, for evaluation"
     parser.add_argument("--test", nargs="+", default=[], metavar="SESSION.h5", help=text)
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
-    text = "go on in spite of what `jaxeit check` calls an error; the results say so"
+    text = "continue despite errors that `jaxeit check` finds; the results name them"
     parser.add_argument("--force", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     many = parser.add_mutually_exclusive_group()
-    text = "calibrate every session by itself, N at a time; those that are done in the output folder are skipped"
+    text = "calibrate each session separately, N at a time; sessions already done in the output folder are skipped"
     many.add_argument("--jobs", type=count, metavar="N", help=text)
-    text = "the same by the workers of a Dask scheduler, which must see the same files"
+    text = "as --jobs, on the workers of a Dask scheduler, which must see the same files"
     many.add_argument("--scheduler", metavar="ADDRESS", help=text)
     add_recipe_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate from all sessions together, or from each by itself."""
+    """Calibrate from all sessions together, or from each session separately."""
     from ...runtime import set_up
 
     set_up()
@@ -89,7 +89,7 @@ def _calibrate_together(args: argparse.Namespace) -> int:
 
 
 def _calibrate_many(args: argparse.Namespace) -> int:
-    """Each session by itself; status 2 if one failed, when all others are done."""
+    """Calibrate each session separately; status 2 if one failed, after all others are done."""
     from tqdm import tqdm
 
     from ...batch.cluster import dask_executor
@@ -130,7 +130,7 @@ _NEED_EIT = ("report", "test", "skin", "location", "locator", "folds", "fidelity
 
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
-    """Sessions without EIT: one curve per log, tested on its second half."""
+    """Fit sessions without EIT: one curve per log, tested on its second half."""
     from ...calibration.logs import fit_session, render_log, save_logs
 
     given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, [], NONE)]

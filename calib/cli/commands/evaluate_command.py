@@ -9,11 +9,11 @@ from ..terminal import progress_bar, title
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """A calibration and the sessions to judge it on."""
+    """A calibration and the sessions on which it is evaluated."""
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
     add_low_pass_argument(parser)
-    text = "go on in spite of what `jaxeit check` calls an error; the results say so"
+    text = "continue despite errors that `jaxeit check` finds; the results name them"
     parser.add_argument("--force", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
 

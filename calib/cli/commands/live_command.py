@@ -10,21 +10,25 @@ from ..signals import orderly_end
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """A calibration, the URLs of its streams, and who is shown the results."""
+    """A calibration, the URLs of its streams, and the outputs of the results."""
     parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
-    parser.add_argument("--eit", required=True, metavar="URL", help="as for jaxeit record")
-    parser.add_argument("--pressure", required=True, metavar="URL")
-    parser.add_argument("--rest", type=above_zero, default=2.0, metavar="S", help="untouched at first; default: 2")
-    parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help="for devices to begin; default: 10")
-    parser.add_argument("--seconds", type=above_zero, help="how long; default: until Ctrl-C")
-    parser.add_argument("--host", default="127.0.0.1", help="to listen on; default: this machine only")
-    parser.add_argument("--port", type=int, default=8765, help="of the page; 0: any; default: 8765")
-    parser.add_argument("--publish", type=int, metavar="PORT", help="send results there as lines of JSON; 0: any")
+    parser.add_argument("--eit", required=True, metavar="URL", help="URL of the EIT stream, as for jaxeit record")
+    parser.add_argument("--pressure", required=True, metavar="URL", help="URL of the pressure stream")
+    parser.add_argument(
+        "--rest", type=above_zero, default=2.0, metavar="S", help="time without contact at the start; default: 2"
+    )
+    text = "time within which every device must begin to send; default: 10"
+    parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help=text)
+    parser.add_argument("--seconds", type=above_zero, help="duration; default: until Ctrl-C")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on; default: this machine only")
+    parser.add_argument("--port", type=int, default=8765, help="port of the page; 0: any free port; default: 8765")
+    text = "send results as lines of JSON to programs that connect to this port; 0: any free port"
+    parser.add_argument("--publish", type=int, metavar="PORT", help=text)
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
-    text = "show results in a rerun viewer that runs there (default: 127.0.0.1:9876), or write them to FILE.rrd"
+    text = "send results to the rerun viewer at HOST:PORT (default: 127.0.0.1:9876), or write them to FILE.rrd"
     parser.add_argument("--rerun", nargs="?", const="127.0.0.1:9876", metavar="HOST:PORT|FILE.rrd", help=text)
-    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record what arrives as well")
-    text = "tell the device what to read next: few readings at rest, those around a contact while there is one"
+    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record the streams at the same time")
+    text = "request the next readings from the device: few at rest, those around the contact during a contact"
     parser.add_argument("--event-driven", action="store_true", help=text)
     text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
     parser.add_argument("--realtime", action="store_true", help=text)
@@ -34,7 +38,7 @@ _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show force maps until somebody stops it."""
+    """Show force maps until the user stops the command."""
     _set_up_process(args)
     from threading import Timer
 

@@ -18,15 +18,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name in _STREAMS:
         also = ["--load-cell"] if name == "force" else []
         streams.add_argument(f"--{name}", *also, dest=name, metavar="URL")
-    parser.add_argument("--skin", help="a shipped skin or a TOML file; says the order of the readings")
+    parser.add_argument("--skin", help="a shipped skin or a TOML file; it defines the order of the readings")
     parser.add_argument("-o", "--output", required=True, metavar="SESSION.h5")
-    parser.add_argument("--seconds", type=above_zero, help="how long; default: until Ctrl-C")
-    parser.add_argument("--title", default="", help="a line to know the session by")
-    parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help="for devices to begin; default: 10")
+    parser.add_argument("--seconds", type=above_zero, help="duration; default: until Ctrl-C")
+    parser.add_argument("--title", default="", help="title of the session, one line")
+    text = "time within which every device must begin to send; default: 10"
+    parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record until the time is over or somebody stops it."""
+    """Record until the time is over or the user stops the command."""
     from ...record.planning import plan_recording
     from ...record.recorder import StopRequest, journal_path, record_session
 

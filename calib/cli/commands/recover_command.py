@@ -8,7 +8,7 @@ from ..terminal import byte_bar, file_size
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The journal that a crash left."""
+    """The journal that a crash left, and the session file to write."""
     parser.add_argument("journal", metavar="SESSION.h5.part")
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="default: the name without .part")
 

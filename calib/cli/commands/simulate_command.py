@@ -17,10 +17,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="SESSION.h5")
     text = "print what the scene simulates and what each part costs, and simulate nothing"
     parser.add_argument("--explain", action="store_true", help=text)
-    text = "then play SESSION.h5, simulated only if it is not there, as the skin would send it, at local TCP ports"
+    text = (
+        "play SESSION.h5 on local TCP ports in real time, as the skin would send it; simulate it first if it is missing"
+    )
     parser.add_argument("--serve", action="store_true", help=text)
-    text = "SCENE is a skin: Gaussian contacts on a grid over it, from 0 to 100 %%, as one data set (HDF5)"
-    parser.add_argument("--data-set", nargs="?", type=int, const=41, metavar="N", help=f"{text}; N x N places, 41")
+    text = "write a data set (HDF5) of Gaussian contacts of 0 to 100 %% at N x N places of a skin, which SCENE names; "
+    parser.add_argument("--data-set", nargs="?", type=int, const=41, metavar="N", help=text + "default N: 41")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(path: str) -> int:
-    """Be a device until interrupted."""
+    """Play a session as a simulated device until interrupted."""
     import threading
 
     from ...record.device import SimulatedDevice, recording_packets
@@ -74,7 +76,7 @@ def _serve(path: str) -> int:
 
 
 def _name_skin(name: str, text: str, session: Path) -> str:
-    """What `record --skin` needs: the name of a shipped skin, or a TOML file that is written beside the session."""
+    """The argument of `record --skin`: a shipped skin by its name, or else a TOML file written beside the session."""
     import jaxeit as je
 
     if name in je.skin.shipped_skins() and je.load_skin(name).toml == text:

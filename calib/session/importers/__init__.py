@@ -1,4 +1,4 @@
-"""Bring recordings made elsewhere into the session format: a class for each format.
+"""Convert recordings in other formats to session files: one class per format.
 
 A new format is one class derived from `AbstractImporter` in a module of `formats`, and its import in the ``__init__``
 there; another package adds one by an entry point of the group ``calib.importers``. A format of tables derives from
@@ -56,9 +56,9 @@ __all__ = [
 
 @cache
 def importers() -> dict[str, type[AbstractImporter]]:
-    """The formats by name: those of this room, and those of entry points.
+    """The formats by name, of this room and of entry points.
 
-    They are not in a `jaxeit.registry.Registry`, whose package takes a second to import.
+    They are in no `jaxeit.registry.Registry`, because its package takes a second to import.
     """
     kinds = sorted(_formats(AbstractImporter), key=lambda kind: kind.name)
     shipped = {kind.name: kind for kind in kinds if kind.__module__.startswith(__name__)}
@@ -66,7 +66,7 @@ def importers() -> dict[str, type[AbstractImporter]]:
 
 
 def _formats(kind: type) -> Iterator[type[AbstractImporter]]:
-    """The formats among the classes below one."""
+    """The concrete formats among the subclasses of a class."""
     subclasses: Sequence[type[AbstractImporter]] = kind.__subclasses__()
     for one in subclasses:
         if not isabstract(one):
@@ -75,7 +75,7 @@ def _formats(kind: type) -> Iterator[type[AbstractImporter]]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of ``jaxeit import``: the format, then those of the format."""
+    """Add the arguments of ``jaxeit import``: the format, then the arguments of that format."""
     formats = parser.add_subparsers(title="formats", dest="format", required=True, metavar="FORMAT")
     for name, kind in importers().items():
         one = formats.add_parser(name, help=kind.summary, description=kind.summary[0].upper() + kind.summary[1:] + ".")

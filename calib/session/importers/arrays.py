@@ -31,7 +31,7 @@ class ArrayShape(NamedTuple):
 
 
 def table_shape(shape: Sequence[int], unit: str = "") -> ArrayShape | None:
-    """An array of this shape as a table, or None; a single row is a column, as MATLAB has vectors."""
+    """The table that an array of this shape gives, or None; a single row becomes a column, as in MATLAB's vectors."""
     if len(shape) == 1:
         return ArrayShape(shape[0], 1, unit)
     if len(shape) != 2:
@@ -40,7 +40,7 @@ def table_shape(shape: Sequence[int], unit: str = "") -> ArrayShape | None:
 
 
 def table_values(values: np.ndarray, shape: ArrayShape) -> np.ndarray:
-    """Values as (rows, columns) float64; times in s since 1970, NaN where there is none."""
+    """Values as (rows, columns) float64; times in s since 1970; NaN for missing values."""
     if values.dtype.kind in "mM":
         nanoseconds = values.astype(f"{values.dtype.kind}8[ns]")
         values = np.where(np.isnat(nanoseconds), np.nan, nanoseconds.astype(np.int64) * 1e-9)
@@ -58,12 +58,12 @@ class AbstractArrayImporter(AbstractTableImporter):
     @classmethod
     @abstractmethod
     def outline(cls, path: Path) -> dict[str, ArrayShape]:
-        """Shapes of the arrays that can be columns, by name, without reading them; raises `SessionError`."""
+        """Shapes, by name, of the arrays that can be columns, without reading their values; raises `SessionError`."""
 
     @classmethod
     @abstractmethod
     def arrays(cls, path: Path, names: Sequence[str]) -> list[np.ndarray]:
-        """These arrays (rows, columns), float64; raises `SessionError`."""
+        """Read the named arrays, each (rows, columns) float64; raises `SessionError`."""
 
     @classmethod
     def opener(cls, args: argparse.Namespace) -> Callable[[Path], AbstractTableFile]:
@@ -124,7 +124,7 @@ def _head(name: str, column: int, shape: ArrayShape) -> str:
 
 
 def known(path: Path, found: dict[str, Any], name: str) -> Any:
-    """What the file holds under a name that its outline had; `SessionError` if it changed meanwhile."""
+    """The array of this name, which the outline of the file contained; `SessionError` if the file has changed since."""
     if name not in found:
         raise problem(path, name, "is no longer there", "leave the file alone while it is imported")
     return found[name]

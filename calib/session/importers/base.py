@@ -1,4 +1,4 @@
-"""What an import format is: its arguments on the command line, and how a recording becomes a session."""
+"""The interface of an import format: its arguments on the command line, and the conversion to a session."""
 
 import argparse
 from abc import ABC, abstractmethod
@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # a second to import, and only wanted with --skin
 
 
 class About(NamedTuple):
-    """What the user says of a recording, whatever its format.
+    """Facts about a recording that the user states, for any format.
 
     | field    | meaning                                                                             |
     |----------|-------------------------------------------------------------------------------------|
@@ -42,7 +42,7 @@ class AbstractImporter(ABC):
     @classmethod
     @abstractmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """The arguments of this format; those of `add_common_arguments` are there in any case."""
+        """Add the arguments of this format; those of `add_common_arguments` are added for every format."""
 
     @classmethod
     @abstractmethod
@@ -55,17 +55,17 @@ class AbstractImporter(ABC):
 
 
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    """What every format is told."""
+    """Add the arguments that every format takes."""
     parser.add_argument("-o", "--output", required=True, metavar="SESSION", help="file to write")
-    parser.add_argument("--title", default="", help="what was recorded")
+    parser.add_argument("--title", default="", help="title of the session")
     parser.add_argument("--license", default="", help="licence of the recording")
-    text = "what eit and pressure were recorded on: a shipped skin or a TOML file, in the order of its protocol"
+    text = "the recorded skin, a shipped one or a TOML file; readings must be in the order of its protocol"
     parser.add_argument("--skin", help=text)
-    parser.add_argument("--epoch", help="ISO time when the clock read zero, with zone")
+    parser.add_argument("--epoch", help="ISO time, with time zone, at which the clock read zero")
 
 
 def parse_epoch(text: str | None) -> datetime | None:
-    """The moment of ``--epoch``; raises `SessionError` for a text that is none, or has no time zone."""
+    """The time of ``--epoch``; raises `SessionError` for a text that is no time, or has no time zone."""
     if text is None:
         return None
     try:

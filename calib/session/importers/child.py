@@ -29,7 +29,7 @@ except ImportError:  # a system without limits for processes: the time alone is 
 
 COMMAND = f"from {__name__} import main; main()"
 BAD_FILE, NO_LIBRARY, TOO_LONG = 2, 3, 4
-"""Exit statuses: the file cannot be used, a library is not installed; TOO_LONG stands for no end in time."""
+"""Exit statuses: the file cannot be used, a library is not installed, the time limit was exceeded (TOO_LONG)."""
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
 """One thread each; the HDF5 library loads no plug-ins."""
 DAMAGED = "the file is damaged, or of another format; take another copy"
@@ -90,7 +90,7 @@ def _asked(request: str) -> tuple[int, str]:
 
 
 def main() -> None:
-    """Do the request on standard input: print its result as JSON, or the error on standard error."""
+    """Process the request on standard input: print its result as JSON, or the error on standard error."""
     _limit()
     status, said = answer(sys.stdin.read())
     print(said, file=sys.stderr if status else sys.stdout)

@@ -13,7 +13,7 @@ from ..units import Unit
 from .tables import Table
 
 UNIX_TIME_FROM = 1e8
-"""A clock beyond this many seconds (1973) counts from 1970; below, from an unknown start."""
+"""Readings in s above this value (1973) are taken as times since 1970, smaller ones as times since an unknown start."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Clock:
 
 
 def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool, counted: str = "line") -> Clock:
-    """Strictly increasing times; repeated ones are left out, backward ones refused or sorted."""
+    """Make a clock of strictly increasing times; repeated times are left out, backward times refused or sorted."""
     seconds = table.values[:, 0] * unit.factor
     rows = np.flatnonzero(np.isfinite(seconds))
     without = np.flatnonzero(~np.isfinite(seconds))

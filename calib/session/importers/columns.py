@@ -1,4 +1,4 @@
-"""Which columns of a table are the clock and the streams, as ``0:ms``, ``force=4:N`` and ``signal=s0-s3:V`` say."""
+"""Texts that assign the columns of a table to clock and streams: ``0:ms``, ``force=4:N``, ``signal=s0-s3:V``."""
 
 import csv
 import itertools
@@ -14,9 +14,9 @@ from .limits import MAX_COLUMNS
 
 @dataclass(frozen=True)
 class StreamSpec:
-    """A stream to make: its name, its columns (numbers, header names or ranges of names), their unit.
+    """A stream to import: its name, its columns (numbers, header names or ranges of names), and their unit.
 
-    An empty unit means that the header says it.
+    An empty unit means that the header states the unit.
     """
 
     name: str
@@ -31,9 +31,9 @@ class FileSpec:
     | field           | meaning                                                                     | unit |
     |-----------------|-----------------------------------------------------------------------------|------|
     | path            | the file                                                                    |      |
-    | time, time_unit | column of the clock and its unit; an empty unit: the header says it         |      |
-    | streams         | what to make of the columns                                                 |      |
-    | missing         | numbers that mean that there is no reading                                  |      |
+    | time, time_unit | column of the clock and its unit; an empty unit: that of the header         |      |
+    | streams         | streams to import from the columns                                          |      |
+    | missing         | numbers that stand for missing readings                                     |      |
     | following       | files of the same layout that continue this one, in order                   |      |
     | rate_hz         | rate of a table without a clock; ``time`` is empty then                     | Hz   |
     | start           | time of the first row of a table without a clock                            | s    |
@@ -65,7 +65,7 @@ def parse_time(text: str) -> tuple[str, str]:
 
 
 def _column_and_unit(text: str) -> tuple[str, str]:
-    """What stands before and after the last colon; without one there is no unit."""
+    """Split a text at its last colon into column and unit; the unit is empty without a colon."""
     column, colon, unit = text.rpartition(":")
     return (column, unit.strip() or "?") if colon else (text, "")
 
@@ -146,7 +146,7 @@ def column_indices(path: Path, column: str, header: Sequence[str], columns: int)
 
 
 def _listed(header: Sequence[str]) -> str:
-    """Names in the header as a user writes them: those of one array as a range, one that holds a comma in quotes."""
+    """Names in the header as a user writes them: the columns of one array as a range, a name with a comma in quotes."""
     written = [f'"{head}"' if "," in head else head for head in header]
     groups = itertools.groupby(written, key=lambda head: re.sub(r"\[\d+\]$", "[]", head))
     ends = [(names[0], names[-1]) for names in (list(group) for _, group in groups)]

@@ -1,4 +1,4 @@
-"""Limits of one import. What is beyond a limit is refused before it is kept in memory."""
+"""Limits of one import. Data beyond a limit are refused before they are kept in memory."""
 
 from pathlib import Path
 
@@ -7,17 +7,17 @@ from jaxeit.budget import current_budget
 from ..errors import problem
 
 MAX_LINE = 1 << 20
-"""Characters of a line."""
+"""Largest number of characters in a line."""
 MAX_COLUMNS = 100_000
-"""More columns in one range or array are taken for a mistake."""
+"""Largest number of columns in one range or array; more are taken for a mistake."""
 MAX_NAMES = 100_000
-"""Arrays of one file."""
+"""Largest number of arrays in one file."""
 
 
 def require_within(path: Path, limit: str, asked: float, counted: str = "") -> None:
     """Refuse a file that asks for more than the limit of that name in the budget allows.
 
-    ``counted`` says what was counted, where that is more than one file.
+    ``counted`` begins the message if several files are counted together.
     """
     if beyond := current_budget().excess(limit, asked):
         what, todo = beyond

@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class StreamReport:
-    """What became of one stream; counts are of values, over all its channels and files."""
+    """Report of one stream: numbers of values, over all its channels and files."""
 
     name: str
     variable: str
@@ -24,7 +24,7 @@ class StreamReport:
 
 @dataclass(frozen=True)
 class FileReport:
-    """What became of one file; ``first_*`` are numbers of lines, or of rows in a binary file, as ``counted`` says.
+    """Report of one file; ``first_*`` are numbers of lines or, in a binary file, of rows, as ``counted`` says.
 
     Streams that several files continue are in the report of the last of these files.
     """
@@ -52,7 +52,7 @@ class ImportReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines a person should act on."""
+        """Warnings that the user should act on, one line each."""
         found = [w for f in self.files for s in f.streams for w in s.warnings]
         if not self.epoch_known:
             found.append("the clock does not say when the recording began; give --epoch if known")

@@ -1,11 +1,11 @@
-"""Numbers that recorders write where they have no reading."""
+"""Find sentinels: numbers that recorders write in place of a missing reading."""
 
 import numpy as np
 
 SENTINELS = (-1.0, -99.0, -999.0, -9999.0, 999.0, 9999.0, 99999.0)
 """Numbers that recorders write where they have no reading."""
 SENTINEL_SHARE = 0.05
-"""Part of a channel from which on such a number is suspicious."""
+"""Smallest fraction of the samples of a channel at which a sentinel is reported."""
 
 
 def sentinel_warnings(name: str, values: np.ndarray) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The command line of all formats of tables: which columns are what, in which files.
+"""The command line of all formats of tables: which columns of which files are clocks and streams.
 
 A file is described by which column is its clock and which columns form which stream::
 
@@ -26,8 +26,8 @@ from .tables import AbstractTableFile
 COLUMNS_HELP = """\
 Columns are numbers counted from zero (5), ranges of numbers (1-15), header names (load), ranges of header names (s0-s3)
 or several of these (1,4-6). The unit of a header such as "load (N)" need not be repeated. Several files of one layout
-become one recording, in the order given. Options apply to the files named before them; --from begins further ones with
-options of their own. Nothing is resampled, filtered or filled in.
+become one recording, in the order given. Options apply to the files named before them; --from begins a further group of
+files with separate options. Nothing is resampled, filtered or filled in.
 """
 
 
@@ -61,34 +61,34 @@ class _Grouped(argparse.Action):
 
 
 class AbstractTableImporter(AbstractImporter):
-    """A format whose files are tables: it says how a file is opened, and all else is shared."""
+    """A format whose files are tables. It defines how a file is opened; all other parts of an import are shared."""
 
     @classmethod
     @abstractmethod
     def opener(cls, args: argparse.Namespace) -> Callable[[Path], AbstractTableFile]:
-        """What opens a file of this format; its errors are `SessionError`."""
+        """The function that opens a file of this format; its errors are `SessionError`."""
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """Files, clock, streams, and numbers that mean missing."""
+        """Add the arguments for files, clock, streams, and numbers that stand for missing readings."""
         grouped: dict[str, Any] = {"action": _Grouped, "default": argparse.SUPPRESS}
         parser.epilog = COLUMNS_HELP
         parser.add_argument(
             "files", nargs="+", metavar="FILE", help="files of one layout, in the order of recording", **grouped
         )
-        text = "the clock's column and unit, as 0:ms; the unit may be left out where the header says it, as time (ms)"
+        text = "column and unit of the clock, such as 0:ms; without a unit, the header must state it, as in time (ms)"
         parser.add_argument("--time", metavar="COLUMN:UNIT", help=text, **grouped)
         text = "rate of a table without a clock, in Hz; instead of --time"
         parser.add_argument("--rate", metavar="HZ", type=float, help=text, **grouped)
         text = "time of the first row of a table without a clock, in s; default 0"
         parser.add_argument("--start", metavar="SECONDS", type=float, help=text, **grouped)
-        text = "pause between one file and the next, where their clocks start anew or they have none"
+        text = "pause between one file and the next, if each file has its own clock or none"
         parser.add_argument("--gap", metavar="SECONDS", type=float, help=text, **grouped)
-        text = "a stream, as force=4:N, sensor=1-15:counts or signal=s0-s3:V; repeat for more"
+        text = "a stream, such as force=4:N, sensor=1-15:counts or signal=s0-s3:V; repeat the option for more streams"
         parser.add_argument("--stream", dest="streams", metavar="NAME=COLUMNS:UNIT", help=text, **grouped)
-        text = "a number that means no reading, as -1; repeat for more"
+        text = "a number that stands for a missing reading, such as -1; repeat the option for more numbers"
         parser.add_argument("--missing", metavar="VALUE", type=float, help=text, **grouped)
-        text = "further files; the options after them are their own"
+        text = "further files; the options that follow apply to these files"
         parser.add_argument("--from", dest="from_files", nargs="+", metavar="FILE", help=text, **grouped)
         parser.add_argument("--sort", action="store_true", help="allow rows that go back in time")
 
@@ -99,7 +99,7 @@ class AbstractTableImporter(AbstractImporter):
 
     @classmethod
     def file_specs(cls, args: argparse.Namespace) -> Sequence[FileSpec]:
-        """What was typed, for each group of files."""
+        """The description of each group of files, from the arguments."""
         return [_file_spec(group) for group in args.groups]
 
 

@@ -1,4 +1,4 @@
-"""Tables become a session: the part of an import that all formats of tables share.
+"""Convert tables to a session: the part of an import that all formats of tables share.
 
 Columns are chosen, clocks are laid on one time line, units are converted to SI. Nothing is resampled, filtered or
 filled in; what is left out or looks suspicious is counted in the report.
@@ -71,10 +71,10 @@ def import_tables(
 
     Args:
         open_table: opens a file of the format.
-        files: what to take from which file.
+        files: descriptions of the files and of the columns to import.
         output: the session file.
-        about: what the user says of the recording. ``about.skin`` is what the stream eit was recorded on, with one
-            column for each reading in the order of its protocol, and the stream pressure, with one for each pad.
+        about: facts that the user states about the recording. ``about.skin`` is the recorded skin: the stream eit has
+            one column for each reading in the order of its protocol, and the stream pressure one for each pad.
         sort: allow rows that go back in time.
 
     The same files and options give the same bytes. Raises `SessionError` for what cannot be read or understood, and
@@ -194,7 +194,7 @@ def _check_same_columns(first: _Part, part: _Part) -> None:
 
 
 def _described(files: Sequence[FileSpec], skin: "je.Skin | None") -> dict[str, Any]:
-    """What the session says of the skin it was recorded on."""
+    """Facts of the session about the skin that was recorded."""
     if skin is None:
         return {"skin_name": "", "skin_toml": ""}
     if not any(s.name == "eit" for f in files for s in f.streams):
@@ -219,7 +219,7 @@ def _check_columns(loaded: Sequence[_Loaded], skin: "je.Skin | None") -> None:
 
 
 def _session_id(files: Sequence[FileSpec], start: str) -> str:
-    """A UUID that depends on the contents of the files and on the options, on nothing else."""
+    """A UUID that depends only on the contents of the files and on the options."""
     digest = hashlib.sha256(start.encode())
     for spec in files:
         inner = [file for path in spec.paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]

@@ -62,7 +62,7 @@ class CountedSteps(Iterable[Any], Sized):
 
 
 def first_bytes(path: Path, count: int = 512, folder: str = "name the file in it") -> bytes:
-    """The beginning of a regular file; raises `SessionError` for what is none or cannot be read."""
+    """The first bytes of a file; raises `SessionError` if it is no regular file or cannot be read."""
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):

@@ -1,4 +1,4 @@
-"""One module a format, and modules that two of them share. A new format is named here, and nowhere else."""
+"""One module per format, and modules that several formats share. A new format is imported here, and nowhere else."""
 
 from .csv_tables import CsvImporter, import_csv
 from .hdf5_files import Hdf5Importer

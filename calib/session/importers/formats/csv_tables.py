@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # a second to import, and only wanted with --skin
 
 BLOCK_CELLS = 1 << 18
 MAX_CELL_LINES = 1000
-"""Lines of one quoted cell; more are taken for a quote that is not closed."""
+"""Largest number of lines in a quoted cell; a longer cell means that its quote is not closed."""
 
 
 class CsvFile(AbstractTableFile):
@@ -57,7 +57,7 @@ class CsvFile(AbstractTableFile):
         return Table(table, np.concatenate(numbers), np.isnan(table))
 
     def _parse(self, block: list[tuple[int, str]], columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (rows, columns), NaN where a cell holds none, and their lines (rows,)."""
+        """Numbers (rows, columns), NaN for a cell without a number, and the line of each row (rows,)."""
         if self._is_plain(block):
             try:
                 delimiter, lines = self._dialect.delimiter, [text for _, text in block]
@@ -90,7 +90,7 @@ class CsvFile(AbstractTableFile):
         return rows
 
     def _row(self, line: int, cells: list[str], columns: Sequence[int]) -> list[float]:
-        """Numbers of one row. A row with more cells than the table has columns cannot be told apart: all NaN."""
+        """Numbers of one row; all NaN if it has more cells than the table has columns, because cells may be shifted."""
         if any(cells[self.columns :]):
             return [np.nan] * len(columns)
         chosen = [cells[c] if c < len(cells) else "" for c in columns]
@@ -137,9 +137,9 @@ class CsvImporter(AbstractTableImporter):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """Add ``--decimal`` to what all tables have."""
+        """Add ``--decimal`` to the arguments of all tables."""
         super().add_arguments(parser)
-        text = "the decimal sign, where the first lines leave it open"
+        text = "the decimal sign, if the first lines do not determine it"
         parser.add_argument("--decimal", choices=("point", "comma"), default="", help=text)
 
     @classmethod

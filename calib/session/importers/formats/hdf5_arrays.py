@@ -1,4 +1,4 @@
-"""Datasets of foreign HDF5 files. This module runs in a child process: the library trusts what a file claims."""
+"""Datasets of foreign HDF5 files. This module runs in a child process, because the library trusts sizes in a file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +36,7 @@ def datasets(
 
 
 def data_inside(dataset: h5py.Dataset) -> bool:
-    """Whether the data are in the file, not in others."""
+    """Whether the data of a dataset are in the file itself, not in other files."""
     return dataset.external is None and not dataset.is_virtual and dataset.shape is not None
 
 

@@ -1,7 +1,7 @@
 """HDF5 files that were not written by this program: tables of arrays, and sessions written by h5py or MATLAB.
 
 `calib.session` opens files of the current HDF5 layout with checksums, fixed-length texts and plain numbers only. A
-session that h5py or MATLAB wrote by default is none, and is converted here, in a child process.
+session that h5py or MATLAB wrote with default settings is not such a file, and is converted here, in a child process.
 """
 
 import argparse
@@ -37,9 +37,9 @@ from ..tables import first_bytes
 from .hdf5_arrays import MAX_DEPTH, data_inside, datasets, members, values_of
 
 MAX_BYTES = 16 << 30
-"""Bytes of the arrays of a session that is converted."""
+"""Largest total size in bytes of the arrays of a session to convert."""
 MAX_TEXTS = 1 << 20
-"""Texts of one array."""
+"""Largest number of texts in one array."""
 BLOCK_BYTES = 16 << 20
 MAX_RANK = 4
 VECTORS = {"time", "status", *STREAM_EXTRAS}
@@ -79,7 +79,7 @@ class Hdf5Importer(AbstractArrayImporter):
 
     @classmethod
     def copy_session(cls, path: Path, folder: Path) -> list[str]:
-        """Write the session ``path`` anew as ``folder/path.name``, and return the names of what was left out."""
+        """Copy the session ``path`` to ``folder/path.name``; returns the names of members that were left out."""
         with _opened(path) as file:
             said = file.attrs.get("format", "")
             if _text(said) != FORMAT:
@@ -93,7 +93,7 @@ class Hdf5Importer(AbstractArrayImporter):
 
 
 def convert_session(path: Path, output: Path) -> ImportReport:
-    """Write a session in an older HDF5 layout anew, as this program reads it; raises `SessionError`."""
+    """Convert a session from an older HDF5 layout to the one that this program reads; raises `SessionError`."""
     with tempfile.TemporaryDirectory() as folder:
         left_out = in_child(Hdf5Importer, "copy_session", path, folder=Path(folder))
         made = Path(folder) / path.name
@@ -125,7 +125,7 @@ def _opened(path: Path) -> h5py.File:
 
 
 class _Copy:
-    """Copies groups, attributes and datasets in a form that this program reads, and notes what it leaves out."""
+    """Copies groups, attributes and datasets in a form that this program reads, and lists those that it leaves out."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -179,7 +179,7 @@ def _copy_rows(source: h5py.Dataset, target: h5py.Dataset) -> None:
 
 
 def _shape(source: h5py.Dataset) -> tuple[int, ...]:
-    """Shape of the copy: what must be a vector loses the second axis that MATLAB gives it."""
+    """Shape of the copy: a member that must be a vector loses the second axis that MATLAB adds."""
     parts = source.name.strip("/").split("/")
     vector = parts[-1] in VECTORS or parts[0] in TABLES
     return (source.size,) if vector and source.ndim == 2 and 1 in source.shape else source.shape

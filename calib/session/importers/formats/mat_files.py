@@ -59,7 +59,7 @@ class MatImporter(AbstractArrayImporter):
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether a MATLAB file is of version 7.3; `SessionError` for a file that is none of MATLAB's."""
+    """Whether a MATLAB file is of version 7.3; `SessionError` for a file of another program."""
     head = first_bytes(path, 1024)
     if b"\x89HDF\r\n\x1a\n" in (head[512:520], head[:8]):
         return True

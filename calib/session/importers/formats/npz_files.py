@@ -86,7 +86,7 @@ def _zipped(path: Path, wanted: set[str] | None) -> Iterator[tuple[str, Buffered
 
 
 def _claimed_shape(path: Path, name: str, stream: BufferedIOBase) -> ArrayShape | None:
-    """What the header of an array says; None for an array that is no table of numbers."""
+    """The shape that the header of an array states; None for an array that is no table of numbers."""
     version = npy.read_magic(stream)
     if version not in HEADERS:
         raise problem(path, name, f"is of the unknown version {version}", "save it with another version of NumPy")

@@ -36,7 +36,7 @@ class McapImporter(AbstractArrayImporter):
 
     @classmethod
     def file_specs(cls, args: argparse.Namespace) -> list[FileSpec]:
-        """One description for each stream, as each topic has times of its own."""
+        """One description for each stream, because each topic has its own times."""
         for group in args.groups:
             group.time = group.time or ("" if group.rate is not None else f"{LOG_TIME}:s")
         specs = super().file_specs(args)
@@ -73,7 +73,7 @@ class McapImporter(AbstractArrayImporter):
 
 
 def _with_clock(spec: FileSpec, index: int) -> FileSpec:
-    """The description with one of its streams alone, whose clock is that of its topic."""
+    """The description reduced to one of its streams, with the clock of the topic of that stream."""
     stream = spec.streams[index]
     topics = {column.split(".")[0] for column in stream.columns}
     if len(topics) > 1:

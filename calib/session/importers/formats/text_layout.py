@@ -11,9 +11,9 @@ from pathlib import Path
 from ...errors import SessionError, problem
 
 FIRST_LINES = 200
-"""Lines from which the layout is found."""
+"""Number of lines from which the layout is determined."""
 DELIMITERS = (",", "\t", ";", " ")
-"""Likelier ones first; a space stands for any white space."""
+"""Possible delimiters, the more likely first; a space stands for any white space."""
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
 
@@ -94,7 +94,7 @@ def _first_rows(dialect: Dialect, first: Sequence[str]) -> list[tuple[int, list[
 
 
 def _score(rows: list[tuple[int, list[str]]], dialect: Dialect) -> tuple[int, int]:
-    """Cells that are numbers, then, the fewer the better, cells that are not."""
+    """Score of a layout: the number of cells that are numbers, then minus the number of other cells."""
     cells = [cell for _, row in rows for cell in row if cell]
     numbers = sum(not math.isnan(dialect.number(cell)) for cell in cells)
     return numbers, numbers - len(cells)
