@@ -19,11 +19,12 @@ COMMANDS = {
     "import numpy": "import numpy",
     "import jax": "import jax",
     "import jaxeit": "import jaxeit",
+    "first use of jaxeit": "import jaxeit; jaxeit.forward",
     "import calib": "import calib",
     "calib.open_session": "import calib; calib.open_session",
     "jaxeit --help": "import sys; sys.argv = ['jaxeit', '--help']; from calib.cli import main; main()",
 }
-IMPORTS = ("jaxeit", "calib.calibration")
+IMPORTS = {"jaxeit": "import jaxeit; jaxeit.forward", "calib.calibration": "import calib.calibration"}
 
 
 def measure(run: Run) -> Iterator[Row]:
@@ -55,9 +56,9 @@ def programs(repeats: int) -> list[Row]:
     return [{"start": f"the README's program, {name}", **spread(taken)} for name, taken in times.items()]
 
 
-def packages(module: str) -> list[Row]:
-    """What the import of a module takes, by package, most first."""
-    said = fresh(f"import {module}", "-X", "importtime")[1].stderr
+def packages(code: str) -> list[Row]:
+    """What the imports of a program take, by package, most first."""
+    said = fresh(code, "-X", "importtime")[1].stderr
     own: dict[str, float] = defaultdict(float)
     for microseconds, name in re.findall(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)", said):
         own[name.split(".")[0]] += int(microseconds) / 1e3
@@ -66,7 +67,7 @@ def packages(module: str) -> list[Row]:
 
 
 def imports(run: Run) -> Iterator[Row]:
-    yield {"imports": {module: packages(module) for module in IMPORTS}}
+    yield {"imports": {module: packages(code) for module, code in IMPORTS.items()}}
 
 
 main = Question("start", __doc__, {"rows": measure, "imports": imports})

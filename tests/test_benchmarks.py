@@ -345,4 +345,4 @@ def test_stability_holds_where_the_textbook_fails(tmp_path):
 def test_smoke_of_stability(capsys):
     rows = stability.main(["--smoke"])["rows"]
     assert len(rows) == 2 * len(stability.AXES)
-    assert capsys.readouterr().out.count("naive") == len(stability.AXES)
+    assert capsys.readouterr().out.count("'naive'") == len(stability.AXES)

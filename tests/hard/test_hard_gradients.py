@@ -630,7 +630,7 @@ def test_every_bit_is_the_same_twice_and_in_another_process(root):
     """On one machine; another one may order its sums otherwise."""
     program = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"
-        "from tests import test_hard_gradients as t; print(t._everything())"
+        "from tests.hard import test_hard_gradients as t; print(t._everything())"
     )
     there = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True)
     assert _everything() == _everything() == there.stdout.strip()

@@ -361,8 +361,8 @@ def test_wide_fronts_are_eliminated_in_halves():
 
 SEVERAL_AT_ONCE = """
 import jax, numpy as np
-from test_solvers import as_pattern, square_sheet
-from jaxeit import NestedDissection
+from tests.linalg.test_solvers import as_pattern, square_sheet
+from jaxeit.linalg import NestedDissection
 matrix, coords = square_sheet(60, 1, np.ones(2))
 pattern, values = as_pattern(matrix, coords, [3600, 3601])
 solver = NestedDissection()
@@ -377,7 +377,7 @@ print(float(found[0][0, 0] / found[3][0, 0]))
 @pytest.mark.slow
 def test_several_solves_in_one_program_do_not_wait_for_each_other_for_ever():
     """What LAPACK calls of jaxlib 0.10 do once each of its threads has to wait for another (`jaxeit.linalg.lapack`)."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "JAX_ENABLE_X64": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "JAX_ENABLE_X64": "1"}
     environment.pop("OPENBLAS_NUM_THREADS", None)  # as users have it
     command = [sys.executable, "-c", SEVERAL_AT_ONCE]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
