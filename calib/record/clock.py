@@ -355,11 +355,11 @@ def _clock_fit(points: list[_PointSegment], tick_ns: float, samples: int) -> Clo
     elapsed = longest.last_host - longest.host
     tick = elapsed / max(longest.last_ticks - longest.ticks, 1) if elapsed else tick_ns
     runs = len(segments) < MAX_SEGMENTS and len(segments) <= 1 + samples // 20
-    valid = runs and not _is_wrong_tick(tick / tick_ns, elapsed)
+    valid = runs and not is_wrong_tick(tick / tick_ns, elapsed)
     return ClockFit(segments, usual_skew, float(np.quantile(residuals, 0.95)), valid, tick / 1e9)
 
 
-def _is_wrong_tick(ratio: float, elapsed: float) -> bool:
+def is_wrong_tick(ratio: float, elapsed: float) -> bool:
     """Whether a tick of `ratio` times the stated length is wrong: more so than late frames in `elapsed` ns explain."""
     tolerance = MAX_SKEW if elapsed > MIN_TICK_SPAN else 2 * MAX_BUFFERED / max(elapsed, 1)
     return max(ratio, 1 / ratio) - 1 > max(tolerance, MAX_SKEW)

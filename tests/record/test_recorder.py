@@ -453,6 +453,13 @@ def test_a_wrong_length_of_tick_is_said_and_times_are_those_of_arrival(tmp_path)
         assert not s.clocks
 
 
+def test_a_counter_of_too_few_bits_is_said(tmp_path):
+    summary, session = finished(tmp_path, [sample(0, n, ticks=10_000 * n % 2**16) for n in range(1500)])
+    assert "its clock jumps" in summary.render()
+    with session as s:
+        np.testing.assert_array_equal(s.stream("eit").time, S + np.arange(1500) * (S // 100) + 200_000)
+
+
 def test_a_missing_count_is_missing(tmp_path):
     values = np.array([-32768, 5], "<i2")
     _, session = finished(tmp_path, [sample(1, n, values=values) for n in range(5)])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...session import Status
-from ..clock import METHOD, NO_LATENCY, ClockFit, DeviceClock, Latency, smallest_latency
+from ..clock import METHOD, NO_LATENCY, ClockFit, DeviceClock, Latency, is_wrong_tick, smallest_latency
 from ..plan import StreamPlan
 from ..summary import ARRIVAL_CLOCK, StreamSummary
 from ..wire.messages import Pong
@@ -159,4 +159,7 @@ class StreamSurvey:
         if not period:
             return "its clock stands still: check the device; times are of arrival"
         tick = self.plan.tick * elapsed / period
+        if not is_wrong_tick(tick / self.plan.tick, elapsed * self.frames):
+            jumps = self.tracker.clock.steps
+            return f"its clock jumps {jumps:,} times: let it count 32 or 64 bits; times are of arrival"
         return f"its ticks are not of {self.plan.tick:g} s (rather {tick:.2g}): give tick=; times are of arrival"
