@@ -105,8 +105,8 @@ def _session_findings(session: Session) -> Iterator[Finding]:
         yield Finding(
             Severity.WARNING,
             "file",
-            "the recording was interrupted (complete = 0)",
-            "check its end; `jaxeit recover` finishes what a crash left",
+            "the recording is not complete (complete = 0)",
+            "see the faults at /events, if there are any, and check its end",
         )
     yield from _recorded_faults(session)
     missing = [n for n in ("eit", "pressure", "force") if n not in session.streams]

@@ -35,7 +35,7 @@ def _head(report: CheckReport) -> Iterator[str]:
     seconds = max((s.seconds for s in report.streams), default=0.0)
     marks.append(f"{seconds:.1f} s")
     marks += ["SIMULATED"] if report.simulated else []
-    marks += [] if report.complete else ["INTERRUPTED"]
+    marks += [] if report.complete else ["NOT COMPLETE"]
     yield ", ".join(marks)
 
 

@@ -51,7 +51,7 @@ class Session:
     | presses, events    | tables, or None                                                           |
     | clocks             | by name of the stream                                                     |
     | truth              | arrays by name; empty unless simulated                                    |
-    | complete           | False for a recording that was interrupted                                |
+    | complete           | False for a recording that was interrupted, or whose devices failed       |
     | recovered          | whether the session was restored after a crash                            |
     | created, epoch     | ISO texts in UTC                                                          |
     | epoch_ns           | ns since 1970                                                             |

@@ -429,8 +429,8 @@ def test_an_interrupted_recording(parts, look):
         file.attrs["complete"] = np.uint8(0)
 
     report = look(parts, break_file=interrupt)
-    only(report, Severity.WARNING, "interrupted")
-    assert "INTERRUPTED" in render(report)
+    only(report, Severity.WARNING, "not complete")
+    assert "NOT COMPLETE" in render(report)
 
 
 def test_a_gap_sets_a_press_aside(parts, look):
