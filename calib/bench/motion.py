@@ -76,11 +76,11 @@ def phase_count(bench: Bench) -> int:
     return 4 * (1 + len(bench.companions)) + 1
 
 
-def temperature_rise(bench: Bench, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+def temperature_rise(bench: Bench, times: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Temperature above that at the start, K."""
     return bench.temperature_rate * times
 
 
-def barometer_rise(bench: Bench, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+def barometer_rise(bench: Bench, times: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Air pressure above that at the start, Pa."""
     return bench.barometer_rate * times
