@@ -21,7 +21,7 @@ import calib
 import jaxeit as je
 from calib.fitting.fields import Geometry, Places, geometry_of
 from calib.fitting.held_out import folds_by_place
-from calib.fitting.pads import Hybrid, LocatedPresses, fit_hybrid
+from calib.fitting.pads import LocatedPresses, PadModel, fit_pads
 from calib.fitting.results import FitResult
 from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
@@ -52,7 +52,7 @@ class Pool:
 
     | meaning                                                        | shape        | unit |
     |----------------------------------------------------------------|--------------|------|
-    | data, geometry, places: what `fit_hybrid` takes                |              |      |
+    | data, geometry, places: what `fit_pads` takes                |              |      |
     | position of each press                                         | (presses, 2) | m    |
     | seconds a press takes, from one to the next                    | ()           | s    |
     | other, elsewhere: pressures and forces of the second session, and its places | |     |
@@ -132,13 +132,13 @@ def at_levels(data: PressData, levels: int | None) -> PressData:
     return replace(data, mask=data.mask & kept)
 
 
-def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> Hybrid | None:
+def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> PadModel | None:
     """None where the presses do not determine it."""
     field, places = (None, None) if recipe[1] == "none" else (calib.PadEdge(), pool.places)
     pressed = pool.position[use]
     data = replace(at_levels(pool.data, levels), reach=np.stack([pressed.min(0), pressed.max(0)]))
     presses = LocatedPresses(data, pool.geometry, places)
-    hybrid = fit_hybrid(CURVES[recipe[0]], field, presses, calib.fitting.SoftL1(), use=use)
+    hybrid = fit_pads(CURVES[recipe[0]], field, presses, calib.fitting.SoftL1(), use=use)
     results = [hybrid.curves.result, *([] if hybrid.field is None else [hybrid.field.result])]
     return hybrid if all((np.asarray(found) == FitResult.SUCCESS).all() for found in results) else None
 
@@ -146,7 +146,7 @@ def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | N
 # --- how well it predicts
 
 
-def errors(hybrid: Hybrid, data: PressData, places: Places) -> tuple[np.ndarray, np.ndarray]:
+def errors(hybrid: PadModel, data: PressData, places: Places) -> tuple[np.ndarray, np.ndarray]:
     """Of the total force, N: over the holds, (presses,), and of samples along the presses, (n,); NaN: not told."""
     held = hybrid.pad_forces(data.pressure, places)[0].sum(1) - data.force
     along = places[data.sample_press]

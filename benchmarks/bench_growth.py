@@ -69,7 +69,7 @@ def reconstructor(pixels: int = PIXELS, readings: int | None = None) -> je.Recon
 
 
 def forward_by_batch(found: je.Model, count: int) -> Work:
-    sigma = found.background * (1 + 0.1 * jnp.arange(count)[:, None] / count)
+    sigma = found.background * (1 + 0.1 * jnp.arange(float(count))[:, None] / count)
     return lambda model, s: jax.lax.map(lambda one: je.forward(model, one), s, batch_size=8), (found, sigma), count
 
 

@@ -13,6 +13,8 @@ the rest.  Time stamps of counts and pressure differ, so that they are aligned b
 misses is mostly the loop, whose branches are 0.1 bar apart (median).  The shorter the reach of a law, the more it
 follows the one branch where the other was held out; stretches a tenth as long a spline predicts as a cubic does, within
 1 %.
+command_line: the same recordings by `jaxeit import`, `check`, `calibrate --curve auto`, `evaluate` and `apply` alone.
+The first half in time is calibrated, the second evaluated.  A newton of the insole stands for a bar.
 """
 
 import sys
@@ -35,6 +37,7 @@ from calib.fitting.validation import rmse
 from calib.runtime import set_up
 
 from .harness import Question, Run
+from .log_commands import through_commands
 from .rows import Row
 
 GRAM = 9.80665e-3  # N
@@ -70,13 +73,19 @@ def _actuators(folder: Path, smoke: bool) -> Iterator[Row]:
 # --- channels against a scale
 
 
-def _eflesh(folder: Path, smoke: bool) -> Iterator[Row]:
+def _eflesh_table(folder: Path) -> np.ndarray:
+    """Time (ns), force (N, NaN where the scale had no new reading) and 15 channels, (n, 17)."""
     states = np.loadtxt(folder / EFLESH / "states.csv", delimiter=",")
     sensor = np.loadtxt(folder / EFLESH / "sensor_post_baselines.csv", delimiter=",")
     time = (states[:, 0] - states[0, 0]) * 1e9
     force = np.where(states[:, 4] == -1, np.nan, states[:, 4] * GRAM)
     at = (sensor[:, 0] - states[0, 0]) * 1e9
-    signals = np.stack([np.interp(time, at, column) for column in sensor[:, 1:].T], 1)
+    return np.column_stack([time, force, *(np.interp(time, at, column) for column in sensor[:, 1:].T)])
+
+
+def _eflesh(folder: Path, smoke: bool) -> Iterator[Row]:
+    table = _eflesh_table(folder)
+    time, force, signals = table[:, 0], table[:, 1], table[:, 2:]
     ways = {
         "static quadratic, ridge by cross-validation": None,
         "Gaussian process, no creep": SmoothChannels(lags=()),
@@ -92,9 +101,7 @@ def _eflesh(folder: Path, smoke: bool) -> Iterator[Row]:
 
 def _insole(folder: Path, smoke: bool) -> Iterator[Row]:
     path = folder / "insole_plenum" / "calibration_dataset.mat"
-    found = io.loadmat(path, squeeze_me=True, struct_as_record=False)["experiment"]
-    counts = found.C[:, 2:]
-    pressure, rate, lag = aligned(counts, found.P)
+    counts, pressure, rate, lag = _insole_counts(path)
     told = faults(counts, pressure)
     sound = ~told.any
     faulty = {name: np.flatnonzero(flags).tolist() for name, flags in told._asdict().items()}
@@ -104,6 +111,13 @@ def _insole(folder: Path, smoke: bool) -> Iterator[Row]:
     rest, gauge = np.median(counts[:REST], 0), np.median(pressure[:REST])  # the gauge's own zero is at 0.056 bar
     press = ndimage.median_filter(rest - counts, (9, 1))[rows][:, sound].T
     yield from _taxel_fits(press, pressure[rows] - gauge)
+
+
+def _insole_counts(path: Path) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Counts (n, 280), pressure at the same samples (n,) bar, and the rate and lag of its own index."""
+    found = io.loadmat(path, squeeze_me=True, struct_as_record=False)["experiment"]
+    counts = found.C[:, 2:]
+    return counts, *aligned(counts, found.P)
 
 
 def aligned(counts: np.ndarray, pressure: np.ndarray) -> tuple[np.ndarray, float, float]:
@@ -157,17 +171,37 @@ def _predicted(law: AbstractCurve, signal: np.ndarray, pressure: np.ndarray, use
     return np.where((np.asarray(fitted.result) == FitResult.SUCCESS)[:, None], force, np.nan)
 
 
+# --- by the command line
+
+
+def _command_line(folder: Path, smoke: bool) -> Iterator[Row]:
+    columns = ["--time", "0:ms", "--stream", "pressure=5:bar", "--stream", "force=6:N"]
+    for name in ACTUATORS[: 1 if smoke else None]:
+        table = np.loadtxt(folder / "pneumatic_actuator" / f"{name}.csv.gz")
+        yield from through_commands(name, table, columns, "affine" if smoke else "auto")
+    if smoke:
+        return
+    columns = ["--time", "0:ns", "--stream", "force=1:N", "--stream", "sensor=2-16:counts"]
+    yield from through_commands("eflesh", _eflesh_table(folder), columns)
+    counts, pressure, _, _ = _insole_counts(folder / "insole_plenum" / "calibration_dataset.mat")
+    rows = np.arange(0, len(counts), THIN)
+    columns = ["--time", "0:s", "--stream", "force=1:N", "--stream", "sensor=2-281:counts"]
+    yield from through_commands("insole", np.column_stack([rows / 50.0, pressure[rows], -counts[rows]]), columns)
+
+
 RECORDINGS: dict[str, Callable[[Path, bool], Iterator[Row]]] = {
     "pneumatic_actuator": _actuators,
     "eflesh": _eflesh,
     "insole_plenum": _insole,
+    "command_line": _command_line,
 }
 
 
 def recording(name: str, run: Run) -> Iterator[Row]:
     """The rows of one recording; stops where a recording that is wanted is not there."""
     wanted = [run.args.only] if run.args.only else list(RECORDINGS)
-    absent = [one for one in wanted if not (run.args.folder / one).is_dir()]
+    needed = [one for one in wanted if one != "command_line"] or FOLDERS
+    absent = [one for one in needed if not (run.args.folder / one).is_dir()]
     if absent:
         folder = run.args.folder
         print(f"{folder} has no folder {', '.join(absent)}: give the one that holds the recordings", file=sys.stderr)
@@ -177,6 +211,7 @@ def recording(name: str, run: Run) -> Iterator[Row]:
         yield {name: [row]}
 
 
+FOLDERS = ["eflesh", "insole_plenum", "pneumatic_actuator"]
 FOLDER: Row = {"type": Path, "metavar": "FOLDER", "help": "with eflesh, pneumatic_actuator and insole_plenum"}
 PARTS = {name: partial(recording, name) for name in RECORDINGS}
 main = Question("real", __doc__, PARTS, {"folder": FOLDER}, prepare=set_up)

@@ -20,6 +20,7 @@ from .calibration import (
     FittedContact as FittedContact,
     ForceEstimate as ForceEstimate,
     ImageCentroid as ImageCentroid,
+    LogCalibration as LogCalibration,
     Recipe as Recipe,
     apply as apply,
     calibrate as calibrate,
@@ -27,6 +28,7 @@ from .calibration import (
     force_map as force_map,
     load_calibration as load_calibration,
     locate as locate,
+    recalibrate as recalibrate,
 )
 from .check import check_session as check_session
 from .fitting import (

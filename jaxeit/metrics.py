@@ -2,10 +2,11 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
@@ -238,7 +239,7 @@ def _greit_figures(
         amplitude=image @ areas,
         position_error=jnp.where(seen, inward_bias(middle, target, centre), jnp.nan),
         resolution=jnp.where(seen, jnp.sqrt(area / areas.sum()), jnp.nan),
-        shape_deformation=jnp.where(seen, jnp.sum(lit * outside, -1) / area, jnp.nan),
+        shape_deformation=jnp.where(seen, jnp.sum(jnp.where(outside, lit, 0), -1) / area, jnp.nan),
         ringing=jnp.where(seen, -negative / positive, jnp.nan),
     )
 
@@ -328,7 +329,8 @@ def _structural_similarity(
 
 def _window(size: int, width: Float[Array, ""]) -> Float[Array, "size size"]:
     """Weights of the local mean along one side, (size, size); every row sums to one."""
-    apart = jnp.arange(size)[:, None] - jnp.arange(size)
+    places = jnp.arange(size, dtype=width.dtype)
+    apart = places[:, None] - places
     weight = jnp.where(jnp.abs(apart) <= jnp.ceil(2 * width), jnp.exp(-0.5 * (apart / width) ** 2), 0)
     return weight / weight.sum(1, keepdims=True)
 
@@ -359,8 +361,13 @@ def _pictures(
         raise MetricError(
             f"pictures of shapes {image.shape} and {truth.shape}; give two of one shape (..., rows, columns)"
         )
-    dtype = jnp.result_type(image, truth, float)
+    dtype = jnp.promote_types(_floating(image), _floating(truth))
     return image.astype(dtype), truth.astype(dtype)
+
+
+def _floating(array: Real[Array, "..."]) -> np.dtype[Any]:
+    """Type of the array if that is a floating one; else JAX's default."""
+    return array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
 
 
 # --- segmentation ----------------------------------------------------------------------------------------------------
@@ -402,7 +409,7 @@ def otsu_thresholds(
         raise MetricError(
             f"values of shape {values.shape} with weights of shape {weights.shape}; give one for each value"
         )
-    dtype = jnp.result_type(values, float)
+    dtype = _floating(values)
     return _otsu_thresholds(values.ravel().astype(dtype), weights.ravel().astype(dtype), classes, bins)
 
 
@@ -417,7 +424,7 @@ def _otsu_thresholds(
     cuts = _best_cuts(jnp.where(jnp.tri(bins + 1, k=-1, dtype=bool), -jnp.inf, gain), classes)
     filled = _sums(count > 0)  # number of bins below each edge that are not empty
     alike = filled == filled[cuts][:, None]
-    return jnp.sum(alike * edges, 1) / jnp.sum(alike, 1)
+    return jnp.sum(jnp.where(alike, edges, 0), 1) / jnp.sum(alike, 1, dtype=edges.dtype)
 
 
 def _histogram(

@@ -30,9 +30,10 @@ from ..calibration.procedure import calibrate
 from ..calibration.recipe import Recipe
 from ..report.document import write_report
 from ..report.figures import require_matplotlib
+from ..report.log_document import write_log_report
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
-from .logs import fit_log_into, log_summary
+from .logs import ensure_log_calibration
 from .workers import begin
 
 try:
@@ -107,7 +108,7 @@ def calibrate_many(
         report: whether to write ``out/NAME.html`` too.
         tell: called with the outcome of each session when the session ends.
 
-    A session without EIT is a log of force and pressure: it gets a curve, as `jaxeit calibrate` fits it, and no page.
+    A session without EIT is a log of force and pressure: it gets the calibration of a log, as by `jaxeit calibrate`.
     The outcome of a session that fails names the reason, and the other sessions complete. The default pool also
     survives a session that kills its worker. Call this function below ``if __name__ == "__main__":``, because spawned
     processes import the main module.
@@ -285,23 +286,27 @@ def calibrate_one(task: _Task) -> Outcome:
 
 
 def _do_task(task: _Task) -> Outcome:
-    """Do a task and return its outcome; a session without EIT is a log, which gets a curve and no report."""
+    """Do a task and return its outcome; a session without EIT is a log."""
     with open_session(task.session) as session:
         mark = _digest(session.hash, task.mark)
         if "eit" not in session.streams:
-            return _ensure_log_fit(task, session, mark)
+            return _do_log(task, session, mark)
         calibration, skipped = _ensure_calibration(task, session, mark)
     skipped &= not _ensure_report(task, calibration)
     summary = calibration.evaluation.summary()
     return Outcome(task.session, task.calibration, "", skipped, calibration.simulated, summary=summary)
 
 
-def _ensure_log_fit(task: _Task, session: Session, mark: str) -> Outcome:
-    outcome = Outcome(task.session, task.calibration, simulated=session.simulated)
-    if summary := log_summary(task.calibration, mark):
-        return replace(outcome, skipped=True, summary=summary)
+def _do_log(task: _Task, session: Session, mark: str) -> Outcome:
     _, recipe, ignore_errors = pickle.loads(task.choices)
-    return replace(outcome, summary=fit_log_into(task.calibration, session, recipe, mark, ignore_errors))
+    found, skipped = ensure_log_calibration(task.calibration, session, recipe, mark, ignore_errors)
+    if not skipped:
+        _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
+    if task.report and not _page_of(task).exists():
+        write_log_report(found, _page_of(task))
+        skipped = False
+    summary = found.evaluation.summary()
+    return Outcome(task.session, task.calibration, "", skipped, found.simulated, summary=summary)
 
 
 def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:

@@ -1,8 +1,10 @@
 """The calibration of a skin: the numbers that turn its frames and pressures into newtons, and their file."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
@@ -11,13 +13,18 @@ import jaxeit as je
 
 from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
-from ..fitting.pads import Hybrid
+from ..fitting.intervals import NoiseLaw
+from ..fitting.pad_gains import PadGains
+from ..fitting.pads import PadModel
 from ..fitting.selection import Candidate
+from ..presses.crosstalk import Crosstalk
 from ..presses.table import Processing
 from ..session import SessionError, read_archive, write_archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
 from .localisation import AbstractLocator, locate
+from .press_examples import PressExamples
+from .recalibration import Recalibration
 from .recipe import Recipe
 from .storage import fields_from_archive, recorded_processing, recorded_recipe, to_archive
 
@@ -39,11 +46,16 @@ class Calibration:
     | simulated: whether any of the sessions was simulated                     |
     | notes: remarks for the reader of the results                             |
     | field: gain as a function of the place pressed; None: no such correction |
+    | crosstalk: between the pads                                              |
+    | noise: deviation of new readings about the model of the pads             |
     | locator: estimates the place of a contact from a frame; None: no field   |
     | baseline: the paper's curves, one slope per pad, for comparison          |
     | image_gain: force over the integral of the image, N / (S m^2), likewise  |
     | loops: one complete press of each pad, loading and unloading             |
+    | examples: a few presses as they were read                                |
     | tried: candidate curves and fields, with their held-out errors           |
+    | rest: gage pressure of the pads without contact, (pads,) Pa              |
+    | recalibration: how pads have moved since; None: never recalibrated       |
     """
 
     skin: je.Skin
@@ -55,16 +67,28 @@ class Calibration:
     simulated: bool
     notes: tuple[str, ...] = ()
     field: FittedField | None = None
+    crosstalk: Crosstalk | None = None
+    noise: NoiseLaw | None = None
     locator: AbstractLocator | None = None
     baseline: FittedCurve | None = None
     image_gain: float = float("nan")
     loops: Loops | None = None
     tried: tuple[Candidate, ...] = ()
+    examples: PressExamples | None = None
+    rest: np.ndarray | None = None
+    recalibration: Recalibration | None = None
+
+    @cached_property
+    def pads(self) -> PadModel:
+        """The model of the pads: curves, field, crosstalk, noise and gains."""
+        mixed = self.crosstalk is not None and self.crosstalk.present
+        matrix = jnp.asarray(self.crosstalk.matrix, self.dtype) if self.crosstalk is not None and mixed else None
+        return PadModel(self.curves, self.field, matrix, self.noise, self.gains)
 
     @property
-    def hybrid(self) -> Hybrid:
-        """The fitted curves and the field as one estimator of pad forces."""
-        return Hybrid(self.curves, self.field)
+    def gains(self) -> PadGains | None:
+        """Gains by which pads have moved since the calibration; None: never recalibrated."""
+        return None if self.recalibration is None else self.recalibration.gains
 
     @property
     def recipe(self) -> Recipe | None:
@@ -80,16 +104,21 @@ class Calibration:
         """How the sessions were cut into presses and corrected; process sessions to evaluate or map alike."""
         return recorded_processing(self.provenance)
 
+    def own_pressures(self, pressures: ArrayLike) -> np.ndarray:
+        """The pads' own pressures, without crosstalk, from readings of the pads (n, pads) Pa."""
+        return np.asarray(self.pads.own(jnp.asarray(pressures, self.dtype)))
+
     def pad_forces(
         self, pressures: ArrayLike, places: Places | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Force on each pad, its standard error (N) and validity from pressures (n, pads) Pa.
+        """Force on each pad, its standard error (N) and validity from readings of the pads (n, pads) Pa.
 
         A correction by location uses `places` (from `locate`). Without them the gain is 1, and the standard error
-        includes the uncertainty of the gain. A force is not valid outside the calibrated range of pressure or after a
-        failed fit.
+        includes the uncertainty of the gain. The standard error is that of one reading: of the model, and of the noise
+        about it. It leaves out what no press of the calibration showed, such as another tip or a drift since. A force
+        is not valid outside the calibrated range of pressure or after a failed fit.
         """
-        return self.hybrid.pad_forces(pressures, places)
+        return self.pads.pad_forces(pressures, places)
 
     def locate(self, frames: ArrayLike, image: Array | None = None, *, single: bool = False) -> Places | None:
         """Places of the contacts in difference frames (n, readings) V; None without a correction by location.

@@ -17,6 +17,8 @@ import jaxeit as je
 from ..fitting.held_out import Split, interval, place_draws
 
 CALIBRATED = "calibrated"
+THIRDS = ("small", "middle", "large")
+"""Thirds of the range of force, up to the largest of the presses."""
 METHODS = {
     "eit": "EIT only",
     "hybrid": "hybrid",
@@ -59,6 +61,7 @@ class Evaluation:
     | force: true, from the load cell                                    | (presses,)      | N    |
     | pressure: change of each pad's pressure over the hold              | (presses, pads) | Pa   |
     | pad_force: estimated for each pad, by a fit that had not seen it   | (presses, pads) | N    |
+    | half_width: half the 90 % interval of the total force; None: old  | (presses,)      | N    |
     | image_sum: integral of the image                                   | (presses,)      | S m^2|
     | centre of the sheet                                                | (2,)            | m    |
     | held_out_by: what the fit had not seen, "location" or "session"    |                 |      |
@@ -76,6 +79,7 @@ class Evaluation:
     image_sum: np.ndarray
     centre: np.ndarray
     held_out_by: str
+    half_width: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
     recipe: str = ""
@@ -121,12 +125,24 @@ class Evaluation:
                     out[f"cv_{name}_ddof{ddof}"] = float(cv)
                 out |= {f"cv_{name}_{k}": v for k, v in self._spread(values, _cv).items()}
         out |= {f"force_{k}": v for k, v in self._errors(self.total_force).items()}
+        out |= self._coverage()
         for name, total in self.others.items():
             out |= {f"force_{name}_{k}": v for k, v in self._errors(total).items()}
         for split in self.splits:
             if not split.note:
                 out[f"force_left_out_{split.by}_rmse"] = split.rmse
         return out
+
+    def _coverage(self) -> dict[str, float]:
+        """Parts of the presses whose force lies in its 90 % interval: of all, and of each third of the force."""
+        if self.half_width is None or not np.isfinite(self.half_width).any():
+            return {}
+        known = np.isfinite(self.half_width)
+        inside = np.abs(self.total_force - self.force) <= self.half_width
+        third = np.minimum((3 * self.force / self.force.max()).astype(int), 2)
+        parts = {name: known & (third == k) for k, name in enumerate(THIRDS)}
+        out = {"coverage": float(inside[known].mean())}
+        return out | {f"coverage_{name}": float(inside[part].mean()) for name, part in parts.items() if part.any()}
 
     @cached_property
     def _draws(self) -> np.ndarray:
@@ -195,6 +211,8 @@ class Evaluation:
             "image_sum": (self.image_sum, "S m2", "integral of the image"),
             "centre": (self.centre, "m", "centre of the sheet"),
         }
+        if self.half_width is not None:
+            out["half_width"] = (self.half_width, "N", "half the 90 % interval of the total force")
         for name, estimate in self.estimated.items():
             out[f"estimated_{name}"] = (estimate, "m", f"position estimated by {name}")
         for name, total in self.others.items():
@@ -214,6 +232,7 @@ class Evaluation:
         return cls(
             **{name: arrays[array + name] for name in names},
             estimated=named("estimated_"),
+            half_width=arrays.get(array + "half_width"),
             others={name: total for name, total in named("force_").items() if name in METHODS},
             recipe=str(attrs.get(f"{attribute}recipe", "")),
             splits=tuple(Split(**split) for split in json.loads(str(attrs.get(f"{attribute}splits", "[]")))),
@@ -269,7 +288,15 @@ def _force_lines(evaluation: Evaluation) -> list[str]:
         shown = ["" if np.isnan(e) else f"{e:.2f}" for e in errors]
         numbers = "".join(f"{text:>{width}}" for text, width in zip(shown, (10, 14, 14, 10), strict=True))
         out.append(f"    {label:<28}{spread}{numbers}")
-    return out
+    return out + _coverage_lines(evaluation.summary())
+
+
+def _coverage_lines(s: Mapping[str, float]) -> list[str]:
+    """How many presses lie in their interval; none without intervals."""
+    if "coverage" not in s:
+        return []
+    thirds = ", ".join(f"{name} {100 * s[f'coverage_{name}']:.0f} %" for name in THIRDS if f"coverage_{name}" in s)
+    return [f"    in their 90 % interval: {100 * s['coverage']:.0f} % of the presses (forces in thirds: {thirds})"]
 
 
 def _split_lines(evaluation: Evaluation) -> list[str]:

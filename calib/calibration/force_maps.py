@@ -1,6 +1,7 @@
 """Applying a calibration: from frames and pressures to force maps in newtons."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,11 +14,11 @@ from jaxtyping import Array, Bool, Float
 import jaxeit as je
 
 from ..check.acceptance import accept
-from ..fitting.curves import FittedCurve
 from ..fitting.curves.samples import bucket
-from ..fitting.fields import FittedField, Places
+from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
-from ..fitting.pads import pad_forces
+from ..fitting.pad_gains import PadGains
+from ..fitting.pads import PadModel
 from ..presses.corrections import AbstractCorrection, correct
 from ..presses.streams import resample
 from ..presses.table import Processing, resting_levels
@@ -40,7 +41,7 @@ class ForceEstimate(NamedTuple):
     |--------------------------------------------------------------------------|--------------|------|
     | map: force on each pixel, its standard error, the validity of its shape  | (n, pixels)  | N    |
     | force on each pad                                                        | (n, pads)    | N    |
-    | standard_error of a new reading: of the curve and about it               | (n, pads)    | N    |
+    | standard_error of one reading: of the model, and of the noise about it   | (n, pads)    | N    |
     | valid: pressure within the calibrated range                              | (n, pads)    |      |
     | position of each contact found; NaN: none                                | (n, K, 2)    | m    |
     | contact_force: its shares of the forces on pads that it lies on          | (n, K)       | N    |
@@ -63,20 +64,23 @@ class ForceLaw(eqx.Module):
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
     masks: je.PadMasks
-    curves: FittedCurve
-    field: FittedField | None
+    pads: PadModel
     locator: AbstractLocator | None
 
     @property
     def remembers(self) -> bool:
         """Whether forces depend on the pressures that came before."""
-        return self.curves.curve.path
+        return self.pads.curves.curve.path
+
+    def moved(self, gains: PadGains | None) -> "ForceLaw":
+        """The law with these gains of the pads."""
+        return replace(self, pads=replace(self.pads, gains=gains))
 
 
 def law_of(calibration: Calibration) -> ForceLaw:
     """The parts of a calibration from which forces are computed."""
     c = calibration
-    return ForceLaw(c.recon, c.masks, c.curves, c.field, c.locator)
+    return ForceLaw(c.recon, c.masks, c.pads, c.locator)
 
 
 def force_map(
@@ -91,9 +95,9 @@ def force_map(
 
     Args:
         frames: change of the readings, (n, readings) V.
-        pressures: change of the pads' gage pressure at the same times, (n, pads) Pa.
+        pressures: change of the readings of the pads at the same times, (n, pads) Pa.
         gate: as in `jaxeit.fuse`.
-        before: pressures that came earlier, (m, pads) Pa, for curves that remember them; see `remembered`.
+        before: the pads' own pressures that came earlier, (m, pads) Pa, for curves with memory; see `remembered`.
 
     Raises:
         ValueError: if the shapes do not fit the calibration.
@@ -107,7 +111,7 @@ def force_map(
         )
     law = law_of(calibration)
     frames = jnp.asarray(frames, law.recon.dtype)
-    pressures = jnp.asarray(pressures, law.curves.parameters.dtype)
+    pressures = jnp.asarray(pressures, law.pads.dtype)
     earlier = filled(law, before)
     found = _force_map(law, frames, pressures, None if earlier is None else jnp.asarray(earlier), gate)
     return ForceEstimate(found.map, *map(np.asarray, found[1:]))
@@ -120,7 +124,7 @@ def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
     # Lengths are rounded up to a few sizes, because each new length compiles the program again.
     first = bucket(len(before))
     rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
-    return rows.astype(law.curves.parameters.dtype)
+    return rows.astype(law.pads.dtype)
 
 
 @je.verb
@@ -142,8 +146,7 @@ def fused(
     gate: float,
 ) -> ForceEstimate:
     """`force_map` from known images and places (None: places are not estimated); pure."""
-    force, error, valid = _pad_forces(law, pressures, places, before)
-    error = jnp.hypot(error, law.curves.residual_rms)
+    force, error, valid = law.pads.with_noise(law.pads.forces(pressures, places, before))
     numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
     if places is None:
         places = nowhere(pressures, 0)
@@ -171,26 +174,22 @@ def _of_contacts(
     return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)
 
 
-def _pad_forces(law: ForceLaw, pressures: Array, places: Places | None, before: Array | None) -> Iterable[Array]:
-    """Forces, errors and validity (n, pads); curves with memory start from the pressures `before`."""
-    if before is None:
-        return pad_forces(law.curves, law.field, pressures, places)
-    first, whole = len(before), jnp.concatenate([before, pressures])
-    if places is not None:
-        places = places[jnp.maximum(jnp.arange(len(whole)) - first, 0)]
-    return (part[first:] for part in pad_forces(law.curves, law.field, whole, places))
+def unmoved_forces(law: ForceLaw, pressures: Float[Array, "n pads"], places: Places | None) -> Float[Array, "n pads"]:
+    """Force on each pad from the pressures that it would have read at the calibration; pure."""
+    return replace(law.pads, gains=None).forces(pressures, places).force
 
 
-_LOADED_MULTIPLE = 3.0  # of the residual scatter of a curve: noise rarely exceeds it, so that idle pads stay idle
+_LOADED_MULTIPLE = 3.0  # of the noise without force: noise rarely exceeds it, so that idle pads stay idle
 
 
 def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
-    """Whether the force on a pad, without correction by location, exceeds the scatter of single samples; pure."""
-    return pad_forces(law.curves, None, pressures).force > _LOADED_MULTIPLE * law.curves.residual_rms
+    """Whether the force on a pad, without correction by location, exceeds the noise of an idle pad; pure."""
+    force = replace(law.pads, field=None).forces(pressures).force
+    return force > _LOADED_MULTIPLE * law.pads.idle_noise
 
 
 def remembered(pressures: np.ndarray) -> np.ndarray:
-    """The turning points (m, pads) of pressures (n, pads) that a curve with hysteresis remembers, padded by NaN.
+    """The turning points (m, pads) of own pressures (n, pads) that a curve with hysteresis remembers, padded by NaN.
 
     A later excursion beyond a turning point wipes it out (wiping-out property of the Preisach model), so few remain.
     """
@@ -267,7 +266,7 @@ def apply(
             pressed = at_frames - levels["pressure"](time)
             found = force_map(calibration, frames - levels["eit"](time), pressed, before=before)
             if calibration.curves.curve.path:
-                before = remembered(np.concatenate([before, pressed]))
+                before = remembered(np.concatenate([before, calibration.own_pressures(pressed)]))
             rows = _of_block(time, found)
             for name in kinds:
                 writer.append(name, rows[name])

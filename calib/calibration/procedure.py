@@ -11,14 +11,15 @@ import jaxeit as je
 
 from ..check.acceptance import accept
 from ..fitting.fields import single_places
-from ..fitting.pads import Hybrid
-from ..fitting.response import PadResponse, fit_response, fitting_problem, hold_out_response, require_every_pad_pressed
+from ..fitting.pads import PadModel
+from ..fitting.response import PadResponse, fit_response, fold_presses, hold_out_response, require_every_pad_pressed
 from ..presses.pooled import pool_presses
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
+from .press_examples import press_examples
 from .press_images import Imager, PressImages, prepare_imager
 from .recipe import Recipe
 from .storage import describe
@@ -62,23 +63,24 @@ def calibrate(
     imager = prepare_imager(skin, presses, recipe)
     images = imager.presses(presses.dv)
     progress("fitting")
-    problem = fitting_problem(skin, presses.data, images.places, recipe.loss, recipe.folds)
-    response = fit_response(problem, skin, recipe.curves, recipe.locations)
+    folds = fold_presses(skin, presses.data, images.places, recipe.loss, recipe.folds)
+    response = fit_response(folds, skin, recipe.curves, recipe.locations)
     progress("holding out")
     true_position = presses.position if presses.true_place else None
-    held_out = hold_out_response(problem, response, presses.groups, images.integral, true_position)
-    choice, hybrid = response.choice, response.hybrid
+    held_out = hold_out_response(folds, response, presses.groups, images.integral, true_position)
+    choice, model = response.choice, response.model
     return Calibration(
         skin=skin,
         recon=imager.recon,
         masks=imager.masks,
-        curves=hybrid.curves,
+        curves=model.curves,
         evaluation=Evaluation(
             position=presses.position,
             estimated=images.estimated,
             force=presses.data.force,
             pressure=presses.data.pressure,
             pad_force=held_out.pad_force,
+            half_width=held_out.half_width,
             image_sum=images.integral,
             centre=centre_of(skin),
             held_out_by="location",
@@ -89,20 +91,24 @@ def calibrate(
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
         notes=(*ignored, *presses.notes, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
-        field=hybrid.field,
-        locator=imager.locator if hybrid.field is not None else None,
+        field=model.field,
+        crosstalk=presses.crosstalk,
+        noise=held_out.noise,
+        locator=imager.locator if model.field is not None else None,
         baseline=response.baseline,
         image_gain=float(presses.data.force.sum() / images.integral.sum()),
-        loops=typical_loops(presses, _gains(hybrid, images)),
+        loops=typical_loops(presses, _gains(model, images)),
         tried=choice.tried,
+        examples=press_examples(presses, skin),
+        rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
     )
 
 
-def _gains(hybrid: Hybrid, images: PressImages) -> np.ndarray | None:
+def _gains(model: PadModel, images: PressImages) -> np.ndarray | None:
     """Gain of each pad at each press, (presses, pads); None without a correction by location."""
-    if hybrid.field is None or images.places is None:
+    if model.field is None or images.places is None:
         return None
-    return np.asarray(np.exp(hybrid.log_gains(images.places)))
+    return np.asarray(np.exp(model.log_gains(images.places)))
 
 
 def _provenance(
@@ -113,6 +119,7 @@ def _provenance(
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, Python {platform.python_version()}",
         "sessions": "\n".join(f"{s.hash}  {s.name}" for s in sessions),
+        "recorded_utc": max(s.epoch for s in sessions),
         **describe(recipe, imager.recon, response.choice),
     }
 
@@ -138,13 +145,14 @@ def evaluate(
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
-    force, _, _ = calibration.pad_forces(found.pressure, images.places)
+    force, error, _ = calibration.pad_forces(found.pressure, images.places)
     return Evaluation(
         position=found.position,
         estimated=images.estimated,
         force=found.force,
-        pressure=found.pressure,
+        pressure=calibration.own_pressures(found.pressure),
         pad_force=force,
+        half_width=calibration.pads.half_widths(error),
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
         held_out_by="session",
@@ -169,7 +177,7 @@ def _compared_forces(
     """Total force by the methods of comparison, (presses,) N each; empty for a file of an early version."""
     if calibration.baseline is None:
         return {}
-    papers = Hybrid(calibration.baseline).pad_forces(found.pressure)[0].sum(1)
+    papers = PadModel(calibration.baseline, crosstalk=calibration.pads.crosstalk).pad_forces(found.pressure)[0].sum(1)
     others = {"eit": calibration.image_gain * image_sum, "hybrid": papers}
     if calibration.field is not None and "contact_position" in found.session.truth:
         true = single_places(found.position, len(calibration.skin.pads))

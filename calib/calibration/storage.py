@@ -16,12 +16,16 @@ from jaxeit.toml import TomlTable, parse_toml
 from ..fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
 from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry
 from ..fitting.fields.base import restored
+from ..fitting.intervals import NORMAL_MULTIPLE, NoiseLaw
 from ..fitting.selection import Candidate, Choice
+from ..presses.crosstalk import Crosstalk
 from ..presses.table import Processing
 from ..session import Archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
 from .localisation import AbstractLocator, locator_from_numbers, locator_numbers
+from .press_examples import PressExamples
+from .recalibration import Recalibration
 from .recipe import Recipe
 from .recipe_text import read_imaging, read_processing
 
@@ -57,6 +61,12 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         arrays[f"pads/{name}"] = (getattr(curves, name), "", meaning)
     for f in fields(curves.curve):
         arrays[f"pads/curve-{f.name}"] = (getattr(curves.curve, f.name), "Pa", "what the curve left open, as fitted")
+    if cal.crosstalk is not None:
+        arrays["pads/crosstalk"] = (cal.crosstalk.matrix, "1", "reading of channel i per own pressure of pad j")
+        arrays["pads/crosstalk_se"] = (cal.crosstalk.standard_error, "1", "of the crosstalk; NaN: not determined")
+    if cal.noise is not None:
+        for f in fields(cal.noise):
+            arrays[f"pads/noise-{f.name}"] = (getattr(cal.noise, f.name), *_NOISE_FIELDS[f.name])
     if cal.baseline is not None:
         attrs["image_gain"] = cal.image_gain
         for name, meaning in _CURVE_FIELDS.items():
@@ -69,9 +79,24 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         arrays[f"presses/{name}"] = value
     if cal.loops is not None:
         arrays |= {f"loops/{name}": value for name, value in cal.loops.arrays().items()}
+    if cal.examples is not None:
+        arrays |= {f"examples/{name}": value for name, value in cal.examples.arrays().items()}
+    if cal.rest is not None:
+        arrays["pads/rest"] = (cal.rest, "Pa", "gage pressure without contact")
+    if cal.recalibration is not None:
+        attrs |= cal.recalibration.attributes()
+        arrays |= cal.recalibration.arrays()
     given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
     return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
 
+
+_NOISE_FIELDS = {
+    "floor": ("N", "standard deviation of a new reading without force"),
+    "fraction": ("1", "standard deviation of a new reading per force"),
+    "scale": ("1", "of each pad's deviation"),
+    "multiple": ("1", "standard deviations in half the 90 % interval"),
+}
+MAX_CONDITION = 1e3  # of a crosstalk matrix: beyond it one pad cannot be told from another
 
 SEAL = "seal_sha256"
 _OF_THE_FORMAT = (SEAL, "format", "format_version", "Conventions", "complete")
@@ -149,6 +174,7 @@ _FIELD_FIELDS = {
     "noise": ("1", "scatter of single presses about the field, in log force"),
     "spread": ("1", "scatter of single presses about no field, in log force"),
     "evidence": ("1", "log of the largest marginal likelihood, over that of no field"),
+    "effective": ("1", "coefficients that the presses determine"),
     "n": ("1", "places fitted"),
     "result": ("1", "0: success"),
 }
@@ -201,11 +227,16 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "provenance": provenance,
         "simulated": bool(attrs["simulated"]),
         "notes": tuple(filter(None, str(attrs["notes"]).split("\n"))),
+        "crosstalk": _crosstalk_from(arrays, len(skin.pads)),
+        "noise": _noise_from(arrays, fitted),
         "field": _field_from(arrays, FIELDS.find(provenance["location"])) if located else None,
         "locator": _locator_from(arrays, recon.dtype) if located else None,
         "baseline": _baseline_from(arrays, len(skin.pads)),
         "image_gain": float(attrs.get("image_gain", "nan")),
         "loops": Loops.restore(arrays, "loops/"),
+        "examples": _examples_from(arrays, len(skin.pads), recon.readings),
+        "rest": _shaped(arrays, "pads/rest", (len(skin.pads),), "f") if "pads/rest" in arrays else None,
+        "recalibration": Recalibration.restore(attrs, arrays, len(skin.pads)),
         "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
     }
     _require_sealed(archive)  # last: what does not fit is named by the checks above
@@ -213,15 +244,51 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
 
 
 def _field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:
-    choice = {f.name: arrays[f"location/choice-{f.name}"] for f in fields(kind)}
+    choice = {
+        f.name: arrays[f"location/choice-{f.name}"] for f in fields(kind) if f"location/choice-{f.name}" in arrays
+    }
+    missing = {f.name for f in fields(kind)} - choice.keys() - kind.early.keys()
+    if missing:
+        raise KeyError(f"location/choice-{min(missing)}")
     geometry = {f.name: jnp.asarray(arrays[f"location/geometry-{f.name}"]) for f in fields(Geometry)}
-    numbers = {name: jnp.asarray(arrays[f"location/{name}"]) for name in _FIELD_FIELDS}
+    given = {"location/effective": np.asarray(np.nan), **arrays}  # early versions did not store it
+    numbers = {name: jnp.asarray(given[f"location/{name}"]) for name in _FIELD_FIELDS}
     return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
 
 
 def _locator_from(arrays: Mapping[str, np.ndarray], dtype: Any) -> AbstractLocator:
     numbers = {k.removeprefix("locator/"): v for k, v in arrays.items() if k.startswith("locator/")}
     return locator_from_numbers(numbers, dtype)
+
+
+def _examples_from(arrays: Mapping[str, np.ndarray], pads: int, readings: int) -> PressExamples | None:
+    """Some presses as they were read; None for a file of an early version."""
+    found = PressExamples.restore(arrays, "examples/")
+    if found is not None:
+        count = len(found.force)
+        for name, tail in {"dv": (readings,), "pressure": (pads,), "position": (2,), "force": ()}.items():
+            _shaped(arrays, f"examples/{name}", (count, *tail), "f")
+    return found
+
+
+def _crosstalk_from(arrays: Mapping[str, np.ndarray], pads: int) -> Crosstalk | None:
+    """The crosstalk; None for a file of an early version."""
+    if "pads/crosstalk" not in arrays:
+        return None
+    matrix, error = (_shaped(arrays, f"pads/{name}", (pads, pads), "f") for name in ("crosstalk", "crosstalk_se"))
+    if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > MAX_CONDITION or (np.diagonal(matrix) != 1).any():
+        raise ValueError("pads/crosstalk is no crosstalk: singular, not finite, or not one on the diagonal")
+    return Crosstalk(matrix, error)
+
+
+def _noise_from(arrays: Mapping[str, np.ndarray], fitted: Mapping[str, jax.Array]) -> NoiseLaw:
+    """The noise law; for a file of an early version that of the residuals, the same for all forces."""
+    rms = fitted["residual_rms"]
+    if "pads/noise-floor" not in arrays:
+        return NoiseLaw(jnp.ones((), rms.dtype), jnp.zeros((), rms.dtype), rms, jnp.asarray(NORMAL_MULTIPLE, rms.dtype))
+    shapes = {"scale": (len(rms),)}
+    numbers = {f.name: _shaped(arrays, f"pads/noise-{f.name}", shapes.get(f.name, ()), "f") for f in fields(NoiseLaw)}
+    return NoiseLaw(**{name: jnp.asarray(number, rms.dtype) for name, number in numbers.items()})
 
 
 def _baseline_from(arrays: Mapping[str, np.ndarray], pads: int) -> FittedCurve | None:
@@ -253,12 +320,16 @@ _NOT_NEGATIVE = (
     "image/masks",
     "pads/scale",
     "pads/residual_rms",
+    "pads/noise-floor",
+    "pads/noise-fraction",
+    "pads/noise-scale",
+    "pads/noise-multiple",
     "baseline/scale",
     "location/noise",
     "location/spread",
 )
 _RANGES = ("pads/pressure_range", "baseline/pressure_range")
-_COVARIANCES = ("pads/covariance", "baseline/covariance", "location/covariance")
+_COVARIANCES = ("pads/covariance", "baseline/covariance", "location/covariance", "recalibration/covariance")
 
 
 def _require_possible(arrays: Mapping[str, np.ndarray]) -> None:

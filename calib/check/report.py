@@ -4,7 +4,7 @@ import enum
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -153,6 +153,11 @@ class CheckReport:
     def count(self, severity: Severity) -> int:
         """Number of findings of one severity."""
         return sum(f.severity == severity for f in self.findings)
+
+
+def with_health(report: CheckReport, health: str) -> CheckReport:
+    """The report with a line on how far the session is off a calibration, among the notes."""
+    return replace(report, findings=(*report.findings, Finding(Severity.OK, "calibration", health)))
 
 
 # --- JSON ----------------------------------------------------------------------------------------

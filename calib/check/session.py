@@ -19,8 +19,10 @@ from .presses import NAMES, list_presses, press_evidence, press_summary
 from .reading_order import OrderCheck
 from .report import ChannelTable, CheckReport, Finding, Severity
 from .responses import pad_response_findings, reading_response_findings
+from .shifts import shift_findings
 from .skin import check_skin
 from .streams import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
+from .stuck import stuck_findings
 
 
 def check_session(
@@ -45,7 +47,9 @@ def check_session(
     statistics = stream_statistics(session, skin, progress, findings)
     for stats in statistics.values():
         findings += stream_findings(stats)
-        findings += [] if session.simulated else copy_findings(stats)  # a simulation may be free of noise
+        if not session.simulated:  # a simulation may be free of noise
+            findings += [*copy_findings(stats), *stuck_findings(stats)]
+    findings += shift_findings(statistics)
     presses, source = list_presses(session, statistics, findings)
     evidence = press_evidence(statistics, presses, findings)
     presses = presses if evidence is None else evidence.presses

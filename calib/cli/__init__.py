@@ -17,6 +17,7 @@ COMMANDS = {
     "check": "validate a recording; say what is wrong and where",
     "import": "convert recordings in other formats to a session file",
     "calibrate": "fit a calibration to recorded sessions",
+    "recalibrate": "move a calibration to what the pads read now: offsets, gains and drift",
     "evaluate": "evaluate a calibration on other sessions",
     "apply": "write the force map of every frame of a session",
     "bench": "measure what accuracy costs in time, for a skin on this machine",

@@ -134,6 +134,12 @@ def processing_of(args: argparse.Namespace, base: Processing) -> Processing:
     return base if args.low_pass is None else replace(base, corrections=(LowPass(args.low_pass),))
 
 
+def refuse_low_pass(args: argparse.Namespace) -> None:
+    """Refuse a filter for the calibration of a log, which is made and used without one."""
+    if args.low_pass is not None:
+        raise ValueError("--low-pass: for calibrations with EIT, and this one is of a log; leave it out")
+
+
 def _made(args: argparse.Namespace, name: str, make: Callable[[str, bool], T]) -> T:
     try:
         return make(getattr(args, name), True)

@@ -37,8 +37,7 @@ from .fields import (
 )
 from .logs import fit_log
 from .losses import LOSSES, AbstractLoss, Cauchy, Huber, SoftL1, Squared
-from .pads import Hybrid
-from .recursive import RecursiveLeastSquares, SensitivityTracker, Touched, follow, follow_frames
+from .pads import PadModel
 from .results import FitError, FitResult
 from .selection import Candidate
 from .validation import cross_validate
@@ -63,29 +62,24 @@ __all__ = [
     "GaussianProcess",
     "Geometry",
     "Huber",
-    "Hybrid",
     "Linear",
     "MonotonePolynomial",
     "MonotoneSpline",
     "PadEdge",
     "PadEdgeSize",
+    "PadModel",
     "Places",
     "Play",
     "PlaySpline",
     "PowerLaw",
     "RadialBasis",
-    "RecursiveLeastSquares",
-    "SensitivityTracker",
     "SoftL1",
     "Squared",
     "TensorSpline",
-    "Touched",
     "cross_validate",
     "fit_curve",
     "fit_curves",
     "fit_field",
     "fit_log",
-    "follow",
-    "follow_frames",
     "single_places",
 ]

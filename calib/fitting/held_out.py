@@ -5,7 +5,7 @@ extrapolation: to a pad that was never pressed, another tip, another day. Interv
 all presses of a place are drawn together, because they share the error of the place.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -15,17 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..presses.means import DOMINANT_SHARE
+from ..presses.pooled import MIN_SHARE, PressData
 from .curves.base import AbstractCurve
 from .curves.fit import fit_curves
 from .fields.base import AbstractField
 from .fields.fitted import FittedField
+from .intervals import COVERAGE, NoiseLaw, fit_noise
 from .losses import AbstractLoss
-from .pads import Hybrid, LocatedPresses, fit_hybrid
+from .pads import LocatedPresses, PadForces, PadModel, along_presses, fit_pads, over_holds
 from .results import FitResult
 from .validation import assign_folds
 
 DRAWS = 2000  # draws of the bootstrap; the ends of an interval then vary by about 2 % of its length
-COVERAGE = 0.9  # probability that an interval covers the true value
 
 
 class Split(NamedTuple):
@@ -72,19 +74,120 @@ def folds_by_place(place: np.ndarray, folds: int) -> np.ndarray:
     return assign_folds(place, min(folds, len(np.unique(place))))
 
 
-def hold_out(
-    curve: AbstractCurve, field: AbstractField | None, presses: LocatedPresses, loss: AbstractLoss, fold: np.ndarray
-) -> np.ndarray:
-    """Pad forces over the hold of every press, (presses, pads) N, by fits without the press's fold (presses,)."""
-    pressure = presses.data.pressure
-    out = np.full(pressure.shape, np.nan)
-    for k in np.unique(fold):
-        held = fold == k
-        hybrid = fit_hybrid(curve, field, presses, loss, use=~held)
-        force, _, _ = hybrid.pad_forces(pressure, presses.places)
-        good = np.asarray(hybrid.curves.result) == FitResult.SUCCESS
-        out[held] = np.where(good, force, np.nan)[held]
+class HeldOut(NamedTuple):
+    """Forces predicted by fits without the fold of the press; NaN for pads whose fit failed.
+
+    | field | meaning                                             | shape of its parts |
+    |-------|-----------------------------------------------------|--------------------|
+    | hold  | pad forces over the holds, and their errors         | (presses, pads)    |
+    | along | pad forces at all samples of the presses, likewise  | (n, pads)          |
+    | fold  | of each press                                       | (presses,)         |
+    """
+
+    hold: PadForces
+    along: PadForces
+    fold: np.ndarray
+
+    def noise(self, data: PressData, use: np.ndarray | None = None) -> NoiseLaw:
+        """The noise law of the residuals at the samples of the presses `use` (presses,), by default all."""
+        rows = slice(None) if use is None else use[data.sample_press]
+        force, error = (part[rows] for part in self.along)
+        residual = data.sample_force[rows] - force.sum(1)
+        return fit_noise(residual, force, (error**2).sum(1), data.sample_place[rows])
+
+    def half_widths(self, data: PressData) -> np.ndarray:
+        """Half the 90 % interval of the total force over each hold, (presses,) N, by the residuals of other folds."""
+        force, error = self.hold
+        half = np.full(len(force), np.nan)
+        for k in np.unique(self.fold):
+            held = self.fold == k
+            if not held.all():
+                half[held] = self.noise(data, ~held).half_widths(force[held], error[held])
+        return half
+
+
+class Folds:
+    """Presses divided into folds by place, and the fits without some of the folds, each made once.
+
+    | attribute | meaning                                                     | shape      |
+    |-----------|-------------------------------------------------------------|------------|
+    | presses   | the presses with their places                               |            |
+    | loss      | robust loss of the curve fits                               |            |
+    | fold      | fold of each press, the same for all at one place           | (presses,) |
+    """
+
+    def __init__(self, presses: LocatedPresses, loss: AbstractLoss, fold: np.ndarray):
+        self.presses, self.loss, self.fold = presses, loss, fold
+        self._fits: dict[tuple[int, int, frozenset[int]], tuple[PadModel, object]] = {}
+
+    @property
+    def numbers(self) -> list[int]:
+        """The numbers of the folds."""
+        found: list[int] = np.unique(self.fold).tolist()
+        return found
+
+    def _within(self, folds: frozenset[int]) -> np.ndarray:
+        return np.isin(self.fold, list(folds))
+
+    def fit(self, curve: AbstractCurve, field: AbstractField | None, without: frozenset[int]) -> PadModel:
+        """The fit of curve and field to the presses of all folds but these."""
+        key = id(curve), id(field), without
+        if key not in self._fits:
+            model = fit_pads(curve, field, self.presses, self.loss, use=~self._within(without))
+            self._fits[key] = model, (curve, field)  # the choices are kept too, so that no other takes their id
+        return self._fits[key][0]
+
+    def predicted(self, model: PadModel, within: frozenset[int]) -> HeldOut:
+        """Forces of the presses of these folds; NaN for the others."""
+        held, data = self._within(within), self.presses.data
+        out = HeldOut(_nothing(data.pressure.shape), _nothing(data.sample_pressure.T.shape), self.fold)
+        _fill(out.hold, over_holds(model, self.presses), held)
+        _fill(out.along, along_presses(model, self.presses), held[data.sample_press])
+        return out
+
+    def hold_out(
+        self, curve: AbstractCurve, field: AbstractField | None, without: frozenset[int] = frozenset()
+    ) -> HeldOut:
+        """Pad forces of every press by fits without its fold and without the folds `without`; NaN for the latter."""
+        left = [frozenset({k}) for k in self.numbers if k not in without]
+        return joined([self.predicted(self.fit(curve, field, one | without), one) for one in left], self)
+
+    def place_errors(
+        self, curve: AbstractCurve, field: AbstractField | None, without: frozenset[int] = frozenset()
+    ) -> np.ndarray:
+        """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place.
+
+        Places in the folds `without` are left out. NaN at all places if a fit fails: its numbers must not be compared
+        with those of others.
+        """
+        data, held = self.presses.data, self.hold_out(curve, field, without)
+        kept = ~self._within(without)
+        if not np.isfinite(held.hold.force[kept]).all():
+            return np.full(len(np.unique(data.place[kept])), np.nan)
+        square = (held.along.force.sum(1) - data.sample_force) ** 2
+        square = np.where(np.isfinite(data.sample_force) & np.isfinite(data.sample_pressure).all(0), square, 0)
+        rows = kept[data.sample_press]
+        _, place, count = np.unique(data.sample_place[rows], return_inverse=True, return_counts=True)
+        return np.bincount(place, square[rows]) / count
+
+
+def joined(parts: Sequence[HeldOut], folds: Folds) -> HeldOut:
+    """Predictions of several folds as one."""
+    data = folds.presses.data
+    out = HeldOut(_nothing(data.pressure.shape), _nothing(data.sample_pressure.T.shape), folds.fold)
+    for part in parts:
+        for mine, theirs in ((out.hold, part.hold), (out.along, part.along)):
+            _fill(mine, theirs, np.isfinite(theirs.standard_error).any(1))
     return out
+
+
+def _nothing(shape: tuple[int, ...]) -> PadForces:
+    return PadForces(np.full(shape, np.nan), np.full(shape, np.nan))
+
+
+def _fill(out: PadForces, found: PadForces, rows: np.ndarray) -> None:
+    for mine, theirs in zip(out, found, strict=True):
+        mine[rows] = theirs[rows]
 
 
 def hold_out_image(image_sum: np.ndarray, force: np.ndarray, fold: np.ndarray) -> np.ndarray:
@@ -111,19 +214,19 @@ def leave_out(
             A left-out "pad" is predicted by one curve of all other pads, and by the field that it shares with them.
     """
     return tuple(
-        _split(by, part, presses, partial(_by_other_pads if by == "pad" else fit_hybrid, curve, field, presses, loss))
+        _split(by, part, presses, partial(_by_other_pads if by == "pad" else fit_pads, curve, field, presses, loss))
         for by, part in groups.items()
     )
 
 
-def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., Hybrid]) -> Split:
+def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., PadModel]) -> Split:
     data, parts = presses.data, np.unique(part[part >= 0])
     if len(parts) < 2:
         return Split(by, len(parts), note=f"the presses are of one {by} only: record presses of another too")
     error = np.full(len(data.force), np.nan)
     for k in parts:
         held = part == k
-        force, _, _ = fit(use=~held).pad_forces(data.pressure, presses.places)
+        force = over_holds(fit(use=~held), presses).force
         error[held] = (force.sum(1) - data.force)[held]
     if not np.isfinite(error[part >= 0]).all():
         return Split(by, len(parts), note=f"without one {by} the rest does not determine the fit: record more presses")
@@ -146,11 +249,13 @@ def _by_other_pads(
     loss: AbstractLoss,
     *,
     use: np.ndarray,
-) -> Hybrid:
-    """As `fit_hybrid`; a pad without presses in `use` gets one curve fitted to the samples of all other pads."""
-    found = fit_hybrid(curve, field, presses, loss, use=use)
+) -> PadModel:
+    """As `fit_pads`; a pad without presses of its own in `use` gets one curve, fitted to the samples of all others."""
     data, places = presses.data, presses.places
-    mine = data.mask & use[data.sample_press]
+    empty = np.flatnonzero(~(use[:, None] & (data.share >= DOMINANT_SHARE)).any(0))
+    use = use & (data.share[:, empty] < MIN_SHARE).all(1)
+    found = fit_pads(curve, field, presses, loss, use=use)
+    mine = data.mask & (use[:, None] & (data.share >= DOMINANT_SHARE))[data.sample_press].T
     gain = 0.0 if found.field is None or places is None else found.log_gains(places)[data.sample_press].T
     together = fit_curves(
         curve,
@@ -160,7 +265,6 @@ def _by_other_pads(
         groups=data.sample_place,
         loss=loss,
     )
-    empty = np.flatnonzero(~mine.any(1))
     if not len(empty) or int(together.result[0]) != FitResult.SUCCESS:
         return found
     curves = jax.tree.map(lambda pads, one: pads.at[empty].set(one[0]), found.curves, together)

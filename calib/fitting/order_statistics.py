@@ -18,11 +18,12 @@ def quantiles(
     Args:
         parts: fraction of the values below each quantile, 0 to 1.
     """
-    ordered, count = _ascending(jnp.where(valid, values, jnp.inf)), jnp.sum(valid)
-    place = jnp.asarray(parts, ordered.dtype) * jnp.maximum(count - 1, 0)
-    below = jnp.floor(place).astype(jnp.int32)
-    low, high = ordered[below], ordered[jnp.minimum(below + 1, jnp.maximum(count - 1, 0))]
-    part = place - below
+    ordered, count = _ascending(jnp.where(valid, values, jnp.inf)), jnp.sum(valid, dtype=jnp.int32)
+    last = jnp.maximum(count - 1, 0)
+    place = jnp.asarray(parts, ordered.dtype) * last.astype(ordered.dtype)
+    below = jnp.floor(place)
+    part, index = place - below, below.astype(jnp.int32)
+    low, high = ordered[index], ordered[jnp.minimum(index + 1, last)]
     found = jnp.where(part > 0, low * (1 - part) + high * part, low)
     return tuple(jnp.where(count > 0, found, jnp.nan))
 

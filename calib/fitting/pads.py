@@ -1,13 +1,13 @@
 """The response of all pads together: a curve for each pad, times a field of gain over the place pressed.
 
-Curves and field are fitted in turn. Given the field, `fit_curves` fits each curve to forces over gains. Given the
-curves, `fit_field` is a linear fit in log force, with evidence and covariance in closed form. The mean of the field
-over the presses of a pad is zero, so that neither changes the level of the other: the covariance of each is complete,
-and a few alternations agree to well within the noise. One joint least-squares problem would give the same numbers, but
-neither the evidence nor the sandwich covariance over places.
+Curves and field are fitted in turn. Given the field, `fit_curves` fits each curve to the force that its pad carries,
+over the gain: the measured force less that of the other pads by their own curves, so that presses across the edge of
+two pads count for both. Given the curves, `fit_field` is a linear fit in log force, with evidence and covariance in
+closed form. The mean of the field over the presses of a pad is zero, so that neither changes the level of the other:
+the covariance of each is complete, and a few alternations agree to well within the noise. One joint least-squares
+problem would give the same numbers, but neither the evidence nor the sandwich covariance over places.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 
+from ..presses.crosstalk import own_pressures
 from ..presses.pooled import PressData
 from .curves.base import AbstractCurve
 from .curves.fit import fit_curves
@@ -29,7 +30,9 @@ from .fields.fit import fit_field
 from .fields.fitted import FittedField, log_gain
 from .fields.geometry import Geometry
 from .fields.places import Places, nowhere
+from .intervals import NORMAL_MULTIPLE, NoiseLaw
 from .losses import AbstractLoss
+from .pad_gains import PadGains
 from .results import FitResult
 
 ALTERNATIONS = 2  # fits of the field, then of the curves; more change the result by far less than the noise
@@ -52,83 +55,166 @@ class LocatedPresses(NamedTuple):
     places: Places | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Hybrid:
-    """The fitted curves, and the field of gain that multiplies them (None: no correction by location)."""
+class PadModel(eqx.Module):
+    """The fitted response of all pads: from what their channels read to forces.
+
+    | field     | meaning                                                            | shape        |
+    |-----------|--------------------------------------------------------------------|--------------|
+    | curves    | pressure-force curve of each pad                                   |              |
+    | field     | gain over the place pressed; None: no correction by location       |              |
+    | crosstalk | reading of channel i per own pressure of pad j; None: no crosstalk | (pads, pads) |
+    | noise     | deviation of new readings about the model; None: residuals' own    |              |
+    | gains     | by which readings have moved since the fit; None: not moved        |              |
+    """
 
     curves: FittedCurve
     field: FittedField | None = None
+    crosstalk: Float[Array, "pads pads"] | None = None
+    noise: NoiseLaw | None = None
+    gains: PadGains | None = None
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Precision of the fitted curves."""
+        return self.curves.parameters.dtype
+
+    def own(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+        """The pads' own pressures at the time of the fit, without crosstalk, from readings (n, pads) Pa; pure."""
+        return self._unmixed(readings if self.gains is None else self.gains.unmoved(readings))
+
+    def _unmixed(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+        return readings if self.crosstalk is None else own_pressures(self.crosstalk, readings)
+
+    def forces(
+        self,
+        readings: Float[Array, "n pads"],
+        places: Places | None = None,
+        before: Float[Array, "m pads"] | None = None,
+    ) -> Prediction:
+        """Forces from readings (n, pads) Pa and own pressures `before` them, with the errors of the gains; pure."""
+
+        def response(unmoved: Array) -> Prediction:
+            return self._continued(self._unmixed(unmoved), places, before)
+
+        return response(readings) if self.gains is None else self.gains.forces(response, readings)
+
+    def _continued(self, own: Array, places: Places | None, before: Array | None) -> Prediction:
+        """`predict` for curves with memory that start from own pressures `before` (m, pads)."""
+        if before is None:
+            return self.predict(own, places)
+        first, whole = len(before), jnp.concatenate([before, own])
+        if places is not None:
+            places = places[jnp.maximum(jnp.arange(len(whole)) - first, 0)]
+        return Prediction(*(part[first:] for part in self.predict(whole, places)))
+
+    @property
+    def coefficients(self) -> float:
+        """Number of effective coefficients of all curves and the field."""
+        field = 0.0 if self.field is None else float(self.field.effective)
+        return float(np.sum(self.curves.rank)) + field
+
+    @property
+    def idle_noise(self) -> Float[Array, " pads"]:
+        """Standard deviation of the force of each pad without load, N."""
+        return self.curves.residual_rms if self.noise is None else self.noise.floor * self.noise.scale
+
+    def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+        """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
+        error includes its variation over the pad."""
+        force, error, valid = (part.T for part in predict_pads(self.curves, own.T))
+        if self.field is None:
+            return Prediction(force, error, valid)
+        gain = self.field.log_gain(nowhere(own) if places is None else places)
+        factor = jnp.exp(gain.mean)
+        return Prediction(force * factor, factor * jnp.sqrt(error**2 + force**2 * gain.variance), valid)
+
+    def with_noise(self, found: Prediction) -> Prediction:
+        """The prediction of a single reading: its standard error includes the noise about the model; pure.
+
+        Without a noise law it is that of the residuals of the fitted samples.
+        """
+        noise = self.curves.residual_rms**2 if self.noise is None else self.noise.variance(found.force)
+        return found._replace(standard_error=jnp.sqrt(found.standard_error**2 + noise))
 
     def pad_forces(
         self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Force on each pad, its standard error (N) and validity, (n, pads), from pressures (n, pads) Pa.
+        """Force on each pad, its standard error (N) and validity, (n, pads), from readings (n, pads) Pa.
 
-        Without places, the gain is one, and the standard error includes its variation over the pad. A force is not
-        valid outside the fitted pressures, or where the fit of the pad failed.
+        The standard error is that of a single reading: it holds the uncertainty of curve and field and the noise about
+        them. Without places, the gain is one, and the standard error includes its variation over the pad. A force is
+        not valid outside the fitted pressures, or where the fit of the pad failed.
         """
-        p = jnp.asarray(pressures, self.curves.parameters.dtype)
-        found = pad_forces(self.curves, self.field, p, places)
+        found = pad_forces(self, jnp.asarray(pressures, self.dtype), places)
         return tuple(map(np.asarray, found))  # type: ignore[return-value]
 
+    def half_widths(self, error: np.ndarray) -> np.ndarray:
+        """Half the 90 % interval of the total force, (n,) N, from the pads' standard errors (n, pads) of `pad_forces`.
+
+        Errors of different pads count as independent.
+        """
+        multiple = NORMAL_MULTIPLE if self.noise is None else float(self.noise.multiple)
+        return np.asarray(multiple * np.sqrt((error**2).sum(1)))
+
     def log_gains(self, places: Places) -> np.ndarray:
-        """Log of the gain of each pad at places, (n, pads). The response must have a field."""
+        """Log of the gain of each pad at places, (n, pads). The model must have a field."""
         assert self.field is not None
         return np.asarray(log_gain(self.field, places).mean)
 
-    @property
-    def scatter(self) -> np.ndarray:
-        """Root mean square residual of the samples of each pad, (pads,) N."""
-        return np.asarray(self.curves.residual_rms)
+
+@je.verb
+def pad_forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+    """`PadModel.pad_forces` as one program: arrays (n, pads)."""
+    return model.with_noise(model.forces(pressures, places))
 
 
 @je.verb
-def pad_forces(
-    curves: FittedCurve, field: FittedField | None, pressures: Float[Array, "n pads"], places: Places | None = None
-) -> Prediction:
-    """`Hybrid.pad_forces` as one program: arrays (n, pads)."""
-    predicted = predict_pads(curves, pressures.T)
-    force, error, valid = (part.T for part in predicted)
-    if field is None:
-        return Prediction(force, error, valid)
-    gain = field.log_gain(nowhere(pressures) if places is None else places)
-    factor = jnp.exp(gain.mean)
-    return Prediction(force * factor, factor * jnp.sqrt(error**2 + force**2 * gain.variance), valid)
+def predict(model: PadModel, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+    """`PadModel.predict`, compiled."""
+    return model.predict(own, places)
 
 
-def fit_hybrid(
+def fit_pads(
     curve: AbstractCurve,
     field: AbstractField | None,
     presses: LocatedPresses,
     loss: AbstractLoss,
     *,
     use: np.ndarray | None = None,
-) -> Hybrid:
+) -> PadModel:
     """Fit curves and field to the presses flagged in `use` (presses,), by default all.
 
     Check `curves.result` and `field.result`: no error is raised for samples that do not determine a fit.
     """
     data, places = presses.data, presses.places
     use = np.ones(len(data.force), bool) if use is None else use
-    hybrid = Hybrid(_curves(curve, data, np.zeros_like(data.sample_pressure), use, loss))
-    if field is None or places is None:
-        return hybrid
-    mean = np.zeros_like(data.pressure)
-    for _ in range(ALTERNATIONS):
-        fitted = _field(field, hybrid.curves, mean, presses, use)
-        mean = np.asarray(log_gain(fitted, places).mean)
-        hybrid = Hybrid(_curves(curve, data, mean[data.sample_press].T, use, loss), fitted)
-    return hybrid
+    gain, fitted = np.zeros_like(data.pressure), None
+    curves = _curves(curve, data, data.share[data.sample_press].T * data.sample_force, gain, use, loss)
+    alone = data.pressure.shape[1] == 1 and field is None
+    for _ in range(0 if alone else ALTERNATIONS):
+        if field is not None and places is not None:
+            fitted = _field(field, curves, gain, presses, use)
+            gain = np.asarray(log_gain(fitted, places).mean)
+        curves = _curves(curve, data, _carried(curves, data, gain), gain, use, loss)
+    return PadModel(curves, fitted)
+
+
+def _carried(curves: FittedCurve, data: PressData, gain: np.ndarray) -> np.ndarray:
+    """Force on each pad at all samples, (pads, n) N: the measured force less that of the other pads by their curves."""
+    each = np.nan_to_num(np.asarray(_curve_forces(curves, jnp.asarray(data.sample_pressure))))
+    each *= np.exp(gain[data.sample_press].T)
+    return np.asarray(data.sample_force - (each.sum(0) - each))
 
 
 def _curves(
-    curve: AbstractCurve, data: PressData, gain: np.ndarray, use: np.ndarray, loss: AbstractLoss
+    curve: AbstractCurve, data: PressData, force: np.ndarray, gain: np.ndarray, use: np.ndarray, loss: AbstractLoss
 ) -> FittedCurve:
-    """Each pad's curve, fitted to forces over gains; the noise is divided by the gain too."""
+    """Each pad's curve, fitted to its forces (pads, n) N over gains; the noise is divided by the gain too."""
     own = data.pad_samples(with_history=curve.path)
-    less = np.exp(-np.take_along_axis(gain, own.rows, 1))
+    less = np.exp(-np.take_along_axis(gain[data.sample_press].T, own.rows, 1))
     mask = own.mask & use[data.sample_press][own.rows]
-    return fit_curves(curve, own.pressure, own.force * less, mask=mask, groups=own.place, sigma=less, loss=loss)
+    force = np.take_along_axis(force, own.rows, 1) * less
+    return fit_curves(curve, own.pressure, force, mask=mask, groups=own.place, sigma=less, loss=loss)
 
 
 _fit_field = je.verb(fit_field)
@@ -160,14 +246,30 @@ def _weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarra
     return np.asarray(weight / np.maximum(np.bincount(place, use)[place], 1))
 
 
-def sample_forces(hybrid: Hybrid, presses: LocatedPresses) -> np.ndarray:
-    """Pad forces at all samples of the presses, (pads, n) N; NaN for pads whose fit failed."""
+class PadForces(NamedTuple):
+    """Predicted pad forces on the host, and their standard errors by the model, (n, pads) N; NaN without a fit."""
+
+    force: np.ndarray
+    standard_error: np.ndarray
+
+
+def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
+    """Pad forces over the holds of the presses, (presses, pads)."""
+    found = predict(model, jnp.asarray(presses.data.pressure), presses.places)
+    good = np.asarray(model.curves.result) == FitResult.SUCCESS
+    return PadForces(np.where(good, found.force, np.nan), np.asarray(found.standard_error))
+
+
+def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
+    """Pad forces at all samples of the presses, (n, pads)."""
     data = presses.data
-    force = np.asarray(_curve_forces(hybrid.curves, jnp.asarray(data.sample_pressure)))
-    force = np.where((np.asarray(hybrid.curves.result) == FitResult.SUCCESS)[:, None], force, np.nan)
-    if hybrid.field is None or presses.places is None:
-        return force
-    return np.asarray(force * np.exp(hybrid.log_gains(presses.places)[data.sample_press].T))
+    force, error, _ = (np.asarray(part).T for part in predict_pads(model.curves, jnp.asarray(data.sample_pressure)))
+    force = np.where(np.asarray(model.curves.result) == FitResult.SUCCESS, force, np.nan)
+    if model.field is None or presses.places is None:
+        return PadForces(force, error)
+    gain = log_gain(model.field, presses.places)
+    factor, variance = (np.asarray(part)[data.sample_press] for part in (jnp.exp(gain.mean), gain.variance))
+    return PadForces(force * factor, factor * np.sqrt(error**2 + force**2 * variance))
 
 
 @je.verb

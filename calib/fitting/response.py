@@ -15,38 +15,26 @@ from .curves.fitted import FittedCurve
 from .fields.base import AbstractField
 from .fields.geometry import geometry_of
 from .fields.places import Places, single_places
-from .held_out import Split, folds_by_place, hold_out, hold_out_image, leave_out
+from .held_out import Folds, HeldOut, Split, folds_by_place, hold_out_image, leave_out
+from .intervals import NoiseLaw
 from .losses import AbstractLoss
-from .pads import Hybrid, LocatedPresses, fit_hybrid
+from .pads import LocatedPresses, PadModel
 from .results import FitError, FitResult
-from .selection import Choice, choose
-
-
-class FittingProblem(NamedTuple):
-    """The presses to fit, and how to fit and divide them.
-
-    | meaning                                                     | shape      |
-    |-------------------------------------------------------------|------------|
-    | presses: the presses with their places                      |            |
-    | loss: robust loss of the curve fits                         |            |
-    | fold: fold of each press, the same for all at one place     | (presses,) |
-    """
-
-    presses: LocatedPresses
-    loss: AbstractLoss
-    fold: np.ndarray
+from .selection import Choice, choose, hold_out_choice
 
 
 @dataclass(frozen=True, eq=False)
 class PadResponse:
     """The curve and field that were chosen, fitted to all presses.
 
+    ``held`` holds the forces of all presses by fits, and by choices, that did not use their fold.
     ``baseline`` holds the curves of the paper's recipe beside them: `Linear`, without a field.
     """
 
     choice: Choice
-    hybrid: Hybrid
+    model: PadModel
     baseline: FittedCurve
+    held: HeldOut
 
 
 class HeldOutForces(NamedTuple):
@@ -55,41 +43,42 @@ class HeldOutForces(NamedTuple):
     | meaning                                                              | shape           | unit |
     |----------------------------------------------------------------------|-----------------|------|
     | pad_force: of each pad, by the response                              | (presses, pads) | N    |
+    | half_width: half the 90 % interval of the total, by other places     | (presses,)      | N    |
+    | noise: deviation of new readings about the response                  |                 |      |
     | others: total force by each method of comparison, by name            | (presses,) each | N    |
     | splits: errors when a whole pad, indenter or session is left out     |                 |      |
     """
 
     pad_force: np.ndarray
+    half_width: np.ndarray
+    noise: NoiseLaw
     others: dict[str, np.ndarray]
     splits: tuple[Split, ...]
 
 
-def fitting_problem(
-    skin: je.Skin, data: PressData, places: Places | None, loss: AbstractLoss, folds: int
-) -> FittingProblem:
-    """The fitting problem of the presses on a skin, whose places are divided into `folds` folds."""
+def fold_presses(skin: je.Skin, data: PressData, places: Places | None, loss: AbstractLoss, folds: int) -> Folds:
+    """The presses on a skin, whose places are divided into `folds` folds."""
     geometry = geometry_of(skin, places.position.dtype if places else None)
-    return FittingProblem(LocatedPresses(data, geometry, places), loss, folds_by_place(data.place, folds))
+    return Folds(LocatedPresses(data, geometry, places), loss, folds_by_place(data.place, folds))
 
 
 def fit_response(
-    problem: FittingProblem, skin: je.Skin, curves: Sequence[AbstractCurve], fields: Sequence[AbstractField | None]
+    folds: Folds, skin: je.Skin, curves: Sequence[AbstractCurve], fields: Sequence[AbstractField | None]
 ) -> PadResponse:
     """Choose one of the curves and one of the fields, as `choose` does, and fit them to all presses.
 
     Raises:
         FitError: if the presses do not determine the curve of some pad, or the field.
     """
-    presses, loss, fold = problem
-    choice = choose(curves, fields, presses, loss, fold)
-    hybrid = fit_hybrid(choice.curve, choice.field, presses, loss)
-    _require_fits(skin, hybrid)
-    baseline = hybrid if _is_baseline(choice) else fit_hybrid(Linear(), None, presses, loss)
-    return PadResponse(choice, hybrid, baseline.curves)
+    choice = choose(curves, fields, folds)
+    model = folds.fit(choice.curve, choice.field, frozenset())
+    _require_fits(skin, model)
+    held = hold_out_choice(curves, fields, folds) if choice.tried else folds.hold_out(choice.curve, choice.field)
+    return PadResponse(choice, model, folds.fit(*_baseline(choice), frozenset()).curves, held)
 
 
 def require_every_pad_pressed(skin: je.Skin, data: PressData) -> None:
-    """Check that every pad has a press that it carries alone, because only such presses determine its curve.
+    """Check that every pad carries at least a third of some press, because such presses determine its curve.
 
     Raises:
         FitError: naming the first pad without one.
@@ -97,29 +86,30 @@ def require_every_pad_pressed(skin: je.Skin, data: PressData) -> None:
     for number, pad in enumerate(skin.pads):
         if not data.mask[number].any():
             raise FitError(
-                f"pad {number} ({pad.name}): the curve could not be fitted: no press rests on it alone; press it "
-                "away from its neighbours"
+                f"pad {number} ({pad.name}): the curve could not be fitted: no press rests on it, or a third of one; "
+                "press it at more places"
             )
 
 
-def _is_baseline(choice: Choice) -> bool:
-    return isinstance(choice.curve, Linear) and choice.field is None
+def _baseline(choice: Choice) -> tuple[AbstractCurve, AbstractField | None]:
+    """Curve and field of the paper: a straight line, and none."""
+    return (choice.curve, None) if isinstance(choice.curve, Linear) else (Linear(), None)
 
 
-def _require_fits(skin: je.Skin, hybrid: Hybrid) -> None:
-    curves = hybrid.curves
+def _require_fits(skin: je.Skin, model: PadModel) -> None:
+    curves = model.curves
     for number, pad in enumerate(skin.pads):
         if int(curves.result[number]) != FitResult.SUCCESS:
             raise FitError(f"pad {number} ({pad.name}): the curve could not be fitted: {curves.pad(number).message()}")
-    if hybrid.field is not None and int(hybrid.field.result) != FitResult.SUCCESS:
+    if model.field is not None and int(model.field.result) != FitResult.SUCCESS:
         raise FitError(
-            f"location: the field could not be fitted to {float(hybrid.field.n):.3g} places that the images find: "
+            f"location: the field could not be fitted to {float(model.field.n):.3g} places that the images find: "
             "press at more places, or calibrate without a correction by location"
         )
 
 
 def hold_out_response(
-    problem: FittingProblem,
+    folds: Folds,
     response: PadResponse,
     groups: Mapping[str, np.ndarray],
     image_sum: np.ndarray,
@@ -132,14 +122,20 @@ def hold_out_response(
         image_sum: integral of each press's image, (presses,) S m^2.
         true_position: exact positions of the presses, (presses, 2) m, if a simulation made them.
     """
-    presses, loss, fold = problem
+    presses, data = folds.presses, folds.presses.data
     curve, field = response.choice.curve, response.choice.field
-    pad_force = hold_out(curve, field, presses, loss, fold)
-    others = {"eit": hold_out_image(image_sum, presses.data.force, fold)}
-    others["hybrid"] = (
-        pad_force if _is_baseline(response.choice) else hold_out(Linear(), None, presses, loss, fold)
-    ).sum(1)
+    others = {
+        "eit": hold_out_image(image_sum, data.force, folds.fold),
+        "hybrid": folds.hold_out(*_baseline(response.choice)).hold.force.sum(1),
+    }
     if field is not None and true_position is not None:
         true = presses._replace(places=single_places(true_position, presses.geometry.pads))
-        others["true_place"] = hold_out(curve, field, true, loss, fold).sum(1)
-    return HeldOutForces(pad_force, others, leave_out(curve, field, presses, loss, groups))
+        others["true_place"] = Folds(true, folds.loss, folds.fold).hold_out(curve, field).hold.force.sum(1)
+    held = response.held
+    return HeldOutForces(
+        held.hold.force,
+        held.half_widths(data),
+        held.noise(data),
+        others,
+        leave_out(curve, field, presses, folds.loss, groups),
+    )

@@ -1,33 +1,41 @@
-"""Choice among candidates by their error on held-out samples, with the reason in words."""
+"""Choice among candidates by their error on held-out samples, with the reason in words.
+
+Candidates are compared in pairs over the same places, because the difference of two errors at one place varies far
+less than the errors do from place to place. Of the candidates that are not worse than the best by more than the
+standard error of the paired difference, the one with the fewest effective coefficients is chosen (the
+one-standard-error rule, Breiman et al. 1984, 3.4.3, on paired differences).
+"""
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .curves import CURVES, AbstractCurve
 from .fields import FIELDS, AbstractField
-from .losses import AbstractLoss
-from .pads import LocatedPresses, fit_hybrid, sample_forces
-from .results import FitResult
+from .held_out import Folds, HeldOut, joined
+
+NOTHING_HELD: frozenset[int] = frozenset()
 
 
 class Candidate(NamedTuple):
     """A candidate and its error at held-out places (of a log: in held-out stretches of time).
 
-    | meaning                                                                        | unit |
-    |--------------------------------------------------------------------------------|------|
-    | part: "curve", "location" or "channels"                                        |      |
-    | name                                                                           |      |
-    | size: number of coefficients (for a curve, of one pad)                         |      |
-    | rmse: root mean square over places of the held-out error; None: not determined | N    |
-    | low, high: roots of the mean square minus and plus its standard error          | N    |
-    | chosen: whether it was chosen                                                  |      |
+    | meaning                                                                           | unit |
+    |-----------------------------------------------------------------------------------|------|
+    | part: what was chosen, such as "curve", "location" or "channels"                  |      |
+    | name                                                                              |      |
+    | size: number of effective coefficients                                            |      |
+    | rmse: root mean square over places of the held-out error; None: not determined    | N    |
+    | low, high: the same for the mean square minus and plus the standard error of its  | N    |
+    |            difference from the best, over places                                  |      |
+    | chosen: whether it was chosen                                                     |      |
     """
 
     part: str
     name: str
-    size: int
+    size: float
     rmse: float | None
     low: float | None
     high: float | None
@@ -35,22 +43,20 @@ class Candidate(NamedTuple):
 
 
 class Tried(NamedTuple):
-    """A candidate with its name and number of coefficients."""
+    """A candidate with its name and number of effective coefficients."""
 
     choice: Any
     name: str
-    size: int
+    size: float
 
 
 def simplest(
     part: str, tried: Sequence[Tried], score: Callable[[Any], np.ndarray], over: str
 ) -> tuple[Any, str, tuple[Candidate, ...]]:
-    """The smallest candidate whose mean square error is at most the least one plus its standard error.
-
-    This is the one-standard-error rule (Breiman et al. 1984, 3.4.3).
+    """The smallest candidate that is not worse than the best by more than the standard error of their difference.
 
     Args:
-        part: "curve", "location" or "channels"; see `Candidate`.
+        part: what is chosen; see `Candidate`.
         tried: the candidates; a single one is not scored.
         score: mean square errors of a `choice`, (n,) N^2 over places; a value that is not finite: not determined.
         over: what n counts, in words.
@@ -62,17 +68,22 @@ def simplest(
     tried = sorted(tried, key=lambda one: one.size)
     errors = [score(one.choice) for one in tried]
     means = np.array([np.mean(e) if np.isfinite(e).all() else np.inf for e in errors])
-    spread = np.array([np.std(e, ddof=1) / np.sqrt(len(e)) for e in errors])
     least = int(np.argmin(means))
-    limit = means[least] + spread[least]
-    chosen = int(np.argmax(means <= limit))
+    spread = np.array([_standard_error(e - errors[least]) for e in errors])
+    chosen = int(np.argmax(means <= means[least] + np.nan_to_num(spread)))
     table = tuple(
-        Candidate(part, one.name, one.size, *_roots(mean, error), chosen=k == chosen)
+        Candidate(part, one.name, round(one.size, 1), *_roots(mean, error), chosen=k == chosen)
         for k, (one, mean, error) in enumerate(zip(tried, means, spread, strict=True))
     )
     said = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in table)
-    why = f"{tried[chosen].name}, the simplest within one standard error ({np.sqrt(limit):.2f} N) of the best"
-    return tried[chosen].choice, f"{why}; held-out RMSE over {over} in N: {said}", table
+    why = f"{tried[chosen].name}, the simplest within one standard error of the paired difference from the best"
+    return tried[chosen].choice, f"{why} ({tried[least].name}); held-out RMSE over {over} in N: {said}", table
+
+
+def _standard_error(difference: np.ndarray) -> float:
+    if len(difference) < 2 or not np.isfinite(difference).all():
+        return 0.0
+    return float(np.std(difference, ddof=1) / np.sqrt(len(difference)))
 
 
 def _roots(mean: float, error: float) -> tuple[float | None, float | None, float | None]:
@@ -93,50 +104,48 @@ class Choice(NamedTuple):
     @property
     def title(self) -> str:
         """The names of curve and field, for a table."""
-        return ", ".join(
-            [CURVES.name_of(self.curve)] + ([FIELDS.name_of(self.field)] if self.field is not None else [])
-        )
+        return _title(self.curve, self.field)
+
+
+def _title(curve: AbstractCurve, field: AbstractField | None) -> str:
+    return ", ".join([CURVES.name_of(curve)] + ([FIELDS.name_of(field)] if field is not None else []))
+
+
+def _name(curve: AbstractCurve, field: AbstractField | None, parts: Sequence[str]) -> str:
+    """The names of those parts that are chosen."""
+    names = {"curve": CURVES.name_of(curve), "location": "none" if field is None else FIELDS.name_of(field)}
+    return ", ".join(names[part] for part in parts)
 
 
 def choose(
     curves: Sequence[AbstractCurve],
     fields: Sequence[AbstractField | None],
-    presses: LocatedPresses,
-    loss: AbstractLoss,
-    fold: np.ndarray,
+    folds: Folds,
+    without: frozenset[int] = NOTHING_HELD,
 ) -> Choice:
-    """The simplest field, then the simplest curve, whose held-out error is within one standard error of the least.
+    """The simplest pair of curve and field whose held-out error is not worse than the least; see `simplest`.
 
     The error is the mean over places of the mean square over the samples of the presses, so that all loads of a ramp
-    count; fits do not use the place (see `simplest`). The simplest has the fewest coefficients. The field is chosen
-    with the first curve, then the curve with that field.
+    count; fits do not use the place.
+
+    Args:
+        without: folds of which nothing is used, neither for fits nor for errors.
     """
-    pads = presses.geometry.pads
-    by_field = [Tried(f, "none" if f is None else FIELDS.name_of(f), 0 if f is None else f.size(pads)) for f in fields]
-    field, why, first = simplest(
-        "location", by_field, lambda f: place_errors(curves[0], f, presses, loss, fold), "places"
+    pairs = list(product(curves, fields))
+    if len(pairs) == 1:
+        return Choice(*pairs[0], "")
+    parts = [part for part, choices in (("curve", curves), ("location", fields)) if len(choices) > 1]
+    tried = [Tried(pair, _name(*pair, parts), folds.fit(*pair, without).coefficients) for pair in pairs]
+    (curve, field), why, table = simplest(
+        " and ".join(parts), tried, lambda pair: folds.place_errors(pair[0], pair[1], without), "places"
     )
-    by_curve = [Tried(c, CURVES.name_of(c), c.size) for c in curves]
-    curve, more, second = simplest("curve", by_curve, lambda c: place_errors(c, field, presses, loss, fold), "places")
-    return Choice(curve, field, "; ".join(filter(None, [why, more])), first + second)
+    return Choice(curve, field, why, table)
 
 
-def place_errors(
-    curve: AbstractCurve, field: AbstractField | None, presses: LocatedPresses, loss: AbstractLoss, fold: np.ndarray
-) -> np.ndarray:
-    """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place.
-
-    NaN at all places if one of the fits fails: its numbers must not be compared with those of others.
-    """
-    data = presses.data
-    total = np.full(data.sample_force.shape, np.nan)
-    for k in np.unique(fold):
-        hybrid = fit_hybrid(curve, field, presses, loss, use=fold != k)
-        if (np.asarray(hybrid.curves.result) != FitResult.SUCCESS).any():
-            return np.full(data.place.max() + 1, np.nan)
-        held = fold[data.sample_press] == k
-        total[held] = sample_forces(hybrid, presses).sum(0)[held]
-    square = (total - data.sample_force) ** 2
-    square = np.where(np.isfinite(data.sample_force) & np.isfinite(data.sample_pressure).all(0), square, 0)
-    count = np.bincount(data.sample_place, minlength=data.place.max() + 1)
-    return np.bincount(data.sample_place, square, len(count)) / np.maximum(count, 1)
+def hold_out_choice(curves: Sequence[AbstractCurve], fields: Sequence[AbstractField | None], folds: Folds) -> HeldOut:
+    """Forces held out of fits and choice alike: for each fold, curve and field are chosen without it (nested)."""
+    parts = []
+    for k in folds.numbers:
+        choice = choose(curves, fields, folds, frozenset({k}))
+        parts.append(folds.predicted(folds.fit(choice.curve, choice.field, frozenset({k})), frozenset({k})))
+    return joined(parts, folds)

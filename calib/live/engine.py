@@ -23,6 +23,7 @@ from ..calibration.localisation import ContactLocator
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
+from .recalibrator import LiveRecalibrator
 from .results import NO_TOUCHES, FrameResult, TouchEstimates
 
 TOUCH_SIGNIFICANCE = 3.0  # a force above this many standard errors is a touch
@@ -105,11 +106,12 @@ class FramePrograms:
     """
 
     def __init__(self, law: ForceLaw):
-        self._law = law
+        self._law, self.gains = law, law.pads.gains
         self._image = law.recon.on_host(IMAGE_DTYPE)
-        self._dtypes = law.recon.dtype, law.curves.parameters.dtype
-        # The numbers of the force law are constants of the program, which takes two thirds off the overhead of a call.
-        self._map = _compiled(lambda *a: _packed_forces(law, *a))
+        self._dtypes = law.recon.dtype, law.pads.dtype
+        # The numbers of the force law are constants of the program, which takes two thirds off the overhead of a call;
+        # only the gains of the pads may change while it runs.
+        self._map = _compiled(lambda gains, *a: _packed_forces(law.moved(gains), *a))
         leaves, tree = jax.tree.flatten(law)
         search = _compiled(lambda leaves, *a: _find_contacts(jax.tree.unflatten(tree, leaves), *a))
         self._search = partial(search, leaves)  # not constants, because the table of responses takes megabytes
@@ -133,7 +135,7 @@ class FramePrograms:
     def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> FrameForces:
         """Forces from a difference frame (readings,) V, pressures (pads,) Pa and those ``before`` (m, pads)."""
         image = self._image(frame)
-        row = self._map(image[None], self._row(pressure, 1), places, filled(self._law, before))
+        row = self._map(self.gains, image[None], self._row(pressure, 1), places, filled(self._law, before))
         return _unpack_forces(np.asarray(row), pressure.size, image)
 
     def search(self, frame: np.ndarray) -> tuple[Places, TouchEstimates]:
@@ -152,7 +154,7 @@ def _compiled(function: Callable[..., T]) -> Callable[..., T]:
 def _packed_forces(law: ForceLaw, image: Array, pressure: Array, places: Places, before: Array | None) -> Array:
     """The fields of `FrameForces` in one row, so that one transfer from the device suffices."""
     image = image.astype(law.recon.dtype)
-    found = fused(law, image, pressure, places if law.field is not None else None, before, GATE)
+    found = fused(law, image, pressure, places if law.pads.field is not None else None, before, GATE)
     loaded, negative = is_loaded(law, pressure), is_loaded(law, -pressure)
     parts = found.map.force, found.force, found.standard_error, found.valid, loaded, negative
     return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])
@@ -198,7 +200,12 @@ class Engine:
     """Turns frames into results with one calibration. Only the thread that created it may use it."""
 
     def __init__(
-        self, calibration: Calibration, rest: float = 2.0, programs: Callable[[ForceLaw], FramePrograms] = FramePrograms
+        self,
+        calibration: Calibration,
+        rest: float = 2.0,
+        programs: Callable[[ForceLaw], FramePrograms] = FramePrograms,
+        *,
+        recalibrator: LiveRecalibrator | None = None,
     ):
         self._rest = rest
         self._rest_levels = RestLevels(rest)
@@ -208,7 +215,8 @@ class Engine:
         recon = calibration.recon
         self._used_readings, self._centres = np.asarray(recon.channels), np.asarray(recon.centres)
         self._pad_weights = np.asarray(calibration.masks.weights)
-        self._law = law_of(calibration)
+        self._recalibrator = recalibrator
+        self._law = law_of(calibration) if recalibrator is None else recalibrator.moved(law_of(calibration))
         self._programs = programs(self._law)
         self._programs.warm_up()
         self._before = np.zeros((1, len(self._pad_weights)))
@@ -230,9 +238,16 @@ class Engine:
             return "running"
         return "waiting for the skin to be at rest: do not touch it" if self.restless else MEASURING
 
+    @property
+    def health(self) -> str:
+        """How far off the calibration is; empty unless it is being recalibrated."""
+        return "" if self._recalibrator is None else self._recalibrator.health
+
     def tare(self) -> None:
         """Measure the rest levels again."""
         self._rest_levels, self._negative_since, self.restless = RestLevels(self._rest), None, False
+        if self._recalibrator is not None:
+            self._recalibrator.tared()
 
     def has_wrong_zero(self, now: int) -> bool:
         """Whether pads read below zero for so long, at `now` (ns), that the skin was pressed when zero was measured."""
@@ -258,7 +273,8 @@ class Engine:
     def pressed(self, arrival: ReceivedFrame) -> np.ndarray:
         """Change of pressure on each pad (pads,) Pa; only once the rest levels are measured."""
         assert self._rest_levels.levels is not None
-        return np.asarray(arrival.pressure - self._rest_levels.levels[1])
+        offset = 0.0 if self._recalibrator is None else self._recalibrator.offset
+        return np.asarray(arrival.pressure - self._rest_levels.levels[1] - offset)
 
     def step(self, arrival: ReceivedFrame, dropped: int = 0) -> FrameResult | None:
         """Process one frame; None while the rest levels are being measured."""
@@ -270,8 +286,10 @@ class Engine:
         pressed = np.where(silent, 0.0, pressure)
         found = self._programs.map(frame, pressed, self._current_places(), self._before)
         if self._law.remembers:
-            self._before = remembered(np.concatenate([self._before, pressure[None]]))
+            own = np.asarray(self._law.moved(self._programs.gains).pads.own(jnp.asarray(pressure[None])))
+            self._before = remembered(np.concatenate([self._before, own]))
         self._schedule_search(frame, bool(found.loaded.any()))
+        self._recalibrate(frame, pressure, bool(found.loaded.any()), arrival.host)
         self._note_negative(found.negative & ~silent, found.loaded & ~silent, arrival.host)
         force = np.where(silent, np.nan, found.force)
         error = np.where(silent, np.nan, found.standard_error)
@@ -292,6 +310,12 @@ class Engine:
             unsearched=self.unsearched,
         )
 
+    def _recalibrate(self, frame: np.ndarray, pressure: np.ndarray, loaded: bool, now: int) -> None:
+        """Let the recalibrator see a frame, and use its gains from the next frame on."""
+        if self._recalibrator is not None:
+            self._recalibrator.add(frame, pressure, loaded, now)
+            self._programs.gains = self._recalibrator.gains
+
     def _current_places(self) -> Places:
         return self._places if time.monotonic() - self._search_end < MAX_PLACE_AGE else self._programs.nowhere
 
@@ -307,7 +331,9 @@ class Engine:
             self._places, self._touches = self._programs.nowhere, replace(NO_TOUCHES, age=0)
 
     def use_spare_time(self, seconds: float) -> None:
-        """Fit contacts of the newest frame if `seconds`, the time until the next frame, allow it."""
+        """Fit contacts of the newest frame if `seconds`, the time until the next frame, allow it; then recalibrate."""
+        if self._recalibrator is not None and self._waiting_frame is None:
+            self._recalibrator.use_spare_time()
         if self._waiting_frame is not None and (
             seconds > self._search_time or time.monotonic() - self._search_end > MAX_SEARCH_DELAY
         ):

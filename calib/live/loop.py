@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from ..record.recorder import Recorder
 from ..record.sources import Source
 from ..record.wire.messages import Frame
 from .engine import Engine, ReceivedFrame
+from .recalibrator import LiveRecalibrator
 from .results import FrameResult
 from .scan_control import ScanDirector, prepare_director
 
@@ -98,6 +100,7 @@ class LiveControl:
     tare: threading.Event = field(default_factory=threading.Event)
     state: str = "waiting for the devices"
     lost: int = 0  # frames that were sent and did not arrive
+    health: str = ""  # of the calibration, while it is being recalibrated
     simulated: bool = False  # whether a device reports that its values are simulated
     warn: Callable[[str], object] = _ignore  # called with what the operator should know
 
@@ -115,12 +118,16 @@ class LiveSettings:
     | wait         | time within which the devices must begin                                     | 10      | s    |
     | event_driven | whether to request readings frame by frame, which the device must support    | False   |      |
     | realtime     | whether to use real-time scheduling once everything is compiled              | False   |      |
+    | recalibrate  | whether zero and gains of the pads follow their drift                        | False   |      |
+    | moved        | calibration file to which the moved calibration is written; None: none       | None    |      |
     """
 
     rest: float = 2.0
     wait: float = 10.0
     event_driven: bool = False
     realtime: bool = False
+    recalibrate: bool = False
+    moved: str | Path | None = None
 
 
 def run_live(
@@ -151,7 +158,8 @@ def run_live(
     settings = settings or LiveSettings()
     _check(calibration, sources)
     queue = FrameQueue(*(source.plan for source in sources))
-    engine = Engine(calibration, settings.rest)
+    recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn) if settings.recalibrate else None
+    engine = Engine(calibration, settings.rest, recalibrator=recalibrator)
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
     director = None
     if settings.event_driven:
@@ -160,6 +168,9 @@ def run_live(
     with real_time(settings.realtime), recorder:
         begun()
         count = _process_frames(engine, queue, recorder, viewers, control, settings.wait, director)
+    if recalibrator is not None:
+        control.warn(recalibrator.health)
+        recalibrator.save()
     if recorder.failure is not None:
         raise LiveError(f"live: {recorder.failure}") from recorder.failure
     return count
@@ -225,4 +236,4 @@ def _tell_state(control: LiveControl, engine: Engine, recorder: Recorder) -> Non
     control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)
     if engine.state != control.state and engine.restless:
         control.warn(engine.state)
-    control.state = engine.state
+    control.state, control.health = engine.state, engine.health

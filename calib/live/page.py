@@ -185,7 +185,9 @@ class _Handler(BaseHTTPRequestHandler):
         while not stop.is_set():
             result = self.server.newest(number)
             control = self.server.control
-            about = json.dumps({"state": control.state, "simulated": control.simulated, "lost": control.lost})
+            about = json.dumps(
+                {"state": control.state, "health": control.health, "simulated": control.simulated, "lost": control.lost}
+            )
             text = result.to_json(image=True) if result is not None else "null"
             number = number if result is None else result.number
             self.wfile.write(f'data: {{"about": {about}, "result": {text}}}\n\n'.encode())

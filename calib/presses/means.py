@@ -95,11 +95,11 @@ def hold_positions(presses: PressColumns, stage: ReadableStream) -> np.ndarray:
         return np.stack([np.median(r, axis=0) if len(r) else np.full(r.shape[1], np.nan) for r in rows])
 
 
-def dominant_pad(pressure: np.ndarray, share: float = 0.9) -> np.ndarray:
-    """Pad (presses,) that carries at least `share` of the positive pressure change (presses, pads); -1 without one.
+DOMINANT_SHARE = 0.9  # of a press, with which a pad carries it alone
 
-    A press across the edge between two pads loads both, and so determines the curve of neither.
-    """
+
+def dominant_pad(pressure: np.ndarray, share: float = DOMINANT_SHARE) -> np.ndarray:
+    """Pad (presses,) that carries at least `share` of the positive pressure change (presses, pads); -1 without one."""
     positive = np.maximum(np.nan_to_num(pressure), 0.0)
     total = positive.sum(axis=1)
     best = positive.argmax(axis=1)

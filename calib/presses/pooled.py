@@ -1,7 +1,7 @@
 """Pool the presses of several sessions into one table, to which curves and fields are fitted."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -11,10 +11,13 @@ import jaxeit as je
 
 from ..session import Session
 from .corrections import correct
+from .crosstalk import Crosstalk, fit_crosstalk
 from .means import FILTER_MARGIN, dominant_pad
 from .streams import finite_mean, index_ranges
 from .table import PressMeasurements, Processing, measure
 
+# Least share of a press that a pad must carry for the press to determine the pad's curve and field.
+MIN_SHARE = 1 / 3
 MEANS_PER_PRESS = 24  # that replace the samples of a press, because neighbouring samples are nearly equal
 
 
@@ -54,7 +57,7 @@ class PadSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PressData:
-    """Presses of one or more sessions: their samples, and the means over their holds.
+    """Presses of one or more sessions: their samples, and the means over their holds. Pressures are the pads' own.
 
     | field           | meaning                                                      | shape           | unit |
     |-----------------|--------------------------------------------------------------|-----------------|------|
@@ -76,6 +79,13 @@ class PressData:
     force: np.ndarray
     place: np.ndarray
     reach: np.ndarray
+
+    @cached_property
+    def share(self) -> np.ndarray:
+        """Share of each pad in the positive pressure over the hold, (presses, pads): where pads are alike, in force."""
+        positive = np.maximum(np.nan_to_num(self.pressure), 0)
+        total = positive.sum(1, keepdims=True)
+        return np.asarray(positive / np.where(total > 0, total, 1))
 
     @property
     def sample_place(self) -> np.ndarray:
@@ -112,6 +122,7 @@ class PooledPresses:
     | groups     | number of the pad, indenter and session of each press      | (presses,) each     |      |
     | channels   | whether a reading was finite in every press                | (readings,)         |      |
     | noise      | of a frame: the largest of the sessions                    | (readings,)         | V    |
+    | crosstalk  | between the pads; all pressures are the pads' own          |                     |      |
     | untouched  | readings without contact                                   | (readings,)         | V    |
     | true_place | whether the position comes from a simulation, and is exact |                     |      |
     | notes      | remarks for the operator, by session                       |                     |      |
@@ -126,6 +137,7 @@ class PooledPresses:
     groups: Mapping[str, np.ndarray]
     channels: np.ndarray
     noise: np.ndarray
+    crosstalk: Crosstalk
     untouched: np.ndarray
     true_place: bool
     notes: tuple[str, ...]
@@ -144,17 +156,19 @@ def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Process
     recordings = tuple(measure(session, skin, processing) for session in sessions)
     position = np.concatenate([m.position for m in recordings])
     pressure = np.concatenate([m.pressure for m in recordings])
+    crosstalk = fit_crosstalk(pressure, position, skin.pads)
+    pressure = crosstalk.own(pressure)
     owner = dominant_pad(pressure)
     series = PressSeries(
         _press_of_samples(recordings),
-        np.concatenate([m.samples.pressure for m in recordings]),
+        crosstalk.own(np.concatenate([m.samples.pressure for m in recordings])),
         np.concatenate([m.samples.force for m in recordings]),
     )
     tip = np.concatenate([m.presses.tip_diameter[m.presses.accepted] for m in recordings])
     return PooledPresses(
         recordings=recordings,
         series=series,
-        data=_press_data(recordings, position, pressure, owner, thinned(series, MEANS_PER_PRESS)),
+        data=_press_data(recordings, position, pressure, thinned(series, MEANS_PER_PRESS)),
         dv=np.concatenate([m.dv for m in recordings]),
         position=position,
         owner=owner,
@@ -165,6 +179,7 @@ def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Process
         },
         channels=np.logical_and.reduce([m.channels for m in recordings]),
         noise=np.max([m.noise for m in recordings], 0),
+        crosstalk=crosstalk,
         untouched=np.mean([m.untouched for m in recordings], 0),
         true_place=any("contact_position" in m.session.truth for m in recordings),
         notes=tuple(f"{m.session.name}: {note}" for m in recordings for note in m.notes),
@@ -172,23 +187,20 @@ def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Process
 
 
 def _press_data(
-    recordings: Sequence[PressMeasurements],
-    position: np.ndarray,
-    pressure: np.ndarray,
-    owner: np.ndarray,
-    means: PressSeries,
+    recordings: Sequence[PressMeasurements], position: np.ndarray, pressure: np.ndarray, means: PressSeries
 ) -> PressData:
     finite = np.isfinite(means.pressure).all(1) & np.isfinite(means.force)
-    return PressData(
+    data = PressData(
         sample_pressure=means.pressure.T,
         sample_force=means.force,
         sample_press=means.press,
-        mask=finite & (owner[means.press] == np.arange(pressure.shape[1])[:, None]),
+        mask=np.broadcast_to(finite, means.pressure.T.shape),
         pressure=pressure,
         force=np.concatenate([m.force for m in recordings]),
         place=np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel(),
         reach=np.stack([position.min(0), position.max(0)]),
     )
+    return replace(data, mask=data.mask & (data.share[means.press] >= MIN_SHARE).T)
 
 
 def _press_of_samples(recordings: Sequence[PressMeasurements]) -> np.ndarray:

@@ -60,6 +60,7 @@ class PressMeasurements:
     | pressure  | change of the gage pressure of the pads over the hold         | (presses, pads)     | Pa   |
     | force     | force of the load cell over the hold                          | (presses,)          | N    |
     | untouched | readings without contact, mean over the presses               | (readings,)         | V    |
+    | rest      | gage pressure of the pads without contact, at each press      | (presses, pads)     | Pa   |
     | noise     | standard deviation of the readings of a single frame          | (readings,)         | V    |
     | channels  | whether a reading was finite in every press                   | (readings,)         |      |
     | samples   | pressure and force over whole presses, sample by sample       |                     |      |
@@ -74,6 +75,7 @@ class PressMeasurements:
     pressure: np.ndarray
     force: np.ndarray
     untouched: np.ndarray
+    rest: np.ndarray
     noise: np.ndarray
     channels: np.ndarray
     samples: PressSamples
@@ -82,21 +84,24 @@ class PressMeasurements:
     notes: tuple[str, ...]
 
 
-def measure(session: Session, skin: je.Skin, processing: Processing | None = None) -> PressMeasurements:
+def measure(
+    session: Session, skin: je.Skin, processing: Processing | None = None, *, place_needed: bool = True
+) -> PressMeasurements:
     """Cut the presses out of the streams of a session, correct them and average each over its hold.
 
     Args:
         session: with eit, pressure and force streams; a stage stream if it has no table of presses.
         skin: the skin that the session was recorded on.
         processing: `Processing()` by default.
+        place_needed: whether the session must tell where the presses were; otherwise positions may be NaN.
 
     Raises:
         SessionError: if the session was not recorded on this skin, lacks a stream, or no press can be used.
     """
     processing = processing or Processing()
     streams = {name: session.stream(name) for name in ("eit", "pressure", "force")}
-    _require_skin(session, skin, streams)
-    presses = _presses(session, streams["force"])
+    require_skin(session, skin, streams)
+    presses = _presses(session, streams["force"], place_needed)
     windows = press_windows(presses, processing.windows, recording_end(streams.values()))
     presses = reject_without_samples(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
@@ -129,6 +134,7 @@ def measure(session: Session, skin: je.Skin, processing: Processing | None = Non
         pressure=means["pressure"][kept],
         force=force[kept],
         untouched=held["eit"].baseline[kept].mean(0),
+        rest=held["pressure"].baseline[kept],
         noise=_frame_noise(held["eit"].change, kept),
         channels=channels,
         samples=samples,
@@ -142,7 +148,8 @@ def _error(session: Session, where: str, what: str, todo: str) -> SessionError:
     return SessionError(f"{session.name}: {where}: {what}; {todo}")
 
 
-def _require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) -> None:
+def require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) -> None:
+    """Check that eit and pressure streams are those of the skin; raises SessionError otherwise."""
     for name, stream in streams.items():
         if not len(stream):
             raise _error(session, f"/streams/{name}", "holds no sample", "record again")
@@ -166,10 +173,10 @@ def _require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) -
         )
 
 
-def _presses(session: Session, force: Stream) -> PressTable:
+def _presses(session: Session, force: Stream, place_needed: bool) -> PressTable:
     if session.presses is not None and len(session.presses):
         return session.presses
-    if "stage" not in session.streams:
+    if "stage" not in session.streams and place_needed:
         raise _error(
             session,
             "/presses",
@@ -177,8 +184,9 @@ def _presses(session: Session, force: Stream) -> PressTable:
             "record the stage, or write the table",
         )
     found = find_presses(force.time, force.read()[:, 0])
-    place = hold_positions(found, session.streams["stage"])
     count = len(found)
+    staged = "stage" in session.streams
+    place = hold_positions(found, session.streams["stage"]) if staged else np.full((count, 2), np.nan)
     return PressTable(
         x=place[:, 0],
         y=place[:, 1],
@@ -259,7 +267,7 @@ def resting_levels(
         SessionError: if the session was not recorded on this skin, or a stream is missing.
     """
     streams = {name: session.stream(name) for name in ("eit", "pressure")}
-    _require_skin(session, skin, streams)
+    require_skin(session, skin, streams)
     return {name: _level(stream, _rest_windows(session, stream, processing)) for name, stream in streams.items()}
 
 

@@ -61,7 +61,6 @@ class StreamCounters:
     lost: int = 0
     rejected: int = 0  # repeated, late, or out of sequence
     miscounted: int = 0  # kept, though their sequence numbers do not count up
-    last_frame: float = 0.0  # time.monotonic() of the last frame that was kept
     timeout: float = FIRST_FRAME_TIMEOUT  # s of silence after which a frame is overdue
     connections: int = 0
     simulated: bool = False
@@ -184,7 +183,7 @@ class StreamReceiver:
             self._rejoined = False
         self._journal.append(self.number, flags, host, pack_frame(frame))
         self.counters.frames += 1
-        self.counters.last_frame, self._last_frame = host / 1e9, (frame, host)
+        self._last_frame = frame, host
         if self._on_frame is not None:
             self._on_frame(self.number, frame, host)
 
@@ -210,8 +209,8 @@ class StreamReceiver:
             yield f"{name}: {what}, so that lost frames cannot be counted; see docs/wire-format.md"
         if counters.lost > MAX_LOST * received:
             yield f"{name}: {counters.lost:,} frames were lost; check the link"
-        silence = now - counters.last_frame
-        if counters.frames and not self.ended and silence > counters.timeout:
+        silence = 0.0 if self._last_frame is None else now - self._last_frame[1] / 1e9
+        if not self.ended and silence > counters.timeout:
             yield f"{name}: no frame came in the last {silence:.1f} s; check the device"
 
     def _note_simulation(self, note: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..calibration.calibration import Calibration
 from ..calibration.evaluation import CALIBRATED, METHODS, Evaluation
+from ..calibration.press_examples import PressExamples
 from ..fitting.fields import FIELDS, FittedField
 from .figures import sensitivity_maps
 from .html_parts import number_text
@@ -29,6 +30,18 @@ def about_localisation(evaluation: Evaluation, estimators: Sequence[str]) -> tup
         "electrodes in another order."
     )
     return alt, caption
+
+
+def about_maps(examples: PressExamples) -> tuple[str, str]:
+    """Alternative text and caption of images and force maps."""
+    count = len(examples.force)
+    return (
+        f"EIT images of {count} presses above their force maps, over the outlines of sheet and pads.",
+        f"{count} presses of nearly the largest force: one that pads share, the others near the middles of pads. "
+        "Above: the EIT image, with the force of the load cell. Below: the force map, the image cut by the pads and "
+        "scaled so that each pad's part sums to the force that its pressure tells; its total stands above it. The "
+        "cross marks the true place. These presses were fitted, not held out.",
+    )
 
 
 def about_sensitivity(evaluation: Evaluation) -> tuple[str, str]:

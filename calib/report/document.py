@@ -9,11 +9,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+import jaxeit as je
+
 from ..calibration.calibration import Calibration
-from ..calibration.evaluation import METHODS, Evaluation
+from ..calibration.evaluation import METHODS, THIRDS, Evaluation
 from ..fitting.selection import Candidate
 from ..session import replacing
-from .captions import about_curves, about_gain, about_localisation, about_loops, about_sensitivity
+from .captions import about_curves, about_gain, about_localisation, about_loops, about_maps, about_sensitivity
 from .figures import (
     ESTIMATOR_MEANING,
     localisation_figure,
@@ -22,6 +24,7 @@ from .figures import (
     sensitivity_figure,
 )
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text, with_error
+from .map_figures import maps_figure
 from .pad_figures import curves_figure, gain_figure, has_loops, loops_figure
 
 _NO_EVALUATIONS: Mapping[str, Evaluation] = MappingProxyType({})
@@ -41,7 +44,7 @@ def write_report(
 
     Args:
         calibration: what the page is about.
-        path: of the page; for ``report.html`` the figures are ``report_localisation.png``,
+        path: of the page; for ``report.html`` the figures are ``report_maps.png``, ``report_localisation.png``,
             ``report_sensitivity.png`` and ``report_curves.png``, of presses that were released also
             ``report_loops.png``, with a correction by location ``report_gain.png``.
         evaluations: of the calibration on other sessions, by name.
@@ -95,6 +98,9 @@ def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
         _Picture("sensitivity", "Sensitivity over the sheet", png(sensitivity), *about_sensitivity(found)),
         _Picture("curves", "Curves and force errors", png(curves), *about_curves(calibration, evaluations)),
     ]
+    if calibration.examples is not None:
+        maps = png(maps_figure(calibration))
+        pictures.insert(0, _Picture("maps", "Force maps of some presses", maps, *about_maps(calibration.examples)))
     if has_loops(calibration):
         pictures.append(_Picture("loops", "Hysteresis", png(loops_figure(calibration)), *about_loops(calibration)))
     if calibration.field is not None:
@@ -113,8 +119,10 @@ def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figur
         f"<h1>{escape(f'Calibration of the skin {calibration.skin.name}')}</h1>",
         _banner(calibration.simulated),
         f"<p>{escape(_lead(calibration))}</p>",
+        _health(calibration),
+        _residuals(_all(calibration, evaluations), calibration.skin),
         _results(calibration, evaluations),
-        _localisation(_all(calibration, evaluations)),
+        _localisation(_all(calibration, evaluations), calibration.skin.name == PAPERS_SKIN),
         _left_out(calibration.evaluation),
         _choice(calibration),
         *map(_figure, figures),
@@ -145,6 +153,70 @@ def _lead(calibration: Calibration) -> str:
     )
 
 
+def _health(calibration: Calibration) -> str:
+    """How the pads have moved since the calibration; empty if it was never recalibrated."""
+    found = calibration.recalibration
+    if found is None:
+        return ""
+    head = ["pad", "offset, Pa", "change, Pa", "gain before", "gain", "moved, %", "presses or contacts", ""]
+    errors, own = np.sqrt(np.diag(found.covariance)), np.exp(found.log_gain)
+    rows = [
+        (
+            name,
+            with_error(found.offset[i], found.offset_error[i], 1),
+            number_text(found.offset_change[i], 1),
+            number_text(np.exp(found.before[i]), 4),
+            with_error(own[i], own[i] * errors[i], 4),
+            with_error(100 * np.expm1(found.change[i]), 100 * found.change_error[i], 2),
+            number_text(found.count[i], 1),
+            "significant" if found.significant[i] else "" if found.determined[i] else "not determined",
+        )
+        for i, name in enumerate(found.pads)
+    ]
+    notes = "".join(f"<li>{escape(note)}</li>" for note in found.notes)
+    about = (
+        f"From {found.evidence} in {found.session.split('  ')[-1]}. Results, figures and curves below are those of the "
+        "calibration itself; forces are computed from pressures divided by these gains."
+    )
+    return (
+        f"<h2>Calibration health</h2><p>{escape(found.health)}.</p>{html_table(head, {'': rows})}"
+        f"<p class='small'>{escape(about)}</p><ul>{notes}</ul>"
+    )
+
+
+def _residuals(found: Mapping[str, Evaluation], skin: je.Skin) -> str:
+    """Residuals of the presses on each pad, by the pad that bears most of the press; and the coverage of intervals."""
+    groups = {name: [_residual_row(e, k, pad.name) for k, pad in enumerate(skin.pads)] for name, e in found.items()}
+    head = ["presses mostly on pad", "presses", "mean error, N", "RMSE, N", "median |error|, N", "worst, N", "in 90 %"]
+    told = [f"{name}: {text}" for name, e in found.items() if (text := _coverage(e))]
+    about = (
+        "Error: estimated less true total force. In 90 %: part of the presses whose true force lies in the 90 % "
+        "interval that the calibration gives with the force. " + " ".join(told)
+    )
+    return f"<h2>Residuals by pad</h2>{html_table(head, groups)}<p class='small'>{escape(about)}</p>"
+
+
+def _residual_row(found: Evaluation, pad: int, name: str) -> tuple[str, ...]:
+    mine = np.nan_to_num(found.pressure).argmax(1) == pad
+    error = (found.total_force - found.force)[mine]
+    if not len(error):
+        return f"{pad} {name}", "0", *["—"] * 5
+    inside = "—"
+    if found.half_width is not None and np.isfinite(found.half_width[mine]).all():
+        inside = f"{100 * np.mean(np.abs(error) <= found.half_width[mine]):.0f} %"
+    sizes = error.mean(), np.sqrt(np.mean(error**2)), np.median(np.abs(error)), np.abs(error).max()
+    return f"{pad} {name}", str(len(error)), *(number_text(float(size), 2) for size in sizes), inside
+
+
+def _coverage(found: Evaluation) -> str:
+    """Coverage of the intervals, of all presses and of each third of force; empty without intervals."""
+    s = found.summary()
+    if "coverage" not in s:
+        return ""
+    thirds = [f"{name} {100 * s[f'coverage_{name}']:.0f} %" for name in THIRDS if f"coverage_{name}" in s]
+    return f"{100 * s['coverage']:.0f} % of all presses; thirds of the force: {', '.join(thirds)}."
+
+
 def _levels(force: np.ndarray) -> str:
     low, high = f"{force.min():.3g}", f"{force.max():.3g}"
     return f"about {low} N" if low == high else f"{low} to {high} N"
@@ -159,7 +231,8 @@ def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
         f"{name}: {len(e.force)} presses, held out by {e.held_out_by}": _method_rows(e)
         for name, e in _all(calibration, evaluations).items()
     }
-    groups[_PAPER] = [(METHODS[name], cv, *["—"] * 4) for name, cv in _PAPER_CV.items()]
+    if calibration.skin.name == PAPERS_SKIN:
+        groups[_PAPER] = [(METHODS[name], cv, *["—"] * 4) for name, cv in _PAPER_CV.items()]
     head = ["total force by", "CV, ddof 1", "RMSE, N", "RMSE, % of largest", "mean absolute, N", "worst, N"]
     about = (
         "EIT only: the integral of the image times one number; hybrid: the paper's recipe, one slope a pad; "
@@ -176,6 +249,7 @@ def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
     return f"<h2>Results</h2>{html_table(head, groups)}<p class='small'>{escape(about)}</p>"
 
 
+PAPERS_SKIN = "testbed"  # the skin of the paper's 225 presses
 _PAPER = "the paper: 225 presses on hardware"
 _PAPER_CV = {"eit": "0.31", "hybrid": "0.14"}
 
@@ -231,14 +305,20 @@ def _choice(calibration: Calibration) -> str:
     return f"<h2>Choice of the model</h2><p>{escape(about + why)}.</p>{_tried(calibration)}"
 
 
-_PARTS = {"location": "correction by location, with the first curve", "curve": "curve, with the correction chosen"}
+_PARTS = {"location": "correction by location", "curve and location": "curve, correction by location"}
 
 
 def _tried(calibration: Calibration) -> str:
     """Table of all candidates and their errors; empty for a file of an early version."""
     parts = dict.fromkeys(candidate.part for candidate in calibration.tried)
     groups = {_PARTS.get(p, p): [_candidate(c) for c in calibration.tried if c.part == p] for p in parts}
-    head = ["candidate", "coefficients", "held-out RMSE, N", "one standard error about, N", ""]
+    head = [
+        "candidate",
+        "effective coefficients",
+        "held-out RMSE, N",
+        "with the error of its difference from the best, N",
+        "",
+    ]
     return html_table(head, groups) if groups else ""
 
 
@@ -249,9 +329,10 @@ def _candidate(tried: Candidate) -> tuple[str, ...]:
     return tried.name, str(tried.size), number_text(tried.rmse, 2), about, "chosen" if tried.chosen else ""
 
 
-def _localisation(found: Mapping[str, Evaluation]) -> str:
+def _localisation(found: Mapping[str, Evaluation], papers_skin: bool) -> str:
     groups = {name: _localisation_rows(e) for name, e in found.items()}
-    groups[_PAPER] = [("not stated", "6.9", "—", "—", "—")]
+    if papers_skin:
+        groups[_PAPER] = [("not stated", "6.9", "—", "—", "—")]
     head = ["estimator", "mean, mm", "median, mm", "95th percentile, mm", "inward bias, mm"]
     used = {name for e in found.values() for name in e.estimated}
     meaning = "; ".join(f"{name}: {text}" for name, text in ESTIMATOR_MEANING.items() if name in used)

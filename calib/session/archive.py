@@ -250,6 +250,16 @@ def open_archive(path: str | os.PathLike[str], format: str) -> ArchiveReader:
         raise
 
 
+def archive_format(path: str | os.PathLike[str]) -> str:
+    """The format that a result file names, empty without one; raises `SessionError` if it cannot be opened."""
+    where = Path(path)
+    file = open_guarded(where)
+    try:
+        return root_node(file, where).text("format", "")
+    finally:
+        file.close()
+
+
 def _check_archive(root: Node, format: str) -> None:
     found = root.text("format", "")
     if found != format:

@@ -11,6 +11,8 @@ import functools
 import hashlib
 import io
 import os
+import re
+import stat
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,6 +26,11 @@ from jaxeit.files import open_regular
 
 from .errors import printable, problem
 from .guard import MAX_ATTRIBUTE_BYTES
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 CHUNK_BYTES = 256 << 10
 DIMENSION_NAME = "This is a netCDF dimension but not a netCDF variable. %9d"
@@ -43,13 +50,20 @@ def file_hash(path: str | os.PathLike[str]) -> str:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path`. The file is synced and renamed to `path`, or removed on failure."""
+    """Yield an empty temporary file beside `path`. It is synced and renamed to `path`, or removed on failure.
+
+    A process that is killed leaves its temporary file; the next one that writes to `path` removes it. A lock on the
+    temporary file, which ends with its process, tells whether the process still runs.
+    """
     if not path.parent.is_dir():
         raise problem(path, "file", f"the folder {path.parent} does not exist", "create the folder first")
     if path.is_dir():
         raise problem(path, "file", "is a folder", "give a file name")
+    _remove_abandoned(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp")
+    descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
     try:
+        _lock(descriptor)
         yield temporary
         sync(temporary)
         os.replace(temporary, path)
@@ -57,6 +71,34 @@ def replacing(path: Path) -> Iterator[Path]:
             sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove temporary files of `path` whose processes have ended."""
+    own = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{12}}\.tmp")
+    with contextlib.suppress(OSError):  # a folder that may not be listed, or another process removes them too
+        for name in filter(own.fullmatch, os.listdir(path.parent)):
+            left = path.with_name(name)
+            if not stat.S_ISREG(left.lstat().st_mode):
+                continue
+            descriptor = os.open(left, os.O_RDWR)
+            try:
+                if _lock(descriptor):
+                    left.unlink()
+            finally:
+                os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file for this process; False if another one holds the lock, or the system has no locks."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def sync(path: Path) -> None:
@@ -178,7 +220,7 @@ def new_file(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
     Yields the file, and a function that raises `SessionError` if a write has failed. Raises `SessionError` if the
     folder or the disk does not allow the file.
     """
-    with writing(path), replacing(path) as temporary, open(temporary, "xb+", buffering=0) as raw:
+    with writing(path), replacing(path) as temporary, open(temporary, "rb+", buffering=0) as raw:
         sink = _FailureTolerantFile(raw)
         with _create(path, sink) as file:
             yield file, functools.partial(_checked, path, sink)

@@ -52,10 +52,11 @@ class Responses(eqx.Module):
     def bump(self, place: Float[Array, "3"]) -> tuple[Float[Array, " r"], Float[Array, "3 r"]]:
         """Response of one bump at x, y, log width, and its slopes with respect to these."""
         t = (place[jnp.array([1, 0, 2])] - self.origin) / self.pitch
-        cells = jnp.array(self.table.shape[:3]) - 4
-        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(t)), 0, cells).astype(int)
+        cells = jnp.array(self.table.shape[:3], t.dtype) - 4
+        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(t)), 0, cells)
         value, slope = _cubic(t - cell)
-        block = jax.lax.dynamic_slice(self.table, (*cell, 0), (4, 4, 4, self.table.shape[3])).reshape(64, -1)
+        corner = *cell.astype(int), 0
+        block = jax.lax.dynamic_slice(self.table, corner, (4, 4, 4, self.table.shape[3])).reshape(64, -1)
         (a, b, c), (da, db, dc) = value, slope / self.pitch[:, None]
         weights = jnp.stack([_outer(*abc) for abc in ((a, b, c), (a, db, c), (da, b, c), (a, b, dc))])
         found = weights @ block

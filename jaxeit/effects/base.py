@@ -18,7 +18,9 @@
 Histories are processed in blocks of samples; a history effect passes its state from one block to the next.
 """
 
+import dataclasses
 import enum
+import math
 import zlib
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -27,7 +29,10 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from .._compile import is_traced
 
 
 class StreamKind(enum.Enum):
@@ -139,20 +144,41 @@ Series = Float[Array, "time channels"]
 State: TypeAlias = PyTree[Array]
 
 
-def parameter(default: float) -> Any:
-    """A numeric field that is a pytree leaf, so that a new value does not trigger recompilation."""
-    return eqx.field(converter=jnp.asarray, default=default)
+def parameter(default: float | tuple[float, ...], *, least: float = 0.0) -> Any:
+    """A numeric field that is a pytree leaf, so that a new value does not trigger recompilation.
+
+    An effect with a value below ``least`` is refused when it is made, unless jit, grad or vmap hides the value.
+    """
+    return eqx.field(converter=jnp.asarray, default=default, metadata={"least": least})
+
+
+class EffectError(ValueError):
+    """An effect whose parameters have no meaning; the message names the parameter."""
 
 
 class AbstractEffect(eqx.Module):
     """One departure from the ideal sensor.
 
     ``rank`` orders effects within their family.  A scene lists at most one effect of each ``alternative``.
+
+    Raises:
+        EffectError: for a parameter below its least value, such as a negative standard deviation.
     """
 
     stage: ClassVar[str]
     rank: ClassVar[int] = 0
     alternative: ClassVar[str] = ""
+
+    def __check_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, least = getattr(self, field.name), field.metadata.get("least", -math.inf)
+            if least == -math.inf or not isinstance(value, jax.Array) or is_traced(value):
+                continue
+            wrong = ~(np.asarray(value) >= least)
+            if wrong.any():
+                number = np.asarray(value)[wrong].ravel()[0]
+                name = f"{type(self).__name__}: {field.name}"
+                raise EffectError(f"{name} is {number:g}; give at least {least:g}")
 
     @abstractmethod
     def __call__(self, state: Any, /, *context: Any) -> Any:

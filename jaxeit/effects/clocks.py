@@ -23,8 +23,8 @@ class ClockError(AbstractClockEffect):
     | batch: period of the adapter, 0 for none | 0       | 1e-3 to 16e-3    | s    | assumption: USB serial     |
     """
 
-    skew: Float[Array, ""] = parameter(50e-6)
-    offset: Float[Array, ""] = parameter(0.0)
+    skew: Float[Array, ""] = parameter(50e-6, least=-jnp.inf)
+    offset: Float[Array, ""] = parameter(0.0, least=-jnp.inf)
     latency: Float[Array, ""] = parameter(1e-3)
     jitter: Float[Array, ""] = parameter(5e-4)
     batch: Float[Array, ""] = parameter(0.0)
@@ -50,5 +50,5 @@ class DropOut(AbstractClockEffect):
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
     def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:
-        lost = jax.random.uniform(key, packets.lost.shape, jnp.float32) < self.probability
+        lost = jax.random.uniform(key, packets.lost.shape, jnp.float32) < self.probability.astype(jnp.float32)
         return packets._replace(lost=packets.lost | lost)

@@ -86,7 +86,7 @@ class CommonMode(AbstractTerminalEffect):
 
     rank: ClassVar[int] = -1  # before `ElectrodeFault`, whose source scales this voltage too
 
-    gain: Float[Array, ""] = parameter(1e-3)
+    gain: Float[Array, ""] = parameter(1e-3, least=-jnp.inf)
 
     def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:
         source, _, plus, minus = circuit.pattern.T

@@ -175,7 +175,7 @@ class SheetTemperature(AbstractSheetEffect):
     | coefficient c of the sheet's resistance | 1e-3    | -5e-4 to 2e-3 | 1/K | assumption |
     """
 
-    coefficient: Float[Array, ""] = parameter(1e-3)
+    coefficient: Float[Array, ""] = parameter(1e-3, least=-jnp.inf)
 
     def __call__(self, sheet: Sheet) -> Sheet:
         return sheet._replace(sigma=sheet.sigma / (1 + self.coefficient * sheet.temperature))

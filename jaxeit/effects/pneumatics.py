@@ -7,7 +7,6 @@ as ideal.
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, Int
@@ -70,8 +69,8 @@ class TpuRelaxation(AbstractPneumaticEffect):
 
     rank: ClassVar[int] = -3
 
-    shares: Float[Array, " elements"] = eqx.field(converter=jnp.asarray, default=(0.10, 0.08, 0.07))
-    times: Float[Array, " elements"] = eqx.field(converter=jnp.asarray, default=(0.1, 1.0, 10.0))
+    shares: Float[Array, " elements"] = parameter((0.10, 0.08, 0.07))
+    times: Float[Array, " elements"] = parameter((0.1, 1.0, 10.0))
     gas_share: Float[Array, ""] = parameter(0.5)
 
     def start(self, first: Float[Array, " channels"]) -> State:

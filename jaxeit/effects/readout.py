@@ -62,11 +62,11 @@ class IntermittentElectrode(AbstractReadoutEffect):
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         chance, floating = jax.random.split(line.key)
-        numbers = jax.random.uniform(chance, series.shape[:1], jnp.float32)
         # Exact for a two-state process, which relaxes to its mean open share at the sum of both rates.
         both = self.rate + 1 / self.duration
         turned = -jnp.expm1(-both * line.interval) / both
         to_open, to_stay = self.rate * turned, 1 - turned / self.duration
+        numbers = jax.random.uniform(chance, series.shape[:1], jnp.float32).astype(turned.dtype)
 
         def step(was_open: Array, number: Array) -> tuple[Array, Array]:
             is_open = number < jnp.where(was_open, to_stay, to_open)
@@ -103,7 +103,7 @@ class MuxSettling(AbstractReadoutEffect):
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         # All frames start from zero in parallel; each then adds the end of the frame before it. 1024 frames of 550
         # readings take 550 + 1024 steps instead of 563,200.
-        times = self.settle / self.time_constant * jnp.arange(1, series.shape[1] + 1)
+        times = self.settle / self.time_constant * jnp.arange(1, series.shape[1] + 1, dtype=float)
         left = jnp.exp(-times).astype(series.dtype)
         alone = _decaying_sums(left[0], jnp.zeros_like(series[:, 0]), (1 - left[0]) * series.T).T
         last = _decaying_sums(left[-1], state, alone[:, -1])
@@ -165,7 +165,7 @@ class LoadCellError(AbstractReadoutEffect):
     rank: ClassVar[int] = -1
     stream: ClassVar[StreamKind] = StreamKind.FORCE  # type: ignore[misc]
 
-    nonlinearity: Float[Array, ""] = parameter(1e-3)
+    nonlinearity: Float[Array, ""] = parameter(1e-3, least=-jnp.inf)
     full_scale: Float[Array, ""] = parameter(50.0)
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
@@ -244,8 +244,8 @@ class Quantisation(AbstractReadoutEffect):
     rank: ClassVar[int] = 1  # after all effects that add to the signal
 
     step: Float[Array, ""] = parameter(1.0)
-    lowest: Float[Array, ""] = parameter(-jnp.inf)
-    highest: Float[Array, ""] = parameter(jnp.inf)
+    lowest: Float[Array, ""] = parameter(-jnp.inf, least=-jnp.inf)
+    highest: Float[Array, ""] = parameter(jnp.inf, least=-jnp.inf)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
@@ -270,16 +270,17 @@ class AdcRanges(AbstractReadoutEffect):
 
     bits: Int[Array, ""] = parameter(14)
     full_scale: Float[Array, ""] = parameter(2.5)
-    gains: Float[Array, " gains"] = eqx.field(converter=jnp.asarray, default=tuple(2.0**k for k in range(8)))
+    gains: Float[Array, " gains"] = parameter(tuple(2.0**k for k in range(8)))
     headroom: Float[Array, ""] = parameter(2.0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
     def start(self, first: Float[Array, " channels"]) -> State:
-        fits = jnp.abs(first)[:, None] * self.headroom * self.gains <= self.full_scale
-        return jnp.where(fits, self.gains, self.gains.min()).max(1).astype(first.dtype)
+        gains = self.gains.astype(first.dtype)
+        fits = jnp.abs(first)[:, None] * self.headroom * gains <= self.full_scale
+        return jnp.where(fits, gains, gains.min()).max(1)
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        half = jnp.exp2(self.bits - 1.0)
+        half = jnp.exp2(self.bits.astype(float) - 1).astype(series.dtype)
         step = (self.full_scale / half / state).astype(series.dtype)
         return jnp.clip(jnp.round(series / step), -half, half - 1) * step, state
 

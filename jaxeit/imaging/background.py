@@ -68,7 +68,7 @@ def fit_background(
     prior = GaussianSmooth(cast(float, jnp.asarray(length, model.dtype))).precision(
         jnp.zeros((1, image.size), model.dtype), image.picture
     )
-    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there))
+    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
     error = jnp.hypot(model_error * known, floor)
     penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)
     x = gauss_newton(physics, penalty, v0, error, tolerance=tolerance)

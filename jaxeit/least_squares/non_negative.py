@@ -58,12 +58,13 @@ class DiagonalProblem(eqx.Module):
 
     def solution(self, positive: Flags) -> Parameters:
         """x where these parameters are free and the others zero, without what is negative."""
-        return jnp.maximum(self.jacobian.T @ self.residual(positive) / self.weight, 0) * positive
+        x = jnp.maximum(self.jacobian.T @ self.residual(positive) / self.weight, 0)
+        return x * positive.astype(x.dtype)  # NaN, of unsolvable data, stays
 
     def residual(self, positive: Flags) -> Data:
         """``y - J x`` where these parameters are free and the others zero, from a system as large as the data."""
         j = self.jacobian
-        system = jnp.eye(len(j), dtype=j.dtype) + (j * (positive / self.weight)) @ j.T
+        system = jnp.eye(len(j), dtype=j.dtype) + (j * (positive.astype(j.dtype) / self.weight)) @ j.T
         return cho_solve(cho_factor(system), self.data)
 
     def quick_residual(self, positive: Flags) -> Data:

@@ -318,7 +318,7 @@ def _split(rows: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
 def _root_loads(plan: NestedDissectionPlan, front: Front) -> list[Float[Array, "1 _ r"]]:
     """U^-T of the unit loads on the unknowns of the root, panel by panel."""
     size = sum(panel.upper.shape[1] for panel in front) + front[-1].beside.shape[2]
-    unit = jnp.arange(size)[:, None] == plan.scatter[plan.root]
+    unit = jnp.arange(size, dtype=plan.scatter.dtype)[:, None] == plan.scatter[plan.root]
     return _forward_front(front, unit[None].astype(front[0].upper.dtype))[0]
 
 

@@ -17,6 +17,9 @@ from ..geometry.shapes import Domain
 STEPS_PER_OCTAVE = 3
 """Lattice spacings between a length and its half."""
 
+REACH_MARGIN = 1 + 1e-9
+"""Factor on the distance up to which a source matters, for rounding."""
+
 QUARTER_CENTRES = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
 """Centres of the four quarters of a square of side 1 around the origin, (4, 2)."""
 
@@ -41,11 +44,20 @@ class SizeField:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Wanted edge length at points (n, 2); (n,) m."""
-        size = np.full(len(points), self.cap)
-        for centre, radius, at_rim in zip(self.centres, self.radii, self.sizes, strict=True):
-            away = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) - radius
-            np.minimum(size, at_rim + self.slope * np.maximum(away, 0.0), out=size)
-        return size
+        # A source matters only where its size is below the cap. On a long strip that is a small part of the points,
+        # which is contiguous if they are sorted along the strip.
+        axis = int(np.argmax(np.ptp(points, axis=0))) if len(points) else 0
+        order = np.argsort(points[:, axis], kind="stable")
+        ordered, size = points[order], np.full(len(points), self.cap)
+        reach = self.radii + REACH_MARGIN * (self.cap - self.sizes) / self.slope if self.slope > 0 else np.inf
+        first, last = (np.searchsorted(ordered[:, axis], self.centres[:, axis] + side * reach) for side in (-1, 1))
+        for i in np.flatnonzero(first < last):
+            part = slice(first[i], last[i])
+            away = np.hypot(*(ordered[part] - self.centres[i]).T) - self.radii[i]
+            np.minimum(size[part], self.sizes[i] + self.slope * np.maximum(away, 0.0), out=size[part])
+        out = np.empty_like(size)
+        out[order] = size
+        return out
 
     def level(self, size: np.ndarray) -> np.ndarray:
         """Number of the lattice whose spacing is nearest to ``size``; 0 is the coarsest."""

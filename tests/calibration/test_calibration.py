@@ -24,7 +24,7 @@ from calib.calibration.storage import SEAL, to_archive
 from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play
 from calib.fitting.fields import Places, geometry_of
-from calib.fitting.pads import LocatedPresses, fit_hybrid
+from calib.fitting.pads import LocatedPresses, fit_pads
 from calib.presses.pooled import pool_presses
 from calib.presses.table import measure
 from calib.report import document as report
@@ -109,7 +109,7 @@ def test_saved_and_loaded_it_is_the_same(calibration, folder):
 
 @pytest.mark.parametrize("curve", [calib.PowerLaw(), calib.Affine()], ids=lambda c: type(c).__name__)
 def test_every_curve_survives_the_file(calibration, pressed, folder, curve):
-    curves = fit_hybrid(
+    curves = fit_pads(
         curve, None, LocatedPresses(pressed, geometry_of(calibration.skin)), calib.fitting.SoftL1()
     ).curves
     assert (np.asarray(curves.result) == 0).all()

@@ -15,8 +15,9 @@ from calib.bench import Bench, Timing, simulate
 from calib.calibration import logs
 from calib.check import RecordingError
 from calib.cli import main
-from calib.fitting import selection
-from calib.fitting.response import fitting_problem
+from calib.fitting import held_out, selection
+from calib.fitting.logs import selection as log_selection
+from calib.fitting.response import fold_presses
 from calib.fitting.results import FitError, FitResult
 from calib.presses.pooled import pool_presses
 from calib.report import document as report
@@ -189,8 +190,8 @@ def failing(fit, curve):
         found = fit(chosen, *args, **kwargs)
         if not isinstance(chosen, curve):
             return found
-        if hasattr(found, "fitted"):
-            return replace(found, fitted=failed(found.fitted))
+        if isinstance(found, calib.fitting.FittedCurve):
+            return failed(found)
         return replace(found, curves=failed(found.curves))
 
     return run
@@ -213,24 +214,24 @@ def curved_log(tmp_path):
 def test_a_log_s_curve_that_does_not_converge_is_neither_chosen_nor_saved(curved_log, monkeypatch):
     curves = [calib.Linear(), calib.Affine(), calib.PowerLaw()]
     with open_session(curved_log) as session:
-        assert isinstance(logs.fit_session(session, curves).fit.fitted.curve, calib.PowerLaw)
-        monkeypatch.setattr(logs, "fit_log", failing(logs.fit_log, calib.PowerLaw))
-        found = logs.fit_session(session, curves)
-        assert not isinstance(found.fit.fitted.curve, calib.PowerLaw)
+        assert logs.calibrate_logs([session], calib.Recipe(curve=curves)).curve_name == "power"
+        monkeypatch.setattr(log_selection, "fit_curves", failing(log_selection.fit_curves, calib.PowerLaw))
+        found = logs.calibrate_logs([session], calib.Recipe(curve=curves))
+        assert found.curve_name != "power"
         assert "power not determined" in found.why
         with pytest.raises(
             FitError, match=r"log\.h5: the power curve could not be fitted: the solver ran out of steps"
         ):
-            logs.fit_session(session, [calib.PowerLaw()])
+            logs.calibrate_logs([session], calib.Recipe(curve=calib.PowerLaw()))
 
 
 def test_a_pad_s_curve_that_does_not_converge_is_not_chosen(sound, skin, monkeypatch):
     curves = [calib.PowerLaw(), calib.Linear()]
     with open_session(sound) as session:
         data = pool_presses([session], skin).data
-        problem = fitting_problem(skin, data, None, QUICK.loss, QUICK.folds)
-    monkeypatch.setattr(selection, "fit_hybrid", failing(selection.fit_hybrid, calib.PowerLaw))
-    choice = selection.choose(curves, [None], problem.presses, problem.loss, problem.fold)
+        folds = fold_presses(skin, data, None, QUICK.loss, QUICK.folds)
+    monkeypatch.setattr(held_out, "fit_pads", failing(held_out.fit_pads, calib.PowerLaw))
+    choice = selection.choose(curves, [None], folds)
     assert isinstance(choice.curve, calib.Linear)
     assert "power not determined" in choice.why
 

@@ -1,5 +1,6 @@
 """The honest input that lies are made from: a small skin, two recordings and a calibration, made once."""
 
+import json
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,14 +10,14 @@ from typing import Any
 import numpy as np
 
 import jaxeit as je
-from calib.bench import Bench, Timing, simulate
+from calib.bench import simulate
 from calib.check import transfer_matrix
 from calib.session import open_session, read_archive
+from tests.check.honest import sixteen_presses
 from tests.check.recording import SECOND, Recording
 
-from .telling import tell
+from .telling import Answer, tell
 
-FORCES = np.array([5.0, 10.0, 20.0])
 SHORT = 4  # presses
 
 
@@ -32,24 +33,6 @@ def small_skin() -> str:
     ):
         text = text.replace(old, new)
     return "\n".join(line.split("#")[0].rstrip() for line in text.splitlines() if line.split("#")[0].strip()) + "\n"
-
-
-def small_bench(skin: je.Skin) -> Bench:
-    """Sixteen presses with noise, off the middles of the pads."""
-    effects = (
-        je.effects.LoadSpreading(),
-        je.effects.CoatingNonUniformity(std=0.15, length=0.03, seed=3),
-        je.effects.ContactPiezoresistance(),
-        je.effects.Noise(std=1e-5),
-        je.effects.Noise(std=5.0, stream=je.effects.StreamKind.PRESSURE),
-        je.effects.Noise(std=0.01, stream=je.effects.StreamKind.FORCE),
-    )
-    x, y = np.meshgrid([0.025, 0.065, 0.12, 0.17], [0.03, 0.07, 0.125, 0.165])
-    timing = Timing(rest=0.6, ramp=0.4, hold=1.1, release=0.4, recovery=0.8)
-    return Bench(
-        je.Scene(skin, effects), np.stack([x.ravel(), y.ravel()], 1), FORCES, timing=timing, blank=3.0, eit_rate=20.0,
-        pad_rate=50.0, eit_step=3e-6, seed=5, toml="x",
-    )  # fmt: skip
 
 
 def first_presses(recording: Recording, count: int) -> Recording:
@@ -80,7 +63,7 @@ class Honest:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "small.toml").write_text(small_skin())
         skin = je.load_skin(folder / "small.toml")
-        simulate(small_bench(skin), folder / "simulated.h5", fidelity=je.Fidelity.draft())
+        simulate(sixteen_presses(skin, blank=3.0, pad_rate=50.0), folder / "simulated.h5", fidelity=je.Fidelity.draft())
         with open_session(folder / "simulated.h5") as session:
             whole = Recording.of(session)  # nothing tells that it was simulated
         short = first_presses(whole, SHORT)
@@ -109,6 +92,16 @@ class Honest:
     def short_maps(self) -> dict[str, np.ndarray]:
         """Force maps of the short recording."""
         return self.force_maps(self.folder / "c.h5", self.folder / "short.h5")[0]
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """What `evaluate` says of the calibration on the whole recording."""
+        return self.evaluated(self.folder / "s.h5")[0]
+
+    def evaluated(self, session: Path) -> tuple[dict[str, Any], Answer]:
+        """What `evaluate` says of the calibration on a session, and its answer; no numbers if it refuses."""
+        answer = tell("evaluate", self.folder / "c.h5", session, "--json")
+        return ({} if answer.refused else next(iter(json.loads(answer.out).values()))), answer
 
     def force_maps(self, calibration: Path, session: Path) -> tuple[dict[str, np.ndarray], Any]:
         """What `apply` writes and answers; no arrays if it refuses."""

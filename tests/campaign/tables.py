@@ -1,6 +1,7 @@
 """Lies of tables to import: columns, units, clocks, quotes, decimal signs, gaps, rows twice or in another order."""
 
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -207,19 +208,44 @@ def clock_jumps(t: Table, rng: Random) -> Table:
 
 
 def clock_in_numbers(t: Table, rng: Random) -> Table:
-    """A clock of dates, counts or in 5 digits of a float."""
-    kind = int(rng.integers(3))
-    if kind == 0:
-        return replace(t, rows=[[f"2026-01-01 00:00:{float(row[0]):06.3f}", *row[1:]] for row in t.rows])
+    """A clock of counts or in 5 digits of a float."""
+    kind = int(rng.integers(2))
     if kind == 1:
         return replace(t, rows=[[f"{1.7e9 + float(row[0]):.6e}", *row[1:]] for row in t.rows])
     return replace(t, rows=[[f"{1.7e9 + float(row[0]):.3f}", *row[1:]] for row in t.rows])
+
+
+def clock_of_dates(t: Table, rng: Random) -> Table:
+    """Dates and times: true ones, with a unit, in two ways, day before month, or with a time zone that changes."""
+    start, kind = datetime(2026, 1, 1, 23, 59, tzinfo=UTC), int(rng.integers(5))
+    moments = [start + timedelta(seconds=float(row[0])) for row in t.rows]
+    texts = [moment.isoformat() for moment in moments]
+    if kind == 2:
+        texts[len(texts) // 2 :] = [text.removesuffix("+00:00") for text in texts[len(texts) // 2 :]]
+    if kind == 3:
+        texts = [f"{moment:%d/%m/%Y %H:%M:%S.%f}" for moment in moments]
+    if kind == 4:
+        at = int(rng.integers(10, len(texts) - 10))
+        texts[at:] = [text.replace("+00:00", "+01:00") for text in texts[at:]]
+    return replace(
+        t, rows=[[x, *r[1:]] for x, r in zip(texts, t.rows, strict=True)], time="time:s" if kind == 1 else "time"
+    )
+
+
+def stated_rate(t: Table, rng: Random) -> Table:
+    """A rate is stated beside a clock that is not used: the true one, another one, or rows are missing."""
+    rate, kind = 50.0, int(rng.integers(3))
+    if kind == 1:
+        rate *= (0.02, 0.1, 0.5, 0.98, 1.02, 2.0, 10.0, 100.0)[int(rng.integers(8))]
+    rows = gap(t, rng).rows if kind == 2 else t.rows
+    return replace(t, rows=rows, time="", more=["--rate", f"{rate:g}"])
 
 
 KINDS = (
     nothing, shuffled_columns, shuffled_by_number, contradicting_unit, unit_in_header, wrong_unit, decimal_comma,
     two_decimal_signs, thousands, quoted_names, header_again, same_name_twice, falling, shuffled_rows, repeated_rows,
     repeated_times, gap, cells_missing, ragged, shifted_cells, footer, clock_jumps, clock_in_numbers,
+    clock_of_dates, stated_rate,
 )  # fmt: skip
 
 
@@ -237,7 +263,8 @@ def _answers(table: Table, mark: str, honest: Honest, folder: Path) -> tuple[Ans
     path, out = folder / "lie.csv", folder / "out.h5"
     path.write_text(mark + table.text())
     out.unlink(missing_ok=True)
-    words = ("--time", table.time, "--stream", table.force, "--stream", table.pressure, *table.more)
+    clock = ("--time", table.time) if table.time else ()
+    words = (*clock, "--stream", table.force, "--stream", table.pressure, *table.more)
     imported = tell("import", "csv", path, *words, "-o", out)
     if imported.refused:
         return imported, None

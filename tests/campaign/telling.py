@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calib.cli import main
+from calib.cli import OUT_OF_MEMORY, main
 
 TOLERANCE = 0.01  # of the largest number of an array: what comes out of an honest input, and of one that does no harm
 
@@ -55,6 +55,8 @@ def tell(*words: object) -> Answer:
     answer = Answer(status, out.getvalue(), err.getvalue().strip())
     if status not in (0, 2) or (status == 2 and not (answer.err or answer.out)) or "\n" in answer.err:
         raise BrokenError(f"status {status}: {answer.err!r}")
+    if OUT_OF_MEMORY in answer.err:
+        raise BrokenError(answer.err)
     return answer
 
 
@@ -74,11 +76,15 @@ def without_numbers(text: str) -> str:
     return re.sub(r"[-+]?[\d.,]*\d", "0", text).strip()
 
 
-def judged(answer: Answer, known: Collection[str] = ()) -> Verdict | None:
-    """The verdict of an answer to `check --json`; None: no more was said than the `known` findings."""
+def judged(answer: Answer, known: Collection[str] = (), about: str = "") -> Verdict | None:
+    """The verdict of an answer to `check --json`; None: no more was said of what was changed than the `known` findings.
+
+    Args:
+        about: a word that each finding about what was changed holds, such as the name of a stream.
+    """
     if answer.refused:
         return Verdict("refused", answer.err)
-    new = {key: text for key, text in said(answer).items() if key not in known}
+    new = {key: text for key, text in said(answer).items() if key not in known and about in text}
     return Verdict("said", next(iter(new.values()))) if new else None
 
 

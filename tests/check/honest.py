@@ -9,6 +9,8 @@ from calib.bench import Bench, Timing, load_bench, presets
 
 QUICK = Timing(rest=0.6, ramp=0.4, hold=1.0, release=0.4, recovery=0.8)
 SKINS = ("testbed", "chest")
+FORCES = np.array([5.0, 10.0, 20.0])
+"""Force of each of the sixteen presses in turn, N."""
 KEPT = 0.75  # probability that an effect of the scene is kept
 ALWAYS = ("ContactPiezoresistance", "Noise", "Quantisation")  # a sheet that shows no touch is not an honest session
 
@@ -60,3 +62,24 @@ def _inside(skin, rng, low, high, reach):
         if skin.domain.contains(place + reach).all():
             return [place.round(4)]
     return []
+
+
+def sixteen_presses(skin: je.Skin, *, blank: float, pad_rate: float) -> Bench:
+    """Sixteen presses with noise; off the middles of the pads, so that no move of the stage leaves all on their pads.
+
+    ``blank`` is the time before the first press, s; ``pad_rate`` the rate of pressure and force, Hz.
+    """
+    effects = (
+        je.effects.LoadSpreading(),
+        je.effects.CoatingNonUniformity(std=0.15, length=0.03, seed=3),
+        je.effects.ContactPiezoresistance(),
+        je.effects.Noise(std=1e-5),
+        je.effects.Noise(std=5.0, stream=je.effects.StreamKind.PRESSURE),
+        je.effects.Noise(std=0.01, stream=je.effects.StreamKind.FORCE),
+    )
+    x, y = np.meshgrid([0.025, 0.065, 0.12, 0.17], [0.03, 0.07, 0.125, 0.165])
+    timing = Timing(rest=0.6, ramp=0.4, hold=1.1, release=0.4, recovery=0.8)
+    return Bench(
+        je.Scene(skin, effects), np.stack([x.ravel(), y.ravel()], 1), FORCES, timing=timing, blank=blank,
+        eit_rate=20.0, pad_rate=pad_rate, eit_step=3e-6, seed=5, toml="x",
+    )  # fmt: skip

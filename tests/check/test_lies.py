@@ -8,35 +8,21 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from calib.bench import Bench, Timing, simulate
+from calib.bench import simulate
 from calib.check import Severity, check_session, render, transfer_matrix
 from calib.check.reading_order import predict_readings
 from calib.session import StreamFacts, open_session
 
+from .honest import sixteen_presses
 from .recording import SECOND, Recording, Samples
 
 ERROR, WARNING = Severity.ERROR, Severity.WARNING
-FORCES = np.array([5.0, 10.0, 20.0])
 
 
 @pytest.fixture(scope="module")
 def honest(skin, tmp_path_factory):
     """Sixteen presses of the testbed with noise, as a file would hold them; nothing tells that they were simulated."""
-    effects = (
-        je.effects.LoadSpreading(),
-        je.effects.CoatingNonUniformity(std=0.15, length=0.03, seed=3),
-        je.effects.ContactPiezoresistance(),
-        je.effects.Noise(std=1e-5),
-        je.effects.Noise(std=5.0, stream=je.effects.StreamKind.PRESSURE),
-        je.effects.Noise(std=0.01, stream=je.effects.StreamKind.FORCE),
-    )
-    # Off the middles of the pads, so that no move of the stage leaves every press on its pad.
-    x, y = np.meshgrid([0.025, 0.065, 0.12, 0.17], [0.03, 0.07, 0.125, 0.165])
-    timing = Timing(rest=0.6, ramp=0.4, hold=1.1, release=0.4, recovery=0.8)
-    bench = Bench(
-        je.Scene(skin, effects), np.stack([x.ravel(), y.ravel()], 1), FORCES, timing=timing, blank=4.0, eit_rate=20.0,
-        pad_rate=100.0, eit_step=3e-6, seed=5, toml="x",
-    )  # fmt: skip
+    bench = sixteen_presses(skin, blank=4.0, pad_rate=100.0)
     path = simulate(bench, tmp_path_factory.mktemp("honest") / "s.h5", fidelity=je.Fidelity.draft())
     with open_session(path) as session:
         return Recording.of(session)
@@ -185,6 +171,15 @@ def clipped(r):
     return r.change("eit", np.clip(values, -limit, limit))
 
 
+def cells_shifted(r):
+    """The log of a table in which, from the middle on, each cell stands one column further right."""
+    table = np.concatenate([r.values("force"), r.values("pressure")], 1)
+    half = len(table) // 2
+    table[half:] = np.roll(table[half:], 1, axis=1)
+    log = replace(r.without("eit"), presses=None)
+    return log.change("force", table[:, :1]).change("pressure", table[:, 1:])
+
+
 def slowed(factor):
     """All time stamps in another unit than they are said to be."""
 
@@ -275,6 +270,7 @@ LIES = {
         ("column 3 responds over pad 'upper left'",),
     ),
     "a pressure column too few": Lie(columns("pressure", [0, 1, 2]), ERROR, ("has 3 columns",)),
+    "cells one column further right": Lie(cells_shifted, WARNING, ("columns look exchanged", "that of pressure[0]")),
     # places
     "x and y exchanged": Lie(moved(lambda x, y: y, lambda x, y: x), ERROR, ("x and y are exchanged",)),
     "x mirrored": Lie(moved(lambda x, y: 0.2 - x), ERROR, ("x is mirrored",)),
@@ -327,6 +323,9 @@ LIES = {
     "EIT at the converter's end": Lie(clipped, ERROR, ("saturated",)),
     "an electrode dead": Lie(dead_electrode(0.0), ERROR, ("all of them use electrode 12",)),
     "pressure frozen": Lie(frozen("pressure", 0.5, 0.8), WARNING, ("no pad feels",)),
+    "pressure of the last moment for ever": Lie(
+        frozen("pressure", 0.9, 1.0), WARNING, ("/streams/pressure", "stands still for")
+    ),
     "pressure of untouched pads": Lie(
         at_rest("pressure"), WARNING, ("/streams/force", "the pressures of the pads bear")
     ),

@@ -60,9 +60,9 @@ def test_a_log_without_eit(tmp_path, capsys):
     assert main(["calibrate", session, "-o", str(tmp_path / "curve.h5")]) == 0
     out = capsys.readouterr().out
     assert "slope 0.01 " in out
-    assert "held out" in out
-    assert main(["calibrate", session, "-o", str(tmp_path / "x.h5"), "--report", str(tmp_path / "r.html")]) == 2
-    assert "--report" in capsys.readouterr().err
+    assert "second half, by the model of the first: 1000 samples" in out
+    assert main(["evaluate", str(tmp_path / "curve.h5"), session]) == 0
+    assert "within the 90 % interval" in capsys.readouterr().out
 
 
 def test_simulate_refuses_a_wrong_scene(tmp_path, root, capsys):

@@ -1,5 +1,7 @@
 """Effects: each against something independent, and the law of absence for all."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -236,6 +238,37 @@ def test_chance_of_one_effect_does_not_depend_on_the_others():
     alone, first, second = fx.keys([noise], key), fx.keys([drift, noise], key), fx.keys([noise, noise], key)
     assert alone[0] == first[1] == second[0]
     assert second[0] != second[1]
+
+
+SIGNED = {"skew", "coefficient", "gain", "nonlinearity", "lowest", "highest"}
+"""Parameters that may be below zero; the offset of a clock may be too, that of sensors is a scatter."""
+
+
+@pytest.mark.parametrize("effect", EVERY, ids=IDS)
+def test_an_effect_refuses_a_negative_scatter_length_or_time(effect):
+    kind = type(effect)
+    for field in dataclasses.fields(effect):
+        value = getattr(effect, field.name)
+        if not isinstance(value, jax.Array):
+            continue
+        if field.name in SIGNED or (kind is fx.ClockError and field.name == "offset"):
+            kind(**{field.name: -jnp.ones_like(value)})
+            continue
+        for wrong in (-jnp.ones_like(value), np.full(value.shape, np.nan)):
+            if value.dtype.kind == "f" or not np.isnan(wrong).any():
+                with pytest.raises(je.effects.EffectError, match=f"{kind.__name__}: {field.name} is (-1|nan); give at"):
+                    kind(**{field.name: wrong})
+
+
+def test_a_scene_file_refuses_a_negative_scatter():
+    table = je.toml.TomlTable({"effects": [{"type": "Noise", "std": -1.0}]}, "scene.toml")
+    with pytest.raises(ValueError, match="Noise: std is -1; give at least 0"):
+        je.model.read_effects(table)
+
+
+def test_hidden_values_are_not_examined():
+    slope = jax.grad(lambda std: 2 * je.effects.Noise(std=std).std)
+    assert slope(-1.0) == 2.0
 
 
 def test_scenes_refuse_what_is_not_an_effect(skin):

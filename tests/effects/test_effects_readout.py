@@ -67,7 +67,7 @@ def test_float32_stays(effect):
 
 
 def test_readings_are_taken_at_the_times_of_the_protocol(skin):
-    nominal = skin.protocol.reading_time * jnp.arange(skin.protocol.readings)
+    nominal = skin.protocol.reading_time * jnp.arange(skin.protocol.readings, dtype=float)
     when = jnp.full(nominal.shape, 0.5)
     np.testing.assert_allclose(je.effects.ScanSkew()(when, nominal), 0.5 + nominal)
     assert float(nominal[-1]) == pytest.approx(5.49e-3)  # 25 x 22 readings of 10 us

@@ -224,7 +224,7 @@ def test_age_of_a_contact_by_brute_force():
 def test_creep_of_a_ramp_does_not_depend_on_the_rate_of_samples():
     """The mean age under a ramp is half its duration."""
     for samples in (100, 1000):
-        load = jnp.arange(1, samples + 1) * 20.0 / samples
+        load = jnp.arange(1.0, samples + 1) * 20.0 / samples
         last = float(_felt(je.effects.Creep(), load, 1 / samples)[-1])
         assert last == pytest.approx(20 * (1 + 0.05 * np.log10(1 + 0.5 / 0.1)), rel=1e-3)
 

@@ -8,7 +8,7 @@ from benchmarks.bench_real import RECORDINGS
 from calib.fitting.channel_faults import faults
 from calib.fitting.curves import Affine
 from calib.fitting.logs import SmoothChannels, fit_log
-from calib.fitting.logs.gaussian_process import lagged
+from calib.fitting.logs.combination import lagged
 
 from ..helpers import REAL_DATA
 

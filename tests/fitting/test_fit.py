@@ -516,9 +516,10 @@ def test_the_simplest_of_those_that_are_as_good_is_chosen_and_said():
     assert table[0].rmse == 3.0
     assert table[1].rmse is None
     spread = 1 / np.sqrt(3)
-    np.testing.assert_allclose(table[3][3:6], np.sqrt([4, 4 - spread, 4 + spread]))
+    np.testing.assert_allclose(table[2][3:6], np.sqrt([4.2, 4.2 - spread, 4.2 + spread]))  # of the difference
+    np.testing.assert_allclose(table[3][3:6], [2.0, 2.0, 2.0])  # the best differs from itself by nothing
     assert why.startswith(
-        "bent, the simplest within one standard error (2.14 N) of the best; held-out RMSE over places"
+        "bent, the simplest within one standard error of the paired difference from the best (free); held-out RMSE"
     )
     assert "failed not determined" in why
     squares["bent"] = [4.7, 4.7, 4.7]

@@ -29,9 +29,9 @@ from calib.fitting.fields import (
 from calib.fitting.fields.base import restored
 from calib.fitting.fields.evidence import PRIOR_RATIOS
 from calib.fitting.fields.fitted import pad_features
-from calib.fitting.held_out import folds_by_place, hold_out
+from calib.fitting.held_out import Folds, folds_by_place
 from calib.fitting.losses import SoftL1
-from calib.fitting.pads import LocatedPresses, fit_hybrid
+from calib.fitting.pads import LocatedPresses, fit_pads
 from calib.fitting.results import FitResult
 from calib.fitting.selection import choose
 from calib.presses.pooled import PressData, PressSeries, thinned
@@ -79,7 +79,10 @@ def test_edge_features_are_distances_to_sides_and_rim(skin, geometry):
     x, y = place.T
     sides = sum(near(d, 8e-3, 4) for d in (x % 0.1, 0.1 - x % 0.1, y % 0.1, 0.1 - y % 0.1))
     rim = near(skin.domain.boundary_distance(place), 8e-3, 4)
-    np.testing.assert_allclose(features, np.concatenate([sides, rim], 1), rtol=1e-9, atol=1e-12)
+    corner = (rim * near(np.sort([x, 0.2 - x, y, 0.2 - y], 0)[1], 8e-3, 4))[:, :3]
+    np.testing.assert_allclose(features, np.concatenate([sides, rim, corner], 1), rtol=1e-9, atol=1e-12)
+    early = np.asarray(features_of(PadEdge(corners=False), geometry, single_places(place, 4)))[inside]
+    np.testing.assert_array_equal(early, features[:, :8])
 
 
 def near(distance, width, bumps):
@@ -178,7 +181,7 @@ def test_coefficients_are_those_of_every_prior_weighed_by_its_evidence(geometry)
         variance = y @ np.linalg.solve(k, y) / 56
         logs.append(-0.5 * (np.linalg.slogdet(k)[1] + 56 * np.log(variance)))
         means.append(ratio * z.T @ np.linalg.solve(k, y))
-        covariances.append(variance * (ratio * np.eye(2) - ratio**2 * z.T @ np.linalg.solve(k, z)))
+        covariances.append(variance * (ratio * np.eye(z.shape[1]) - ratio**2 * z.T @ np.linalg.solve(k, z)))
         variances.append(variance)
     weight = np.exp(np.array(logs) - max(logs)) / np.exp(np.array(logs) - max(logs)).sum()
     mean = weight @ np.array(means)
@@ -254,7 +257,8 @@ def test_beyond_what_was_pressed_the_field_stays_level_and_grows_uncertain(fitte
     assert variance[1, 0] > 4 * variance[2, 0]
 
 
-def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geometry):
+@pytest.mark.parametrize("corners", [True, False])
+def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geometry, corners):
     """Presses nearest to a border spill over to the next pad, and differ by what no field says: that is no reason to
     give the next pad's edge any gain that explains it. The standard error tells how far from the truth that leaves."""
     x = np.r_[np.linspace(0.01, 0.087, 6), np.linspace(0.113, 0.19, 6)]
@@ -266,7 +270,8 @@ def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geo
     share /= share.sum(1, keepdims=True)
     true = dip(skin, place)
     y = true - 0.2 * (share.max(1) < 1) + np.random.default_rng(4).normal(0, 0.01, len(place))
-    found = fit(PadEdge(), geometry, single_places(place, 4), jnp.asarray(y), jnp.asarray(share), jnp.ones(144), REACH)
+    rows = jnp.asarray(y), jnp.asarray(share), jnp.ones(144), REACH
+    found = fit(PadEdge(corners=corners), geometry, single_places(place, 4), *rows)
     border, pressed = single_places([[0.1, 0.05], [0.0999, 0.05]], 4), single_places(place, 4)
     mean, variance = (np.asarray(part)[:, 0] for part in log_gain(found, border))
     of_presses = np.asarray(log_gain(found, pressed).mean)[np.arange(144), owner(place)]
@@ -275,7 +280,8 @@ def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geo
     dipped = -np.log(0.6) - (-np.log(1 - 0.4 * np.exp(-0.05 / 0.01)) - true.min())
     assert abs(mean[0] - dipped) < 3 * np.sqrt(variance[0])
     free = eqx.tree_at(lambda f: f.reach, found, jnp.array([[[0.0, 0.0], [0.2, 0.2]]] * 4))
-    assert abs(log_gain(free, border).mean[0, 0]) > 1  # what the coefficients alone would say
+    if not corners:  # so that the bound matters here
+        assert abs(log_gain(free, border).mean[0, 0]) > 1  # what the coefficients alone would say
 
 
 def test_two_contacts_on_one_pad_share_its_gain_by_their_weights(fitted):
@@ -359,7 +365,7 @@ def test_curve_and_field_are_found_together_and_held_out_by_place(skin, geometry
     place, data = session_data(skin)
     places = single_places(place, 4)
     presses = LocatedPresses(data, geometry, places)
-    hybrid = fit_hybrid(Linear(), PadEdge(), presses, SoftL1())
+    hybrid = fit_pads(Linear(), PadEdge(), presses, SoftL1())
     slope = np.asarray(hybrid.curves.parameters)[:, 0]
     np.testing.assert_allclose(slope, 0.01, rtol=0.02)
     force, error, valid = hybrid.pad_forces(data.pressure, places)
@@ -370,10 +376,10 @@ def test_curve_and_field_are_found_together_and_held_out_by_place(skin, geometry
     loaded = np.arange(len(place)), owner(place)
     assert (error[loaded] < blind_error[loaded]).all()
     fold = folds_by_place(data.place, 4)
-    held = hold_out(Linear(), PadEdge(), presses, SoftL1(), fold)
+    held = Folds(presses, SoftL1(), fold).hold_out(Linear(), PadEdge()).hold.force
     assert np.std(held.sum(1)) / np.mean(held.sum(1)) < 0.05
     lied = replace(data, force=np.where(fold == 0, 99.0, data.force))
-    again = hold_out(Linear(), PadEdge(), presses._replace(data=lied), SoftL1(), fold)
+    again = Folds(presses._replace(data=lied), SoftL1(), fold).hold_out(Linear(), PadEdge()).hold.force
     np.testing.assert_array_equal(again[fold == 0], held[fold == 0])
 
 
@@ -383,7 +389,7 @@ def test_the_simplest_within_one_standard_error_is_chosen_and_says_why(skin, geo
         place, data = session_data(skin, depth=depth)
         fold = folds_by_place(data.place, 4)
         presses = LocatedPresses(data, geometry, single_places(place, 4))
-        found = choose([Linear()], [PadEdge(), None, Constant()], presses, SoftL1(), fold)
+        found = choose([Linear()], [PadEdge(), None, Constant()], Folds(presses, SoftL1(), fold))
         assert found.why.startswith(f"{name}, the simplest within one standard error")
         assert (FIELDS.name_of(found.field) if found.field else "none") == name
         assert isinstance(found.curve, Linear)

@@ -7,6 +7,9 @@ import sys
 
 import pytest
 
+from ..campaign.joined import CASE, joined, texts, write
+from ..hard_cases import Row, table
+
 KINDS = 5  # of input, told in turn
 
 
@@ -36,9 +39,36 @@ def test_some_lies(root):
 def test_ten_thousand_lies(root, hard):
     found = campaign(10_000, 2, root, 7200)
     judged(found, 10_000)
-    total = found["total"]
-    hard(
-        "a campaign of lies",
-        "10,000 generated: recordings, descriptions, calibrations, tables, devices",
-        beyond=f"{total['refused']:,} refused, {total['said']:,} named, {total['harmless']:,} without effect",
+    reached, beyond = texts(found)
+    hard(CASE, reached, beyond=beyond)
+
+
+def part(seed, first, lies, **changes):
+    """The summary of one part of a campaign."""
+    extreme = {"seconds": lies / 100, "grown": 1_000_000 * lies}
+    counts = {"table": {"refused": lies - 3, "said": 2, "harmless": 1}}
+    parts = {"total": counts["table"], "counts": counts, "seconds": 1.0, "slowest": extreme, "largest": extreme}
+    return {"seed": seed, "first": first, "lies": lies, "failures": [], **parts, **changes}
+
+
+def test_campaigns_are_joined_to_one_row(tmp_path):
+    found = joined([part(1, 0, 100), part(1, 100, 50), part(2, 0, 30)])
+    path = tmp_path / "table.md"
+    path.write_text(
+        "before\n\n" + table([Row("a", "b", None, None, None, "c"), Row(CASE, "old", 1.0, None, None, "x")])
     )
+    write(path, found)
+    assert path.read_text() == "before\n\n" + table([
+        Row("a", "b", None, None, None, "c"),
+        Row(
+            CASE, "180 generated: 180 tables", None, None, None, "171 refused, 6 named, 3 without effect, none silent; "
+            "slowest 1.0 s of the processor, largest growth of memory 100 MB",
+        ),
+    ])  # fmt: skip
+
+
+def test_no_lie_is_counted_twice_and_no_failure_is_written(tmp_path):
+    with pytest.raises(ValueError, match="lie 60 of seed 1 was told twice"):
+        joined([part(1, 0, 100), part(1, 60, 100)])
+    with pytest.raises(ValueError, match="1 lies were silent"):
+        write(tmp_path / "table.md", joined([part(1, 0, 5, failures=["SILENT"])]))

@@ -399,7 +399,7 @@ def _program(case):
     def numbers(x, along):
         def total(x):
             out = jnp.ravel(case.function(x))
-            weight = jnp.cos(1.0 + jnp.arange(out.size))
+            weight = jnp.cos(jnp.arange(1.0, out.size + 1))
             return jnp.sum(jnp.where(jnp.isfinite(out), out * weight, 0))
 
         value, slope = jax.jvp(total, (x,), (along,))

@@ -27,6 +27,7 @@ from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.force_maps import ForceLaw, fused
 from calib.cli import main
+from calib.fitting.pads import PadModel
 from calib.live import loop as live_module
 from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestLevels
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
@@ -107,8 +108,8 @@ def calibration(monkeypatch, skin):
         recon=recon,
         masks=SimpleNamespace(weights=weights),
         simulated=True,
+        pads=SimpleNamespace(curves=curves, field=None, gains=None),
         curves=curves,
-        field=None,
         locator=None,
         evaluation=None,
     )
@@ -305,7 +306,7 @@ def test_programs_for_one_frame_are_those_of_the_force_map(model, skin, pixels):
     recon, rng = je.prepare(model, basis=pixels), np.random.default_rng(0)
     pressure = np.tile(np.linspace(0, 4000, 40), (len(skin.pads), 1))
     curves = calib.fit_curves(calib.Linear(), pressure, 5e-3 * pressure[0] + rng.normal(0, 0.1, 40))
-    law = ForceLaw(recon, je.pad_masks(skin, recon), curves, None, None)
+    law = ForceLaw(recon, je.pad_masks(skin, recon), PadModel(curves), None)
     frame, pressed = rng.normal(0, 1e-3, recon.readings), np.array([3000.0, 0.0, 1000.0, 0.0])
     holes, few = (np.where(rng.random(recon.readings) < share, np.nan, frame) for share in (0.3, 0.9))
     programs = FramePrograms(law)
@@ -601,7 +602,7 @@ def test_a_viewer_is_given_the_newest_result_only(page, calibration):
     for force in range(200):
         page.show_result(engine.step(arrival([11.0 + force, 20.0])))
     found = events(reply, 2)
-    assert found[-1]["about"] == {"state": "running", "simulated": False, "lost": 0}
+    assert found[-1]["about"] == {"state": "running", "health": "", "simulated": False, "lost": 0}
     last = [event["result"] for event in found if event["result"]][-1]
     assert last["number"] > 100
     assert len(base64.b64decode(last["map"])) == 16

@@ -161,7 +161,7 @@ def test_derivatives_with_every_kind_of_electrode(mixed):
     turn = np.array([1.0, -0.5, 2.0, 0.0])  # of the contacts; the point has none
 
     def weighed(contact):
-        return jnp.sum(jnp.asarray(WEIGHTS) * transfer(mixed, theta._replace(contact=contact)))
+        return jnp.sum(jnp.asarray(WEIGHTS, float) * transfer(mixed, theta._replace(contact=contact)))
 
     slope = float(jax.grad(weighed)(theta.contact) @ (theta.contact * turn))
     high, low = (float(weighed(theta.contact * (1 + h * turn))) for h in (1e-5, -1e-5))

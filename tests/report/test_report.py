@@ -120,6 +120,7 @@ def located(calibration):
         noise=jnp.array(0.04),
         spread=jnp.array(0.125),
         evidence=jnp.array(90.0),
+        effective=jnp.array(5.0),
         n=jnp.array(16.0),
         result=jnp.array(0),
     )
@@ -203,8 +204,18 @@ def test_numbers_are_those_of_the_evaluation(calibration, written):
     assert cells[cells.index("hybrid") : cells.index("hybrid") + 6] == row_of("hybrid", s, "hybrid", "force_hybrid")
     last = len(cells) - cells[::-1].index("hybrid")  # the paper's
     assert cells[last : last + 5] == ["0.14", "—", "—", "—", "—"]
-    row = cells.index("0 lower left")
+    row = len(cells) - 1 - cells[::-1].index("0 lower left")
     assert cells[row + 1 : row + 7] == [f"0.01{PM}0.0001", "0 to 2000", "80", "9", "0.75", "fitted"]
+
+
+def test_residuals_by_pad_come_first(calibration, written):
+    cells, found = Reader(written[0].read_text(encoding="utf-8")).cells, calibration.evaluation
+    mine = found.pressure.argmax(1) == 0
+    error = (found.total_force - found.force)[mine]
+    sizes = error.mean(), np.sqrt(np.mean(error**2)), np.median(np.abs(error)), np.abs(error).max()
+    row = cells.index("0 lower left")
+    assert row < cells.index("EIT only")
+    assert cells[row + 1 : row + 6] == [str(mine.sum()), *(f"{size:.2f}".replace("-", "−") for size in sizes)]
 
 
 def row_of(label, s, spread, errors):

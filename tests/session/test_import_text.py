@@ -203,6 +203,53 @@ def test_a_table_without_a_clock_has_the_stated_rate(tmp_path, capsys):
         assert said in refusal(capsys, path, *words, "--stream", "force=0:N")
 
 
+CLOCK_BESIDE_RATE = {
+    "the true rate": ([0, 0.25, 0.5, 0.75], 4, False),
+    "in ms": ([0, 250, 500, 750], 4, False),
+    "another rate": ([0, 0.25, 0.5, 0.75], 8, True),
+    "rows are missing": ([0, 0.25, 0.5, 1.75], 4, True),
+    "a number of the row": ([5, 6, 7, 8], 4, False),
+    "no clock": ([3, 1, 2, 1], 4, False),
+}
+
+
+@pytest.mark.parametrize("case", CLOCK_BESIDE_RATE)
+def test_a_clock_that_contradicts_the_stated_rate_is_noted(case, tmp_path, capsys):
+    times, rate, noted = CLOCK_BESIDE_RATE[case]
+    path = written(tmp_path, "time,f\n" + "".join(f"{t},{i}\n" for i, t in enumerate(times)))
+    brought(path, "--rate", str(rate), "--stream", "force=f:N")
+    assert ("column 'time' looks like a clock" in capsys.readouterr().out) == noted
+
+
+def test_dates_and_times_are_a_clock(tmp_path, capsys):
+    rows = [(".250", 1.5), (".500", 2.5), (".750123456", 3.5)]
+    text = "when;f\n" + "".join(f"2026-03-29T01:59:59{t}+01:00;{f}\n" for t, f in rows)
+    words = ("--time", "when", "--stream", "force=f:N")
+    path = written(tmp_path, text.replace(".5\n", ",5\n"))
+    found = brought(path, *words)
+    np.testing.assert_allclose(found["time"] / 1e9, [0.25, 0.5, 0.750123], atol=1e-6)
+    np.testing.assert_array_equal(found["force"][:, 0], [1.5, 2.5, 3.5])
+    with open_session(path.with_name("s.h5")) as session:
+        assert session.epoch.startswith("2026-03-29T00:59:59")
+    assert "warning" not in capsys.readouterr().out
+    path = written(tmp_path, text.replace("+01:00", "").replace("T", " "))
+    assert len(brought(path, *words)["time"]) == 3
+    assert "state no time zone and are read as UTC" in capsys.readouterr().out
+
+
+def test_dates_are_no_numbers_and_have_no_unit(tmp_path, capsys):
+    rows = "".join(f"{i},2026-01-01T00:00:0{i}Z,{i}\n" for i in range(5))
+    path = written(tmp_path, "t,when,f\n" + rows)
+    force = ("--stream", "force=f:N")
+    assert "which have no unit; leave out :ms" in refusal(capsys, path, "--time", "when:ms", *force)
+    assert "names a column of dates and times" in refusal(capsys, path, "--time", "t:s", *force, "--stream", "x=1:V")
+    mixed = written(tmp_path, "when,f\n" + rows.replace("3Z", "3").replace("0,2", "2").replace(",2026", "2026"))
+    mixed.write_text("when,f\n2026-01-01T00:00:00Z,1\n2026-01-01T00:00:01,2\n2026-01-01T00:00:02Z,3\n")
+    found = brought(mixed, "--time", "when", *force)
+    np.testing.assert_array_equal(found["force"][:, 0], [1, 3])
+    assert "1 rows without a time left out (first: line 3)" in capsys.readouterr().out
+
+
 def test_logs_that_follow_each_other_become_one_recording(tmp_path, capsys):
     """Columns are found by name in each file, and rows after a change of file are flagged."""
     first = written(tmp_path, "t,f,x\n0,1,9\n1,2,9\n", "a.csv")

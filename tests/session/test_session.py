@@ -253,6 +253,40 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["s.h5"]
 
 
+KILLED = """
+import os, signal, sys
+from datetime import datetime, UTC
+from calib.session import SessionFacts, SessionWriter
+about = {"title": "", "skin_name": "", "skin_toml": "", "epoch": datetime(2025, 1, 1, tzinfo=UTC)}
+with SessionWriter(sys.argv[1], SessionFacts(**about)):
+    if len(sys.argv) > 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    print("writes", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs locks of files")
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "s.h5"
+    assert subprocess.run([sys.executable, "-c", KILLED, str(path), "now"], timeout=100, check=False).returncode < 0
+    (left,) = os.listdir(tmp_path)
+    assert left.endswith(".tmp")
+    command = [sys.executable, "-c", KILLED, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "writes\n"
+        (being_written,) = os.listdir(tmp_path)
+        assert being_written != left
+        bystanders = {".other.h5.0123456789ab.tmp", ".s.h5.mine.tmp"}
+        for name in bystanders:
+            (tmp_path / name).write_text("")
+        make(path)
+        assert {*os.listdir(tmp_path)} == {"s.h5", being_written, *bystanders}
+        other.communicate("\n")
+    assert {*os.listdir(tmp_path)} == {"s.h5", *bystanders}
+
+
 FULL_DISK = """
 import resource, signal, sys
 from datetime import datetime, UTC

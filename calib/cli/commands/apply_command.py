@@ -3,7 +3,7 @@
 import argparse
 
 from ..arguments import prepare_outputs
-from ..recipe_options import add_low_pass_argument, processing_of
+from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar
 
 
@@ -18,16 +18,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the force map of every frame."""
+    """Write the force map of every frame, or the force of a log over time."""
     from ...runtime import set_up
 
     set_up()
-    from ...calibration.calibration import load_calibration
-    from ...calibration.force_maps import apply
+    from ...calibration import LogCalibration, apply, apply_log, load_calibration
     from ...session import open_session
 
     prepare_outputs(args.output)
     calibration = load_calibration(args.calibration)
+    if isinstance(calibration, LogCalibration):
+        refuse_low_pass(args)
+        with open_session(args.session) as session:
+            found = apply_log(calibration, session, args.output, ignore_errors=args.force)
+        outside = (~found.valid).mean() if len(found.valid) else 0.0
+        print(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
+        return 0
     with open_session(args.session) as session:
         apply(
             calibration,

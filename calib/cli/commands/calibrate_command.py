@@ -8,8 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from ...calibration import Recipe
-from ...calibration.recipe_text import AUTO, NONE
-from ...fitting import CURVES
+from ...calibration.recipe_text import NONE
 from ...session import Session
 from ..arguments import count, prepare_outputs, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
@@ -126,19 +125,36 @@ def _calibrate_many(args: argparse.Namespace) -> int:
     return 2 if any(outcome.reason for outcome in outcomes) else 0
 
 
-_NEED_EIT = ("report", "test", "skin", "location", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
+_NEED_EIT = ("skin", "location", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
 
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
-    """Fit sessions without EIT: one curve per log, tested on its second half."""
-    from ...calibration.logs import fit_session, render_log, save_logs
+    """Fit one model to sessions without EIT; it is evaluated on their second halves and on the test sessions."""
+    from ...calibration.log_evaluation import render_evaluation
+    from ...calibration.logs import calibrate_logs, evaluate_log, render_log
+    from ...session import open_session
 
     given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, [], NONE)]
     if given:
         raise ValueError(f"{', '.join(given)}: for sessions with EIT, and these hold none; leave it out")
-    curves = tuple(CURVES.make(name) for name in CURVES.shipped) if args.curve == AUTO else recipe.curves
-    fits = {s.name: fit_session(s, curves, recipe.loss, ignore_errors=args.force) for s in sessions}
-    save_logs(fits, args.output)
-    print("\n".join(render_log(name, fit) for name, fit in fits.items()))
-    print(f"\nwrote {args.output}")
+    calibration = calibrate_logs(sessions, recipe, ignore_errors=args.force)
+    tried = {}
+    for path in args.test:
+        with open_session(path) as session:
+            tried[Path(path).name] = evaluate_log(calibration, session, ignore_errors=args.force)
+    calibration.save(args.output)
+    if args.report:
+        from ...report.log_document import write_log_report
+
+        write_log_report(calibration, Path(args.report), evaluations=tried)
+    if args.json:
+        results = {"calibration": calibration.evaluation.summary()} | {n: e.summary() for n, e in tried.items()}
+        print(json.dumps(results, indent=2, sort_keys=True))
+        return 0
+    names = ", ".join(Path(path).name for path in args.sessions)
+    print(render_log(title(names, calibration.simulated), calibration))
+    print("\n" + render_evaluation(calibration.evaluation))
+    for name, found in tried.items():
+        print("\n" + render_evaluation(found, name))
+    print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
     return 0

@@ -2,15 +2,22 @@
 
 import argparse
 import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ..arguments import skin_of
 from ..terminal import one_line, progress_bar
+
+if TYPE_CHECKING:
+    from ...session import Session
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sessions, and how to print what is found."""
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
+    text = "also print how far the session is off this calibration, and whether to recalibrate"
+    parser.add_argument("--calibration", metavar="CALIBRATION.h5", help=text)
     parser.add_argument("--all", action="store_true", help="print every channel")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
@@ -21,13 +28,16 @@ def run(args: argparse.Namespace) -> int:
 
     set_up()
     from ...check import check_session, render, to_json
+    from ...check.report import with_health
     from ...session import SessionError, open_session
 
     skin, worst = skin_of(args.skin), 0
+    health = _health_by(args.calibration)
     for path in args.sessions:
         try:
             with open_session(path) as session:
                 report = check_session(session, skin, progress=progress_bar(session.name))
+                report = report if health is None else with_health(report, health(session))
         except SessionError as error:
             print(f"jaxeit: {one_line(error)}", file=sys.stderr)
             worst = 2
@@ -35,3 +45,22 @@ def run(args: argparse.Namespace) -> int:
         print(to_json(report) if args.json else render(report, verbose=args.all))
         worst = worst if report.ok else 2
     return worst
+
+
+def _health_by(path: str | None) -> "Callable[[Session], str] | None":
+    """How a session's health is told by a calibration; None without one."""
+    if path is None:
+        return None
+    from ...calibration import assess
+    from ...calibration.calibration import load_calibration
+    from ...session import SessionError
+
+    calibration = load_calibration(path)
+
+    def health(session: "Session") -> str:
+        try:
+            return assess(calibration, session).health
+        except SessionError as error:
+            return f"calibration health: not determined: {one_line(error)}"
+
+    return health

@@ -3,9 +3,13 @@
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ..recipe_options import add_low_pass_argument, processing_of
+from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar, title
+
+if TYPE_CHECKING:
+    from ...calibration import LogCalibration
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,11 +27,13 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    from ...calibration import evaluate, load_calibration
+    from ...calibration import LogCalibration, evaluate, load_calibration
     from ...calibration.evaluation import render_table
     from ...session import open_session
 
     calibration = load_calibration(args.calibration)
+    if isinstance(calibration, LogCalibration):
+        return _evaluate_logs(args, calibration)
     results = {}
     for path in progress_bar("sessions")(args.sessions):
         with open_session(path) as session:
@@ -37,6 +43,26 @@ def run(args: argparse.Namespace) -> int:
         results[Path(path).name] = found.summary()
         if not args.json:
             print(render_table(found, heading))
+    if args.json:
+        print(json.dumps(results, indent=2, sort_keys=True))
+    return 0
+
+
+def _evaluate_logs(args: argparse.Namespace, calibration: "LogCalibration") -> int:
+    """Evaluate the calibration of a sensor without EIT on logs."""
+    from ...calibration.log_evaluation import render_evaluation
+    from ...calibration.logs import evaluate_log
+    from ...session import open_session
+
+    refuse_low_pass(args)
+    results = {}
+    for path in progress_bar("sessions")(args.sessions):
+        with open_session(path) as session:
+            found = evaluate_log(calibration, session, ignore_errors=args.force)
+            heading = title(session.name, session.simulated)
+        results[Path(path).name] = found.summary()
+        if not args.json:
+            print(render_evaluation(found, heading))
     if args.json:
         print(json.dumps(results, indent=2, sort_keys=True))
     return 0

@@ -30,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record the streams at the same time")
     text = "request the next readings from the device: few at rest, those around the contact during a contact"
     parser.add_argument("--event-driven", action="store_true", help=text)
+    text = "let zero and relative gains of the pads follow their drift, and write the moved calibration"
+    parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
     text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
     parser.add_argument("--realtime", action="store_true", help=text)
 
@@ -48,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from ...record.planning import plan_recording
     from ...record.recorder import StopRequest
 
-    prepare_outputs(args.output)
+    prepare_outputs(args.output, args.recalibrate)
     calibration = load_calibration(args.calibration)
     plan, sources = plan_recording({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
     orders = StopRequest()
@@ -69,7 +71,14 @@ def run(args: argparse.Namespace) -> int:
             sources,
             show,
             Presentation(host=args.host, port=args.port, publish=args.publish, output=args.output),
-            LiveSettings(event_driven=args.event_driven, realtime=args.realtime, rest=args.rest, wait=args.wait),
+            LiveSettings(
+                event_driven=args.event_driven,
+                realtime=args.realtime,
+                rest=args.rest,
+                wait=args.wait,
+                recalibrate=args.recalibrate is not None,
+                moved=args.recalibrate,
+            ),
             also=also,
             tell=_tell,
         )

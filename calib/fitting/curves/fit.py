@@ -193,7 +193,7 @@ def fit_samples(
         covariance=jnp.where(result != FitResult.SUCCESS, jnp.nan, found.covariance),
         pressure_range=jnp.where(n > 0, limits, jnp.nan),
         scale=jnp.where(unusable, jnp.nan, end.spread),
-        residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / (n - k))),
+        residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / (n - k).astype(raw.dtype))),
         n=n,
         n_missing=jnp.sum(~present),
         n_groups=groups,

@@ -135,7 +135,8 @@ class MonotoneSpline(PositiveSlopes, _RisingFromZero):
     def _unit(self, params: Params, z: Values) -> Values:
         pieces = len(params) - 1
         slopes = params * self._top(params.dtype) / pieces
-        along = jnp.clip(z[..., None] * pieces - jnp.arange(pieces), 0, 1)  # part of each piece that lies below z
+        starts = jnp.arange(pieces, dtype=z.dtype)
+        along = jnp.clip(z[..., None] * pieces - starts, 0, 1)  # part of each piece that lies below z
         return jnp.sum(slopes[:-1] * along + 0.5 * jnp.diff(slopes) * along**2, -1)
 
     def _ends(self, params: Params) -> tuple[Scalar, Scalar]:

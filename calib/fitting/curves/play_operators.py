@@ -17,19 +17,16 @@ from .monotone import MonotoneSpline
 def play(signal: Float[Array, " n"], width: Float[Array, " m"]) -> Float[Array, "n m"]:
     """Play operators: each follows the signal at a distance of at most its width; each starts at zero.
 
-    y_k = max(u_k - r, min(u_k + r, y_(k-1))). Every step clamps the state, and a composition of clamps is a clamp, so
-    that an associative scan computes the series in log(n) parallel steps. The state is kept where the signal is NaN.
+    y_k = max(u_k - r, min(u_k + r, y_(k-1))). The state is kept where the signal is NaN. The loop over the samples is
+    compiled in 0.1 s whatever their number; an associative scan takes 10 to 40 s and is slower on a CPU.
     """
-    u = signal[:, None]
-    hold = jnp.isnan(u)
-    low = jnp.where(hold, -jnp.inf, u - width)
-    high = jnp.where(hold, jnp.inf, u + width)
 
-    def then(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-        return jnp.clip(first[0], *second), jnp.clip(first[1], *second)
+    def follow(state: Float[Array, " m"], sample: Scalar) -> tuple[Array, Array]:
+        near = jnp.clip(state, sample - width, sample + width)
+        state = jnp.where(jnp.isnan(sample), state, near)
+        return state, state
 
-    low, high = jax.lax.associative_scan(then, (low, high))
-    return jnp.clip(jnp.zeros((), u.dtype), low, high)
+    return jax.lax.scan(follow, jnp.zeros(width.shape, signal.dtype), signal)[1]
 
 
 def _cumulative_weights(slopes: Float[Array, " m"]) -> Float[Array, " m"]:

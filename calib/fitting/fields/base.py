@@ -9,7 +9,7 @@ the pad belongs to its curve alone.
 
 import abc
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,8 +30,10 @@ class AbstractField(eqx.Module):
     """Features of a place on a pad, and the priors of their coefficients.
 
     `shared`: all pads have one field, in coordinates relative to the pad; otherwise each pad has its own coefficients.
+    ``early`` holds settings that files of early versions lack, with the values that these versions had.
     """
 
+    early: ClassVar[Mapping[str, Any]] = {}
     shared: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
@@ -74,7 +76,7 @@ def cubic_bspline(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def restored(kind: type[AbstractField], settings: Mapping[str, np.ndarray]) -> AbstractField:
     """The field of this class whose settings were stored as arrays, by setting."""
-    return kind(**{name: _setting(value) for name, value in settings.items()})
+    return kind(**{**kind.early, **{name: _setting(value) for name, value in settings.items()}})
 
 
 def _setting(value: np.ndarray) -> Any:

@@ -37,16 +37,22 @@ def without_levels(
     gram = x.T @ x + jnp.diag(jnp.where(present, 1e-12, 1.0).astype(x.dtype))
     levels = solve(gram, x.T @ jnp.column_stack([z, y]))
     left = jnp.column_stack([z, y]) - x @ levels
-    return LevelFree(left[:, :-1], left[:, -1], jnp.maximum(jnp.sum(weight) - jnp.sum(present), 1.0))
+    degrees = jnp.sum(weight) - jnp.sum(present, dtype=weight.dtype)
+    return LevelFree(left[:, :-1], left[:, -1], jnp.maximum(degrees, 1.0))
 
 
 class Posterior(NamedTuple):
-    """Coefficients and covariance over all priors, the largest log evidence, and the variance of the noise."""
+    """Coefficients and covariance over all priors.
+
+    ``evidence`` is the largest log evidence, ``variance`` that of the noise, and ``effective`` the number of
+    coefficients that the presses determine: the trace of the matrix that maps log ratios to their fit.
+    """
 
     coefficients: Array
     covariance: Array
     evidence: Array
     variance: Array
+    effective: Array
 
 
 class _Shape(NamedTuple):
@@ -59,6 +65,7 @@ class _Shape(NamedTuple):
     | shrink   | posterior variance of the coordinates over the noise's | (sizes, m) |
     | moment   | posterior mean of the coordinates                      | (sizes, m) |
     | axes     | coefficients for each coordinate                       | (m, m)     |
+    | trace    | number of coordinates that the presses determine       | (sizes,)   |
     """
 
     evidence: Array
@@ -66,6 +73,7 @@ class _Shape(NamedTuple):
     shrink: Array
     moment: Array
     axes: Array
+    trace: Array
 
 
 def _of_shape(levelled: LevelFree, shape: Float[Array, " m"]) -> _Shape:
@@ -76,7 +84,8 @@ def _of_shape(levelled: LevelFree, shape: Float[Array, " m"]) -> _Shape:
     shrink = ratio / (1 + ratio * values)
     square = jnp.maximum(levelled.y @ levelled.y - jnp.sum(shrink * moment**2, 1), jnp.finfo(shape.dtype).tiny)
     evidence = -0.5 * (jnp.sum(jnp.log1p(ratio * values), 1) + levelled.degrees * jnp.log(square))
-    return _Shape(evidence, square / levelled.degrees, shrink, shrink * moment, axes)
+    trace = jnp.sum(values * shrink, 1)
+    return _Shape(evidence, square / levelled.degrees, shrink, shrink * moment, axes, trace)
 
 
 def average_over_priors(levelled: LevelFree, shapes: Float[Array, "shapes m"]) -> Posterior:
@@ -94,4 +103,10 @@ def average_over_priors(levelled: LevelFree, shapes: Float[Array, "shapes m"]) -
     mean = of_shape @ means
     between = jnp.einsum("s,si,sj->ij", of_shape, means - mean, means - mean)
     covariance = jnp.einsum("sik,skl,sjl->ij", each.axes, within, each.axes) + between
-    return Posterior(mean, covariance, jnp.max(each.evidence), jnp.sum(weight * each.variance))
+    return Posterior(
+        mean,
+        covariance,
+        jnp.max(each.evidence),
+        jnp.sum(weight * each.variance),
+        jnp.sum(weight * each.trace),
+    )

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ...presses.pooled import MIN_SHARE
 from ..order_statistics import MAD_TO_SIGMA
 from ..results import FitResult
 from .base import AbstractField
@@ -18,9 +19,6 @@ from .fitted import FittedField, pad_features
 from .geometry import Geometry, onto_pads, relative_to_pads
 from .places import Places
 
-# Least share of a press's force that a pad must carry for the press to say where the field of the pad is determined: a
-# press where three pads meet may count for each.
-MIN_SHARE = 1 / 3
 # Distance from the field, in standard deviations, beyond which a press loses weight (Huber's weights): 1 % of normal
 # noise lies beyond.
 HUBER_WIDTH = 2.5
@@ -129,7 +127,7 @@ def fit_field(
     shapes = jnp.asarray(np.tile(field.shapes(), (1, 1 if field.shared else geometry.pads)), z.dtype)
     found, square, degrees = _robust_posterior(z, y, share, weight, shapes)
     n = jnp.sum(weight)
-    enough = n >= 2 + jnp.sum(jnp.sum(share * weight[:, None], 0) > 0)
+    enough = n >= 2 + jnp.sum(jnp.sum(share * weight[:, None], 0) > 0, dtype=n.dtype)
     sound = jnp.all(jnp.isfinite(found.coefficients)) & jnp.all(jnp.isfinite(found.covariance))
     result = jnp.select([~enough, ~sound], [FitResult.TOO_FEW, FitResult.NOT_FINITE], FitResult.SUCCESS)
     good = result == FitResult.SUCCESS
@@ -143,6 +141,7 @@ def fit_field(
         noise=jnp.sqrt(found.variance),
         spread=jnp.sqrt(square / degrees),
         evidence=found.evidence + 0.5 * degrees * jnp.log(jnp.maximum(square, jnp.finfo(square.dtype).tiny)),
+        effective=jnp.where(good, found.effective, 0),
         n=n,
         result=result,
     )

@@ -35,6 +35,7 @@ class FittedField(eqx.Module):
     | noise        | scatter of single presses about the field, in log force            | ()           | 1    |
     | spread       | the same without a field                                           | ()           | 1    |
     | evidence     | log of the largest marginal likelihood, relative to no field       | ()           | 1    |
+    | effective    | number of coefficients that the presses determine                  | ()           |      |
     | n            | presses used; all presses at one place count as one                | ()           |      |
     | result       | a `FitResult`; if not 0, there is no correction                    | ()           |      |
     """
@@ -48,6 +49,7 @@ class FittedField(eqx.Module):
     noise: Float[Array, ""]
     spread: Float[Array, ""]
     evidence: Float[Array, ""]
+    effective: Float[Array, ""]
     n: Float[Array, ""]
     result: Int[Array, ""]
 

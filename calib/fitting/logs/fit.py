@@ -13,9 +13,10 @@ from ..curves.samples import Numbers
 from ..results import FitError
 from ..validation import Score, score, trusted_forces
 from .blend import BlendChannels
+from .combination import AbstractCombination, one_channel
 
-Channels = Callable[[np.ndarray, np.ndarray, np.ndarray, AbstractCurve], tuple[np.ndarray, str]]
-"""Makes one signal (n,) and says how, from time (n,), signals (n, channels), force (n,) and the curve to be fitted."""
+Channels = Callable[[np.ndarray, np.ndarray, np.ndarray, AbstractCurve], AbstractCombination]
+"""Combines channels, from time (n,), signals (n, channels), force (n,) (NaN: not to be used) and the curve."""
 
 
 def time_split(time: Numbers, fraction: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
@@ -80,18 +81,19 @@ def fit_log(
         raise FitError(
             "no sample of the fitted part has both a force and a signal; record more, or choose a larger fraction."
         )
-    signal, source = _one_signal(np.asarray(time), values, np.where(train, forces, np.nan), curve, channels)
+    combination = _combination(np.asarray(time), values, np.where(train, forces, np.nan), curve, channels)
+    signal = combination.signal(np.asarray(time), values)
     fitted = fit_curves(curve, signal[None], forces, mask=train, **options)
     predicted = trusted_forces(fitted, signal[None])[0]
     scores = [score(predicted[m], forces[m]) for m in (train, rest & complete)]
-    return LogFit(fitted.pad(0), signal, predicted, source, int((~complete).sum()), *scores)
+    return LogFit(fitted.pad(0), signal, predicted, combination.words, int((~complete).sum()), *scores)
 
 
-def _one_signal(
+def _combination(
     time: np.ndarray, signals: np.ndarray, force: np.ndarray, curve: AbstractCurve, channels: Channels | None
-) -> tuple[np.ndarray, str]:
-    """A signal (n,) of all channels, and how it was made; `force` is NaN outside the fitted part."""
+) -> AbstractCombination:
+    """One signal of all channels; `force` is NaN outside the fitted part."""
     if signals.shape[1] == 1:
-        return signals[:, 0], "channel 0"
+        return one_channel(0)
     choose = BlendChannels() if channels is None else channels
     return choose(time, signals, force, curve)

@@ -76,7 +76,7 @@ class AbstractTableImporter(AbstractImporter):
         parser.add_argument(
             "files", nargs="+", metavar="FILE", help="files of one layout, in the order of recording", **grouped
         )
-        text = "column and unit of the clock, such as 0:ms; without a unit, the header must state it, as in time (ms)"
+        text = "column and unit of the clock, such as 0:ms; no unit for dates and times, or if the header states it"
         parser.add_argument("--time", metavar="COLUMN:UNIT", help=text, **grouped)
         text = "rate of a table without a clock, in Hz; instead of --time"
         parser.add_argument("--rate", metavar="HZ", type=float, help=text, **grouped)

@@ -27,6 +27,7 @@ from .limits import MAX_COLUMNS
 from .reports import FileReport, ImportReport, StreamReport
 from .sentinels import sentinel_warnings
 from .tables import AbstractTableFile, Table
+from .unused_clocks import clock_notes
 
 if TYPE_CHECKING:  # a second to import, and only wanted with --skin
     import jaxeit as je
@@ -126,23 +127,41 @@ def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About
         wanted = column_indices(path, spec.time, file.header, file.columns)
         if len(wanted) > 1:
             raise problem(path, f"--time {printable(spec.time)}", f"names {len(wanted)} columns", "name one")
-        time_unit = spec.time_unit or _unit_of(path, f"--time {printable(spec.time)}", wanted, file.header, "s")
-        notes += _contradictions(path, f"--time {printable(spec.time)}", time_unit, wanted, file.header)
+        time_unit = _clock_unit(file, spec, wanted, notes)
     for stream in spec.streams:
         found = [i for text in stream.columns for i in column_indices(path, text, file.header, file.columns)]
         places[stream.name] = list(range(len(wanted), len(wanted) + len(found)))
         where = f"--stream {printable(stream.name)}"
+        if any(column in file.dates for column in found):
+            raise problem(path, where, "names a column of dates and times", "name it with --time, or leave it out")
         units[stream.name] = stream.unit or _unit_of(path, where, found, file.header)
         notes += _contradictions(path, where, units[stream.name], found, file.header)
         wanted = [*wanted, *found]
     if len(wanted) > MAX_COLUMNS:
         raise problem(path, "--stream", f"{len(wanted):,} columns are too many", "name fewer")
     table = file.read(wanted, used, about.progress)
+    if spec.rate_hz is not None:
+        notes += clock_notes(file, spec, wanted, about.progress)
     if spec.rate_hz is None:
         clock = clock_of(path, table, spec.time, UNITS[time_unit], sort, file.counted)
     else:
         clock = clock_of_rate(path, len(table.line), spec.rate_hz, spec.start)
     return _Part(path, table, clock, places, units, file.counted, tuple(notes))
+
+
+def _clock_unit(file: AbstractTableFile, spec: FileSpec, wanted: Sequence[int], notes: list[str]) -> str:
+    """The unit of the clock: the stated one, or that of the header; dates and times are read as s since 1970."""
+    path, where = file.path, f"--time {printable(spec.time)}"
+    if wanted[0] not in file.dates:
+        unit = spec.time_unit or _unit_of(path, where, wanted, file.header, "s")
+        notes += _contradictions(path, where, unit, wanted, file.header)
+        return unit
+    if spec.time_unit:
+        what = "the column holds dates and times, which have no unit"
+        raise problem(path, where, what, f"leave out :{spec.time_unit}")
+    if not file.dates[wanted[0]]:
+        notes.append(f"{printable(path.name)}: {where}: the times state no time zone and are read as UTC")
+    return "s"
 
 
 def _contradictions(path: Path, where: str, unit: str, indices: Sequence[int], header: Sequence[str]) -> Iterator[str]:

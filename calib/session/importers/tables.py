@@ -2,9 +2,10 @@
 
 import stat
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,12 +33,15 @@ class AbstractTableFile(ABC):
     | header    | names of the columns; empty if the file has none      |
     | columns   | number of columns                                     |
     | counted   | what ``Table.line`` counts: "line" or "row"           |
+    | dates     | columns of text that hold dates and times, read as s  |
+    |           | since 1970, and whether these state a time zone       |
     """
 
     path: Path
     header: tuple[str, ...]
     columns: int
     counted: str = "row"
+    dates: Mapping[int, bool] = MappingProxyType({})
 
     @abstractmethod
     def read(self, columns: Sequence[int], used: int, progress: Progress) -> Table:

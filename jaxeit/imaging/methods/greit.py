@@ -31,7 +31,7 @@ class Greit(AbstractLinearMethod):
         areas, centres = problem.picture.areas, problem.picture.centres
         square = jnp.sum((centres[:, None] - centres) ** 2, -1)
         distance = jnp.sqrt(square)
-        contacts = jnp.exp(-0.5 * square / self.width**2) * (areas > 0)
+        contacts = jnp.where(areas > 0, jnp.exp(-0.5 * square / self.width**2), 0)
         disc = jax.nn.sigmoid((self.radius - distance) / self.edge)
         mass, whole = areas @ contacts, areas @ disc
         desired = disc * jnp.where(whole > 0, mass / jnp.where(whole > 0, whole, 1), 0)

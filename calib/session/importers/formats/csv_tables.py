@@ -20,6 +20,7 @@ from ..reports import ImportReport
 from ..table_importer import AbstractTableImporter
 from ..table_session import import_tables
 from ..tables import AbstractTableFile, CountedSteps, Progress, Table
+from .text_dates import date_columns, seconds_of
 from .text_files import count_lines, lines_of
 from .text_layout import FIRST_LINES, layout_of, wrong_sign
 
@@ -42,6 +43,8 @@ class CsvFile(AbstractTableFile):
         first = [line for _, line in itertools.islice(lines_of(path), FIRST_LINES)]
         self._dialect = layout_of(path, first, decimal)
         self.header, self.columns = self._dialect.header, self._dialect.columns
+        rows = [cells for line, cells in self._dialect.rows(first, strict=False) if line > self._dialect.header_lines]
+        self.dates = date_columns(rows)
 
     def read(self, columns: Sequence[int], used: int, progress: Progress) -> Table:
         """See `AbstractTableFile.read`."""
@@ -93,11 +96,14 @@ class CsvFile(AbstractTableFile):
         """Numbers of one row; all NaN if it has more cells than the table has columns, because cells may be shifted."""
         if any(cells[self.columns :]):
             return [np.nan] * len(columns)
-        chosen = [cells[c] if c < len(cells) else "" for c in columns]
-        for cell in chosen:
-            if self._dialect.contradicted_by(cell):
-                raise wrong_sign(self.path, line, cell, self._dialect)
-        return [self._dialect.number(cell) for cell in chosen]
+        return [self._value(line, cells[c] if c < len(cells) else "", c) for c in columns]
+
+    def _value(self, line: int, cell: str, column: int) -> float:
+        if column in self.dates:
+            return seconds_of(cell, self.dates[column])
+        if self._dialect.contradicted_by(cell):
+            raise wrong_sign(self.path, line, cell, self._dialect)
+        return self._dialect.number(cell)
 
 
 def _blocks(lines: Iterator[tuple[int, str]], rows: int) -> Iterator[list[tuple[int, str]]]:

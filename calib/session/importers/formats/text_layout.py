@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...errors import SessionError, problem
+from .text_dates import is_date
 
 FIRST_LINES = 200
 """Number of lines from which the layout is determined."""
@@ -94,9 +95,9 @@ def _first_rows(dialect: Dialect, first: Sequence[str]) -> list[tuple[int, list[
 
 
 def _score(rows: list[tuple[int, list[str]]], dialect: Dialect) -> tuple[int, int]:
-    """Score of a layout: the number of cells that are numbers, then minus the number of other cells."""
+    """Score of a layout: the number of cells that are numbers or dates, then minus the number of other cells."""
     cells = [cell for _, row in rows for cell in row if cell]
-    numbers = sum(not math.isnan(dialect.number(cell)) for cell in cells)
+    numbers = sum(not math.isnan(dialect.number(cell)) or is_date(cell) for cell in cells)
     return numbers, numbers - len(cells)
 
 

@@ -1,0 +1,116 @@
+"""What each fault of a bench costs, on sessions of the second simulator (tests/oracles/bench), not of `calib.bench`.
+
+A session of 100 places at 5, 10 and 20 N is calibrated with `--location edge --curve polynomial`; another session of
+the same skin (other places, order and noise) is predicted.  Rows of the first kind have the fault in both sessions.  In
+rows of the second kind the calibration is that without faults, and only the predicted session has the fault.
+
+CV is that of estimated over true force, bias their mean ratio less one; `rmse_scaled_n` is the error that is left after
+division by that ratio.  The third of least forces is that at 5 N, and so on.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import calib
+import jaxeit as je
+from calib.calibration import Calibration, Evaluation
+from calib.fitting import FitError
+from calib.session import Session
+from tests.oracles.bench import Bench, Faults, simulate, write
+
+from .harness import Question, Run
+from .rows import Row
+
+BOTH = {
+    "none": Faults(),
+    "crosstalk 2 %": Faults(crosstalk=0.02),
+    "crosstalk 3 %": Faults(crosstalk=0.03),
+    "crosstalk 10 %": Faults(crosstalk=0.1),
+    "bolts misplaced, 1 mm": Faults(misplaced=1e-3),
+    "bolts misplaced, 2 mm": Faults(misplaced=2e-3),
+    "hysteresis 10 %": Faults(hysteresis=0.1),
+    "creep 5 %": Faults(creep=0.05),
+    "coating 15 %": Faults(coating=0.15),
+    "protrusions 30 %": Faults(scatter=0.3),
+    "drift, ten times": Faults(drift=10.0),
+    "temperature, 2 K": Faults(temperature=2.0),
+    "several": Faults(
+        crosstalk=0.03, hysteresis=0.05, misplaced=1e-3, coating=0.15, creep=0.03, scatter=0.2, drift=3.0
+    ),
+}
+LATER = {
+    "ring": Faults(shape="ring"),
+    "tilted": Faults(shape="tilted"),
+    "ellipse": Faults(shape="ellipse"),
+    "sphere": Faults(shape="hertz"),
+    "10 mm tip": Faults(tip=0.01),
+    "pads moved, 5 % and 50 Pa": Faults(moved_gain=0.05, moved_offset=50.0),
+}
+FULL, SMOKE = Bench(), Bench(places=16, levels=(10.0, 20.0), spacing=6e-3)
+RECIPE = calib.Recipe(location=calib.PadEdge(), curve=calib.MonotonePolynomial())
+DRAFT = replace(
+    RECIPE, curve=calib.Linear(), fidelity=je.Fidelity.draft(), locator=calib.ImageCentroid("half"), folds=2
+)
+
+
+def measure(run: Run) -> Iterator[Row]:
+    """A row for each fault."""
+    bench, recipe = (SMOKE, DRAFT) if run.smoke else (FULL, RECIPE)
+    calibrations: dict[str, Calibration] = {}
+    for name, faults in run.sizes(list(BOTH.items()), [("none", Faults())]):
+        row: Row = {"fault": name, "in": "both"}
+        try:
+            with _recorded(replace(bench, faults=faults)) as session:
+                calibrations[name] = calib.calibrate([session], recipe=recipe)
+            row |= predicted(calibrations[name], replace(bench, faults=faults, seed=2))
+        except FitError as error:
+            row["refused"] = str(error)
+        yield {"rows": [row]}
+    for name, faults in run.sizes(list(LATER.items()), []):
+        row = {"fault": name, "in": "the second"}
+        yield {"rows": [row | predicted(calibrations["none"], replace(bench, faults=faults, seed=2))]}
+
+
+@contextmanager
+def _recorded(bench: Bench) -> Iterator[Session]:
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "session.h5", simulate(bench))
+        with calib.open_session(Path(folder) / "session.h5") as session:
+            yield session
+
+
+def predicted(calibration: Calibration, bench: Bench) -> Row:
+    """Errors of a calibration on another session."""
+    with _recorded(bench) as session:
+        return figures(calib.evaluate(calibration, session))
+
+
+def figures(found: Evaluation) -> Row:
+    """Errors of place and force, rounded."""
+    error, ratio = found.total_force - found.force, found.total_force / found.force
+    third = np.argsort(np.argsort(found.force)) * 3 // len(error)
+    row = {
+        "rmse_n": _rms(error),
+        "cv": ratio.std(ddof=1),
+        "bias": ratio.mean() - 1,
+        "rmse_scaled_n": _rms(found.total_force / ratio.mean() - found.force),
+    }
+    row |= {f"rmse_third_{k + 1}_n": _rms(error[third == k]) for k in range(3)}
+    for name, place in found.estimated.items():
+        row[f"{name}_mm"] = 1e3 * float(np.linalg.norm(place - found.position, axis=1).mean())
+    return {name: round(float(value), 4) for name, value in row.items()}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+main = Question("oracle", __doc__, {"rows": measure})
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""`jaxeit recalibrate`."""
+
+import argparse
+
+from ..arguments import above_zero, prepare_outputs
+from ..terminal import title
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """A calibration, a session recorded since, and the file to write."""
+    parser.add_argument("calibration", metavar="CALIBRATION.h5")
+    parser.add_argument("session", metavar="SESSION.h5")
+    parser.add_argument("-o", "--output", required=True, metavar="NEW.h5", help="the same calibration, moved")
+    text = (
+        "presses of known force, or ordinary use without a load cell; default: force, if the session has such a stream"
+    )
+    parser.add_argument("--from", dest="evidence", choices=("force", "use"), help=text)
+    text = (
+        "percent by which a gain may have drifted, of each pad and of all together (standard deviations); default: 10"
+    )
+    parser.add_argument("--drift", type=above_zero, default=10.0, metavar="PERCENT", help=text)
+    text = "continue despite errors that `jaxeit check` finds, or if the session determines the gain of no pad"
+    parser.add_argument("--force", action="store_true", help=text)
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the moved calibration, and print what has changed."""
+    from ...runtime import set_up
+
+    set_up()
+    from ...calibration import KnownForces, OrdinaryUse, recalibrate
+    from ...calibration.calibration import load_calibration
+    from ...calibration.recalibration import render
+    from ...fitting.gain_update import GainDrift
+    from ...session import open_session
+
+    prepare_outputs(args.output)
+    drift = GainDrift(args.drift / 100, args.drift / 100)
+    ways = {"force": KnownForces(drift), "use": OrdinaryUse(drift)}
+    calibration = load_calibration(args.calibration)
+    with open_session(args.session) as session:
+        way = args.evidence or ("force" if "force" in session.streams else "use")
+        moved = recalibrate(calibration, session, ways[way], ignore_errors=args.force)
+        heading = title(session.name, session.simulated)
+    moved.save(args.output)
+    found = moved.recalibration
+    assert found is not None
+    print(found.to_json() if args.json else f"{heading}\n{render(found)}")
+    return 0

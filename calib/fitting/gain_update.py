@@ -1,0 +1,137 @@
+"""Bayesian update of the log gains of pads: linear, Gaussian, robust against outliers.
+
+With residuals r (n,) of observed over expected logarithms, their slopes A (n, pads) in the log gains g, their
+covariance R and a prior N(m, P), the posterior has the precision P^-1 + A' W A with W = R^-1. Directions U that the
+data cannot tell from something unknown, such as a gain common to all pads and the image, are projected out:
+W = R^-1 - R^-1 U (U' R^-1 U)^+ U' R^-1. Along them the posterior is the prior.
+
+An outlier has an independent error besides that of R: variance R_ii (1 / w - 1), with the weights w = 1 for residuals
+within `USUAL` deviations and of Cauchy's distribution beyond, iterated. Multiplying the rows of R instead would take
+the errors that neighbours share for differences between them, and so overstate what is known. Deviations are the larger
+of the stated and the median one, so that a start far away does not select a few observations.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..presses.streams import MAD_TO_SIGMA
+
+USUAL = 2.0  # deviations
+STEPS = 30
+TOLERANCE = 1e-7  # largest step of a log gain at the end
+DETERMINED = 0.5  # standard deviation of a determined gain over that of its prior, at most
+
+
+class GainPrior(NamedTuple):
+    """What is known of the log gains before the data, as a normal distribution: mean (pads,), covariance."""
+
+    mean: Float[np.ndarray, " pads"]
+    covariance: Float[np.ndarray, "pads pads"]
+
+
+class GainDrift(NamedTuple):
+    """Standard deviations by which log gains may have moved since they were known last.
+
+    | field  | meaning                                                                 | default |
+    |--------|-------------------------------------------------------------------------|---------|
+    | own    | of each pad by itself: its sensor, its air, its material                | 0.1     |
+    | common | of all pads together: temperature, barometric pressure, the load cell   | 0.1     |
+    """
+
+    own: float = 0.1
+    common: float = 0.1
+
+    def covariance(self, pads: int, *, together: bool) -> Float[np.ndarray, "pads pads"]:
+        """Covariance of the move. Without `together` one pad says nothing about the others: the same variances."""
+        shared = np.full((pads, pads), self.common**2)
+        return np.asarray(self.own**2 * np.eye(pads) + (shared if together else np.diag(np.diag(shared))))
+
+
+class GainUpdate(NamedTuple):
+    """Log gains after an update.
+
+    | field      | meaning                                                                   | shape        |
+    |------------|---------------------------------------------------------------------------|--------------|
+    | mean       | of the log gains                                                          | (pads,)      |
+    | covariance | of the log gains                                                          | (pads, pads) |
+    | determined | whether the data determine the gain (relative to the others, with nuisance) | (pads,)    |
+    | misfit     | median deviation of the residuals over the stated one; 1 is as stated     | ()           |
+    | weight     | of each observation, small for outliers                                   | (n,)         |
+    """
+
+    mean: Float[np.ndarray, " pads"]
+    covariance: Float[np.ndarray, "pads pads"]
+    determined: Bool[np.ndarray, " pads"]
+    misfit: float
+    weight: Float[np.ndarray, " n"]
+
+
+Residuals = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Log gains (pads,) -> residuals (n,), observed minus expected, and the slopes (n, pads) of what is expected."""
+
+
+def update_gains(
+    prior: GainPrior,
+    residuals: Residuals,
+    covariance: Float[np.ndarray, "n n"],
+    nuisance: Float[np.ndarray, "n k"] | None = None,
+) -> GainUpdate:
+    """Update log gains by observations with the covariance of their errors.
+
+    The covariance of the result grows by the square of `misfit` where the residuals are significantly larger than
+    stated. Without observations the result is the prior.
+    """
+    gain, n = prior.mean, len(covariance)
+    free = np.zeros((n, 0)) if nuisance is None else nuisance
+    inverse = np.linalg.inv(prior.covariance)
+    sigma, weight, misfit = np.sqrt(np.diag(covariance)), np.ones(n), 1.0
+    information = np.zeros_like(inverse)
+    for _ in range(STEPS if n else 0):
+        residual, slope = residuals(gain)
+        precision = _precision(covariance, weight, free)
+        information = slope.T @ precision @ slope
+        step = np.linalg.solve(inverse + information, slope.T @ precision @ residual + inverse @ (prior.mean - gain))
+        gain = gain + step
+        fitted = free.shape[1] + np.trace(np.linalg.solve(inverse + information, information))
+        # Residuals of a fit are smaller than the errors, as n - fitted to n.
+        left = _without(free, covariance, weight, residuals(gain)[0]) / sigma * np.sqrt(n / max(n - fitted, 1.0))
+        misfit = float(MAD_TO_SIGMA * np.median(np.abs(left)))
+        weight = np.minimum(1.0, (1 + USUAL**2) / (1 + (left / max(misfit, 1.0)) ** 2))
+        if np.abs(step).max() < TOLERANCE:
+            break
+    scale = misfit if misfit > _largest_usual(n) else 1.0
+    posterior = np.linalg.inv(inverse + information / scale**2)
+    return GainUpdate(gain, posterior, _determined(prior, posterior, nuisance is not None), misfit, weight)
+
+
+def _largest_usual(n: int) -> float:
+    """Misfit that sound residuals exceed in a few percent of cases."""
+    return float(1 + 2.4 / np.sqrt(max(n, 1)))
+
+
+def _precision(covariance: np.ndarray, weight: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Inverse covariance of weighted observations, with the directions `free` projected out."""
+    whole = np.linalg.inv(covariance + np.diag(np.diag(covariance) * (1 / weight - 1)))
+    held = whole @ free
+    return np.asarray(whole - held @ np.linalg.pinv(free.T @ held, hermitian=True) @ held.T)
+
+
+def _without(free: np.ndarray, covariance: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Residuals minus what the directions `free` explain of them, by weighted least squares."""
+    held = free * (weight / np.diag(covariance))[:, None]
+    return np.asarray(residual - free @ (np.linalg.pinv(free.T @ held, hermitian=True) @ (held.T @ residual)))
+
+
+def relative(covariance: Float[np.ndarray, "pads pads"]) -> Float[np.ndarray, "pads pads"]:
+    """Covariance of the log gains minus their mean over the pads."""
+    pads = len(covariance)
+    centre = np.eye(pads) - 1 / pads
+    return np.asarray(centre @ covariance @ centre)
+
+
+def _determined(prior: GainPrior, posterior: np.ndarray, is_relative: bool) -> np.ndarray:
+    before, after = (relative(c) if is_relative else c for c in (prior.covariance, posterior))
+    return np.asarray(np.diag(after) < DETERMINED**2 * np.diag(before))

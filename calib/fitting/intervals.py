@@ -1,0 +1,120 @@
+"""Noise of a reading about a fitted response, which grows with force, and intervals that cover a stated fraction.
+
+The standard deviation of a new reading about the prediction F of a pad is s(F) = scale sqrt(floor^2 + (fraction F)^2):
+the floor is the noise of the sensors, the fraction holds what is proportional to force, such as an error of gain or
+place that the model does not know. Both have the largest normal likelihood of held-out residuals, from which the
+variance of the model is subtracted. Half the width of an interval is a multiple of the standard deviation, taken from
+the same residuals (split conformal prediction; Lei et al. 2018, JASA 113), so that it holds without normal noise.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import minimize
+
+COVERAGE = 0.9  # of the intervals
+NORMAL_MULTIPLE = 1.6449  # half the width of a normal distribution's 90 % interval, in standard deviations
+MIN_GROUPS = 10  # of held-out readings; fewer determine no multiple, and the normal one is used
+# Groups' worth of readings that speak for the common deviation, against those of the pad itself.
+PRIOR_GROUPS = 5.0
+
+
+class NoiseLaw(eqx.Module):
+    """Deviation of new readings about a fitted response.
+
+    | field    | meaning                                                       | shape   | unit |
+    |----------|---------------------------------------------------------------|---------|------|
+    | floor    | standard deviation without force                              | ()      | N    |
+    | fraction | standard deviation per force, for large forces                | ()      | 1    |
+    | scale    | of each pad, relative to all                                  | (pads,) | 1    |
+    | multiple | half the 90 % interval, in standard deviations                | ()      | 1    |
+    """
+
+    floor: Float[Array, ""]
+    fraction: Float[Array, ""]
+    scale: Float[Array, " pads"]
+    multiple: Float[Array, ""]
+
+    def variance(self, force: Float[Array, "*n pads"]) -> Float[Array, "*n pads"]:
+        """Variance (N^2) of a new reading about each pad's predicted force (N)."""
+        return self.scale**2 * (self.floor**2 + (self.fraction * force) ** 2)
+
+    def half_widths(self, force: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """Half the 90 % interval of the total of predicted forces (n, pads) N with these standard errors, (n,) N."""
+        variance = (np.asarray(self.variance(jnp.asarray(force))) + error**2).sum(1)
+        return np.asarray(float(self.multiple) * np.sqrt(variance))
+
+
+def fit_noise(
+    residual: Float[np.ndarray, " n"],
+    force: Float[np.ndarray, "n pads"],
+    variance: Float[np.ndarray, " n"],
+    group: np.ndarray,
+) -> NoiseLaw:
+    """The noise law of held-out residuals of the total force.
+
+    Args:
+        residual: measured minus predicted total force, N; rows that are not finite are left out.
+        force: predicted force of each pad, N.
+        variance: of the predicted total force, by the model, N^2.
+        group: place or press (n,) of each row. Rows of a group count as one, because they err together.
+    """
+    sound = np.isfinite(residual) & np.isfinite(force).all(1) & np.isfinite(variance)
+    residual, force, variance, group = residual[sound], force[sound], variance[sound], group[sound]
+    _, group, count = np.unique(group, return_inverse=True, return_counts=True)
+    weight = 1 / count[group]
+    scale = np.ones(force.shape[1])
+    floor, fraction = _most_likely(residual, force, variance, weight, scale)
+    if len(count) >= MIN_GROUPS and len(scale) > 1:
+        scale = _of_pads(residual, force, variance + _variance(floor, fraction, scale, force), weight)
+        floor, fraction = _most_likely(residual, force, variance, weight, scale)
+    pull = residual / np.sqrt(np.maximum(variance + _variance(floor, fraction, scale, force), np.finfo(float).tiny))
+    multiple = _quantile(np.abs(pull), weight, len(count)) if len(count) >= MIN_GROUPS else NORMAL_MULTIPLE
+    return NoiseLaw(*map(jnp.asarray, (floor, fraction, scale, multiple)))
+
+
+def _variance(floor: float, fraction: float, scale: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Variance (n,) N^2 of the total force about its prediction."""
+    return np.asarray((floor**2 + (fraction * force) ** 2) @ scale**2)
+
+
+def _most_likely(
+    residual: np.ndarray, force: np.ndarray, variance: np.ndarray, weight: np.ndarray, scale: np.ndarray
+) -> tuple[float, float]:
+    """Floor (N) and fraction of largest normal likelihood."""
+    if not len(residual):
+        return 0.0, 0.0
+    size = float(np.sqrt(np.average(residual**2, weights=weight)))
+    typical = float(np.sqrt(np.average((force**2).sum(1), weights=weight)))
+    if size == 0 or typical == 0:
+        return size, 0.0
+    start = np.log([size / np.sqrt((scale**2).sum()), size / typical])
+
+    def cost(logs: np.ndarray) -> float:
+        floor, fraction = np.exp(logs)
+        total = variance + _variance(floor, fraction, scale, force)
+        return float(weight @ (np.log(total) + residual**2 / total))
+
+    found = min(
+        (minimize(cost, start + shift, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
+         for shift in ((0.0, -3.0), (-2.0, 0.0))), key=lambda one: one.fun)  # fmt: skip
+    floor, fraction = np.exp(np.maximum(found.x, start - 12))
+    return float(floor), float(fraction)
+
+
+def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Scale (pads,): deviation of the presses on a pad over that of all, drawn to one where they are few."""
+    size = np.abs(force)
+    share = weight[:, None] * size / np.maximum(size.sum(1), np.finfo(float).tiny)[:, None]
+    square = share.T @ (residual**2 / total)
+    scale = np.sqrt((square + PRIOR_GROUPS) / (share.sum(0) + PRIOR_GROUPS))
+    return np.asarray(scale)
+
+
+def _quantile(size: np.ndarray, weight: np.ndarray, groups: int) -> float:
+    """The size below which a fraction `COVERAGE` of the readings of a new group are expected."""
+    order = np.argsort(size)
+    below = np.cumsum(weight[order]) / groups
+    at = int(np.searchsorted(below, min(COVERAGE * (1 + 1 / groups), 1.0)))
+    return float(size[order[min(at, len(order) - 1)]])

@@ -1,0 +1,99 @@
+"""The fitted model of a log: channels to force, its standard error and the interval that a new reading falls into."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..curves.fitted import FittedCurve, predict_pads
+from ..curves.samples import bucket
+from ..intervals import NoiseLaw
+from .combination import AbstractCombination
+
+# Part of the range of a channel by which a reading may lie outside it; as for the pressure of a curve.
+TOLERANCE = 0.05
+
+
+class LogPrediction(NamedTuple):
+    """Forces over time.
+
+    | field          | meaning                                                           | shape | unit |
+    |----------------|-------------------------------------------------------------------|-------|------|
+    | force          | NaN where a channel is missing                                    | (n,)  | N    |
+    | standard_error | of a new reading: of the curve, and of readings about it          | (n,)  | N    |
+    | low, high      | the interval that 90 % of new readings fall into                  | (n,)  | N    |
+    | valid          | all channels within the ranges that the model was fitted to       | (n,)  |      |
+    """
+
+    force: Float[np.ndarray, " n"]
+    standard_error: Float[np.ndarray, " n"]
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    valid: Bool[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class LogModel:
+    """Channels to force: a combination of the channels into one signal, and a curve from the signal to force.
+
+    | field       | meaning                                                       | shape         | unit     |
+    |-------------|---------------------------------------------------------------|---------------|----------|
+    | combination | channels to one signal                                        |               |          |
+    | curve       | signal to force, with the covariance over blocks of time      |               |          |
+    | noise       | of readings about the curve, from blocks that were held out   |               |          |
+    | reach       | lowest and highest fitted value of each channel               | (2, channels) | sensor's |
+
+    The covariance is that of the curve for the combination as it is. What the combination's own numbers are uncertain
+    by is part of the noise, because both were fitted without the blocks that the noise was estimated from.
+    """
+
+    combination: AbstractCombination
+    curve: FittedCurve
+    noise: NoiseLaw
+    reach: Float[np.ndarray, "2 channels"]
+
+    def predict(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> LogPrediction:
+        """Forces at times (n,) ns, which must rise. A model with memory begins with a sensor at rest."""
+        signal = self.combination.signal(time, values)
+        force, error, valid = curve_forces(_batched(self.curve), signal[None])
+        variance = error[0] ** 2 + np.asarray(self.noise.variance(jnp.asarray(force[0])[:, None]))[:, 0]
+        deviation = np.sqrt(variance)
+        half = float(self.noise.multiple) * deviation
+        inside = valid[0] & within(self.reach, values)
+        return LogPrediction(force[0], deviation, force[0] - half, force[0] + half, inside)
+
+
+def within(reach: Float[np.ndarray, "2 channels"], values: Float[np.ndarray, "n channels"]) -> np.ndarray:
+    """Flags (n,) of the rows whose channels all lie within their ranges, or less than `TOLERANCE` of it outside."""
+    low, high = reach
+    margin = TOLERANCE * (high - low)
+    return np.asarray(((values >= low - margin) & (values <= high + margin)).all(1))
+
+
+def reach_of(values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, "2 channels"]:
+    """Lowest and highest value of each channel."""
+    return np.stack([values.min(0), values.max(0)])
+
+
+def curve_forces(
+    curves: FittedCurve, signals: Float[np.ndarray, "fits n"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Force, standard error and validity (fits, n) of curves with a leading axis, for signals (fits, n).
+
+    Signals are filled up to a few lengths, because each new length compiles the program again.
+    """
+    n = signals.shape[1]
+    wide = np.pad(signals, ((0, 0), (0, bucket(n) - n)), constant_values=np.nan)
+    found = predict_pads(curves, jnp.asarray(wide, curves.parameters.dtype))
+    force, error, valid = (np.asarray(part)[:, :n] for part in found)
+    known = np.isfinite(signals)
+    return np.where(known, force, np.nan), np.where(known, error, np.nan), valid & known
+
+
+def _batched(curve: FittedCurve) -> FittedCurve:
+    """The fit of one pad as a batch of one."""
+    found: FittedCurve = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], curve)
+    return found

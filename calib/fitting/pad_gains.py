@@ -1,0 +1,55 @@
+"""Gains of pads that have moved since the calibration, applied at the door of their pressures.
+
+A pad reads exp(log_gain) times the pressure that it read when it was calibrated. Dividing by this gain gives what the
+calibration would have read, so that curve, field, memory and calibrated range apply as they are. The uncertainty of the
+gains adds (dF/dg) C (dF/dg)' to the variance of a force, with the slopes by forward derivatives of the whole response.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .curves.fitted import Prediction
+
+
+class PadGains(eqx.Module):
+    """Pressure of each pad over what it was at the calibration.
+
+    | field      | meaning                       | shape        | unit |
+    |------------|-------------------------------|--------------|------|
+    | log_gain   | natural logarithm of the gain | (pads,)      | 1    |
+    | covariance | of the logarithms             | (pads, pads) | 1    |
+    """
+
+    log_gain: Float[Array, " pads"] = eqx.field(converter=jnp.asarray)
+    covariance: Float[Array, "pads pads"] = eqx.field(converter=jnp.asarray)
+
+    def unmoved(self, pressures: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+        """What the pads would have read at the calibration."""
+        return pressures * jnp.exp(-self.log_gain).astype(pressures.dtype)
+
+    def forces(self, response: Callable[[Array], Prediction], pressures: Float[Array, "n pads"]) -> Prediction:
+        """Prediction of `response`, a function of calibrated pressures (n, pads) Pa, from pressures as read now."""
+        then = self.unmoved(pressures)
+        found = response(then)
+        slopes = gain_slopes(lambda p: response(p).force, then)
+        variance = jnp.einsum("qnr,qs,snr->nr", slopes, self.covariance.astype(then.dtype), slopes)
+        return found._replace(standard_error=jnp.sqrt(found.standard_error**2 + jnp.maximum(variance, 0)))
+
+
+def gain_slopes(
+    force: Callable[[Array], Array], pressures: Float[Array, "n pads"]
+) -> Float[Array, "pads n pads_of_force"]:
+    """Derivative of each pad's force (N) with respect to minus the log gain of every pad q, the first axis."""
+    own = jnp.eye(pressures.shape[1], dtype=bool)[:, None]
+    tangents = jnp.where(own, pressures, 0)  # `where`, because a product with a missing pressure would be NaN
+
+    def slope(tangent: Array) -> Array:
+        derivative: Array = jax.jvp(force, (pressures,), (tangent,))[1]
+        return derivative
+
+    slopes: Array = jax.vmap(slope)(tangents)
+    return slopes

@@ -1,0 +1,74 @@
+"""Figures of a log's calibration: residuals and predictions over force, and forces over time."""
+
+from typing import Any
+
+import numpy as np
+
+from ..calibration.log_evaluation import LogEvaluation
+from .figures import BLUE, GREY, RED
+
+try:  # an extra: without it everything but the figures works
+    from matplotlib.figure import Figure
+except ImportError:
+    Figure = None  # type: ignore[assignment,misc]
+
+MAX_POINTS = 4000  # drawn, evenly spread; more only make the page larger
+
+
+def _rows(found: LogEvaluation, rows: np.ndarray) -> np.ndarray:
+    """At most `MAX_POINTS` of the flagged samples."""
+    at = np.flatnonzero(rows)
+    return np.asarray(at[np.linspace(0, len(at) - 1, min(len(at), MAX_POINTS)).astype(int)])
+
+
+def _axes(height: float, x: str, y: str) -> tuple["Figure", Any]:
+    figure = Figure(figsize=(8, height), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(alpha=0.3)
+    return figure, axes
+
+
+def residual_figure(found: LogEvaluation) -> "Figure":
+    """Predicted minus recorded force over the predicted force, with the interval; samples out of range in red."""
+    figure, axes = _axes(3.6, "predicted force, N", "predicted - recorded, N")
+    _scatter(axes, found, found.predicted, found.predicted - found.force)
+    rows = _rows(found, found.known)
+    rows = rows[np.argsort(found.predicted[rows])]
+    half = ((found.high - found.low) / 2)[rows]
+    axes.fill_between(found.predicted[rows], -half, half, color=GREY, alpha=0.25, linewidth=0)
+    axes.axhline(0, color="black", linewidth=0.8)
+    return figure
+
+
+def scatter_figure(found: LogEvaluation) -> "Figure":
+    """Predicted over recorded force."""
+    figure, axes = _axes(4.5, "recorded force, N", "predicted force, N")
+    _scatter(axes, found, found.force, found.predicted)
+    low, high = np.nanmin(found.force[found.known]), np.nanmax(found.force[found.known])
+    axes.plot([low, high], [low, high], color="black", linewidth=0.8)
+    return figure
+
+
+def _scatter(axes: Any, found: LogEvaluation, x: np.ndarray, y: np.ndarray) -> None:
+    for rows, colour, label in ((found.valid, BLUE, "calibrated range"), (~found.valid, RED, "outside of it")):
+        shown = _rows(found, found.known & rows)
+        if len(shown):
+            axes.plot(x[shown], y[shown], ".", color=colour, markersize=2.5, label=label)
+    if not found.valid[found.known].all():
+        axes.legend()
+
+
+def time_figure(found: LogEvaluation) -> "Figure":
+    """Recorded and predicted force over time, with the interval."""
+    figure, axes = _axes(3.6, "time, s", "force, N")
+    rows = _rows(found, np.isfinite(found.predicted))
+    axes.fill_between(
+        found.time[rows], found.low[rows], found.high[rows], color=BLUE, alpha=0.2, linewidth=0, label="90 % interval"
+    )
+    axes.plot(found.time[rows], found.predicted[rows], color=BLUE, linewidth=0.9, label="predicted")
+    recorded = _rows(found, np.isfinite(found.force))
+    axes.plot(found.time[recorded], found.force[recorded], ".", color="black", markersize=1.5, label="recorded")
+    axes.legend()
+    return figure
