@@ -5,7 +5,8 @@ the same skin (other places, order and noise) is predicted.  Rows of the first k
 rows of the second kind the calibration is that without faults, and only the predicted session has the fault.
 
 CV is that of estimated over true force, bias their mean ratio less one; `rmse_scaled_n` is the error that is left after
-division by that ratio.  The third of least forces is that at 5 N, and so on.
+division by that ratio.  The third of least forces is that at 5 N, and so on.  Coverage is the share of presses within
+their 90 % interval.
 """
 
 import tempfile
@@ -101,6 +102,7 @@ def figures(found: Evaluation) -> Row:
         "rmse_scaled_n": _rms(found.total_force / ratio.mean() - found.force),
     }
     row |= {f"rmse_third_{k + 1}_n": _rms(error[third == k]) for k in range(3)}
+    row |= {name: value for name, value in found.summary().items() if name.startswith("coverage")}
     for name, place in found.estimated.items():
         row[f"{name}_mm"] = 1e3 * float(np.linalg.norm(place - found.position, axis=1).mean())
     return {name: round(float(value), 4) for name, value in row.items()}
