@@ -48,6 +48,7 @@ class Calibration:
     | field: gain as a function of the place pressed; None: no such correction |
     | crosstalk: between the pads                                              |
     | noise: deviation of new readings about the model of the pads             |
+    | hold_noise: deviation of means over the holds of presses about it        |
     | locator: estimates the place of a contact from a frame; None: no field   |
     | baseline: the paper's curves, one slope per pad, for comparison          |
     | image_gain: force over the integral of the image, N / (S m^2), likewise  |
@@ -69,6 +70,7 @@ class Calibration:
     field: FittedField | None = None
     crosstalk: Crosstalk | None = None
     noise: NoiseLaw | None = None
+    hold_noise: NoiseLaw | None = None
     locator: AbstractLocator | None = None
     baseline: FittedCurve | None = None
     image_gain: float = float("nan")
@@ -83,7 +85,7 @@ class Calibration:
         """The model of the pads: curves, field, crosstalk, noise and gains."""
         mixed = self.crosstalk is not None and self.crosstalk.present
         matrix = jnp.asarray(self.crosstalk.matrix, self.dtype) if self.crosstalk is not None and mixed else None
-        return PadModel(self.curves, self.field, matrix, self.noise, self.gains)
+        return PadModel(self.curves, self.field, matrix, self.noise, self.hold_noise, self.gains)
 
     @property
     def gains(self) -> PadGains | None:

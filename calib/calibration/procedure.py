@@ -94,6 +94,7 @@ def calibrate(
         field=model.field,
         crosstalk=presses.crosstalk,
         noise=held_out.noise,
+        hold_noise=held_out.hold_noise,
         locator=imager.locator if model.field is not None else None,
         baseline=response.baseline,
         image_gain=float(presses.data.force.sum() / images.integral.sum()),
@@ -145,14 +146,14 @@ def evaluate(
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
-    force, error, _ = calibration.pad_forces(found.pressure, images.places)
+    force, half_width = calibration.pads.hold_forces(found.pressure, images.places)
     return Evaluation(
         position=found.position,
         estimated=images.estimated,
         force=found.force,
         pressure=calibration.own_pressures(found.pressure),
         pad_force=force,
-        half_width=calibration.pads.half_widths(error),
+        half_width=half_width,
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
         held_out_by="session",

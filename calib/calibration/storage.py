@@ -16,7 +16,7 @@ from jaxeit.toml import TomlTable, parse_toml
 from ..fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
 from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry
 from ..fitting.fields.base import restored
-from ..fitting.intervals import NORMAL_MULTIPLE, NoiseLaw
+from ..fitting.intervals import NoiseLaw
 from ..fitting.selection import Candidate, Choice
 from ..presses.crosstalk import Crosstalk
 from ..presses.table import Processing
@@ -64,9 +64,10 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
     if cal.crosstalk is not None:
         arrays["pads/crosstalk"] = (cal.crosstalk.matrix, "1", "reading of channel i per own pressure of pad j")
         arrays["pads/crosstalk_se"] = (cal.crosstalk.standard_error, "1", "of the crosstalk; NaN: not determined")
-    if cal.noise is not None:
-        for f in fields(cal.noise):
-            arrays[f"pads/noise-{f.name}"] = (getattr(cal.noise, f.name), *_NOISE_FIELDS[f.name])
+    for name in _NOISES:
+        law = getattr(cal, name.replace("-", "_"))
+        if law is not None:
+            arrays |= {f"pads/{name}-{f.name}": (getattr(law, f.name), *_NOISE_FIELDS[f.name]) for f in fields(law)}
     if cal.baseline is not None:
         attrs["image_gain"] = cal.image_gain
         for name, meaning in _CURVE_FIELDS.items():
@@ -90,9 +91,10 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
     return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
 
 
+_NOISES = ("noise", "hold-noise")  # of a reading, of a mean over a hold
 _NOISE_FIELDS = {
-    "floor": ("N", "standard deviation of a new reading without force"),
-    "fraction": ("1", "standard deviation of a new reading per force"),
+    "floor": ("N", "standard deviation of a new reading, or of a mean over a hold, without force"),
+    "fraction": ("1", "the same per force"),
     "scale": ("1", "of each pad's deviation"),
     "multiple": ("1", "standard deviations in half the 90 % interval"),
 }
@@ -228,7 +230,8 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "simulated": bool(attrs["simulated"]),
         "notes": tuple(filter(None, str(attrs["notes"]).split("\n"))),
         "crosstalk": _crosstalk_from(arrays, len(skin.pads)),
-        "noise": _noise_from(arrays, fitted),
+        "noise": _noise_from(arrays, "noise", fitted),
+        "hold_noise": _noise_from(arrays, "hold-noise", fitted),
         "field": _field_from(arrays, FIELDS.find(provenance["location"])) if located else None,
         "locator": _locator_from(arrays, recon.dtype) if located else None,
         "baseline": _baseline_from(arrays, len(skin.pads)),
@@ -281,13 +284,13 @@ def _crosstalk_from(arrays: Mapping[str, np.ndarray], pads: int) -> Crosstalk | 
     return Crosstalk(matrix, error)
 
 
-def _noise_from(arrays: Mapping[str, np.ndarray], fitted: Mapping[str, jax.Array]) -> NoiseLaw:
-    """The noise law; for a file of an early version that of the residuals, the same for all forces."""
+def _noise_from(arrays: Mapping[str, np.ndarray], name: str, fitted: Mapping[str, jax.Array]) -> NoiseLaw | None:
+    """The noise law of this name; None for a file of an early version."""
+    if f"pads/{name}-floor" not in arrays:
+        return None
     rms = fitted["residual_rms"]
-    if "pads/noise-floor" not in arrays:
-        return NoiseLaw(jnp.ones((), rms.dtype), jnp.zeros((), rms.dtype), rms, jnp.asarray(NORMAL_MULTIPLE, rms.dtype))
     shapes = {"scale": (len(rms),)}
-    numbers = {f.name: _shaped(arrays, f"pads/noise-{f.name}", shapes.get(f.name, ()), "f") for f in fields(NoiseLaw)}
+    numbers = {f.name: _shaped(arrays, f"pads/{name}-{f.name}", shapes.get(f.name, ()), "f") for f in fields(NoiseLaw)}
     return NoiseLaw(**{name: jnp.asarray(number, rms.dtype) for name, number in numbers.items()})
 
 
@@ -320,10 +323,7 @@ _NOT_NEGATIVE = (
     "image/masks",
     "pads/scale",
     "pads/residual_rms",
-    "pads/noise-floor",
-    "pads/noise-fraction",
-    "pads/noise-scale",
-    "pads/noise-multiple",
+    *(f"pads/{name}-{field}" for name in _NOISES for field in _NOISE_FIELDS),
     "baseline/scale",
     "location/noise",
     "location/spread",

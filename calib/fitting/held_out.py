@@ -95,6 +95,12 @@ class HeldOut(NamedTuple):
         residual = data.sample_force[rows] - force.sum(1)
         return fit_noise(residual, force, (error**2).sum(1), data.sample_place[rows])
 
+    def hold_noise(self, data: PressData, use: np.ndarray | None = None) -> NoiseLaw:
+        """The noise law of the means over the holds of the presses `use` (presses,), by default all."""
+        use = np.ones(len(data.force), bool) if use is None else use
+        force, error = (part[use] for part in self.hold)
+        return fit_noise(data.force[use] - force.sum(1), force, (error**2).sum(1), data.place[use])
+
     def half_widths(self, data: PressData) -> np.ndarray:
         """Half the 90 % interval of the total force over each hold, (presses,) N, by the residuals of other folds."""
         force, error = self.hold
@@ -102,7 +108,7 @@ class HeldOut(NamedTuple):
         for k in np.unique(self.fold):
             held = self.fold == k
             if not held.all():
-                half[held] = self.noise(data, ~held).half_widths(force[held], error[held])
+                half[held] = self.hold_noise(data, ~held).half_widths(force[held], error[held])
         return half
 
 

@@ -58,19 +58,21 @@ class LocatedPresses(NamedTuple):
 class PadModel(eqx.Module):
     """The fitted response of all pads: from what their channels read to forces.
 
-    | field     | meaning                                                            | shape        |
-    |-----------|--------------------------------------------------------------------|--------------|
-    | curves    | pressure-force curve of each pad                                   |              |
-    | field     | gain over the place pressed; None: no correction by location       |              |
-    | crosstalk | reading of channel i per own pressure of pad j; None: no crosstalk | (pads, pads) |
-    | noise     | deviation of new readings about the model; None: residuals' own    |              |
-    | gains     | by which readings have moved since the fit; None: not moved        |              |
+    | field      | meaning                                                            | shape        |
+    |------------|--------------------------------------------------------------------|--------------|
+    | curves     | pressure-force curve of each pad                                   |              |
+    | field      | gain over the place pressed; None: no correction by location       |              |
+    | crosstalk  | reading of channel i per own pressure of pad j; None: no crosstalk | (pads, pads) |
+    | noise      | deviation of new readings about the model; None: residuals' own    |              |
+    | hold_noise | deviation of means over a hold about the model; None: as `noise`   |              |
+    | gains      | by which readings have moved since the fit; None: not moved        |              |
     """
 
     curves: FittedCurve
     field: FittedField | None = None
     crosstalk: Float[Array, "pads pads"] | None = None
     noise: NoiseLaw | None = None
+    hold_noise: NoiseLaw | None = None
     gains: PadGains | None = None
 
     @property
@@ -116,7 +118,7 @@ class PadModel(eqx.Module):
     @property
     def idle_noise(self) -> Float[Array, " pads"]:
         """Standard deviation of the force of each pad without load, N."""
-        return self.curves.residual_rms if self.noise is None else self.noise.floor * self.noise.scale
+        return self._noise.floor * self._noise.scale
 
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
         """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
@@ -133,8 +135,7 @@ class PadModel(eqx.Module):
 
         Without a noise law it is that of the residuals of the fitted samples.
         """
-        noise = self.curves.residual_rms**2 if self.noise is None else self.noise.variance(found.force)
-        return found._replace(standard_error=jnp.sqrt(found.standard_error**2 + noise))
+        return found._replace(standard_error=jnp.sqrt(found.standard_error**2 + self._noise.variance(found.force)))
 
     def pad_forces(
         self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None
@@ -148,13 +149,31 @@ class PadModel(eqx.Module):
         found = pad_forces(self, jnp.asarray(pressures, self.dtype), places)
         return tuple(map(np.asarray, found))  # type: ignore[return-value]
 
-    def half_widths(self, error: np.ndarray) -> np.ndarray:
-        """Half the 90 % interval of the total force, (n,) N, from the pads' standard errors (n, pads) of `pad_forces`.
+    def hold_forces(
+        self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Force on each pad (n, pads) N, and half the 90 % interval of their total (n,) N, of means over holds.
 
+        The interval is narrower than that of a reading, because a mean holds less noise than the readings in it.
         Errors of different pads count as independent.
+
+        Args:
+            pressures: means over the holds of presses, (n, pads) Pa.
+            places: as for `pad_forces`.
         """
-        multiple = NORMAL_MULTIPLE if self.noise is None else float(self.noise.multiple)
-        return np.asarray(multiple * np.sqrt((error**2).sum(1)))
+        found = forces(self, jnp.asarray(pressures, self.dtype), places)
+        force, error = np.asarray(found.force), np.asarray(found.standard_error)
+        noise = self._noise if self.hold_noise is None else self.hold_noise
+        return force, noise.half_widths(force, error)
+
+    @property
+    def _noise(self) -> NoiseLaw:
+        """The noise of a reading; without a law, that of the residuals of the fitted samples for all forces."""
+        if self.noise is not None:
+            return self.noise
+        rms = self.curves.residual_rms
+        one = jnp.ones((), rms.dtype)
+        return NoiseLaw(one, 0 * one, rms, NORMAL_MULTIPLE * one)
 
     def log_gains(self, places: Places) -> np.ndarray:
         """Log of the gain of each pad at places, (n, pads). The model must have a field."""
@@ -166,6 +185,12 @@ class PadModel(eqx.Module):
 def pad_forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
     """`PadModel.pad_forces` as one program: arrays (n, pads)."""
     return model.with_noise(model.forces(pressures, places))
+
+
+@je.verb
+def forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+    """`PadModel.forces`, compiled."""
+    return model.forces(pressures, places)
 
 
 @je.verb

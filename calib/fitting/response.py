@@ -45,6 +45,7 @@ class HeldOutForces(NamedTuple):
     | pad_force: of each pad, by the response                              | (presses, pads) | N    |
     | half_width: half the 90 % interval of the total, by other places     | (presses,)      | N    |
     | noise: deviation of new readings about the response                  |                 |      |
+    | hold_noise: deviation of means over holds about the response         |                 |      |
     | others: total force by each method of comparison, by name            | (presses,) each | N    |
     | splits: errors when a whole pad, indenter or session is left out     |                 |      |
     """
@@ -52,6 +53,7 @@ class HeldOutForces(NamedTuple):
     pad_force: np.ndarray
     half_width: np.ndarray
     noise: NoiseLaw
+    hold_noise: NoiseLaw
     others: dict[str, np.ndarray]
     splits: tuple[Split, ...]
 
@@ -136,6 +138,7 @@ def hold_out_response(
         held.hold.force,
         held.half_widths(data),
         held.noise(data),
+        held.hold_noise(data),
         others,
         leave_out(curve, field, presses, folds.loss, groups),
     )
