@@ -38,6 +38,8 @@ from .results import FitResult
 ALTERNATIONS = 2  # fits of the field, then of the curves; more change the result by far less than the noise
 # Fraction of the largest force below which presses weigh less: their noise is constant, not proportional to the force.
 FAINT_FORCE = 0.05
+# Fraction of the largest fitted pressure below which the force of a curve that is not zero at rest falls to zero.
+REST_FRACTION = 0.05
 
 
 class LocatedPresses(NamedTuple):
@@ -123,7 +125,7 @@ class PadModel(eqx.Module):
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
         """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
         error includes its variation over the pad."""
-        force, error, valid = (part.T for part in predict_pads(self.curves, own.T))
+        force, error, valid = (part.T for part in _predict_curves(self.curves, own.T))
         if self.field is None:
             return Prediction(force, error, valid)
         gain = self.field.log_gain(nowhere(own) if places is None else places)
@@ -238,6 +240,9 @@ def _curves(
     own = data.pad_samples(with_history=curve.path)
     less = np.exp(-np.take_along_axis(gain[data.sample_press].T, own.rows, 1))
     mask = own.mask & use[data.sample_press][own.rows]
+    if not _zero_at_rest(curve):
+        top = np.where(mask, own.pressure, 0).max(1, initial=0)
+        mask &= own.pressure >= REST_FRACTION * top[:, None]
     force = np.take_along_axis(force, own.rows, 1) * less
     return fit_curves(curve, own.pressure, force, mask=mask, groups=own.place, sigma=less, loss=loss)
 
@@ -250,7 +255,7 @@ def _field(
 ) -> FittedField:
     """The field fitted to log forces over those of the curves, which were fitted with the log-gain `gain`."""
     data = presses.data
-    force = np.asarray(predict_pads(curves, jnp.asarray(data.pressure.T)).force).T * np.exp(gain)
+    force = np.asarray(_curve_forces(curves, jnp.asarray(data.pressure.T))).T * np.exp(gain)
     part = np.maximum(np.nan_to_num(force), 0)
     total = part.sum(1)
     use = use & (total > 0) & (data.force > 0)
@@ -288,7 +293,7 @@ def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
 def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces at all samples of the presses, (n, pads)."""
     data = presses.data
-    force, error, _ = (np.asarray(part).T for part in predict_pads(model.curves, jnp.asarray(data.sample_pressure)))
+    force, error, _ = (np.asarray(part).T for part in predict_curves(model.curves, jnp.asarray(data.sample_pressure)))
     force = np.where(np.asarray(model.curves.result) == FitResult.SUCCESS, force, np.nan)
     if model.field is None or presses.places is None:
         return PadForces(force, error)
@@ -300,4 +305,28 @@ def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
 @je.verb
 def _curve_forces(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Float[Array, "pads n"]:
     found: Array = eqx.filter_vmap(lambda fitted, p: fitted.curve(fitted.parameters, p))(curves, pressure)
-    return found
+    return found * _load(curves, pressure)
+
+
+def _predict_curves(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Prediction:
+    """Forces of the curves of all pads, (pads, n); a pad at rest bears none, whatever the offset of its curve."""
+    found, load = predict_pads(curves, pressure), _load(curves, pressure)
+    return found._replace(force=found.force * load, standard_error=found.standard_error * load)
+
+
+predict_curves = je.verb(_predict_curves)
+
+
+def _zero_at_rest(curve: AbstractCurve) -> bool:
+    return bool(curve.positive.all()) and not curve.path
+
+
+def _load(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Float[Array, "#pads #n"]:
+    """From 0 at rest to 1 for a loaded pad; 1 everywhere for curves that are zero at rest by themselves.
+
+    The offset of a curve, or the force that its memory holds, would otherwise count for every pad of the skin,
+    pressed or not.
+    """
+    if _zero_at_rest(curves.curve):
+        return jnp.ones((1, 1), pressure.dtype)
+    return jnp.clip(pressure / (REST_FRACTION * curves.pressure_range[:, 1:]), 0, 1)

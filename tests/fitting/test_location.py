@@ -383,6 +383,19 @@ def test_curve_and_field_are_found_together_and_held_out_by_place(skin, geometry
     np.testing.assert_array_equal(again[fold == 0], held[fold == 0])
 
 
+@pytest.mark.parametrize("name", ["affine", "hysteresis"])
+def test_a_pad_at_rest_bears_nothing_whatever_the_offset_of_its_curve(name, skin, geometry):
+    """The offsets of all four pads counted, and were taken from the force of each: 24 N of error at 20 N."""
+    place, data = session_data(skin, depth=False)
+    presses = LocatedPresses(data, geometry)
+    model = fit_pads(CURVES.make(name), None, presses, SoftL1())
+    np.testing.assert_allclose(np.asarray(model.curves.parameters)[:, 0], 0.01, rtol=0.03)
+    force, error, _ = model.pad_forces(data.pressure)
+    np.testing.assert_allclose(force.sum(1), 20, rtol=0.1)
+    assert (force[data.pressure == 0] == 0).all()
+    assert np.isfinite(error).all()
+
+
 @pytest.mark.slow
 def test_the_simplest_within_one_standard_error_is_chosen_and_says_why(skin, geometry):
     for depth, name in ((True, "edge"), (False, "none")):
