@@ -386,7 +386,7 @@ def test_curve_and_field_are_found_together_and_held_out_by_place(skin, geometry
 @pytest.mark.parametrize("name", ["affine", "hysteresis"])
 def test_a_pad_at_rest_bears_nothing_whatever_the_offset_of_its_curve(name, skin, geometry):
     """The offsets of all four pads counted, and were taken from the force of each: 24 N of error at 20 N."""
-    place, data = session_data(skin, depth=False)
+    _, data = session_data(skin, depth=False)
     presses = LocatedPresses(data, geometry)
     model = fit_pads(CURVES.make(name), None, presses, SoftL1())
     np.testing.assert_allclose(np.asarray(model.curves.parameters)[:, 0], 0.01, rtol=0.03)
