@@ -1,7 +1,9 @@
 """From a scene and a fidelity to arrays: the only transfer from host to device, and the only module that
 refuses models that cannot be computed."""
 
+import pickle
 from collections.abc import Sequence
+from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from .._compile import is_traced
 from ..budget import require
 from ..effects import AbstractCoatEffect, AbstractEffect, chosen
+from ..geometry.shapes import Domain
 from ..linalg import AbstractLinearSolver, default_solver
 from ..linalg.base import on_device
 from ..meshing.elements import Space, function_space
@@ -163,8 +166,23 @@ def _edge_length(skin: Skin, fidelity: Fidelity) -> float:
 
 
 def _mesh(skin: Skin, footprints: Sequence[AbstractFootprint], edge_length: float, growth: float) -> Mesh:
-    mesh = triangulate(skin.domain, footprints, edge_length, growth=growth)
+    mesh = _flat_mesh(skin.domain, footprints, edge_length, growth)
     return mesh if skin.surface is None else mesh.lift(skin.surface).check()
+
+
+def _flat_mesh(domain: Domain, footprints: Sequence[AbstractFootprint], edge_length: float, growth: float) -> Mesh:
+    """The mesh of the flat sheet. The last few are kept, because scenes and sessions of one skin share theirs."""
+    try:
+        content = pickle.dumps((domain, footprints, edge_length, growth))
+    except (pickle.PicklingError, AttributeError, TypeError):  # a user's class inside a function cannot be pickled
+        return triangulate(domain, footprints, edge_length, growth=growth)
+    return _kept_mesh(content)
+
+
+@lru_cache(maxsize=4)
+def _kept_mesh(content: bytes) -> Mesh:
+    domain, footprints, edge_length, growth = pickle.loads(content)
+    return triangulate(domain, footprints, edge_length, growth=growth)
 
 
 def _put(values: np.ndarray | Array | float, dtype: np.dtype) -> Array:
