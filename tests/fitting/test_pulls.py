@@ -93,7 +93,7 @@ def pulls(skin, curve, field):
 
 
 def judge(found, bias):
-    """`bias` is the largest mean at one sample: what a prior or a memory that begins at rest leaves there."""
+    """`bias` is the largest mean at one sample: 4 standard errors, and more where a prior or memory leaves some."""
     error = 1 / np.sqrt(2 * TRIALS)
     assert abs(found.mean()) < 0.2  # samples of one fit err together, so that it is hardly less than that of one
     assert np.abs(found.mean(0)).max() < bias
@@ -103,7 +103,7 @@ def judge(found, bias):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CURVES)
 def test_pulls_of_every_curve(name, skin):
-    judge(pulls(skin, CURVES.make(name), None), 0.3 if name != "play" else 0.7)
+    judge(pulls(skin, CURVES.make(name), None), 0.7 if CURVES.make(name).path else 0.3)
 
 
 @pytest.mark.slow
