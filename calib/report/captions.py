@@ -44,6 +44,16 @@ def about_maps(examples: PressExamples) -> tuple[str, str]:
     )
 
 
+def about_curved(estimator: str) -> tuple[str, str]:
+    """Alternative text and caption of the views of a curved sheet."""
+    return (
+        "Places, sensitivity and two force maps on the curved sheet in space.",
+        f"The sheet as it is curved. Places: true ones and those of the estimator {estimator}. Sensitivity: "
+        "estimated over true total force, divided by its mean. Force maps: of the first and the last press of the "
+        "figure above. All other figures show the sheet unrolled, with distances along it.",
+    )
+
+
 def about_sensitivity(evaluation: Evaluation) -> tuple[str, str]:
     """Alternative text and caption of the maps of sensitivity."""
     s, maps = evaluation.summary(), sensitivity_maps(evaluation)

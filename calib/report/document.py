@@ -15,7 +15,16 @@ from ..calibration.calibration import Calibration
 from ..calibration.evaluation import METHODS, THIRDS, Evaluation
 from ..fitting.selection import Candidate
 from ..session import replacing
-from .captions import about_curves, about_gain, about_localisation, about_loops, about_maps, about_sensitivity
+from .captions import (
+    about_curved,
+    about_curves,
+    about_gain,
+    about_localisation,
+    about_loops,
+    about_maps,
+    about_sensitivity,
+)
+from .curved_figure import curved_figure
 from .figures import (
     ESTIMATOR_MEANING,
     localisation_figure,
@@ -101,6 +110,9 @@ def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
     if calibration.examples is not None:
         maps = png(maps_figure(calibration))
         pictures.insert(0, _Picture("maps", "Force maps of some presses", maps, *about_maps(calibration.examples)))
+        if skin.surface is not None:
+            curved = png(curved_figure(calibration, estimators[-1]))
+            pictures.insert(1, _Picture("curved", "On the curved sheet", curved, *about_curved(estimators[-1])))
     if has_loops(calibration):
         pictures.append(_Picture("loops", "Hysteresis", png(loops_figure(calibration)), *about_loops(calibration)))
     if calibration.field is not None:

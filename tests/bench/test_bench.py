@@ -245,13 +245,33 @@ def test_warmth_is_simulated_where_it_is_felt(skin):
 @pytest.mark.parametrize("name", presets())
 def test_presets_are_benches(name):
     bench = load_bench(name)
-    assert bench.scene.skin.name == "testbed"
+    assert bench.scene.skin.name == ("chest" if name.startswith("chest") else "testbed")
     assert bench.duration < 3600
     assert (name == "ideal") == (not bench.scene.effects)
 
 
 def test_every_preset_asked_for_is_there():
-    assert {"ideal", "paper_bench", "sliding", "two_contacts", "hot_day", "broken_electrode"} <= set(presets())
+    on_testbed = {"ideal", "paper_bench", "sliding", "two_contacts", "hot_day", "broken_electrode"}
+    assert on_testbed | {"chest_bench", "chest_two_contacts"} <= set(presets())
+
+
+@pytest.mark.slow
+def test_the_chest_from_scene_to_force_map(tmp_path):
+    """Every third press of the shipped scene is calibrated; two contacts of the other scene are mapped."""
+    bench, pair = load_bench("chest_bench"), load_bench("chest_two_contacts")
+    bench = dataclasses.replace(bench, sites=bench.sites[::3], eit_rate=10.0, pad_rate=20.0, blank=5.0)
+    grid = simulate(bench, tmp_path / "grid.h5", fidelity=DRAFT)
+    recipe = calib.Recipe(fidelity=DRAFT)
+    with calib.open_session(grid) as session:
+        calibration = calib.calibrate([session], recipe=recipe)
+    assert calibration.evaluation.summary()["localisation_half_mean"] < 0.02
+    calib.write_report(calibration, tmp_path / "report.html")
+    assert (tmp_path / "report_curved.png").exists()
+    short = dataclasses.replace(pair, sites=pair.sites[:1], eit_rate=10.0, blank=2.0)
+    with calib.open_session(simulate(short, tmp_path / "pair.h5", fidelity=DRAFT)) as session:
+        calib.apply(calibration, session, tmp_path / "map.h5")
+    found = calib.session.read_archive(tmp_path / "map.h5", "skin-forcemap").arrays
+    assert found["pad_force"].sum(1).max() == pytest.approx(25, rel=0.3)  # 15 N and 10 N, without a correction
 
 
 def test_an_unknown_preset_is_named():

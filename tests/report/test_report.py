@@ -14,11 +14,13 @@ import jaxeit as je
 from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.hysteresis_loops import Loops
+from calib.calibration.press_examples import PressExamples
 from calib.fitting.curves import FittedCurve, Linear
 from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.fitting.held_out import Split
 from calib.fitting.selection import Candidate
 from calib.report import document as report, figures
+from calib.report.curved_figure import curved_figure
 from calib.report.document import write_report
 from calib.report.figures import ReportError, localisation_figure, png, sensitivity_figure
 from calib.report.force_series import ForceSeries, force_series_figure
@@ -456,6 +458,24 @@ def test_the_calibrated_force_has_a_third_map_where_it_is_not_the_papers(calibra
     s, expected = located.evaluation.summary(), located.evaluation.sensitivity("calibrated")
     assert f"Calibrated: estimated / true force\nCV {s['cv_calibrated_ddof1']:.3f}" in third.get_title()
     assert third.collections[0].get_array().ravel()[0] == pytest.approx(expected[:2].mean() / expected.mean())
+
+
+def test_a_curved_sheet_is_drawn_in_space_and_a_flat_one_is_not(located, written, tmp_path):
+    """As a cylinder: places, cells and maps lie on it."""
+    curved = replace(located.skin, surface=je.geometry.Cylinder(0.3, 0.1))
+    examples = PressExamples(
+        np.ones((2, 3)), np.full((2, 4), 500.0), np.array([[0.05, 0.05], [0.15, 0.05]]), np.ones(2)
+    )
+    page, *pictures = write_report(replace(located, skin=curved, examples=examples), tmp_path / "r.html")
+    assert "On the curved sheet" in page.read_text()
+    assert tmp_path / "r_curved.png" in pictures
+    assert not any("curved" in path.name for path in written)
+    figure = curved_figure(replace(located, skin=curved, examples=examples), "fitted")
+    views = [axes for axes in figure.axes if axes.name == "3d"]
+    assert len(views) == 4
+    assert all(len(axes.collections) == 1 for axes in views[1:])
+    assert views[0].get_xlim3d() == pytest.approx((-300 * np.sin(1 / 3), 300 * np.sin(1 / 3)))
+    assert views[0].get_zlim3d() == pytest.approx((300 * np.cos(1 / 3), 300), rel=1e-3)
 
 
 def test_both_sensitivity_maps_have_one_scale_about_their_mean(calibration, skin):

@@ -1,7 +1,11 @@
-"""Two contacts that come and go one by one, as in the paper's figure 8: force over time, its error, and interference.
+"""The paper's figures 5, 6 and 8 for both skins, SIMULATED, into docs/figures: SKIN-places, -sensitivity, -contacts.
 
-The shipped scene `two_contacts` (SIMULATED): press 1, press 2, release 1, release 2, three times with both tips on one
-pad and on neighbouring ones otherwise.  The calibration is of single presses on a grid over the same sheet, as a bench
+Figures 5 and 6 show a calibration of the bench (scenes `paper_bench` and `chest_bench`): true and estimated places, and
+sensitivity over the sheet.
+
+Figure 8 shows two contacts that come and go one by one: force over time, its error, and interference.  Its scenes
+(`two_contacts` and `chest_two_contacts`): press 1, press 2, release 1, release 2, some with both tips on one pad, the
+others on neighbouring ones.  The calibration is of single presses on a grid over the same sheet, as a bench
 makes them: it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump, and
 beside it that of the force map's pixels nearest to it.  A pad's true force is that of the tips above it, so that what
 spreads to its neighbours counts as interference; it means nothing for tips that stand on a border of pads.
@@ -18,14 +22,16 @@ import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
-from calib.report.figures import write_figure
+from calib.report.curved_figure import curved_figure
+from calib.report.figures import localisation_figure, sensitivity_figure, write_figure
 from calib.report.force_series import ForceSeries, force_series_figure
 from calib.runtime import set_up
 
 from .harness import ROOT, Question, Run
 from .rows import Row, grouped
 
-PICTURE = ROOT / "docs" / "figure-8.png"
+PICTURES = ROOT / "docs" / "figures"
+SCENES = {"testbed": ("paper_bench", "two_contacts"), "chest": ("chest_bench", "chest_two_contacts")}
 SIDE = 9  # of the grid of presses that are calibrated on
 MARGIN = 0.01  # m
 KINDS = ("one pad", "two pads", "a border of pads")
@@ -47,7 +53,7 @@ def alone(bench: Bench, smoke: bool) -> Bench:
 def force_map(bench: Bench, smoke: bool) -> dict[str, np.ndarray]:
     """What `calib.apply` writes: time (n,) ns, force (n, pixels) N, pad_force (n, pads) N, centres (pixels, 2) m,
     contact_position (n, K, 2) m, contact_force (n, K) N."""
-    fidelity = je.Fidelity.draft() if smoke else None
+    fidelity = je.Fidelity.draft() if smoke else je.Fidelity.standard()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         grid = simulate(alone(bench, smoke), folder / "alone.h5", fidelity=fidelity)
@@ -138,19 +144,51 @@ def summary(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def measure(run: Run) -> Iterator[Row]:
-    bench = load_bench("two_contacts")
-    bench = replace(bench, eit_rate=10.0, blank=2.0) if run.smoke else bench
-    forces = force_map(bench, run.smoke)
+    for skin, (bench, contacts) in run.sizes(list(SCENES.items()), list(SCENES.items())[:1]):
+        single = bench_figures(skin, bench, run.smoke)
+        rows = contact_figure(skin, contacts, run.smoke)
+        means = [{"skin": skin, "tips_on": kind} | row for kind, row in summary(rows).items()]
+        yield {"bench": [{"skin": skin} | single], "contacts": means, "rows": [{"skin": skin} | row for row in rows]}
+
+
+def bench_figures(skin: str, scene: str, smoke: bool) -> Row:
+    """Figures 5 and 6 from a calibration of the scene, and its errors."""
+    bench = load_bench(scene)
+    bench = replace(bench, sites=bench.sites[::4], eit_rate=10.0, pad_rate=20.0, blank=5.0) if smoke else bench
+    fidelity = je.Fidelity.draft() if smoke else je.Fidelity.standard()
+    with tempfile.TemporaryDirectory() as folder:
+        path = simulate(bench, Path(folder) / "bench.h5", fidelity=fidelity)
+        with calib.open_session(path) as session:
+            recipe = calib.Recipe(location=calib.PadEdge(), fidelity=fidelity)
+            calibration = calib.calibrate([session], recipe=recipe)
+    found, sheet = calibration.evaluation, calibration.skin
+    figures = {
+        "places": localisation_figure(found, sheet, "quarter", "fitted", simulated=True),
+        "sensitivity": sensitivity_figure(found, sheet, simulated=True),
+    }
+    if sheet.surface is not None:
+        figures["curved"] = curved_figure(calibration, "fitted")
+    if not smoke:
+        for name, figure in figures.items():
+            write_figure(figure, PICTURES / f"{skin}-{name}.png")
+    names = ("localisation_quarter_mean", "localisation_fitted_mean", "cv_eit_ddof1", "cv_hybrid_ddof1", "force_rmse")
+    return {name: round(float(value), 4) for name, value in found.summary().items() if name in names}
+
+
+def contact_figure(skin: str, scene: str, smoke: bool) -> list[Row]:
+    """Figure 8, and a row for each press of both tips."""
+    bench = load_bench(scene)
+    bench = replace(bench, eit_rate=10.0, blank=2.0) if smoke else bench
+    forces = force_map(bench, smoke)
     presses = [Press(bench, forces, number) for number in range(len(bench.sites))]
-    rows = [press.row() for press in presses]
-    yield {"rows": rows, "summary": summary(rows), "grid": SIDE}
-    if not run.smoke:
+    if not smoke:
         firsts = [next(press for press in presses if press.kind == kind) for kind in KINDS[:2]]
         cases = [press.series(title) for press, title in zip(firsts, CASES, strict=True)]
-        write_figure(force_series_figure(cases, simulated=True), PICTURE)
+        write_figure(force_series_figure(cases, simulated=True), PICTURES / f"{skin}-contacts.png")
+    return [press.row() for press in presses]
 
 
-main = Question("figure8", __doc__, {"rows": measure}, prepare=set_up)
+main = Question("paper_figures", __doc__, {"rows": measure}, prepare=set_up)
 
 if __name__ == "__main__":
     main()
