@@ -11,8 +11,8 @@ import numpy as np
 import jaxeit as je
 
 from ..fitting.curves import CURVES, FittedCurve
-from ..fitting.intervals import NoiseLaw
 from ..fitting.logs import COMBINATIONS, AbstractCombination, LogModel
+from ..fitting.logs.noise import LogNoise
 from ..fitting.selection import Candidate
 from ..session import Archive
 from .log_evaluation import LogEvaluation
@@ -35,7 +35,7 @@ CURVE_FIELDS = {
 NOISE_FIELDS = {
     "floor": ("N", "standard deviation of a reading without force"),
     "fraction": ("1", "standard deviation of a reading per force"),
-    "scale": ("1", "of the pad, relative to all"),
+    "lag": ("s", "standard deviation of a reading per rate of the force"),
     "multiple": ("1", "half the 90 % interval, in standard deviations"),
 }
 
@@ -109,7 +109,8 @@ def _model(attrs: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LogMod
     kind = CURVES.find(str(attrs["curve"]))
     curve = kind(**{f.name: jnp.asarray(arrays[f"curve/choice-{f.name}"]) for f in fields(kind)})
     numbers = {name: jnp.asarray(arrays[f"curve/{name}"]) for name in CURVE_FIELDS}
-    noise = NoiseLaw(**{name: jnp.asarray(arrays[f"noise/{name}"]) for name in NOISE_FIELDS})
+    given = {"noise/lag": np.zeros(()), **arrays}  # early versions did not store it
+    noise = LogNoise(**{name: jnp.asarray(given[f"noise/{name}"]) for name in NOISE_FIELDS})
     return LogModel(_combination(attrs, arrays), FittedCurve(curve=curve, **numbers), noise, arrays["channels/reach"])
 
 
@@ -131,5 +132,5 @@ def _require_possible(model: LogModel, kept: np.ndarray, columns: int) -> None:
         raise ValueError(f"channels/kept names channels outside of {columns}")
     values = np.full((1, channels), np.nan)
     model.combination.signal(np.zeros(1), values)  # raises where its shapes do not fit
-    if min(float(model.noise.floor), float(model.noise.fraction), float(model.noise.multiple)) < 0:
+    if min(float(getattr(model.noise, name)) for name in NOISE_FIELDS) < 0:
         raise ValueError("noise holds a number below zero")

@@ -70,7 +70,7 @@ def fit_noise(
         scale = _of_pads(residual, force, variance + _variance(floor, fraction, scale, force), weight)
         floor, fraction = _most_likely(residual, force, variance, weight, scale)
     pull = residual / np.sqrt(np.maximum(variance + _variance(floor, fraction, scale, force), np.finfo(float).tiny))
-    multiple = _quantile(np.abs(pull), weight, len(count)) if len(count) >= MIN_GROUPS else NORMAL_MULTIPLE
+    multiple = _multiple(np.abs(pull), weight, len(count))
     return NoiseLaw(*map(jnp.asarray, (floor, fraction, scale, multiple)))
 
 
@@ -83,24 +83,42 @@ def _most_likely(
     residual: np.ndarray, force: np.ndarray, variance: np.ndarray, weight: np.ndarray, scale: np.ndarray
 ) -> tuple[float, float]:
     """Floor (N) and fraction of largest normal likelihood."""
-    if not len(residual):
-        return 0.0, 0.0
-    size = float(np.sqrt(np.average(residual**2, weights=weight)))
-    typical = float(np.sqrt(np.average((force**2).sum(1), weights=weight)))
-    if size == 0 or typical == 0:
-        return size, 0.0
-    start = np.log([size / np.sqrt((scale**2).sum()), size / typical])
+    terms = np.stack([np.full(len(force), (scale**2).sum()), force**2 @ scale**2], 1)
+    floor, fraction = most_likely_sizes(residual, variance, weight, terms)
+    return float(floor), float(fraction)
+
+
+def most_likely_sizes(
+    residual: Float[np.ndarray, " n"],
+    variance: Float[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"],
+    terms: Float[np.ndarray, "n terms"],
+) -> Float[np.ndarray, " terms"]:
+    """Sizes s of largest normal likelihood, if residuals have the variances `variance + terms @ s^2`.
+
+    Args:
+        residual: of readings, in any unit.
+        variance: known part of their variances.
+        weight: of each reading in the likelihood.
+        terms: squares, not negative; a term that is zero throughout has size 0.
+    """
+    out = np.zeros(terms.shape[1])
+    size = float(np.sqrt(np.average(residual**2, weights=weight))) if len(residual) else 0.0
+    used = (terms > 0).any(0) if len(terms) else np.zeros(len(out), bool)
+    if size == 0 or not used.any():
+        return out
+    terms = terms[:, used]
+    start = np.log(size / np.sqrt(np.average(terms, axis=0, weights=weight)))
 
     def cost(logs: np.ndarray) -> float:
-        floor, fraction = np.exp(logs)
-        total = variance + _variance(floor, fraction, scale, force)
+        total = variance + terms @ np.exp(2 * logs)
         return float(weight @ (np.log(total) + residual**2 / total))
 
-    found = min(
-        (minimize(cost, start + shift, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
-         for shift in ((0.0, -3.0), (-2.0, 0.0))), key=lambda one: one.fun)  # fmt: skip
-    floor, fraction = np.exp(np.maximum(found.x, start - 12))
-    return float(floor), float(fraction)
+    shifts = -3 * (1 - np.eye(len(start)))  # one term holds nearly all of the variance
+    options = {"xatol": 1e-4, "fatol": 1e-6, "maxiter": 2000}
+    tried = [minimize(cost, start + shift, method="Nelder-Mead", options=options) for shift in shifts]
+    out[used] = np.exp(np.maximum(min(tried, key=lambda one: one.fun).x, start - 12))
+    return out
 
 
 def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -112,9 +130,17 @@ def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight:
     return np.asarray(scale)
 
 
-def _quantile(size: np.ndarray, weight: np.ndarray, groups: int) -> float:
-    """The size below which a fraction `COVERAGE` of the readings of a new group are expected."""
-    order = np.argsort(size)
+def _multiple(pull: np.ndarray, weight: np.ndarray, groups: int) -> float:
+    """Size of the pull below which a fraction `COVERAGE` of the readings of a new group are expected.
+
+    Args:
+        pull: errors over their standard deviations, not negative.
+        weight: of each; those of a group sum to one.
+        groups: number of groups; fewer than `MIN_GROUPS` give the multiple of normal errors.
+    """
+    if groups < MIN_GROUPS:
+        return NORMAL_MULTIPLE
+    order = np.argsort(pull)
     below = np.cumsum(weight[order]) / groups
     at = int(np.searchsorted(below, min(COVERAGE * (1 + 1 / groups), 1.0)))
-    return float(size[order[min(at, len(order) - 1)]])
+    return float(pull[order[min(at, len(order) - 1)]])

@@ -150,7 +150,8 @@ def _curve(calibration: LogCalibration) -> str:
     noise = calibration.model.noise
     about = (
         f"Standard errors are over {int(fitted.n_groups)} blocks of time. A new reading deviates by "
-        f"{float(noise.floor):.3g} N without force and by {100 * float(noise.fraction):.2g} % of a large force; half "
+        f"{float(noise.floor):.3g} N without force, by {100 * float(noise.fraction):.2g} % of a large force, and by "
+        f"{float(noise.lag):.2g} s times the rate of a force that changes; half "
         f"the 90 % interval is {float(noise.multiple):.2f} standard deviations. These come from blocks "
         "that were held out."
     )

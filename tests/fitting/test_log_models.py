@@ -1,11 +1,13 @@
 """Models of logs: honest standard errors and intervals of samples that err together, blocks, thinning, the choice."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import signal
 
 from calib.fitting.curves import Affine, AffinePlay, fit_curves
 from calib.fitting.logs import LogSeries, fit_series, series_of, ways_of
+from calib.fitting.logs.noise import fit_log_noise, force_rate
 from calib.fitting.logs.series import thinned
 from calib.fitting.losses import Squared
 
@@ -44,6 +46,50 @@ def test_standard_errors_and_intervals_of_autocorrelated_logs_are_honest():
         new = one.model.predict(other[0], other[1])
         covered.append(np.mean((other[2] > new.low) & (other[2] < new.high)))
     assert 0.85 < np.mean(covered) < 0.97
+
+
+def test_noise_that_grows_with_the_rate_is_recovered_and_covered():
+    """A force that goes between two levels, read 30 ms late or early: few samples move, and these err most."""
+    covered = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        time = np.arange(6000) * 1e7
+        level = np.where(np.arange(6000) // 150 % 2, 10.0, 0.0)
+        force = np.convolve(np.pad(level, 20, "edge"), np.full(41, 1 / 41), "valid")
+        rate = force_rate(time, force)
+        late = np.repeat(rng.normal(0, 0.03, 40), 150)  # of each stretch
+        residual = 0.05 * rng.normal(size=6000) + late * rate
+        group, fitted = np.arange(6000) // 150, np.arange(6000) < 4500
+        noise = fit_log_noise(np.where(fitted, residual, np.nan), time, force, np.zeros(6000), group)
+        half = noise.multiple * np.sqrt(noise.variance(time, force))
+        moving = np.abs(rate) > 1
+        covered.append([np.mean(np.abs(residual) <= half, where=~fitted & (moving == k)) for k in (False, True)])
+        assert float(noise.floor) == pytest.approx(0.05, rel=0.15)
+        assert float(noise.lag) == pytest.approx(0.03, rel=0.5)
+    assert ((np.mean(covered, 0) > 0.88) & (np.mean(covered, 0) < 0.99)).all()
+
+
+def test_a_log_that_begins_under_load_holds_its_unknown_history_in_its_interval():
+    """Cycles of a curve with hysteresis, cut at any sample: forces lie in the intervals, which narrow in a cycle."""
+    curve, n = AffinePlay(np.array([0.2, 0.4, 0.8])), 2400
+    rng = np.random.default_rng(0)
+    load = 1 - np.cos(np.arange(n) / 40 + 0.3 * np.sin(np.arange(n) / 300))
+    force = np.asarray(curve(jnp.array([1.0, 2.0, 3.0, 4.0, 0.0]), jnp.asarray(load))) + 0.02 * rng.normal(size=n)
+    time = np.arange(n) * 1e7
+    series = series_of([(time, load[:, None], force)])
+    model = fit_series(series, series.complete, [curve], ways_of(1, 128), Squared()).model
+    whole = model.predict(time, load[:, None])
+    inside, width = [], []
+    for start in (start for start in range(300, 1500, 37) if load[start] > 0.25):  # less counts as rest
+        found = model.predict(time[start:], load[start:, None])
+        first = slice(0, 60)
+        inside.append(np.mean((force[start:] > found.low)[first] & (force[start:] < found.high)[first]))
+        width.append(found.high - found.low)
+        np.testing.assert_allclose(found.force[-400:], whole.force[start:][-400:], atol=1e-6)
+        np.testing.assert_allclose(width[-1][-400:], (whole.high - whole.low)[-400:], atol=1e-6)
+    assert np.mean(inside) > 0.88
+    under_load = [w[:20].max() for w in width]
+    assert max(under_load) > 3 * np.median(whole.high - whole.low)
 
 
 def test_blocks_are_parts_of_one_log_each_and_the_later_half_decides():

@@ -10,11 +10,13 @@ from jaxtyping import Bool, Float
 
 from ..curves.fitted import FittedCurve, predict_pads
 from ..curves.samples import bucket
-from ..intervals import NoiseLaw
 from .combination import AbstractCombination
+from .noise import LogNoise
 
 # Part of the range of a channel by which a reading may lie outside it; as for the pressure of a curve.
 TOLERANCE = 0.05
+# Part of the range of the fitted signal below which a sensor counts as at rest.
+REST = 0.1
 
 
 class LogPrediction(NamedTuple):
@@ -52,18 +54,44 @@ class LogModel:
 
     combination: AbstractCombination
     curve: FittedCurve
-    noise: NoiseLaw
+    noise: LogNoise
     reach: Float[np.ndarray, "2 channels"]
 
     def predict(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> LogPrediction:
-        """Forces at times (n,) ns, which must rise. A model with memory begins with a sensor at rest."""
+        """Forces at times (n,) ns, which must rise.
+
+        A curve with memory that begins at rest begins with the state of the fitted recordings. If the log begins under
+        load, its history is unknown: the force is the mean of the forces after a rise from the lowest and after a fall
+        from the highest fitted signal, between which it lies, and the standard error holds their difference. The two
+        come together as the signal goes through its range.
+        """
         signal = self.combination.signal(time, values)
-        force, error, valid = curve_forces(_batched(self.curve), signal[None])
-        variance = error[0] ** 2 + np.asarray(self.noise.variance(jnp.asarray(force[0])[:, None]))[:, 0]
-        deviation = np.sqrt(variance)
-        half = float(self.noise.multiple) * deviation
-        inside = valid[0] & within(self.reach, values)
-        return LogPrediction(force[0], deviation, force[0] - half, force[0] + half, inside)
+        force, error, valid = self._forces(signal)
+        inside = valid & within(self.reach, values)
+        return with_noise(self.noise, time, force, error, inside)
+
+    def _forces(self, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Force, standard error and validity (n,) of the curve."""
+        known = signal[np.isfinite(signal)]
+        low, high = np.asarray(self.curve.pressure_range, float)
+        if not self.curve.curve.path or not len(known) or known[0] <= low + REST * (high - low):
+            found = curve_forces(_batched(self.curve), signal[None])
+            return found[0][0], found[1][0], found[2][0]
+        both = [jnp.asarray(leaf)[None].repeat(2, 0) for leaf in jax.tree.leaves(self.curve)]
+        curves = jax.tree.unflatten(jax.tree.structure(self.curve), both)
+        signals = np.stack([np.concatenate([[end], signal]) for end in (low, high)])
+        force, error, valid = (part[:, 1:] for part in curve_forces(curves, signals))
+        spread = (force[1] - force[0]) / 2  # the history of a cycle is at one of the two, not between them
+        return force.mean(0), np.sqrt((error**2).mean(0) + spread**2), np.asarray(valid.all(0))
+
+
+def with_noise(
+    noise: LogNoise, time: np.ndarray, force: np.ndarray, error: np.ndarray, valid: np.ndarray
+) -> LogPrediction:
+    """Predicted forces (n,) N at times (ns) with the noise of new readings about the model's own error (n,) N."""
+    deviation = np.sqrt(error**2 + noise.variance(time, force))
+    half = float(noise.multiple) * deviation
+    return LogPrediction(force, deviation, force - half, force + half, valid)
 
 
 def within(reach: Float[np.ndarray, "2 channels"], values: Float[np.ndarray, "n channels"]) -> np.ndarray:

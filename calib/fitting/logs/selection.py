@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..curves import CURVES
@@ -20,14 +19,14 @@ from ..curves.base import AbstractCurve
 from ..curves.elementary import Affine
 from ..curves.fit import fit_curves
 from ..curves.fitted import FittedCurve
-from ..intervals import fit_noise
 from ..losses import AbstractLoss
 from ..results import FitError, FitResult
 from ..selection import Candidate, Tried, simplest
 from .blend import BestChannel, BlendChannels
 from .combination import AbstractCombination, one_channel
 from .gaussian_process import SmoothChannels
-from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, within
+from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, with_noise, within
+from .noise import fit_log_noise
 from .series import LogSeries
 
 Way = BestChannel | BlendChannels | SmoothChannels | None
@@ -208,12 +207,9 @@ def _fitted(
     series, held = problem.series, problem.held_out(fits)
     residual = np.where(held.valid & problem.decides, series.force - held.force, np.nan)
     groups = series.blocks(problem.used, NOISE_BLOCKS)
-    noise = fit_noise(residual, held.force[:, None], held.error**2, groups)
+    noise = fit_log_noise(residual, series.time, held.force, held.error**2, groups)
     model = LogModel(fits.combination, fits.curves.pad(0), noise, reach_of(series.values[problem.used]))
-    deviation = np.sqrt(fits.error[0] ** 2 + np.asarray(noise.variance(jnp.asarray(fits.force[0])[:, None]))[:, 0])
-    half = float(noise.multiple) * deviation
-    force = fits.force[0]
-    predicted = LogPrediction(force, deviation, force - half, force + half, fits.valid[0])
+    predicted = with_noise(noise, series.time, fits.force[0], fits.error[0], fits.valid[0])
     return FittedLog(model, predicted, held, way, curve, why, tried)
 
 
