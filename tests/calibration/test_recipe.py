@@ -181,8 +181,11 @@ ITERATIVE = {
 }
 
 
-@pytest.mark.parametrize("imaging", ITERATIVE.values(), ids=ITERATIVE)
-def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(imaging, grid, folder):  # noqa: F811
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "non-negative")) for name in ITERATIVE]
+)
+def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, folder):  # noqa: F811
+    imaging = ITERATIVE[name]
     with calib.open_session(grid) as session:
         made = calib.calibrate([session], recipe=replace(QUICK, imaging=imaging))
     assert isinstance(made.recon, je.imaging.IterativeReconstructor)

@@ -32,7 +32,7 @@ def judged(found, count):
 
 
 def test_some_lies(root):
-    judged(campaign(60, 1, root, 100), 60)
+    judged(campaign(30, 1, root, 100), 30)
 
 
 @pytest.mark.slow
