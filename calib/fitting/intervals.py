@@ -18,6 +18,9 @@ NORMAL_MULTIPLE = 1.6449  # half the width of a normal distribution's 90 % inter
 MIN_GROUPS = 10  # of held-out readings; fewer determine no multiple, and the normal one is used
 # Groups' worth of readings that speak for the common deviation, against those of the pad itself.
 PRIOR_GROUPS = 5.0
+# Least size of a part of the noise, over that with which the part alone would make all of it. Without a bound, readings
+# that a model meets exactly, such as a force of zero without load, would end as noise of zero.
+LEAST_PART = 0.01
 
 
 class NoiseLaw(eqx.Module):
@@ -109,15 +112,16 @@ def most_likely_sizes(
         return out
     terms = terms[:, used]
     start = np.log(size / np.sqrt(np.average(terms, axis=0, weights=weight)))
+    least = start + np.log(LEAST_PART)
 
     def cost(logs: np.ndarray) -> float:
-        total = variance + terms @ np.exp(2 * logs)
+        total = variance + terms @ np.exp(2 * np.maximum(logs, least))
         return float(weight @ (np.log(total) + residual**2 / total))
 
     shifts = -3 * (1 - np.eye(len(start)))  # one term holds nearly all of the variance
     options = {"xatol": 1e-4, "fatol": 1e-6, "maxiter": 2000}
     tried = [minimize(cost, start + shift, method="Nelder-Mead", options=options) for shift in shifts]
-    out[used] = np.exp(np.maximum(min(tried, key=lambda one: one.fun).x, start - 12))
+    out[used] = np.exp(np.maximum(min(tried, key=lambda one: one.fun).x, least))
     return out
 
 

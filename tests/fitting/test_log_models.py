@@ -6,7 +6,7 @@ import pytest
 from scipy import signal
 
 from calib.fitting.curves import Affine, AffinePlay, fit_curves
-from calib.fitting.logs import LogSeries, fit_series, series_of, ways_of
+from calib.fitting.logs import LogSeries, SmoothChannels, fit_series, series_of, ways_of
 from calib.fitting.logs.noise import fit_log_noise, force_rate
 from calib.fitting.logs.series import thinned
 from calib.fitting.losses import Squared
@@ -90,6 +90,29 @@ def test_a_log_that_begins_under_load_holds_its_unknown_history_in_its_interval(
     assert np.mean(inside) > 0.88
     under_load = [w[:20].max() for w in width]
     assert max(under_load) > 3 * np.median(whole.high - whole.low)
+
+
+def test_a_soft_sensor_that_was_in_use_before_the_log_is_told_by_its_like():
+    """Channels that creep by 30 % with 30 s, and loads at random: the interval holds what is unknown."""
+    rng = np.random.default_rng(0)
+    time = np.arange(0, 1800, 0.25)
+    force = np.repeat(rng.uniform(0, 20, 180) * (rng.random(180) > 0.3), 40)
+    creep = signal.lfilter([1 - np.exp(-0.25 / 30)], [1.0, -np.exp(-0.25 / 30)], force)
+    values = (force + 0.3 * creep)[:, None] * [1.0, 0.5] + 0.02 * rng.normal(size=(len(time), 2))
+    series = series_of([(time[:3600] * 1e9, values[:3600], force[:3600])])
+    model = fit_series(series, series.complete, [Affine()], {"smooth": SmoothChannels((2,))}, Squared()).model
+    rest, like, inside, without = [], [], [], []
+    for start in range(3600, 7000, 80):
+        rows = slice(start, start + 120)
+        found = model.predict(time[rows] * 1e9, values[rows])
+        at_rest = np.asarray(model.curve.predict(model.combination.signal(time[rows] * 1e9, values[rows])).force)
+        rest.append(np.mean((at_rest - force[rows]) ** 2))
+        like.append(np.mean((found.force - force[rows]) ** 2))
+        inside.append(np.mean((force[rows] > found.low) & (force[rows] < found.high)))
+        half = float(model.noise.multiple) * np.sqrt(model.noise.variance(time[rows] * 1e9, at_rest))
+        without.append(np.mean(np.abs(at_rest - force[rows]) < half))
+    assert np.sqrt(np.mean(like)) < 0.85 * np.sqrt(np.mean(rest))
+    assert np.mean(inside) > 0.85 > np.mean(without) + 0.1
 
 
 def test_blocks_are_parts_of_one_log_each_and_the_later_half_decides():

@@ -19,6 +19,12 @@ class AbstractCombination(abc.ABC):
     def signal(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, " n"]:
         """Signal (n,) of readings in order of time (n,) ns; NaN where a channel that it needs is NaN."""
 
+    def possible_signals(
+        self, time: np.ndarray, values: Float[np.ndarray, "n channels"]
+    ) -> Float[np.ndarray, "histories n"]:
+        """Signals (n,) after each of several histories before the first reading; one if the history does not matter."""
+        return self.signal(time, values)[None]
+
     @property
     @abc.abstractmethod
     def words(self) -> str:
@@ -119,6 +125,9 @@ def products(z: np.ndarray) -> np.ndarray:
     return np.concatenate([z, z[:, i] * z[:, j]], axis=1)
 
 
+STRETCHES = 32  # of the calibrated log, each of which has one history, so that they differ
+HISTORIES = 16  # those of them that are tried for a new log
+DECAY_TIMES = 6.0  # time constants after which a history no longer matters
 ROWS = 4096  # of the kernel matrix that are computed at once, so that memory does not grow with the log
 
 
@@ -144,7 +153,33 @@ class SmoothSignal(AbstractCombination):
     weights: np.ndarray
 
     def signal(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, " n"]:
-        at = lag_inputs(time, values, self.axes, self.lags)
+        return self._forces(lag_inputs(time, values, self.axes, self.lags))
+
+    def possible_signals(
+        self, time: np.ndarray, values: Float[np.ndarray, "n channels"]
+    ) -> Float[np.ndarray, "histories n"]:
+        """As if the sensor had been through what it had when the calibrated log was nearest to the first reading.
+
+        A difference from a lag that is wrong at first decays with the time constant of the lag.
+        """
+        whole = self.signal(time, values)
+        at, lags = lag_inputs(time, values, self.axes, self.lags), len(self.lags)
+        known = np.flatnonzero(np.isfinite(at).all(1))
+        if not lags or not len(known):
+            return whole[None]
+        distance = ((self.inputs[:, lags:] - at[known[0], lags:]) ** 2).sum(1)
+        parts = np.array_split(np.arange(len(distance)), min(STRETCHES, len(distance)))
+        nearest = np.array([part[np.argmin(distance[part])] for part in parts])
+        rows = nearest[np.argsort(distance[nearest], kind="stable")[:HISTORIES]]
+        since = np.maximum(np.asarray(time, float) - float(time[known[0]]), 0) / 1e9
+        early = since < DECAY_TIMES * self.lags.max()
+        out = np.repeat(whole[None], len(rows), 0)
+        for signal, row in zip(out, rows, strict=True):
+            past = self.inputs[row, :lags] * np.exp(-since[early, None] / self.lags)
+            signal[early] = self._forces(at[early] + np.pad(past, ((0, 0), (0, at.shape[1] - lags))))
+        return out
+
+    def _forces(self, at: np.ndarray) -> np.ndarray:
         return np.concatenate([self._force(at[k : k + ROWS]) for k in range(0, len(at), ROWS)] or [np.empty(0)])
 
     def _force(self, at: np.ndarray) -> np.ndarray:

@@ -60,29 +60,28 @@ class LogModel:
     def predict(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> LogPrediction:
         """Forces at times (n,) ns, which must rise.
 
-        A curve with memory that begins at rest begins with the state of the fitted recordings. If the log begins under
-        load, its history is unknown: the force is the mean of the forces after a rise from the lowest and after a fall
-        from the highest fitted signal, between which it lies, and the standard error holds their difference. The two
-        come together as the signal goes through its range.
+        What the sensor went through before the log is unknown. The force is the mean over the histories that are
+        possible, and the standard error holds their spread: the differences from lags that the calibrated log had
+        when it was nearest to the first reading and, for a curve with hysteresis that begins under load, a rise from
+        the lowest and a fall from the highest fitted signal. Histories come together as time goes on.
         """
-        signal = self.combination.signal(time, values)
-        force, error, valid = self._forces(signal)
-        inside = valid & within(self.reach, values)
-        return with_noise(self.noise, time, force, error, inside)
+        signals = self._with_starts(self.combination.possible_signals(time, values))
+        curves = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], len(signals), 0), self.curve)
+        force, error, valid = curve_forces(curves, signals)
+        first = len(signals[0]) - len(time)
+        force, error, valid = (part[:, first:] for part in (force, error, valid))
+        spread = force.std(0)
+        inside = np.asarray(valid.all(0)) & within(self.reach, values)
+        return with_noise(self.noise, time, force.mean(0), np.sqrt((error**2).mean(0) + spread**2), inside)
 
-    def _forces(self, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Force, standard error and validity (n,) of the curve."""
-        known = signal[np.isfinite(signal)]
+    def _with_starts(self, signals: Float[np.ndarray, "histories n"]) -> Float[np.ndarray, "more m"]:
+        """The signals after each extreme of a history, where the curve remembers and the log begins under load."""
+        known = signals[0][np.isfinite(signals[0])]
         low, high = np.asarray(self.curve.pressure_range, float)
         if not self.curve.curve.path or not len(known) or known[0] <= low + REST * (high - low):
-            found = curve_forces(_batched(self.curve), signal[None])
-            return found[0][0], found[1][0], found[2][0]
-        both = [jnp.asarray(leaf)[None].repeat(2, 0) for leaf in jax.tree.leaves(self.curve)]
-        curves = jax.tree.unflatten(jax.tree.structure(self.curve), both)
-        signals = np.stack([np.concatenate([[end], signal]) for end in (low, high)])
-        force, error, valid = (part[:, 1:] for part in curve_forces(curves, signals))
-        spread = (force[1] - force[0]) / 2  # the history of a cycle is at one of the two, not between them
-        return force.mean(0), np.sqrt((error**2).mean(0) + spread**2), np.asarray(valid.all(0))
+            return signals
+        ends = [np.full((len(signals), 1), end) for end in (low, high)]
+        return np.concatenate([np.concatenate([end, signals], 1) for end in ends])
 
 
 def with_noise(
@@ -119,9 +118,3 @@ def curve_forces(
     force, error, valid = (np.asarray(part)[:, :n] for part in found)
     known = np.isfinite(signals)
     return np.where(known, force, np.nan), np.where(known, error, np.nan), valid & known
-
-
-def _batched(curve: FittedCurve) -> FittedCurve:
-    """The fit of one pad as a batch of one."""
-    found: FittedCurve = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], curve)
-    return found
