@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 import jaxeit as je
 
 from ..check.acceptance import accept
+from ..fitting.curves.play_operators import remembered
 from ..fitting.curves.samples import bucket
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
@@ -186,29 +187,6 @@ def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "
     """Whether the force on a pad, without correction by location, exceeds the noise of an idle pad; pure."""
     force = replace(law.pads, field=None).forces(pressures).force
     return force > _LOADED_MULTIPLE * law.pads.idle_noise
-
-
-def remembered(pressures: np.ndarray) -> np.ndarray:
-    """The turning points (m, pads) of own pressures (n, pads) that a curve with hysteresis remembers, padded by NaN.
-
-    A later excursion beyond a turning point wipes it out (wiping-out property of the Preisach model), so few remain.
-    """
-    turns = [_turns(column) for column in np.asarray(pressures).T]
-    longest = max(map(len, turns), default=0)
-    return np.stack([np.r_[np.full(longest - len(t), np.nan), t] for t in turns], 1)
-
-
-def _turns(column: np.ndarray) -> list[float]:
-    kept: list[float] = [0.0]  # at rest
-    for value in column[np.isfinite(column)].tolist():
-        kept.append(value)
-        # An excursion at least as large as the one before closes that inner loop, which has no further effect.
-        while len(kept) > 3 and abs(kept[-1] - kept[-2]) >= abs(kept[-2] - kept[-3]):
-            del kept[-3:-1]
-        # A value that continues in the same direction makes the value before it no turning point.
-        while len(kept) > 2 and (kept[-1] - kept[-2]) * (kept[-2] - kept[-3]) >= 0:
-            del kept[-2]
-    return kept
 
 
 def apply(

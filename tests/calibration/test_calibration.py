@@ -17,12 +17,12 @@ import calib
 import jaxeit as je
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.evaluation import render_table
-from calib.calibration.force_maps import fused, law_of, remembered
+from calib.calibration.force_maps import fused, law_of
 from calib.calibration.localisation import locator_from_numbers, locator_numbers
 from calib.calibration.press_images import fit_untouched_sheet
 from calib.calibration.storage import SEAL, to_archive
 from calib.fitting.curves import CURVES
-from calib.fitting.curves.play_operators import play
+from calib.fitting.curves.play_operators import play, remembered
 from calib.fitting.fields import Places, geometry_of
 from calib.fitting.pads import LocatedPresses, fit_pads
 from calib.presses.pooled import pool_presses
@@ -191,11 +191,13 @@ def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, cali
     assert error.mean() < 0.006  # a draft mesh, and a table to match
 
 
-@pytest.mark.slow
-def test_what_a_curve_remembers_of_the_past_is_enough():
+@pytest.mark.parametrize("part", [0, 1])
+def test_what_a_curve_remembers_of_the_past_is_enough(part):
+    """A random walk, and its running sum, which goes on in one direction by steps that grow."""
     rng = np.random.default_rng(0)
-    past = np.cumsum(rng.normal(0, 1, (500, 2)), 0)
-    now = past[-1] + np.cumsum(rng.normal(0, 1, (40, 2)), 0)
+    walk = np.cumsum(rng.normal(0, 1, (540, 2)), 0)
+    walk = walk if part == 0 else np.cumsum(rng.normal(0, 1, (540, 2)) + 0.1 * np.sin(walk), 0)
+    past, now = walk[:500], walk[500:]
     few = remembered(past)
     assert len(few) < 60
     widths = jnp.array([0.5, 2.0, 8.0, 20.0])

@@ -210,3 +210,29 @@ class PlaySpline(AbstractCurve):
         slope, offset = Affine().initial(pressure, force, valid, scale)
         slopes = jnp.broadcast_to(slope, (len(MonotoneSpline.names),))
         return jnp.concatenate([slopes, jnp.ones(len(RATIO_NAMES), slopes.dtype), offset[None]])
+
+
+def remembered(pressures: np.ndarray) -> np.ndarray:
+    """The turning points (m, pads) of own pressures (n, pads) that a curve with hysteresis remembers, padded by NaN.
+
+    A later excursion beyond a turning point wipes it out (wiping-out property of the Preisach model), so few remain.
+    """
+    turns = [_turns(column) for column in np.asarray(pressures).T]
+    longest = max(map(len, turns), default=0)
+    return np.stack([np.r_[np.full(longest - len(t), np.nan), t] for t in turns], 1)
+
+
+def _turns(column: np.ndarray) -> list[float]:
+    kept: list[float] = [0.0]  # at rest
+    for value in column[np.isfinite(column)].tolist():
+        kept.append(value)
+        # A value that continues in the same direction makes the value before it no turning point.
+        while len(kept) > 2 and (kept[-1] - kept[-2]) * (kept[-2] - kept[-3]) >= 0:
+            del kept[-2]
+        # An excursion at least as large as the one before closes that inner loop, which has no further effect.
+        while len(kept) > 3 and abs(kept[-1] - kept[-2]) >= abs(kept[-2] - kept[-3]):
+            del kept[-3:-1]
+        # At rest all operators are at zero, so that an excursion farther to the other side wipes out the first one.
+        if len(kept) == 3 and abs(kept[2]) >= abs(kept[1]):
+            del kept[1]
+    return kept
