@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..fitting.curves import CURVES
-from ..fitting.logs import LogModel, LogPrediction
+from ..fitting.logs import LogModel, LogPrediction, LogTracker
 from ..fitting.selection import Candidate
 from ..session import SessionError, read_archive, write_archive
 from .log_evaluation import LogEvaluation
-from .log_storage import fields_of_log, log_archive
+from .log_storage import fields_of_log, location_name, log_archive
 
 FORMAT = "log-calibration"
 
@@ -46,21 +46,53 @@ class LogCalibration:
     why: str = ""
     tried: tuple[Candidate, ...] = ()
 
-    def predict(self, time: np.ndarray, values: Float[np.ndarray, "n columns"]) -> LogPrediction:
+    def predict(
+        self,
+        time: np.ndarray,
+        values: Float[np.ndarray, "n columns"],
+        place: Float[np.ndarray, "n 2"] | None = None,
+    ) -> LogPrediction:
         """Force, standard error, 90 % interval and validity at times (n,) ns, from all channels of the stream.
 
-        Times must rise. A model with memory begins with a sensor at rest. A force is not valid where a channel lies
-        outside the range that was calibrated.
+        Times must rise. A force is not valid where a channel or the place lies outside the range that was calibrated.
+
+        Args:
+            place: of the contact, m, as the stage tells it; only for a calibration that `needs_place`.
 
         Raises:
-            SessionError: if the number of channels is not that of the calibrated sensor.
+            SessionError: if the number of channels is not that of the calibrated sensor, or the place is needed and
+                not given.
         """
+        if self.needs_place and place is None:
+            raise SessionError(
+                "the calibration depends on the place of contact, and none is given: record the stream stage, or "
+                "calibrate with --location none"
+            )
         if values.ndim != 2 or values.shape[1] != self.columns:
             raise SessionError(
                 f"/streams/{self.stream}: {values.shape[-1]} channels, but the calibration is of {self.columns}; "
                 "give the calibration of this sensor"
             )
-        return self.model.predict(time, values[:, self.kept])
+        return self.model.predict(time, values[:, self.kept], place)
+
+    def tracker(self) -> "CalibrationTracker":
+        """`predict` for one reading after the other, as a running sensor sends them."""
+        return CalibrationTracker(self)
+
+    @property
+    def needs_place(self) -> bool:
+        """Whether the force depends on the place of contact."""
+        return self.model.location is not None
+
+    @property
+    def groups(self) -> str:
+        """What standard errors of the curve are over, in words."""
+        return "places" if self.needs_place else "blocks of time"
+
+    @property
+    def location_name(self) -> str:
+        """Name of the field of gain; "inputs": the place is an input beside the channels; "none": it is not used."""
+        return location_name(self.model.location)
 
     @property
     def curve_name(self) -> str:
@@ -77,6 +109,19 @@ class LogCalibration:
         """Write the calibration, whole or not at all, as HDF5 in the format log-calibration."""
         fields: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         write_archive(path, FORMAT, *log_archive(fields))
+
+
+class CalibrationTracker:
+    """`LogCalibration.predict` for one reading after the other."""
+
+    def __init__(self, calibration: LogCalibration):
+        self._kept, self._tracker = calibration.kept, LogTracker(calibration.model)
+
+    def step(
+        self, time: float, values: Float[np.ndarray, " columns"], place: Float[np.ndarray, " 2"] | None = None
+    ) -> LogPrediction:
+        """Force, standard error, interval and validity of one reading, at a time (ns) that rises."""
+        return self._tracker.step(time, values[self._kept], place)
 
 
 def load_log_calibration(path: str | Path) -> LogCalibration:

@@ -98,7 +98,7 @@ ARRAYS: Mapping[str, tuple[str, str]] = {
     "standard_error": ("N", "of a reading"),
     "low": ("N", "lower end of the 90 % interval of a reading"),
     "high": ("N", "upper end of the 90 % interval of a reading"),
-    "valid": ("", "whether all channels lie within the calibrated ranges"),
+    "valid": ("", "whether channels and place lie within the calibrated ranges"),
 }
 
 

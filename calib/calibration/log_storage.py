@@ -11,12 +11,12 @@ import numpy as np
 import jaxeit as je
 
 from ..fitting.curves import CURVES, FittedCurve
-from ..fitting.logs import COMBINATIONS, AbstractCombination, LogModel
-from ..fitting.logs.noise import LogNoise
+from ..fitting.fields import FIELDS
+from ..fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise
 from ..fitting.selection import Candidate
 from ..session import Archive
 from .log_evaluation import LogEvaluation
-from .storage import SEAL, seal
+from .storage import SEAL, field_arrays, field_from, seal
 
 Described = dict[str, tuple[Any, str, str]]
 
@@ -32,6 +32,7 @@ CURVE_FIELDS = {
     "rank": "parameters that the samples determine",
     "result": "0: success",
 }
+NO_PLACE, PLACE_INPUTS = "none", "inputs"  # what a model does with the place, unless it has a field of gain
 NOISE_FIELDS = {
     "floor": ("N", "standard deviation of a reading without force"),
     "fraction": ("1", "standard deviation of a reading per force"),
@@ -54,6 +55,7 @@ def log_archive(given: Mapping[str, Any]) -> tuple[dict[str, Any], Described]:
         "tried": json.dumps([candidate._asdict() for candidate in given["tried"]]),
         "curve": CURVES.name_of(model.curve.curve),
         "combination": model.combination.name,
+        "location": location_name(model.location),
         **{f"provenance_{k}": v for k, v in given["provenance"].items()},
         **{f"evaluation_{k}": v for k, v in evaluation.attributes().items()},
     }
@@ -74,7 +76,17 @@ def _model_arrays(model: LogModel) -> Described:
         f"curve/choice-{f.name}": (getattr(curve.curve, f.name), "", "setting of the curve")
         for f in fields(curve.curve)
     }
+    if model.location is not None:
+        arrays["location/box"] = (model.location.box, "m", "lowest and highest corner of the presses")
+        arrays |= {} if model.location.gain is None else field_arrays(model.location.gain)
     return arrays | {f"noise/{name}": (getattr(model.noise, name), *about) for name, about in NOISE_FIELDS.items()}
+
+
+def location_name(location: LogLocation | None) -> str:
+    """The name that files have for what a model does with the place."""
+    if location is None:
+        return NO_PLACE
+    return PLACE_INPUTS if location.gain is None else FIELDS.name_of(location.gain.field)
 
 
 def fields_of_log(archive: Archive) -> dict[str, Any]:
@@ -111,7 +123,16 @@ def _model(attrs: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LogMod
     numbers = {name: jnp.asarray(arrays[f"curve/{name}"]) for name in CURVE_FIELDS}
     given = {"noise/lag": np.zeros(()), **arrays}  # early versions did not store it
     noise = LogNoise(**{name: jnp.asarray(given[f"noise/{name}"]) for name in NOISE_FIELDS})
-    return LogModel(_combination(attrs, arrays), FittedCurve(curve=curve, **numbers), noise, arrays["channels/reach"])
+    fitted = FittedCurve(curve=curve, **numbers)
+    location = _location(str(attrs.get("location", NO_PLACE)), arrays)
+    return LogModel(_combination(attrs, arrays), fitted, noise, arrays["channels/reach"], location)
+
+
+def _location(name: str, arrays: Mapping[str, np.ndarray]) -> LogLocation | None:
+    if name == NO_PLACE:
+        return None
+    gain = None if name == PLACE_INPUTS else field_from(arrays, FIELDS.find(name))
+    return LogLocation(arrays["location/box"], gain)
 
 
 def _combination(attrs: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> AbstractCombination:
@@ -130,7 +151,16 @@ def _require_possible(model: LogModel, kept: np.ndarray, columns: int) -> None:
         raise ValueError(f"channels/reach is not lowest and highest values of {channels} channels")
     if channels == 0 or kept.min() < 0 or kept.max() >= columns:
         raise ValueError(f"channels/kept names channels outside of {columns}")
-    values = np.full((1, channels), np.nan)
-    model.combination.signal(np.zeros(1), values)  # raises where its shapes do not fit
+    _require_possible_place(model.location)
+    model.predict(np.zeros(1), np.full((1, channels), np.nan))  # raises where shapes do not fit
     if min(float(getattr(model.noise, name)) for name in NOISE_FIELDS) < 0:
         raise ValueError("noise holds a number below zero")
+
+
+def _require_possible_place(location: LogLocation | None) -> None:
+    if location is None:
+        return
+    if location.box.shape != (2, 2) or not (location.box[0] < location.box[1]).all():
+        raise ValueError("location/box is not the lowest and highest corner of a box")
+    if location.gain is not None and not je.linalg.is_covariance(np.asarray(location.gain.covariance)):
+        raise ValueError("location/covariance is no covariance: not symmetric, or of a variance below zero")

@@ -19,12 +19,14 @@ from jaxeit.budget import current_budget
 from ..check.acceptance import accept
 from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ..fitting.curves import CURVES, AbstractCurve
-from ..fitting.logs import FittedLog, LogPrediction, LogSeries, fit_series, series_of, ways_of
+from ..fitting.fields import FIELDS, AbstractField, PadEdge
+from ..fitting.logs import MIN_PLACES, FittedLog, LogPrediction, LogSeries, fit_series, series_of, ways_of
 from ..fitting.results import FitError
 from ..presses.streams import resample
 from ..session import Session, SessionError, Stream, write_archive
 from .log_calibration import LogCalibration
 from .log_evaluation import LogEvaluation, log_evaluation
+from .log_storage import location_name
 from .recipe import Recipe
 from .recipe_text import AUTO_CURVES
 
@@ -41,10 +43,12 @@ def calibrate_logs(
     The signal is the stream "pressure", or the only stream besides force, stage, temperature and barometer. It is
     interpolated to the times of the force. Channels of a wide array that are dead, stuck or silent on the first halves
     are left out. How several channels become one signal (the best channel, a blend, a Gaussian process that models
-    creep) and which of several curves is fitted are chosen by stretches of time that the fits have not seen.
+    creep) and which of several curves is fitted are chosen by stretches of time that the fits have not seen. With a
+    correction by location, the place of contact is that of the stream "stage", and places are held out instead.
 
     Args:
-        recipe: curves and loss; its other choices do not concern logs. "auto" stands for all shipped curves.
+        recipe: curves, locations and loss; its other choices do not concern logs. "auto" stands for all shipped curves.
+            Several locations stand also for the place as an input beside the channels.
         ignore_errors: fit also a session in which `check_session` finds an error, and note it.
 
     Raises:
@@ -55,12 +59,12 @@ def calibrate_logs(
     recipe = recipe or Recipe()
     ignored = accept(sessions, None, ignore_errors=ignore_errors)
     signal = _same_signal(sessions)
-    series = series_of([_log(session) for session in sessions])
+    series, locations, placed = _with_places(_series(sessions, recipe), recipe, sessions)
     where = f"{sessions[0].name}: /streams/{signal.name}"
     kept, note = _informative(series, where)
     series = series.channels(kept)
     try:
-        half, whole = _fitted(series, curves_of(recipe), recipe)
+        half, whole = _fitted(series, curves_of(recipe), recipe, locations)
     except FitError as error:
         raise FitError(f"{', '.join(s.name for s in sessions)}: {error}") from None
     thin = _thinning(sessions, series)
@@ -73,7 +77,7 @@ def calibrate_logs(
         evaluation=_second_halves(sessions, series, half, thin),
         provenance=_provenance(sessions, recipe, half, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=tuple(filter(None, [*ignored, note, thin])),
+        notes=tuple(filter(None, [*ignored, note, placed, thin])),
         why=half.why,
         tried=half.tried,
     )
@@ -87,20 +91,70 @@ def curves_of(recipe: Recipe) -> tuple[AbstractCurve, ...]:
     return recipe.curves
 
 
-def _fitted(series: LogSeries, curves: Sequence[AbstractCurve], recipe: Recipe) -> tuple[FittedLog, FittedLog]:
-    """The model chosen on the first halves of the logs, and the same kind of model fitted to all samples.
+def _series(sessions: Sequence[Session], recipe: Recipe) -> LogSeries:
+    """The samples of the sessions, with the places of the stage if the recipe asks for them."""
+    logs = [_log(session) for session in sessions]
+    if not recipe.locates:
+        return series_of(logs)
+    return series_of(logs, places=[place_of(session, session.stream("force").time) for session in sessions])
 
-    A curve that converges on the halves but not on all samples is chosen by none; the others are tried again.
+
+def place_of(session: Session, time: np.ndarray) -> np.ndarray:
+    """The place of contact (n, 2) m at times (n,) ns by the stream "stage"; NaN where the stage says nothing.
+
+    Raises:
+        SessionError: if there is no stage that tells x and y.
     """
-    ways = ways_of(series.values.shape[1], current_budget().blend_channels)
-    half = fit_series(series, series.first_half, curves, ways, recipe.loss)
+    if "stage" not in session.streams or session.stream("stage").channels < 2:
+        raise SessionError(
+            f"{session.name}: /streams/stage: no x and y of the stage, on which a correction by location depends; "
+            "record the stage, or calibrate with --location none"
+        )
+    stage = session.stream("stage")
+    return resample(stage.time, stage.read()[:, :2], time)
+
+
+def _with_places(
+    series: LogSeries, recipe: Recipe, sessions: Sequence[Session]
+) -> tuple[LogSeries, Sequence[AbstractField | None], str]:
+    """The series with its places told apart, the fields to choose from, and a note where there are too few places."""
+    fields = recipe.locations
+    if not recipe.locates:
+        return series, fields, ""
+    if len(fields) > 1:  # a log has no outline of a pad, from which distances to walls would count
+        fields = tuple(field for field in fields if not isinstance(field, PadEdge))
+    elif isinstance(fields[0], PadEdge):
+        raise FitError(f"--location {FIELDS.name_of(fields[0])}: a log has no walls of a pad; give rbf, gp or auto")
+    found = series.at_places()
+    count = len(np.unique(found.sites[found.loaded]))
+    if count >= MIN_PLACES:
+        return found, fields, ""
+    names = ", ".join(session.name for session in sessions)
+    about = (
+        f"{count} place{'s' * (count != 1)} of contact by the stage, and a correction by location needs {MIN_PLACES}"
+    )
+    if None not in fields:
+        raise FitError(f"{names}: {about}; press more places, or calibrate with --location none")
+    return replace(series, place=None), (None,), f"no correction by location: {about}"
+
+
+def _fitted(
+    series: LogSeries, curves: Sequence[AbstractCurve], recipe: Recipe, locations: Sequence[AbstractField | None]
+) -> tuple[FittedLog, FittedLog]:
+    """The model chosen on a part of the logs (`LogSeries.fitted_part`), and the same kind fitted to all samples.
+
+    A curve that converges on the part but not on all samples is chosen by none; the others are tried again.
+    """
+    ways = ways_of(series.values.shape[1], current_budget().blend_channels, len(locations) > 1)
+    half = fit_series(series, series.fitted_part, curves, ways, recipe.loss, fields=locations)
+    chosen = {"chosen": half.way}
     try:
-        return half, fit_series(series, series.complete, [half.curve], {"chosen": half.way}, recipe.loss)
+        return half, fit_series(series, series.complete, [half.curve], chosen, recipe.loss, fields=[half.field])
     except FitError:
         others = [curve for curve in curves if CURVES.name_of(curve) != CURVES.name_of(half.curve)]
         if not others:
             raise
-        return _fitted(series, others, recipe)
+        return _fitted(series, others, recipe, locations)
 
 
 def _same_signal(sessions: Sequence[Session]) -> Stream:
@@ -144,7 +198,7 @@ def _informative(series: LogSeries, where: str) -> tuple[np.ndarray, str]:
     channels = series.values.shape[1]
     if channels < MIN_ARRAY_CHANNELS:
         return np.arange(channels), ""
-    half = series.first_half  # the second half is held out, and must not decide which channels are used
+    half = series.fitted_part  # the rest is held out, and must not decide which channels are used
     found = faults(series.values[half], series.force[half])
     if found.uninformative.all():
         raise FitError(f"{where}: none of {channels} channels follows the force; see jaxeit check")
@@ -161,10 +215,10 @@ def _thinning(sessions: Sequence[Session], series: LogSeries) -> str:
 
 
 def _second_halves(sessions: Sequence[Session], series: LogSeries, half: FittedLog, thin: str) -> LogEvaluation:
-    rows = ~series.first_half
+    rows = ~series.fitted_part
     found = LogPrediction(*(part[rows] for part in half.predicted))
     which = "second half" if len(sessions) == 1 else "second half of each log"
-    title = f"{which}, by the model of the first"
+    title = f"{which}, by the model of the first" if series.site is None else "a third of the places, by the others"
     return log_evaluation(title, series.time[rows], series.force[rows], found, (thin,) if thin else ())
 
 
@@ -177,7 +231,8 @@ def _provenance(
         "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, Python {platform.python_version()}",
         "sessions": "\n".join(f"{s.hash}  {s.name}" for s in sessions),
         "curve": CURVES.name_of(fitted.curve),
-        "channels": fitted.model.combination.words,
+        "channels": fitted.model.words,
+        "location": location_name(fitted.model.location),
         "choice": fitted.why,
         "recipe": recipe.to_toml(),
     }
@@ -202,13 +257,18 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
     """
     signal = _stream_of(calibration, session)
     ignored = accept([session], None, ignore_errors=ignore_errors)
-    found = calibration.predict(signal.time, signal.read())
+    found = _predicted(calibration, session, signal)
     force = session.stream("force")
-    at = resample(signal.time, np.stack(found[:4], 1), force.time)
+    numbers = (found.force, found.standard_error, found.low, found.high)
+    predicted, error, low, high = resample(signal.time, np.stack(numbers, 1), force.time).T
     nearest = np.clip(np.searchsorted(signal.time, force.time), 0, len(signal.time) - 1)
-    predicted, error, low, high = at.T
     at_force = LogPrediction(predicted, error, low, high, found.valid[nearest] & np.isfinite(predicted))
     return log_evaluation(session.name, force.time, force.read()[:, 0], at_force, ignored)
+
+
+def _predicted(calibration: LogCalibration, session: Session, signal: Stream) -> LogPrediction:
+    place = place_of(session, signal.time) if calibration.needs_place else None
+    return calibration.predict(signal.time, signal.read(), place)
 
 
 def apply_log(
@@ -222,7 +282,7 @@ def apply_log(
     """
     signal = _stream_of(calibration, session)
     ignored = accept([session], None, ignore_errors=ignore_errors, where=(f"/streams/{signal.name}",))
-    found = calibration.predict(signal.time, signal.read())
+    found = _predicted(calibration, session, signal)
     attrs: dict[str, str | int] = {
         "session": session.name,
         "session_sha256": session.hash,
@@ -242,7 +302,7 @@ def _force_arrays(time: np.ndarray, found: LogPrediction) -> Mapping[str, tuple[
         "standard_error": (found.standard_error, "N", "of a reading"),
         "low": (found.low, "N", "lower end of the 90 % interval of a reading"),
         "high": (found.high, "N", "upper end of the 90 % interval of a reading"),
-        "valid": (found.valid, "", "whether all channels lie within the calibrated ranges"),
+        "valid": (found.valid, "", "whether channels and place lie within the calibrated ranges"),
     }
 
 
@@ -259,8 +319,9 @@ def render_log(name: str, calibration: LogCalibration) -> str:
     terms = ", ".join(f"{n} {v:.4g} +- {e:.2g} {u}" for n, v, e, u in numbers)
     why = f"\n  chosen: {calibration.why}" if calibration.why else ""
     notes = "".join(f"\n  note: {note}" for note in calibration.notes)
+    place = "" if calibration.location_name in ("none", "inputs") else f", gain by place {calibration.location_name}"
     return (
-        f"{name}: {calibration.curve_name} curve of {calibration.model.combination.words}, fitted to the whole "
-        f"recording{why}\n  {terms} (standard errors over {int(fitted.n_groups)} blocks of time)\n"
+        f"{name}: {calibration.curve_name} curve of {calibration.model.words}{place}, fitted to the whole "
+        f"recording{why}\n  {terms} (standard errors over {int(fitted.n_groups)} {calibration.groups})\n"
         f"  {int(fitted.n)} samples fitted, {int(fitted.n_missing)} samples without a force or a signal left out{notes}"
     )

@@ -73,7 +73,7 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         for name, meaning in _CURVE_FIELDS.items():
             arrays[f"baseline/{name}"] = (getattr(cal.baseline, name), "", meaning)
     if cal.field is not None and cal.locator is not None:
-        arrays |= _field_arrays(cal.field)
+        arrays |= field_arrays(cal.field)
         for name, array in locator_numbers(cal.locator).items():
             arrays[f"locator/{name}"] = (array, "", "of the estimator of the place, as the library names it")
     for name, value in cal.evaluation.arrays().items():
@@ -158,7 +158,8 @@ def _part(provenance: Mapping[str, str], key: str, read: Callable[[TomlTable], T
     return parse_toml(provenance["recipe"], "calibration: recipe", lambda table: read(table.table(key)))
 
 
-def _field_arrays(found: FittedField) -> dict[str, tuple[Any, str, str]]:
+def field_arrays(found: FittedField) -> dict[str, tuple[Any, str, str]]:
+    """The arrays of a field of gain, by name: values, unit and meaning."""
     choice = {f"choice-{f.name}": getattr(found.field, f.name) for f in fields(found.field)}
     place = {f"geometry-{f.name}": getattr(found.geometry, f.name) for f in fields(Geometry)}
     out: dict[str, tuple[Any, str, str]] = {
@@ -232,7 +233,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "crosstalk": _crosstalk_from(arrays, len(skin.pads)),
         "noise": _noise_from(arrays, "noise", fitted),
         "hold_noise": _noise_from(arrays, "hold-noise", fitted),
-        "field": _field_from(arrays, FIELDS.find(provenance["location"])) if located else None,
+        "field": field_from(arrays, FIELDS.find(provenance["location"])) if located else None,
         "locator": _locator_from(arrays, recon.dtype) if located else None,
         "baseline": _baseline_from(arrays, len(skin.pads)),
         "image_gain": float(attrs.get("image_gain", "nan")),
@@ -246,7 +247,8 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     return parts
 
 
-def _field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:
+def field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:
+    """The field that `field_arrays` described."""
     choice = {
         f.name: arrays[f"location/choice-{f.name}"] for f in fields(kind) if f"location/choice-{f.name}" in arrays
     }

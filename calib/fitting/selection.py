@@ -16,6 +16,7 @@ from .curves import CURVES, AbstractCurve
 from .fields import FIELDS, AbstractField
 from .held_out import Folds, HeldOut, joined
 
+MAX_SAID = 12  # candidates that the reason in words names; the table of the report has all
 NOTHING_HELD: frozenset[int] = frozenset()
 
 
@@ -75,9 +76,19 @@ def simplest(
         Candidate(part, one.name, round(one.size, 1), *_roots(mean, error), chosen=k == chosen)
         for k, (one, mean, error) in enumerate(zip(tried, means, spread, strict=True))
     )
-    said = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in table)
+    said = ", ".join(
+        f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in _worth_saying(table)
+    )
+    said += f" and {len(table) - MAX_SAID} more" if len(table) > MAX_SAID else ""
     why = f"{tried[chosen].name}, the simplest within one standard error of the paired difference from the best"
     return tried[chosen].choice, f"{why} ({tried[least].name}); held-out RMSE over {over} in N: {said}", table
+
+
+def _worth_saying(table: Sequence[Candidate]) -> list[Candidate]:
+    """All candidates, or the best few of many."""
+    if len(table) <= MAX_SAID:
+        return list(table)
+    return sorted(table, key=lambda c: np.inf if c.rmse is None else c.rmse)[:MAX_SAID]
 
 
 def _standard_error(difference: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from ..calibration.log_evaluation import THIRDS, LogEvaluation
 from ..session import replacing
 from .figures import png, require_matplotlib
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text
-from .log_figures import residual_figure, scatter_figure, time_figure
+from .log_figures import place_figure, residual_figure, scatter_figure, time_figure
 
 _NONE: Mapping[str, LogEvaluation] = MappingProxyType({})
 
@@ -49,6 +49,7 @@ def _page(calibration: LogCalibration, found: Mapping[str, LogEvaluation]) -> st
         _residuals(found),
         _coverage(found),
         *(_figures(name, one) for name, one in found.items()),
+        _gain(calibration),
         _curve(calibration),
         _choice(calibration),
         _notes(calibration, found),
@@ -67,10 +68,10 @@ def _banner(simulated: bool) -> str:
 
 def _lead(calibration: LogCalibration) -> str:
     return (
-        f"{len(calibration.kept)} of {calibration.columns} channels, {calibration.model.combination.words}; curve: "
+        f"{len(calibration.kept)} of {calibration.columns} channels, {calibration.model.words}; curve: "
         f"{calibration.curve_name}. The errors of this recording are of a model that was chosen and fitted on the "
-        "first half of each log, and predicts the second half. The calibration in the file is the same kind of "
-        "model, fitted to the whole recording."
+        "first part, and predicts the rest: the second half of each log or, with a correction by location, a third of "
+        "the places. The calibration in the file is the same kind of model, fitted to the whole recording."
     )
 
 
@@ -140,6 +141,18 @@ def _picture(heading: str, data: bytes, caption: str) -> str:
     )
 
 
+def _gain(calibration: LogCalibration) -> str:
+    """Map of the gain over the place; nothing for a model without one."""
+    location = calibration.model.location
+    if location is None or location.gain is None:
+        return ""
+    about = (
+        f"By the field {calibration.location_name}, over the box of the presses. The force is that of the curve times "
+        "the gain; its geometric mean over the fitted places is 1."
+    )
+    return _picture("Gain by place", png(place_figure(location.gain, location.box)), about)
+
+
 def _curve(calibration: LogCalibration) -> str:
     fitted = calibration.model.curve
     values, errors = np.asarray(fitted.parameters, float), np.asarray(fitted.standard_errors, float)
@@ -149,7 +162,7 @@ def _curve(calibration: LogCalibration) -> str:
     ]
     noise = calibration.model.noise
     about = (
-        f"Standard errors are over {int(fitted.n_groups)} blocks of time. A new reading deviates by "
+        f"Standard errors are over {int(fitted.n_groups)} {calibration.groups}. A new reading deviates by "
         f"{float(noise.floor):.3g} N without force, by {100 * float(noise.fraction):.2g} % of a large force, and by "
         f"{float(noise.lag):.2g} s times the rate of a force that changes; half "
         f"the 90 % interval is {float(noise.multiple):.2f} standard deviations. These come from blocks "

@@ -1,11 +1,13 @@
-"""Figures of a log's calibration: residuals and predictions over force, and forces over time."""
+"""Figures of a log's calibration: residuals and predictions over force, forces over time, and gain by place."""
 
 from typing import Any
 
 import numpy as np
 
 from ..calibration.log_evaluation import LogEvaluation
-from .figures import BLUE, GREY, RED
+from ..fitting.fields import FittedField
+from .figures import BLUE, GREY, MM, RED, cell_edges, label_y_once
+from .pad_figures import pad_gain, symmetric_limit
 
 try:  # an extra: without it everything but the figures works
     from matplotlib.figure import Figure
@@ -71,4 +73,24 @@ def time_figure(found: LogEvaluation) -> "Figure":
     recorded = _rows(found, np.isfinite(found.force))
     axes.plot(found.time[recorded], found.force[recorded], ".", color="black", markersize=1.5, label="recorded")
     axes.legend()
+    return figure
+
+
+def place_figure(gain: FittedField, box: np.ndarray) -> "Figure":
+    """Gain and its standard error over the box (2, 2) m of the presses."""
+    x, y, value, error = pad_gain(gain, 0, box)
+    reach = symmetric_limit(value - 1)
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    shown = (
+        (value, (1 - reach, 1 + reach), "RdBu_r", "gain"),
+        (error, (0.0, symmetric_limit(error)), "Purples", "standard error of the gain, %"),
+    )
+    for axes, (cells, (low, high), colours, label) in zip(panels, shown, strict=True):
+        drawn = axes.pcolormesh(cell_edges(x) * MM, cell_edges(y) * MM, cells, vmin=low, vmax=high, cmap=colours)
+        figure.colorbar(drawn, ax=axes).set_label(label)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x, mm")
+        axes.set_ylabel("y, mm")
+    label_y_once(panels)
     return figure

@@ -199,7 +199,7 @@ def gain_figure(calibration: Calibration) -> "Figure":
     skin = calibration.skin
     figure = new_figure(9.6, 4.8, calibration.simulated)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    x, y, gain, error = zip(*(_pad_gain(field, i, pad.outline) for i, pad in enumerate(skin.pads)), strict=True)
+    x, y, gain, error = zip(*(pad_gain(field, i, pad.outline) for i, pad in enumerate(skin.pads)), strict=True)
     reach = symmetric_limit(np.stack(gain) - 1)
     _pad_maps(figure, panels[0], skin, zip(x, y, gain, strict=True), (1 - reach, 1 + reach, "RdBu_r"), "gain")
     shades = (0, symmetric_limit(np.stack(error)), "Purples")
@@ -215,7 +215,7 @@ def gain_figure(calibration: Calibration) -> "Figure":
 CELLS = 48  # along each side of a pad
 
 
-def _pad_gain(field: FittedField, number: int, outline: np.ndarray) -> tuple[np.ndarray, ...]:
+def pad_gain(field: FittedField, number: int, outline: np.ndarray) -> tuple[np.ndarray, ...]:
     """Centres of cells x, y (m) over a pad's box, and there (y, x) its gain and the gain's standard error, %."""
     low, high = outline.min(0), outline.max(0)
     x, y = (low + (high - low) * (np.arange(CELLS)[:, None] + 0.5) / CELLS).T

@@ -6,7 +6,7 @@ import pytest
 from scipy import signal
 
 from calib.fitting.curves import Affine, AffinePlay, fit_curves
-from calib.fitting.logs import LogSeries, SmoothChannels, fit_series, series_of, ways_of
+from calib.fitting.logs import LogSeries, LogTracker, SmoothChannels, fit_series, series_of, ways_of
 from calib.fitting.logs.noise import fit_log_noise, force_rate
 from calib.fitting.logs.series import thinned
 from calib.fitting.losses import Squared
@@ -156,3 +156,32 @@ def test_two_halves_of_a_real_log_agree_within_their_errors(log):
     apart = np.asarray(one.parameters) - np.asarray(two.parameters)
     error = np.hypot(np.asarray(one.standard_errors), np.asarray(two.standard_errors))
     assert np.sqrt(np.mean((apart / error) ** 2)) < 2.5
+
+
+def assert_tracked(model, time, values, place=None):
+    """One reading after the other gives what the log up to this reading gives."""
+    tracker = LogTracker(model)
+    for k in range(len(time)):
+        found = tracker.step(float(time[k]), values[k], None if place is None else place[k])
+        if k % 23 == 0 or k == len(time) - 1:
+            whole = model.predict(time[: k + 1], values[: k + 1], None if place is None else place[: k + 1])
+            for ours, theirs in zip(found, whole, strict=True):
+                np.testing.assert_allclose(ours[0], theirs[-1], rtol=1e-9, atol=1e-9, err_msg=str(k))
+
+
+def test_one_reading_after_the_other_gives_the_forces_of_the_whole_log():
+    """Curves with hysteresis that begin under load, and lags with unknown histories, with readings missing."""
+    rng, n = np.random.default_rng(0), 400
+    time = np.cumsum(rng.uniform(0.5, 1.5, n)) * 1e8
+    load = 1 - np.cos(np.arange(n) / 20 + 0.3 * np.sin(np.arange(n) / 70))
+    curve = AffinePlay(np.array([0.2, 0.4, 0.8]))
+    force = np.asarray(curve(jnp.array([1.0, 2.0, 3.0, 4.0, 0.0]), jnp.asarray(load))) + 0.02 * rng.normal(size=n)
+    series = series_of([(time, load[:, None], force)])
+    missing = np.where(np.isin(np.arange(n), [0, 1, 150, 151]), np.nan, load)[:, None]
+    plain = fit_series(series, series.complete, [curve], ways_of(1, 128), Squared()).model
+    assert_tracked(plain, time[45:], missing[45:])
+    assert_tracked(plain, time, missing)
+    values = np.stack([load, load**2], 1) + 0.01 * rng.normal(size=(n, 2))
+    two = series_of([(time, values, force)])
+    smooth = fit_series(two, two.complete, [curve], {"smooth": SmoothChannels((2,))}, Squared()).model
+    assert_tracked(smooth, time[45:], np.where(np.isnan(missing[45:]), np.nan, values[45:]))

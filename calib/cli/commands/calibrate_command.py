@@ -125,7 +125,7 @@ def _calibrate_many(args: argparse.Namespace) -> int:
     return 2 if any(outcome.reason for outcome in outcomes) else 0
 
 
-_NEED_EIT = ("skin", "location", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
+_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
 
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:

@@ -1,6 +1,7 @@
 """Ways to make one signal of many channels: a ridge regression of the force on all channels, or the best channel."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +68,21 @@ class BlendChannels:
         """The way to fit to a part of the samples that `found` was fitted to."""
         del found
         return self
+
+
+@dataclass(frozen=True)
+class WithPlace:
+    """Make one signal in N of all channels and of the two coordinates of the place, which are the last columns."""
+
+    way: Any
+
+    def __call__(self, time: np.ndarray, signals: np.ndarray, force: np.ndarray, curve: AbstractCurve | None) -> Any:
+        """The combination, as by `way`."""
+        return self.way(time, signals, force, curve)
+
+    def near(self, found: Any) -> "WithPlace":
+        """The way to fit to a part of the samples that `found` was fitted to."""
+        return WithPlace(self.way.near(found))
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,10 @@ class AbstractCombination(abc.ABC):
         """Signals (n,) after each of several histories before the first reading; one if the history does not matter."""
         return self.signal(time, values)[None]
 
+    def tracker(self) -> "SignalTracker":
+        """The same signals for one reading after the other."""
+        return SignalTracker(self)
+
     @property
     @abc.abstractmethod
     def words(self) -> str:
@@ -43,6 +47,18 @@ class AbstractCombination(abc.ABC):
     def arrays(self) -> dict[str, np.ndarray]:
         """All fields by name."""
         return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+
+
+class SignalTracker:
+    """`AbstractCombination.possible_signals` for one reading after the other; this one needs no reading before."""
+
+    def __init__(self, combination: AbstractCombination):
+        self._combination = combination
+
+    def step(self, seconds: float, values: Float[np.ndarray, " channels"]) -> Float[np.ndarray, " histories"]:
+        """Signals of the reading at this time, which rises, after each history; NaN where a channel is NaN."""
+        del seconds
+        return self._combination.signal(np.zeros(1), values[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +169,7 @@ class SmoothSignal(AbstractCombination):
     weights: np.ndarray
 
     def signal(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, " n"]:
-        return self._forces(lag_inputs(time, values, self.axes, self.lags))
+        return self.forces(lag_inputs(time, values, self.axes, self.lags))
 
     def possible_signals(
         self, time: np.ndarray, values: Float[np.ndarray, "n channels"]
@@ -167,19 +183,28 @@ class SmoothSignal(AbstractCombination):
         known = np.flatnonzero(np.isfinite(at).all(1))
         if not lags or not len(known):
             return whole[None]
-        distance = ((self.inputs[:, lags:] - at[known[0], lags:]) ** 2).sum(1)
+        since = np.maximum(np.asarray(time, float) - float(time[known[0]]), 0) / 1e9
+        early = since < DECAY_TIMES * self.lags.max()
+        starts = self.histories(at[known[0]])
+        out = np.repeat(whole[None], len(starts), 0)
+        for signal, start in zip(out, starts, strict=True):
+            past = start * np.exp(-since[early, None] / self.lags)
+            signal[early] = self.forces(at[early] + np.pad(past, ((0, 0), (0, at.shape[1] - lags))))
+        return out
+
+    def histories(self, first: Float[np.ndarray, " inputs"]) -> Float[np.ndarray, "histories lags"]:
+        """Differences from the lags that the calibrated log had, in several stretches, nearest to the first inputs."""
+        lags = len(self.lags)
+        distance = ((self.inputs[:, lags:] - first[lags:]) ** 2).sum(1)
         parts = np.array_split(np.arange(len(distance)), min(STRETCHES, len(distance)))
         nearest = np.array([part[np.argmin(distance[part])] for part in parts])
         rows = nearest[np.argsort(distance[nearest], kind="stable")[:HISTORIES]]
-        since = np.maximum(np.asarray(time, float) - float(time[known[0]]), 0) / 1e9
-        early = since < DECAY_TIMES * self.lags.max()
-        out = np.repeat(whole[None], len(rows), 0)
-        for signal, row in zip(out, rows, strict=True):
-            past = self.inputs[row, :lags] * np.exp(-since[early, None] / self.lags)
-            signal[early] = self._forces(at[early] + np.pad(past, ((0, 0), (0, at.shape[1] - lags))))
-        return out
+        return np.asarray(self.inputs[rows, :lags])
 
-    def _forces(self, at: np.ndarray) -> np.ndarray:
+    def tracker(self) -> "LagTracker":
+        return LagTracker(self)
+
+    def forces(self, at: np.ndarray) -> np.ndarray:
         return np.concatenate([self._force(at[k : k + ROWS]) for k in range(0, len(at), ROWS)] or [np.empty(0)])
 
     def _force(self, at: np.ndarray) -> np.ndarray:
@@ -196,6 +221,30 @@ class SmoothSignal(AbstractCombination):
     @property
     def channels(self) -> int | None:
         return int(self.axes.shape[1])
+
+
+class LagTracker(SignalTracker):
+    """The signals of a `SmoothSignal`, with the states of its lags."""
+
+    def __init__(self, combination: SmoothSignal):
+        self._combination: SmoothSignal = combination
+        self._state: np.ndarray | None = None
+        self._starts = np.zeros((1, len(combination.lags)))
+        self._first = self._before = 0.0
+
+    def step(self, seconds: float, values: Float[np.ndarray, " channels"]) -> Float[np.ndarray, " histories"]:
+        c, along = self._combination, self._combination.axes @ values
+        if not np.isfinite(along).all():
+            return np.full(len(self._starts), np.nan)
+        if self._state is None:
+            self._state, self._first = np.full(len(c.lags), along[0]), seconds
+            self._starts = c.histories(np.r_[along[0] - self._state, along]) if len(c.lags) else self._starts
+        self._state = self._state - (along[0] - self._state) * np.expm1((self._before - seconds) / c.lags)
+        self._before = seconds
+        since = seconds - self._first
+        decay = np.exp(-since / c.lags) if since < DECAY_TIMES * c.lags.max(initial=0.0) else np.zeros(len(c.lags))
+        lags = along[0] - self._state + self._starts * decay
+        return c.forces(np.column_stack([lags, np.repeat(along[None], len(lags), 0)]))
 
 
 def kernel(hyper: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:

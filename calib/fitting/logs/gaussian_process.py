@@ -47,12 +47,15 @@ class SmoothChannels:
     | lags: time constants of the creep; none: no creep     | 3, 30     | s    |
     | start: hyperparameters to start from; None: of order 1|           |      |
     | max_steps: of the minimiser                           | 60        |      |
+    | coordinates: last columns that are no channels, but   | 0         |      |
+    |   coordinates of the place, each an input of its own  |           |      |
     """
 
     directions: tuple[int, ...] = (2, 3, 4, 5, 6)
     lags: tuple[float, ...] = (3.0, 30.0)
     start: np.ndarray | None = None
     max_steps: int = MAX_STEPS
+    coordinates: int = 0
 
     def __call__(
         self, time: np.ndarray, signals: np.ndarray, force: np.ndarray, curve: AbstractCurve | None
@@ -60,8 +63,9 @@ class SmoothChannels:
         """The combination, from the samples (n, channels) at times (n,) ns whose force (n,) N is finite."""
         del curve
         known = np.isfinite(force)
-        possible = [k for k in self.directions if k <= signals.shape[1]] or [signals.shape[1]]
-        axes = _components(signals[known], max(possible))
+        channels = signals.shape[1] - self.coordinates
+        possible = [k + self.coordinates for k in self.directions if k <= channels] or [signals.shape[1]]
+        axes = self._axes(signals[known], max(possible))
         inputs = lag_inputs(time, signals, axes, np.array(self.lags))[known]
         rows = _evenly(len(inputs), MAX_SAMPLES)
         size = float(np.std(force[known]))
@@ -76,7 +80,16 @@ class SmoothChannels:
     def near(self, found: AbstractCombination) -> "SmoothChannels":
         """The way to fit to a part of the samples that `found` was fitted to: the same components, fewer steps."""
         assert isinstance(found, SmoothSignal)
-        return replace(self, directions=(len(found.axes),), start=found.hyper, max_steps=STEPS_NEARBY)
+        directions = (len(found.axes) - self.coordinates,)
+        return replace(self, directions=directions, start=found.hyper, max_steps=STEPS_NEARBY)
+
+    def _axes(self, signals: np.ndarray, directions: int) -> np.ndarray:
+        """Inputs (directions, columns): the first component, which has the lags, coordinates, further components."""
+        if not self.coordinates:
+            return _components(signals, directions)
+        own = _components(signals[:, : -self.coordinates], directions - self.coordinates)
+        wide = np.pad(own, ((0, 0), (0, self.coordinates)))
+        return np.concatenate([wide[:1], np.eye(signals.shape[1])[-self.coordinates :], wide[1:]])
 
     def _tried(self, inputs: np.ndarray, force: np.ndarray, directions: int) -> _Found:
         """The hyperparameters of largest evidence; unused components are zero, so that all share a compiled program."""

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from ..curves.fitted import FittedCurve, predict_pads
 from ..curves.samples import bucket
 from .combination import AbstractCombination
+from .location import LogLocation
 from .noise import LogNoise
 
 # Part of the range of a channel by which a reading may lie outside it; as for the pressure of a curve.
@@ -25,9 +26,9 @@ class LogPrediction(NamedTuple):
     | field          | meaning                                                           | shape | unit |
     |----------------|-------------------------------------------------------------------|-------|------|
     | force          | NaN where a channel is missing                                    | (n,)  | N    |
-    | standard_error | of a new reading: of the curve, and of readings about it          | (n,)  | N    |
+    | standard_error | of a new reading: of model and start state, and of readings       | (n,)  | N    |
     | low, high      | the interval that 90 % of new readings fall into                  | (n,)  | N    |
-    | valid          | all channels within the ranges that the model was fitted to       | (n,)  |      |
+    | valid          | channels and place within the ranges that the model was fitted to | (n,)  |      |
     """
 
     force: Float[np.ndarray, " n"]
@@ -45,36 +46,65 @@ class LogModel:
     |-------------|---------------------------------------------------------------|---------------|----------|
     | combination | channels to one signal                                        |               |          |
     | curve       | signal to force, with the covariance over blocks of time      |               |          |
-    | noise       | of readings about the curve, from blocks that were held out   |               |          |
+    | noise       | of readings about the curve, which no fit had seen            |               |          |
     | reach       | lowest and highest fitted value of each channel               | (2, channels) | sensor's |
+    | location    | how the place of contact is used; None: it is not             |               |          |
 
     The covariance is that of the curve for the combination as it is. What the combination's own numbers are uncertain
-    by is part of the noise, because both were fitted without the blocks that the noise was estimated from.
+    by is part of the noise, because both were fitted without the samples that the noise was estimated from.
     """
 
     combination: AbstractCombination
     curve: FittedCurve
     noise: LogNoise
     reach: Float[np.ndarray, "2 channels"]
+    location: LogLocation | None = None
 
-    def predict(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> LogPrediction:
-        """Forces at times (n,) ns, which must rise.
+    @property
+    def words(self) -> str:
+        """What the signal is made of."""
+        beside = self.location is not None and self.location.gain is None
+        return self.combination.words + (", the last two of which are the place" if beside else "")
+
+    def predict(
+        self,
+        time: np.ndarray,
+        values: Float[np.ndarray, "n channels"],
+        place: Float[np.ndarray, "n 2"] | None = None,
+    ) -> LogPrediction:
+        """Forces at times (n,) ns, which must rise, of contacts at places (n, 2) m, which only some models need.
 
         What the sensor went through before the log is unknown. The force is the mean over the histories that are
         possible, and the standard error holds their spread: the differences from lags that the calibrated log had
         when it was nearest to the first reading and, for a curve with hysteresis that begins under load, a rise from
         the lowest and a fall from the highest fitted signal. Histories come together as time goes on.
         """
-        signals = self._with_starts(self.combination.possible_signals(time, values))
-        curves = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], len(signals), 0), self.curve)
-        force, error, valid = curve_forces(curves, signals)
-        first = len(signals[0]) - len(time)
-        force, error, valid = (part[:, first:] for part in (force, error, valid))
-        spread = force.std(0)
-        inside = np.asarray(valid.all(0)) & within(self.reach, values)
-        return with_noise(self.noise, time, force.mean(0), np.sqrt((error**2).mean(0) + spread**2), inside)
+        where = self.location
+        place = np.full((len(values), 2), np.nan) if place is None else place
+        inputs = values if where is None else where.inputs(values, place)
+        signals = self.with_starts(self.combination.possible_signals(time, inputs))
+        return with_noise(self.noise, time, *self.forces(signals, values, place))
 
-    def _with_starts(self, signals: Float[np.ndarray, "histories n"]) -> Float[np.ndarray, "more m"]:
+    def forces(
+        self,
+        signals: Float[np.ndarray, "histories m"],
+        values: Float[np.ndarray, "n channels"],
+        place: Float[np.ndarray, "n 2"],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Force, its standard error without the noise of readings, and validity of the last n signals."""
+        where = self.location
+        count = len(signals)
+        curves = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (count, *np.shape(leaf))), self.curve)
+        force, error, valid = (part[:, len(signals[0]) - len(values) :] for part in curve_forces(curves, signals))
+        deviation = np.sqrt((error**2).mean(0) + force.var(0))
+        force, inside = force.mean(0), np.asarray(valid.all(0)) & within(self.reach, values)
+        if where is not None:
+            gain, variance = where.gains(place)
+            deviation = gain * np.sqrt(deviation**2 + force**2 * variance)
+            force, inside = gain * force, inside & where.inside(place)
+        return force, deviation, inside
+
+    def with_starts(self, signals: Float[np.ndarray, "histories n"]) -> Float[np.ndarray, "more m"]:
         """The signals after each extreme of a history, where the curve remembers and the log begins under load."""
         known = signals[0][np.isfinite(signals[0])]
         low, high = np.asarray(self.curve.pressure_range, float)

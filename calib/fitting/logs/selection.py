@@ -10,8 +10,10 @@ groups, because samples that follow each other err together.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ..curves import CURVES
@@ -19,23 +21,27 @@ from ..curves.base import AbstractCurve
 from ..curves.elementary import Affine
 from ..curves.fit import fit_curves
 from ..curves.fitted import FittedCurve
+from ..fields import FIELDS, AbstractField, FittedField
 from ..losses import AbstractLoss
 from ..results import FitError, FitResult
 from ..selection import Candidate, Tried, simplest
-from .blend import BestChannel, BlendChannels
+from .blend import BestChannel, BlendChannels, WithPlace
 from .combination import AbstractCombination, one_channel
 from .gaussian_process import SmoothChannels
+from .location import LogLocation, box_of, fit_gains, inside, ratios, relative
 from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, with_noise, within
 from .noise import fit_log_noise
 from .series import LogSeries
 
-Way = BestChannel | BlendChannels | SmoothChannels | None
+Way = BestChannel | BlendChannels | SmoothChannels | WithPlace | None
 """How several channels become one signal; None: there is only one."""
 
 # Parts of time whose errors count as one in the quantile of the interval. Half of them decide; a quantile of 90 % from
 # ten would be their maximum, and many short ones err together.
 NOISE_BLOCKS = 40
 FOLDS = 5  # of blocks of time, which are held out in turn
+ROUNDS = 2  # of fits of the gain over places and of the curve, in turn
+COST_OF_WAY = 10.0  # effective coefficients that a way counts more than the one before it in the list of ways
 
 
 class HeldOut(NamedTuple):
@@ -46,13 +52,11 @@ class HeldOut(NamedTuple):
     | force    |                                                | (n,)  | N    |
     | error    | standard error of the curve                    | (n,)  | N    |
     | valid    | channels within the ranges of the other folds  | (n,)  |      |
-    | block    | number of the block of time                    | (n,)  |      |
     """
 
     force: np.ndarray
     error: np.ndarray
     valid: np.ndarray
-    block: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,7 @@ class FittedLog:
     | model      | the model fitted to all used samples                                 |
     | predicted  | its forces at all samples of the series, used or not                 |
     | held_out   | its forces without the stretch of time of each used sample           |
-    | way, curve | what was chosen                                                      |
+    | way, curve, field | what was chosen                                               |
     | why        | reason for the choice; empty: there was none                         |
     | tried      | the candidates                                                       |
     """
@@ -74,6 +78,7 @@ class FittedLog:
     held_out: HeldOut
     way: Way
     curve: AbstractCurve
+    field: AbstractField | None
     why: str
     tried: tuple[Candidate, ...]
 
@@ -83,6 +88,7 @@ class _Fits(NamedTuple):
 
     combination: AbstractCombination
     curves: FittedCurve
+    gains: FittedField | None
     force: np.ndarray
     error: np.ndarray
     valid: np.ndarray
@@ -92,7 +98,15 @@ class _Fits(NamedTuple):
         """Flags (fits,): the fit with all samples succeeded; others need no covariance, but all parameters."""
         result, rank = np.asarray(self.curves.result), np.asarray(self.curves.rank)
         whole = (result == FitResult.SINGULAR) & (rank == self.curves.parameters.shape[1]) & (np.arange(len(rank)) > 0)
+        if self.gains is not None:
+            whole &= np.asarray(self.gains.result) == FitResult.SUCCESS
+            result = np.where(np.asarray(self.gains.result) == FitResult.SUCCESS, result, self.gains.result)
         return np.asarray((result == FitResult.SUCCESS) | whole)
+
+    @property
+    def effective(self) -> float:
+        """Effective coefficients of the field."""
+        return 0.0 if self.gains is None else float(self.gains.effective[0])
 
 
 class _Problem:
@@ -107,61 +121,126 @@ class _Problem:
         kept = [self.used, *(self.used & (self.fold != k) for k in np.unique(self.fold[self.used]))]
         self.train = np.stack([rows for rows in kept if rows.any()])
         self._signals: dict[str, tuple[AbstractCombination, np.ndarray]] = {}
-        self._fits: dict[tuple[str, str], _Fits] = {}
+        self._fits: dict[tuple[str, str, str], _Fits] = {}
+
+    @property
+    def over(self) -> str:
+        """What is held out, in words."""
+        return "stretches of time" if self.series.site is None else "places"
+
+    @cached_property
+    def box(self) -> np.ndarray:
+        """Box of the used presses, (2, 2) m; the series has places."""
+        assert self.series.place is not None
+        return box_of(self.series.place[self.used & self.series.loaded])
 
     @cached_property
     def inside(self) -> np.ndarray:
-        """Flags (fits, n): channels within the ranges of the samples of each fit."""
-        values = self.series.values
-        return np.stack([within(reach_of(values[rows]), values) for rows in self.train])
+        """Flags (fits, n): channels, and places, within the ranges of the samples of each fit."""
+        values, place = self.series.values, self.series.place
+        found = np.stack([within(reach_of(values[rows]), values) for rows in self.train])
+        if place is None:
+            return found
+        pressed = self.train & self.series.loaded
+        return np.asarray(found & np.stack([inside(box_of(place[rows]), place) for rows in pressed]))
+
+    def inputs(self, way: Way) -> np.ndarray:
+        """The channels, and the place if the way takes it."""
+        s = self.series
+        if not isinstance(way, WithPlace) or s.place is None:
+            return s.values
+        return np.column_stack([s.values, relative(self.box, s.place)])
 
     def signals(self, way: Way) -> tuple[AbstractCombination, np.ndarray]:
         """The combination of all used samples, and the signals (fits, n) of the combinations of each fit."""
-        key = type(way).__name__
+        key = _key(way)
         if key not in self._signals:
             self._signals[key] = self._combined(way)
         return self._signals[key]
 
     def _combined(self, way: Way) -> tuple[AbstractCombination, np.ndarray]:
-        s = self.series
+        s, inputs = self.series, self.inputs(way)
         if way is None:
             return one_channel(0), np.broadcast_to(s.values[:, 0], self.train.shape)
         forces = [np.where(rows, s.force, np.nan) for rows in self.train]
-        first: AbstractCombination = way(s.time, s.values, forces[0], Affine())
+        first: AbstractCombination = way(s.time, inputs, forces[0], Affine())
         near = way.near(first)
-        others = [near(s.time, s.values, force, Affine()) for force in forces[1:]]
-        return first, np.stack([one.signal(s.time, s.values) for one in (first, *others)])
+        others = [near(s.time, inputs, force, Affine()) for force in forces[1:]]
+        return first, np.stack([one.signal(s.time, inputs) for one in (first, *others)])
 
-    def fits(self, way: Way, curve: AbstractCurve) -> _Fits:
+    def fits(self, way: Way, curve: AbstractCurve, field: AbstractField | None = None) -> _Fits:
         """All fits of a candidate."""
-        key = type(way).__name__, CURVES.name_of(curve)
+        key = _key(way), CURVES.name_of(curve), "" if field is None else FIELDS.name_of(field)
         if key not in self._fits:
             combination, signals = self.signals(way)
-            fitted = fit_curves(curve, signals, self.series.force, mask=self.train, groups=self.block, loss=self.loss)
+            fitted, gains, gain, spread = self._fitted(curve, field, signals)
             force, error, _ = curve_forces(fitted, signals)
+            error = gain * np.hypot(np.nan_to_num(error), np.nan_to_num(force) * spread)
             valid = self.inside & _in_range(fitted, signals)
-            self._fits[key] = _Fits(combination, fitted, force, np.nan_to_num(error), valid)
+            self._fits[key] = _Fits(combination, fitted, gains, gain * force, error, valid)
         return self._fits[key]
+
+    def _fitted(
+        self, curve: AbstractCurve, field: AbstractField | None, signals: np.ndarray
+    ) -> tuple[FittedCurve, FittedField | None, np.ndarray, np.ndarray]:
+        """Curves and fields of all fits, and the gain (fits, n) with the standard deviation of its logarithm."""
+        force, gain, spread = self.series.force, np.ones(self.train.shape), np.zeros(self.train.shape)
+        options: dict[str, Any] = {"mask": self.train, "groups": self.block, "loss": self.loss}
+        fitted, gains = fit_curves(curve, signals, force, **options), None
+        for _ in range(0 if field is None else ROUNDS):
+            assert field is not None
+            gains = self._gains(field, curve_forces(fitted, signals)[0])
+            gain, spread = self._at_samples(gains)
+            fitted = fit_curves(curve, signals, force / gain, **options)
+        return fitted, gains, gain, spread
+
+    def _gains(self, field: AbstractField, curves: np.ndarray) -> FittedField:
+        """The fields of the fits, from the force over that of the curves at each place."""
+        s = self.series
+        assert s.place is not None
+        pressed, count = self.used & s.loaded, int(s.sites.max()) + 1
+        at = s.sites[pressed]
+        seen = np.maximum(np.bincount(at, minlength=count), 1)
+        place = np.stack([np.bincount(at, one[pressed], count) / seen for one in s.place.T], 1)
+        return fit_gains(field, self.box, place, ratios(s.force, curves, self.train & pressed, s.sites, count))
+
+    def _at_samples(self, gains: FittedField) -> tuple[np.ndarray, np.ndarray]:
+        assert self.series.place is not None
+        each = [LogLocation(self.box, _row(gains, k)).gains(self.series.place) for k in range(len(self.train))]
+        return np.stack([gain for gain, _ in each]), np.sqrt(np.stack([variance for _, variance in each]))
 
     def held_out(self, fits: _Fits) -> HeldOut:
         """Each used sample as the fit without its fold predicts it; NaN where that fit failed."""
         n, good = len(self.fold), fits.good
-        force, error, valid = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool)
+        found = HeldOut(np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool))
         for row in range(1, len(self.train)):
-            held = self.used & ~self.train[row]
             if good[row]:
-                force[held], error[held] = fits.force[row, held], fits.error[row, held]
-                valid[held] = fits.valid[row, held]
-        return HeldOut(force, error, valid, self.block)
+                _copy(fits, row, self.used & ~self.train[row], found)
+        return found
 
-    def errors(self, way: Way, curve: AbstractCurve) -> np.ndarray:
+    def errors(self, way: Way, curve: AbstractCurve, field: AbstractField | None = None) -> np.ndarray:
         """Mean square held-out errors of the blocks that decide, (blocks,) N^2; NaN if a fit failed."""
-        fits = self.fits(way, curve)
+        fits = self.fits(way, curve, field)
         numbers = np.unique(self.block[self.decides])
         if not fits.good.all():
             return np.full(len(numbers), np.nan)
         square = (self.held_out(fits).force - self.series.force) ** 2
         return np.array([square[self.decides & (self.block == k)].mean() for k in numbers])
+
+
+def _key(way: Way) -> str:
+    return f"{type(way.way).__name__} with place" if isinstance(way, WithPlace) else type(way).__name__
+
+
+def _row(gains: FittedField, row: int) -> FittedField:
+    found: FittedField = jax.tree.map(lambda leaf: leaf[row], gains)
+    return found
+
+
+def _copy(fits: _Fits, row: int, rows: np.ndarray, found: HeldOut) -> None:
+    """Write what one fit predicts for the flagged samples."""
+    for part, given in zip(found, (fits.force, fits.error, fits.valid), strict=True):
+        part[rows] = given[row, rows]
 
 
 def _in_range(curves: FittedCurve, signals: np.ndarray) -> np.ndarray:
@@ -178,8 +257,12 @@ def fit_series(
     ways: Mapping[str, Way],
     loss: AbstractLoss,
     folds: int = FOLDS,
+    fields: Sequence[AbstractField | None] = (None,),
 ) -> FittedLog:
-    """Choose how to combine the channels, then the curve, by held-out stretches of time, and fit the chosen ones.
+    """Choose how to combine channels, the curve and the field by held-out parts of the log, and fit the chosen ones.
+
+    Parts are stretches of time: ways are compared with an affine curve, then curves with the chosen way. If the series
+    has places, these are held out, and all three are chosen together, because a gain over the place goes with a curve.
 
     Raises:
         FitError: if no used sample is complete, or the fit of the only or of every candidate failed.
@@ -187,35 +270,72 @@ def fit_series(
     problem = _Problem(series, use, loss, folds)
     if not problem.used.any():
         raise FitError("no sample of the fitted part has both a force and all channels; record more.")
-    named = [Tried(way, name, order) for order, (name, way) in enumerate(ways.items())]
-    way, why, first = simplest("channels", named, lambda way: problem.errors(way, Affine()), "stretches of time")
-    listed = [Tried(curve, CURVES.name_of(curve), curve.size) for curve in curves]
-    curve, more, second = simplest("curve", listed, lambda curve: problem.errors(way, curve), "stretches of time")
-    fits = problem.fits(way, curve)
-    _require_success(curve, fits.curves.pad(0))
-    return _fitted(problem, fits, way, curve, "; ".join(filter(None, [why, more])), first + second)
+    why: list[str] = []
+    tried: tuple[Candidate, ...] = ()
+    if len(ways) > 1 and series.site is None:
+        (name, *_), said, tried = _choose(problem, ways, [Affine()], fields)
+        why, ways = [said], {name: ways[name]}
+    (name, curve, field), said, table = _choose(problem, ways, curves, fields)
+    fits = problem.fits(ways[name], curve, field)
+    _require_success(curve, fits)
+    return _fitted(problem, fits, (ways[name], curve, field), "; ".join(filter(None, [*why, said])), tried + table)
 
 
-def _require_success(curve: AbstractCurve, fitted: FittedCurve) -> None:
+def _choose(
+    problem: _Problem,
+    ways: Mapping[str, Way],
+    curves: Sequence[AbstractCurve],
+    fields: Sequence[AbstractField | None],
+) -> tuple[tuple[str, AbstractCurve, AbstractField | None], str, tuple[Candidate, ...]]:
+    """The best of all ways with all curves and fields; a way that takes the place itself has no field."""
+    parts = [part for part, of in (("channels", ways), ("curve", curves), ("location", fields)) if len(of) > 1]
+    listed = []
+    for order, (name, way) in enumerate(ways.items()):
+        for curve, field in product(curves, (None,) if isinstance(way, WithPlace) else fields):
+            at = "none" if field is None else FIELDS.name_of(field)
+            names = {"channels": name, "curve": CURVES.name_of(curve), "location": at}
+            size = COST_OF_WAY * order + curve.size
+            size += 0.0 if field is None else problem.fits(way, curve, field).effective
+            listed.append(Tried((name, curve, field), ", ".join(names[part] for part in parts), size))
+    return simplest(" and ".join(parts), listed, lambda one: problem.errors(ways[one[0]], *one[1:]), problem.over)
+
+
+def _require_success(curve: AbstractCurve, fits: _Fits) -> None:
+    fitted = fits.curves.pad(0)
     if int(fitted.result) != FitResult.SUCCESS:
         raise FitError(f"the {CURVES.name_of(curve)} curve could not be fitted: {fitted.message()}")
+    if not fits.good[0]:
+        raise FitError("the gain over the place could not be fitted: press more places, or leave the location out")
 
 
 def _fitted(
-    problem: _Problem, fits: _Fits, way: Way, curve: AbstractCurve, why: str, tried: tuple[Candidate, ...]
-) -> FittedLog:
-    series, held = problem.series, problem.held_out(fits)
+    problem: _Problem, fits: _Fits, chosen: tuple[Way, AbstractCurve, AbstractField | None], why: str,
+    tried: tuple[Candidate, ...],
+) -> FittedLog:  # fmt: skip
+    series, (way, curve, field), held = problem.series, chosen, problem.held_out(fits)
     residual = np.where(held.valid & problem.decides, series.force - held.force, np.nan)
     groups = series.blocks(problem.used, NOISE_BLOCKS)
     noise = fit_log_noise(residual, series.time, held.force, held.error**2, groups)
-    model = LogModel(fits.combination, fits.curves.pad(0), noise, reach_of(series.values[problem.used]))
+    gains = None if fits.gains is None else _row(fits.gains, 0)
+    location = LogLocation(problem.box, gains) if gains is not None or isinstance(way, WithPlace) else None
+    reach = reach_of(series.values[problem.used])
+    model = LogModel(fits.combination, fits.curves.pad(0), noise, reach, location)
     predicted = with_noise(noise, series.time, fits.force[0], fits.error[0], fits.valid[0])
-    return FittedLog(model, predicted, held, way, curve, why, tried)
+    return FittedLog(model, predicted, held, way, curve, field, why, tried)
 
 
-def ways_of(channels: int, most: int) -> dict[str, Any]:
-    """The ways to combine this number of channels, the simplest first; `most` channels can be blended."""
+def ways_of(channels: int, most: int, places: bool = False) -> dict[str, Any]:
+    """The ways to combine this number of channels, the simplest first; `most` channels can be blended.
+
+    Args:
+        places: also those that take the place of the contact as two further inputs. For one channel there are none: a
+            curve and its gain over the place say what a function of signal and place can.
+    """
     if channels == 1:
         return {"channel": None}
     blend = {"blend": BlendChannels()} if channels <= most else {}
-    return {"best channel": BestChannel(), **blend, "Gaussian process": SmoothChannels()}
+    many: dict[str, Any] = {"best channel": BestChannel(), **blend, "Gaussian process": SmoothChannels()}
+    if not places:
+        return many
+    also = {"blend with place": WithPlace(BlendChannels())} if channels + 2 <= most else {}
+    return many | also | {"Gaussian process with place": WithPlace(SmoothChannels(coordinates=2))}

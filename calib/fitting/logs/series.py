@@ -1,9 +1,12 @@
 """Samples of one or several logs as one series, and its parts: halves, blocks of time, folds."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from .location import loaded_rows, sites_of
 
 # Samples of a series that curves are fitted to. Longer series are replaced by means over equal numbers of samples.
 MAX_SAMPLES = 8192
@@ -11,6 +14,8 @@ MAX_SAMPLES = 8192
 BLOCKS = 20
 # Seconds between logs on the clock of a series: longer than any memory of a sensor.
 PAUSE = 3600.0
+# Every third place is held out of the fit whose errors are shown.
+HELD_SITES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +28,40 @@ class LogSeries:
     | values | of the channels, NaN where missing                    | (n, channels) | sensor's |
     | force  | NaN where missing                                     | (n,)          | N        |
     | log    | number of the log                                     | (n,)          |          |
+    | place  | of the contact, by the stage; None: not to be used    | (n, 2)        | m        |
+    | site   | number of the place of contact; see `sites_of`        | (n,)          |          |
+
+    With places, they take the part of the blocks of time: parts that are held out are places.
     """
 
     time: Float[np.ndarray, " n"]
     values: Float[np.ndarray, "n channels"]
     force: Float[np.ndarray, " n"]
     log: Int[np.ndarray, " n"]
+    place: Float[np.ndarray, "n 2"] | None = None
+    site: Int[np.ndarray, " n"] | None = None
+
+    @property
+    def sites(self) -> np.ndarray:
+        """Number (n,) of the place of contact of each sample; the series has its places told apart."""
+        assert self.site is not None
+        return self.site
+
+    def at_places(self) -> "LogSeries":
+        """The series with its places told apart."""
+        assert self.place is not None
+        return replace(self, site=sites_of(self.place, self.force))
+
+    @property
+    def loaded(self) -> np.ndarray:
+        """Flags (n,) of the samples of presses whose place is known; the series has places."""
+        assert self.place is not None
+        return loaded_rows(self.place, self.force)
+
+    @property
+    def fitted_part(self) -> np.ndarray:
+        """Flags (n,) of what is fitted to measure errors: the first half in time, or two of three places."""
+        return self.first_half if self.site is None else np.asarray(self.site % HELD_SITES != 0)
 
     @property
     def complete(self) -> np.ndarray:
@@ -48,8 +81,10 @@ class LogSeries:
     def blocks(self, use: np.ndarray, count: int = BLOCKS) -> np.ndarray:
         """Number (n,) of the block of each sample: about `count` equal parts of the used samples, none over two logs.
 
-        Samples that are not used have the number of the used sample before.
+        Samples that are not used have the number of the used sample before. With places: the number of the place.
         """
+        if self.site is not None:
+            return self.site
         out, first = np.zeros(len(self.time), int), 0
         used = use & self.complete
         total = max(int(used.sum()), 1)
@@ -63,7 +98,9 @@ class LogSeries:
         return out
 
     def late(self, block: np.ndarray) -> np.ndarray:
-        """Flags (n,) of the samples in the later half of the blocks of their log."""
+        """Flags (n,) of the samples in the later half of the blocks of their log; with places all."""
+        if self.site is not None:
+            return np.ones(len(self.time), bool)
         middle = np.array([np.median(np.unique(block[self.log == k])) for k in range(int(self.log.max()) + 1)])
         return np.asarray(block >= middle[self.log])
 
@@ -72,15 +109,33 @@ class LogSeries:
         return replace(self, values=self.values[:, kept])
 
 
-def series_of(logs: list[tuple[np.ndarray, np.ndarray, np.ndarray]], most: int = MAX_SAMPLES) -> LogSeries:
-    """One series of the logs (time ns, values, force), each thinned by the same factor to about `most` samples."""
+def series_of(
+    logs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    most: int = MAX_SAMPLES,
+    places: Sequence[Float[np.ndarray, "n 2"]] | None = None,
+) -> LogSeries:
+    """One series of the logs (time ns, values, force), each thinned by the same factor to about `most` samples.
+
+    Args:
+        places: of the contacts of each log, m.
+    """
     factor = -(-sum(len(time) for time, _, _ in logs) // most)
     parts, end = [], 0.0
     for number, (time, values, force) in enumerate(logs):
-        t, v, f = thinned(np.asarray(time - time[0], float), values, force, factor)
-        parts.append((t + end, v, f, np.full(len(t), number)))
+        at = np.asarray(time - time[0], float)
+        t, v, f = thinned(at, values, force, factor)
+        where = np.full((len(t), 2), np.nan) if places is None else _at_times(at, places[number], t)
+        parts.append((t + end, v, f, np.full(len(t), number), where))
         end = parts[-1][0][-1] + 1e9 * PAUSE
-    return LogSeries(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    at, values, force, log, where = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return LogSeries(at, values, force, log, None if places is None else where)
+
+
+def _at_times(time: np.ndarray, place: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """The place (m, 2) of the sample that is nearest to each time: a mean would lie between two places."""
+    right = np.clip(np.searchsorted(time, at), 1, max(len(time) - 1, 1)) if len(time) > 1 else np.zeros(len(at), int)
+    nearest = np.where(at - time[right - 1] < time[right] - at, right - 1, right)
+    return np.asarray(place[nearest])
 
 
 def thinned(
