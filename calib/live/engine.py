@@ -18,8 +18,9 @@ from jaxtyping import Array
 import jaxeit as je
 
 from ..calibration.calibration import Calibration
-from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of, remembered
+from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of
 from ..calibration.localisation import ContactLocator
+from ..fitting.curves.play_operators import remembered
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
@@ -39,10 +40,14 @@ T = TypeVar("T")
 
 
 class ReceivedFrame(NamedTuple):
-    """A frame: voltages (readings,) V, mean pressure since the frame before (pads,) Pa, and arrival (ns)."""
+    """A frame of the stream that sets the pace, the mean of the other stream since the frame before, and arrival (ns).
 
-    voltage: np.ndarray
-    pressure: np.ndarray
+    Of a skin: voltages (readings,) V and pressures (pads,) Pa. Of a sensor without EIT: its channels and, if the
+    calibration needs it, the place of the stage (3,) m; otherwise nothing (0,).
+    """
+
+    values: np.ndarray
+    beside: np.ndarray
     host: int
 
 
@@ -63,7 +68,7 @@ class RestLevels:
     def add(self, arrival: ReceivedFrame) -> None:
         """Add a frame without contact."""
         self._since = arrival.host if self._since is None else self._since
-        self._rows.append((arrival.voltage, arrival.pressure, arrival.host))
+        self._rows.append((arrival.values, arrival.beside, arrival.host))
         if arrival.host - self._since >= self._seconds * 1e9:
             voltages, pressures, _ = zip(*self._rows, strict=True)
             first, second = np.array_split(np.stack(pressures), 2)
@@ -258,7 +263,7 @@ class Engine:
         self._rest_levels.add(arrival)
         if self._rest_levels.levels is not None:
             change = np.nan_to_num(self._rest_levels.change)
-            found = self._programs.map(np.zeros(arrival.voltage.size), change, self._programs.nowhere, self._before)
+            found = self._programs.map(np.zeros(arrival.values.size), change, self._programs.nowhere, self._before)
             self.restless = bool((found.loaded | found.negative).any())
             if self.restless:
                 self._rest_levels.slide()
@@ -274,14 +279,14 @@ class Engine:
         """Change of pressure on each pad (pads,) Pa; only once the rest levels are measured."""
         assert self._rest_levels.levels is not None
         offset = 0.0 if self._recalibrator is None else self._recalibrator.offset
-        return np.asarray(arrival.pressure - self._rest_levels.levels[1] - offset)
+        return np.asarray(arrival.beside - self._rest_levels.levels[1] - offset)
 
     def step(self, arrival: ReceivedFrame, dropped: int = 0) -> FrameResult | None:
         """Process one frame; None while the rest levels are being measured."""
         if self._rest_levels.levels is None:
             self._add_rest(arrival)
             return None
-        frame, pressure = arrival.voltage - self._rest_levels.levels[0], self.pressed(arrival)
+        frame, pressure = arrival.values - self._rest_levels.levels[0], self.pressed(arrival)
         lost, silent = ~np.isfinite(frame), ~np.isfinite(pressure)
         pressed = np.where(silent, 0.0, pressure)
         found = self._programs.map(frame, pressed, self._current_places(), self._before)

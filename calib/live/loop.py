@@ -11,10 +11,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from ..calibration.calibration import Calibration
+from ..calibration.log_calibration import LogCalibration
 from ..record.intake import NullSink, RecordSink, explain_silence
 from ..record.plan import RecordingPlan, StreamPlan
 from ..record.priority import real_time
@@ -22,8 +24,9 @@ from ..record.recorder import Recorder
 from ..record.sources import Source
 from ..record.wire.messages import Frame
 from .engine import Engine, ReceivedFrame
+from .log_engine import LogEngine
 from .recalibrator import LiveRecalibrator
-from .results import FrameResult
+from .results import FrameResult, Result
 from .scan_control import ScanDirector, prepare_director
 
 MAX_WAIT = 10_000_000  # ns
@@ -38,17 +41,17 @@ class LiveError(ValueError):
 class FrameQueue:
     """Frames on their way from the threads that receive them to the thread that computes; stale ones are dropped."""
 
-    def __init__(self, eit: StreamPlan, pressure: StreamPlan):
-        self._plans = (eit, pressure)
+    def __init__(self, pace: StreamPlan, beside: StreamPlan | None = None):
+        self._plans = (pace,) if beside is None else (pace, beside)
         self._ready = threading.Condition()
         self._frames: deque[tuple[np.ndarray, int]] = deque()
-        self._sum, self._count = np.zeros(pressure.channels), 0
-        self._pressure: np.ndarray | None = None
+        self._sum, self._count = np.zeros(0 if beside is None else beside.channels), 0
+        self._beside: np.ndarray | None = self._sum if beside is None else None
         self._last, self._period = 0, 0.0
         self.dropped = 0
 
     def put(self, number: int, frame: Frame, host: int) -> None:
-        """Add a frame of stream 0 (eit) or 1 (pressure); returns at once."""
+        """Add a frame of stream 0, which sets the pace, or 1; returns at once."""
         values = self._plans[number].in_si(frame.values)
         with self._ready:
             if number:
@@ -61,18 +64,21 @@ class FrameQueue:
             self._ready.notify()
 
     def take(self, timeout: float) -> ReceivedFrame | None:
-        """The next frame, after waiting for at most `timeout` s; None without a frame or before the first pressure."""
+        """The next frame, after waiting for at most `timeout` s.
+
+        None without a frame, or before the first one of the other stream.
+        """
         with self._ready:
             if not self._frames:
                 self._ready.wait(timeout)
             self._drop_stale(time.monotonic_ns())
             if self._count:
-                self._pressure = self._sum / self._count
+                self._beside = self._sum / self._count
                 self._sum, self._count = np.zeros_like(self._sum), 0
-            if not self._frames or self._pressure is None:
+            if not self._frames or self._beside is None:
                 return None
-            voltage, host = self._frames.popleft()
-            return ReceivedFrame(voltage, self._pressure, host)
+            values, host = self._frames.popleft()
+            return ReceivedFrame(values, self._beside, host)
 
     def _drop_stale(self, now: int) -> None:
         """Drop frames that have waited too long; the newest frame stays."""
@@ -105,7 +111,7 @@ class LiveControl:
     warn: Callable[[str], object] = _ignore  # called with what the operator should know
 
 
-Publish = Callable[[FrameResult], object]
+Publish = Callable[[Result], object]
 
 
 @dataclass(frozen=True)
@@ -131,7 +137,7 @@ class LiveSettings:
 
 
 def run_live(
-    calibration: Calibration,
+    calibration: Calibration | LogCalibration,
     plan: RecordingPlan,
     sources: Sequence[Source],
     viewers: Sequence[Publish],
@@ -144,7 +150,8 @@ def run_live(
     """Process frames until a stop is requested; returns the number of processed frames.
 
     Args:
-        plan, sources: of the streams eit and pressure, in this order, from `plan_recording`.
+        plan, sources: of the streams eit and pressure, in this order, from `plan_recording`; of a log's calibration,
+            of its sensor and, if the calibration needs the place, of the stage.
         viewers: functions that are called with each result; they must return at once.
         control: lets other threads stop the loop or measure rest levels again, and shows them its state.
         settings: how frames are processed.
@@ -156,15 +163,21 @@ def run_live(
         PriorityError: if real-time scheduling is refused.
     """
     settings = settings or LiveSettings()
-    _check(calibration, sources)
+    recalibrator, director = None, None
+    engine: Engine | LogEngine
+    if isinstance(calibration, LogCalibration):
+        _check_log(calibration, sources, settings)
+        engine = LogEngine(calibration, settings.rest)
+    else:
+        _check(calibration, sources)
+        if settings.recalibrate:
+            recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn)
+        engine = Engine(calibration, settings.rest, recalibrator=recalibrator)
     queue = FrameQueue(*(source.plan for source in sources))
-    recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn) if settings.recalibrate else None
-    engine = Engine(calibration, settings.rest, recalibrator=recalibrator)
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
-    director = None
     if settings.event_driven:
         control.state = "choosing the readings for each place of the skin"
-        director = prepare_director(calibration, sources[0].plan.number, recorder.receivers[0].send)
+        director = prepare_director(cast(Calibration, calibration), sources[0].plan.number, recorder.receivers[0].send)
     with real_time(settings.realtime), recorder:
         begun()
         count = _process_frames(engine, queue, recorder, viewers, control, settings.wait, director)
@@ -186,8 +199,24 @@ def _check(calibration: Calibration, sources: Sequence[Source]) -> None:
         )
 
 
+def _check_log(calibration: LogCalibration, sources: Sequence[Source], settings: LiveSettings) -> None:
+    channels = sources[0].plan.channels
+    if channels != calibration.columns:
+        raise LiveError(
+            f"live: {channels} channels, but this calibration is for {calibration.columns}; give the calibration of "
+            "this sensor"
+        )
+    if calibration.needs_place and len(sources) < 2:
+        raise LiveError("live: the calibration depends on the place of contact; give --stage, the URL of the stage")
+    if settings.recalibrate or settings.event_driven:
+        raise LiveError(
+            "live: --recalibrate and --event-driven need a skin with EIT; move this calibration by `jaxeit "
+            "recalibrate`, from a log with force"
+        )
+
+
 def _process_frames(
-    engine: Engine,
+    engine: Engine | LogEngine,
     queue: FrameQueue,
     recorder: Recorder,
     viewers: Sequence[Publish],
@@ -214,12 +243,12 @@ def _process_frames(
             for publish in viewers:
                 publish(result)
             if director is not None:
-                director.update(engine.pressed(arrival), result.centre)
+                director.update(cast(Engine, engine).pressed(arrival), cast(FrameResult, result).centre)
             engine.use_spare_time(queue.time_to_next())
     return count
 
 
-def _must_tare(engine: Engine, control: LiveControl) -> bool:
+def _must_tare(engine: Engine | LogEngine, control: LiveControl) -> bool:
     """Whether the rest levels are to be measured again: on request, or because they must be wrong."""
     wrong = engine.has_wrong_zero(time.monotonic_ns())
     if wrong:
@@ -230,7 +259,7 @@ def _must_tare(engine: Engine, control: LiveControl) -> bool:
     return wrong
 
 
-def _tell_state(control: LiveControl, engine: Engine, recorder: Recorder) -> None:
+def _tell_state(control: LiveControl, engine: Engine | LogEngine, recorder: Recorder) -> None:
     """Show viewers the state of engine and streams, and warn the operator of a skin that is not at rest."""
     control.lost = sum(receiver.counters.lost for receiver in recorder.receivers)
     control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)

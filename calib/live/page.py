@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibration import Calibration
+from ..calibration.log_calibration import LogCalibration
 from .loop import LiveControl
-from .results import FrameResult
+from .results import Result
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PAGE_FILE = Path(__file__).with_name("page.html")
@@ -37,8 +38,10 @@ SECURITY_HEADERS = {
 OWN_FETCH_SITES = (None, "same-origin", "none")  # Sec-Fetch-Site of this page, of the user, and of programs
 
 
-def page_scene(calibration: Calibration) -> dict[str, object]:
-    """Fixed contents of the page: pads, electrodes and grid, in m."""
+def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
+    """Fixed contents of the page: pads, electrodes and grid, in m; of a sensor without EIT only its name."""
+    if isinstance(calibration, LogCalibration):
+        return {"skin": calibration.stream, "simulated": calibration.simulated, "pads": [calibration.stream]}
     skin, recon = calibration.skin, calibration.recon
     centres = np.asarray(recon.centres)
     return {
@@ -59,9 +62,11 @@ class Page(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = True
 
-    def __init__(self, calibration: Calibration, control: LiveControl, host: str = "127.0.0.1", port: int = 0):
+    def __init__(
+        self, calibration: Calibration | LogCalibration, control: LiveControl, host: str = "127.0.0.1", port: int = 0
+    ):
         self.control, self.scene = control, json.dumps(page_scene(calibration)).encode()
-        self._result: FrameResult | None = None
+        self._result: Result | None = None
         self._fresh = threading.Condition()
         self._host = host
         self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
@@ -82,13 +87,13 @@ class Page(ThreadingHTTPServer):
         port = self.server_address[1]
         return {f"{name}:{port}" for name in LOOPBACK} if self._host in LOOPBACK else None
 
-    def show_result(self, result: FrameResult) -> None:
+    def show_result(self, result: Result) -> None:
         """Hand over the newest result; returns at once, and viewers take the result when they are ready."""
         with self._fresh:
             self._result = result
             self._fresh.notify_all()
 
-    def newest(self, after: int) -> FrameResult | None:
+    def newest(self, after: int) -> Result | None:
         """The newest result with a number above `after`, or None after `KEEP_ALIVE_INTERVAL` without one."""
         with self._fresh:
             self._fresh.wait_for(lambda: self._number > after or self.control.stop.is_set(), KEEP_ALIVE_INTERVAL)

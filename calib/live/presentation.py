@@ -5,8 +5,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.calibration.calibration import Calibration
-
+from ..calibration.calibration import Calibration
+from ..calibration.log_calibration import LogCalibration
 from ..record.broadcast import Broadcaster
 from ..record.plan import RecordingPlan
 from ..record.recorder import session_journal
@@ -34,7 +34,7 @@ class Presentation:
 
 
 def present(
-    calibration: Calibration,
+    calibration: Calibration | LogCalibration,
     plan: RecordingPlan,
     sources: Sequence[Source],
     control: LiveControl,
@@ -47,7 +47,7 @@ def present(
     """Show results until a stop is requested; returns the number of processed frames.
 
     Args:
-        plan, sources: of the streams eit and pressure, from `plan_recording`.
+        plan, sources: from `plan_recording`, as for `run_live`.
         where: where results are shown.
         settings: how frames are processed.
         also: further functions that are called with each result.

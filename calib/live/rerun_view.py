@@ -14,10 +14,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ..calibration.calibration import Calibration
+from ..calibration.log_calibration import LogCalibration
 from .loop import LiveControl
-from .results import FrameResult, TouchEstimates
+from .results import FrameResult, Result, TouchEstimates
 
 VIEWER = "127.0.0.1:9876"
+SERIES: tuple[str, ...] = ("force", "standard_error")  # of each pad
 MIN_PICTURE_INTERVAL = 0.1  # s between two pictures, which take milliseconds to pack
 MAX_WAITING_RESULTS = 4096  # while the thread gets no processor time
 VIEWER_TIMEOUT = 2.0  # s for a viewer to answer, and to receive the last results
@@ -39,26 +41,29 @@ class RerunView:
         RerunError: on entering, if no viewer answers, or the file exists.
     """
 
-    def __init__(self, calibration: Calibration, control: LiveControl, where: str = VIEWER):
-        recon = calibration.recon
-        self._control, self._skin, self._simulated = control, calibration.skin.name, calibration.simulated
-        self._pads = [pad.name for pad in calibration.skin.pads]
-        self._grid = Grid(np.asarray(recon.centres), recon.shape)
+    def __init__(self, calibration: Calibration | LogCalibration, control: LiveControl, where: str = VIEWER):
+        self._control, self._simulated = control, calibration.simulated
+        if isinstance(calibration, LogCalibration):
+            self._skin, self._pads, self._shown = calibration.stream, [calibration.stream], (*SERIES, "low", "high")
+            self._grid: Grid | None = None
+        else:
+            self._skin, self._pads = calibration.skin.name, [pad.name for pad in calibration.skin.pads]
+            self._shown, self._grid = SERIES, Grid(np.asarray(calibration.recon.centres), calibration.recon.shape)
         self._where = where
         self._stream = rr.RecordingStream("jaxeit")
-        self._waiting: deque[FrameResult] = deque(maxlen=MAX_WAITING_RESULTS)
+        self._waiting: deque[Result] = deque(maxlen=MAX_WAITING_RESULTS)
         self._stop = threading.Event()
         self._first: int | None = None
         self._top = {"map": MIN_COLOUR_RANGE, "image": MIN_COLOUR_RANGE}
         self._thread = threading.Thread(target=self._work, name="rerun", daemon=True)
 
-    def show_result(self, result: FrameResult) -> None:
+    def show_result(self, result: Result) -> None:
         """Hand over a result; returns at once."""
         self._waiting.append(result)
 
     def __enter__(self) -> "RerunView":
         _connect(self._stream, self._where)
-        self._stream.send_blueprint(_blueprint())
+        self._stream.send_blueprint(_blueprint(maps=self._grid is not None))
         self._thread.start()
         return self
 
@@ -83,9 +88,11 @@ class RerunView:
         self._first = results[0].host if self._first is None else self._first
         self._series(results)
         self._stream.set_time("arrival", duration=(results[-1].host - self._first) / 1e9)
-        self._picture(results[-1])
+        self._about()
+        if isinstance(results[-1], FrameResult) and self._grid is not None:
+            self._picture(results[-1], self._grid)
 
-    def _series(self, results: list[FrameResult]) -> None:
+    def _series(self, results: list[Result]) -> None:
         """Send the forces, latencies and counts of all results."""
         assert self._first is not None
         time = rr.TimeColumn("arrival", duration=np.array([r.host - self._first for r in results]) / 1e9)
@@ -94,28 +101,30 @@ class RerunView:
             rr.send_columns(path, [time], rr.Scalars.columns(scalars=values), recording=self._stream)
 
         for number, pad in enumerate(self._pads):
-            for name in ("force", "standard_error"):
+            for name in self._shown:
                 send(f"{name}/{_path(pad)}", np.array([getattr(r, name)[number] for r in results]))
         send("latency_ms", np.array([1e3 * r.latency for r in results]))
         send("dropped", np.array([float(r.dropped) for r in results]))
 
-    def _picture(self, result: FrameResult) -> None:
+    def _about(self) -> None:
         simulated = ", SIMULATED" if self._simulated or self._control.simulated else ""
         self._stream.log("about", rr.TextDocument(f"{self._skin}{simulated}: {self._control.state}"))
+
+    def _picture(self, result: FrameResult, grid: "Grid") -> None:
         for name, values in (("map", result.map), ("image", np.abs(result.image))):
             self._top[name] = max(0.98 * self._top[name], float(values.max()), MIN_COLOUR_RANGE)
             picture = rr.DepthImage(
-                self._grid.picture(values),
+                grid.picture(values),
                 colormap=rr.components.Colormap.Viridis,
                 depth_range=[0.0, self._top[name]],
             )
             self._stream.log(name, picture)
-        self._stream.log("map/contacts", self._contacts(result.touches))
-        self._stream.log("map/centres", self._centres(result))
+        self._stream.log("map/contacts", self._contacts(result.touches, grid))
+        self._stream.log("map/centres", self._centres(result, grid))
 
-    def _contacts(self, touches: TouchEstimates) -> rr.LineStrips2D:
+    def _contacts(self, touches: TouchEstimates, grid: "Grid") -> rr.LineStrips2D:
         """Contacts as ellipses of two standard errors, with coordinates as labels."""
-        strips = [self._grid.pixels(ellipse(*at)) for at in zip(touches.position, touches.covariance, strict=True)]
+        strips = [grid.pixels(ellipse(*at)) for at in zip(touches.position, touches.covariance, strict=True)]
         labels = [
             f"{1e3 * x:.1f}, {1e3 * y:.1f} mm ± {1e3 * dx:.1f}, {1e3 * dy:.1f}" + ("" if sure else ", a guess")
             for (x, y), (dx, dy), sure in zip(
@@ -124,11 +133,11 @@ class RerunView:
         ]
         return rr.LineStrips2D(strips, labels=labels, show_labels=False, colors=MARK_COLOUR)
 
-    def _centres(self, result: FrameResult) -> rr.Points2D:
+    def _centres(self, result: FrameResult, grid: "Grid") -> rr.Points2D:
         """Centre and size of the force on each pressed pad."""
         pressed = np.isfinite(result.centre).all(1)
         labels = [f"{self._pads[n]} {result.force[n]:.1f} N" for n in np.flatnonzero(pressed)]
-        return rr.Points2D(self._grid.pixels(result.centre[pressed]), labels=labels, colors=MARK_COLOUR, radii=0.3)
+        return rr.Points2D(grid.pixels(result.centre[pressed]), labels=labels, colors=MARK_COLOUR, radii=0.3)
 
 
 class Grid:
@@ -177,9 +186,9 @@ def _path(name: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
 
 
-def _blueprint() -> rrb.Blueprint:
-    """Layout of the viewer: map and image side by side, forces below."""
-    maps = rrb.Horizontal(
+def _blueprint(*, maps: bool) -> rrb.Blueprint:
+    """Layout of the viewer: map and image side by side, forces below; without maps forces alone."""
+    pictures = rrb.Horizontal(
         rrb.Spatial2DView(origin="map", name="force map, N per pixel"),
         rrb.Spatial2DView(origin="image", name="change of conductivity, S"),
     )
@@ -189,4 +198,5 @@ def _blueprint() -> rrb.Blueprint:
         rrb.TextDocumentView(origin="about"),
         column_shares=[3, 2, 1],
     )
-    return rrb.Blueprint(rrb.Vertical(maps, series, row_shares=[2, 1]), collapse_panels=True)
+    whole = rrb.Vertical(pictures, series, row_shares=[2, 1]) if maps else series
+    return rrb.Blueprint(whole, collapse_panels=True)

@@ -1,4 +1,4 @@
-"""Result of one frame: forces, force map, image and fitted contacts."""
+"""Results of one frame: forces, force map, image and fitted contacts of a skin; the force of a sensor without EIT."""
 
 import base64
 import json
@@ -94,6 +94,52 @@ class FrameResult:
         if image:
             out |= {name: base64.b64encode(getattr(self, name).astype("<f4")).decode() for name in ("map", "image")}
         return json.dumps(out, allow_nan=False)
+
+
+@dataclass(frozen=True, eq=False)
+class LogResult:
+    """Result of one reading of a sensor whose calibration is that of a log.
+
+    | field          | meaning                                                           | shape | unit |
+    |----------------|-------------------------------------------------------------------|-------|------|
+    | number         | of the reading among the processed ones                           | ()    |      |
+    | host           | time of arrival on the monotonic clock                            | ()    | ns   |
+    | latency        | from arrival to this result                                       | ()    | s    |
+    | force          | NaN where a channel is missing                                    | (1,)  | N    |
+    | standard_error | of the force                                                      | (1,)  | N    |
+    | low, high      | ends of the interval that 90 % of new readings of a force fall in | (1,)  | N    |
+    | valid          | whether channels and place are within the calibrated ranges       | (1,)  |      |
+    | missing        | number of channels that were not finite                           | ()    |      |
+    | dropped        | number of readings that were not processed so far                 | ()    |      |
+    """
+
+    number: int
+    host: int
+    latency: float
+    force: np.ndarray
+    standard_error: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    valid: np.ndarray
+    missing: int
+    dropped: int
+
+    def to_json(self, *, image: bool = False) -> str:
+        """The result as one line of JSON; there is no ``image``."""
+        del image
+        out: dict[str, object] = {
+            "number": self.number,
+            "host_ns": self.host,
+            "latency_ms": round(1e3 * self.latency, 3),
+            "valid": self.valid.tolist(),
+            "missing": self.missing,
+            "dropped": self.dropped,
+        }
+        out |= {name: _json_numbers(getattr(self, name)) for name in ("force", "standard_error", "low", "high")}
+        return json.dumps(out, allow_nan=False)
+
+
+Result = FrameResult | LogResult
 
 
 def _json_numbers(values: np.ndarray) -> list[float | None]:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
@@ -12,23 +13,27 @@ from .sources import Source, source_from_url
 if TYPE_CHECKING:
     import jaxeit as je
 
+NO_CHANNELS: Mapping[str, int] = MappingProxyType({})
 CHANNELS = {"force": 1, "stage": 3, "temperature": 1, "barometer": 1}  # of streams that do not depend on the skin
 
 
 def plan_recording(
-    urls: Mapping[str, str], skin: "je.Skin | None", title: str = ""
+    urls: Mapping[str, str], skin: "je.Skin | None", title: str = "", *, channels: Mapping[str, int] = NO_CHANNELS
 ) -> tuple[RecordingPlan, list[Source]]:
     """Plan what to record, and from which sources.
 
     Args:
         urls: by stream name (a key of `STREAM_KINDS`); see `sources` for their form.
         skin: gives the protocol of the EIT stream and the number of pads; None if neither is recorded.
+        channels: numbers of values of streams, by name, where they are known otherwise.
 
     Raises:
         PlanError: without any stream, or if a stream needs the skin.
         SourceError: for URLs that name no source.
     """
-    sources = [source_from_url(name, url, _channels(name, url, skin)) for name, url in urls.items()]
+    sources = [
+        source_from_url(name, url, channels.get(name) or _channels(name, url, skin)) for name, url in urls.items()
+    ]
     eit = skin.protocol if skin is not None and "eit" in urls else None
     plan = RecordingPlan(
         streams=tuple(s.plan for s in sources),

@@ -230,7 +230,7 @@ def test_frames_that_come_together_are_all_taken():
     now = time.monotonic_ns()
     for number in range(3):
         inbox.put(0, Frame(1, 0, 0, 32, np.array([float(number)])), now)
-    assert [inbox.take(0.0).voltage[0] for _ in range(3)] == [0.0, 1.0, 2.0]
+    assert [inbox.take(0.0).values[0] for _ in range(3)] == [0.0, 1.0, 2.0]
     for number in range(50):
         inbox.put(0, Frame(1, 0, 0, 32, np.array([float(number)])), time.monotonic_ns())
     assert inbox.dropped >= 50 - 16
@@ -246,11 +246,11 @@ def test_the_newest_frame_is_taken_and_the_others_are_counted():
     for number in range(3):
         inbox.put(0, Frame(1, 0, 0, 32, np.array([number, 4], "<i2")), number)
     found = inbox.take(0.0)
-    assert (found.voltage.tolist(), found.pressure.tolist(), found.host) == ([1.0, 2.0], [3.0], 2)
+    assert (found.values.tolist(), found.beside.tolist(), found.host) == ([1.0, 2.0], [3.0], 2)
     assert inbox.dropped == 3
     assert inbox.take(0.0) is None
     inbox.put(0, Frame(1, 0, 0, 32, np.array([1, 4], "<i2")), 9)
-    assert inbox.take(0.0).pressure.tolist() == [3.0]  # held
+    assert inbox.take(0.0).beside.tolist() == [3.0]  # held
 
 
 # --- contacts, and readings that are missing -----

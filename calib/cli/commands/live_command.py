@@ -4,16 +4,26 @@ import argparse
 import os
 import sys
 from contextlib import ExitStack
+from typing import TYPE_CHECKING
 
 from ..arguments import above_zero, prepare_outputs
 from ..signals import orderly_end
+
+if TYPE_CHECKING:
+    from ...calibration import Calibration, LogCalibration
+    from ...record.plan import RecordingPlan
+    from ...record.sources import Source
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A calibration, the URLs of its streams, and the outputs of the results."""
     parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
-    parser.add_argument("--eit", required=True, metavar="URL", help="URL of the EIT stream, as for jaxeit record")
-    parser.add_argument("--pressure", required=True, metavar="URL", help="URL of the pressure stream")
+    text = "URL of the EIT stream, as for jaxeit record; not for the calibration of a log"
+    parser.add_argument("--eit", metavar="URL", help=text)
+    text = "URL of the pressure stream; for the calibration of a log, of the stream of its sensor"
+    parser.add_argument("--pressure", required=True, metavar="URL", help=text)
+    text = "URL of the stage, for the calibration of a log that corrects by location"
+    parser.add_argument("--stage", metavar="URL", help=text)
     parser.add_argument(
         "--rest", type=above_zero, default=2.0, metavar="S", help="time without contact at the start; default: 2"
     )
@@ -44,15 +54,14 @@ def run(args: argparse.Namespace) -> int:
     _set_up_process(args)
     from threading import Timer
 
-    from ...calibration.calibration import load_calibration
+    from ...calibration import load_calibration
     from ...live.loop import LiveControl, LiveSettings, Publish
     from ...live.presentation import Presentation, present
-    from ...record.planning import plan_recording
     from ...record.recorder import StopRequest
 
     prepare_outputs(args.output, args.recalibrate)
     calibration = load_calibration(args.calibration)
-    plan, sources = plan_recording({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
+    plan, sources = _planned(args, calibration)
     orders = StopRequest()
     show = LiveControl(stop=orders.stop, warn=_tell)
     also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
@@ -85,6 +94,24 @@ def run(args: argparse.Namespace) -> int:
         timer.cancel()
     _tell(f"{count} frames")
     return orders.status
+
+
+def _planned(
+    args: argparse.Namespace, calibration: "Calibration | LogCalibration"
+) -> tuple["RecordingPlan", "list[Source]"]:
+    """The streams that the calibration needs, with their sources."""
+    from ...calibration import Calibration
+    from ...record.planning import plan_recording
+
+    if isinstance(calibration, Calibration):
+        if args.eit is None or args.stage is not None:
+            raise ValueError(f"{args.calibration}: the calibration of a skin; give --eit and --pressure, no --stage")
+        return plan_recording({"eit": args.eit, "pressure": args.pressure}, calibration.skin)
+    if args.eit is not None or (args.stage is None) == calibration.needs_place:
+        need = "--pressure and --stage" if calibration.needs_place else "--pressure"
+        raise ValueError(f"{args.calibration}: the calibration of a log; give {need} and no other stream")
+    urls = {"pressure": args.pressure} | ({"stage": args.stage} if calibration.needs_place else {})
+    return plan_recording(urls, None, channels={"pressure": calibration.columns})
 
 
 def _set_up_process(args: argparse.Namespace) -> None:
