@@ -22,7 +22,8 @@ MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the co
 MAX_EMPTY_FRACTION = 0.25  # of the readings without a value, up to which the others make an image
 MAX_SATURATED_FRACTION = 0.05  # of the readings: those beside the drive may clip without much harm to an image
 MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
-AMPLITUDE_RATIO_RANGE = 0.03, 30.0  # of measured over modelled voltage: outside it, a unit is wrong
+AMPLITUDE_RATIO_RANGE = 0.2, 5.0  # of measured over modelled voltage: outside it, a unit or the sheet is wrong
+AMPLITUDE_RATIO_OF_OTHER_ORDERS = 0.03, 30.0  # the same for readings that do not look like the model
 MIN_CORRELATION = 0.9  # with the model: readings below it do not look like this skin
 MIN_SOUND_READINGS = 10  # for a comparison with the model
 
@@ -245,7 +246,8 @@ def _order_findings(order: OrderCheck) -> Iterator[Finding]:
         )
         remedy = "compare positions and numbering of the electrodes in the skin's file with the hardware"
         yield Finding(Severity.WARNING, where, what, remedy)
-    low, high = AMPLITUDE_RATIO_RANGE
+    low, high = AMPLITUDE_RATIO_RANGE if order.as_is >= MIN_CORRELATION else AMPLITUDE_RATIO_OF_OTHER_ORDERS
     if order.as_is > 0 and not low < order.scale < high:
-        what = f"the amplitude is {order.scale:.3g} times the model's: unit (V, mV), gain or current is wrong"
+        parts = "unit (V, mV), gain, current or sheet_resistance is wrong"
+        what = f"the amplitude is {order.scale:.3g} times the model's: {parts}"
         yield Finding(Severity.WARNING, where, what, "correct the unit at import, current or sheet_resistance")

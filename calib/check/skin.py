@@ -9,6 +9,9 @@ import jaxeit as je
 from ..session import Session
 from .report import Finding, Severity, listed
 
+RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrodes are looked at
+MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
+
 
 def check_skin(session: Session, given: je.Skin | None, findings: list[Finding]) -> je.Skin | None:
     """The skin to check against, or None. What is wrong with it, or with the protocol, is added to ``findings``."""
@@ -19,6 +22,7 @@ def check_skin(session: Session, given: je.Skin | None, findings: list[Finding])
         findings += _differences(own.toml, je.load_skin(own.name).toml, f"the shipped {own.name!r}")
     skin = own if given is None else given
     if skin is not None:
+        findings += _size_findings(skin)
         findings += _protocol_findings(session, skin)
     return skin
 
@@ -54,6 +58,19 @@ def _flat(value: object, key: str = "") -> dict[str, object]:
     else:
         return {key: value}
     return {k: v for name, part in items for k, v in _flat(part, name).items()}
+
+
+def _size_findings(skin: je.Skin) -> Iterator[Finding]:
+    """A sheet that reaches far beyond its electrodes has its size in another unit than their positions, or a typo."""
+    electrodes = np.asarray(skin.electrode_positions)[:, :2]
+    rim = skin.domain.boundary_point(np.linspace(0, skin.domain.perimeter, RIM_POINTS, endpoint=False))
+    between = np.linalg.norm(electrodes[:, None] - electrodes, axis=-1)
+    np.fill_diagonal(between, np.inf)
+    pitch = float(np.median(between.min(1)))
+    beyond = float(np.linalg.norm(rim[:, None] - electrodes, axis=-1).min(1).max())
+    if np.isfinite(pitch) and beyond > MAX_RIM_PITCHES * pitch:
+        what = f"the sheet reaches {beyond:.3g} m beyond its electrodes, which are {pitch:.3g} m apart"
+        yield Finding(Severity.WARNING, "/device", what, "correct the size of the sheet or the positions of electrodes")
 
 
 def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:

@@ -388,6 +388,20 @@ def test_low_signal_is_a_warning(parts, look):
 # --- skin and protocol ---------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("size", ["[0.2, 2.0]", "[200.0, 0.2]"])
+def test_a_sheet_that_reaches_far_beyond_its_electrodes_is_named(size, parts, look):
+    """The readings alone follow such a sheet nearly as well."""
+    parts.toml = parts.toml.replace("size = [0.2, 0.2]", f"size = {size}")
+    has(look(parts), Severity.WARNING, "m beyond its electrodes, which are 0.04 m apart")
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_sheet_resistance_that_is_ten_times_wrong_is_suspected(factor, parts, look):
+    variable, units, rate, time, eit = parts.streams["eit"]
+    parts.streams["eit"] = (variable, units, rate, time, factor * eit)
+    has(look(parts), Severity.WARNING, "times the model's", "sheet_resistance is wrong")
+
+
 def test_a_skin_that_does_not_parse_is_an_error(parts, look):
     parts.toml = parts.toml.replace('shape = "rectangle"', 'shape = "rhombus"')
     only(look(parts), Severity.ERROR, "/device", "rhombus")
