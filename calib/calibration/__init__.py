@@ -6,6 +6,7 @@ from .files import load_calibration
 from .force_maps import ForceEstimate, apply, force_map
 from .localisation import LOCATORS, AbstractLocator, AbstractLocatorChoice, FittedContact, ImageCentroid, locate
 from .log_calibration import LogCalibration
+from .log_recalibrating import assess_log, recalibrate_log
 from .logs import apply_log, calibrate_logs, evaluate_log
 from .procedure import calibrate, evaluate
 from .recalibrating import AbstractEvidence, KnownForces, OrdinaryUse, assess, recalibrate
@@ -31,6 +32,7 @@ __all__ = [
     "apply",
     "apply_log",
     "assess",
+    "assess_log",
     "calibrate",
     "calibrate_logs",
     "evaluate",
@@ -39,4 +41,5 @@ __all__ = [
     "load_calibration",
     "locate",
     "recalibrate",
+    "recalibrate_log",
 ]

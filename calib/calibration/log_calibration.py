@@ -12,6 +12,7 @@ from ..fitting.logs import LogModel, LogPrediction, LogTracker
 from ..fitting.selection import Candidate
 from ..session import SessionError, read_archive, write_archive
 from .log_evaluation import LogEvaluation
+from .log_recalibration import LogShift
 from .log_storage import fields_of_log, location_name, log_archive
 
 FORMAT = "log-calibration"
@@ -31,6 +32,7 @@ class LogCalibration:
     | provenance: sessions, their hashes, versions, recipe, date                                   |
     | simulated: whether any of the sessions was simulated                                         |
     | notes: remarks for the reader of the results                                                 |
+    | shift: how the sensor has moved since, by the last recalibration; None: it was not recalibrated |
     | why, tried: reason for the choice of channels and curve, and the candidates                  |
     """
 
@@ -43,6 +45,7 @@ class LogCalibration:
     provenance: dict[str, str]
     simulated: bool
     notes: tuple[str, ...] = ()
+    shift: LogShift | None = None
     why: str = ""
     tried: tuple[Candidate, ...] = ()
 
@@ -73,7 +76,10 @@ class LogCalibration:
                 f"/streams/{self.stream}: {values.shape[-1]} channels, but the calibration is of {self.columns}; "
                 "give the calibration of this sensor"
             )
-        return self.model.predict(time, values[:, self.kept], place)
+        return self._moved(self.model.predict(time, values[:, self.kept], place))
+
+    def _moved(self, found: LogPrediction) -> LogPrediction:
+        return found if self.shift is None else self.shift.applied(found, float(self.model.noise.multiple))
 
     def tracker(self) -> "CalibrationTracker":
         """`predict` for one reading after the other, as a running sensor sends them."""
@@ -83,6 +89,12 @@ class LogCalibration:
     def needs_place(self) -> bool:
         """Whether the force depends on the place of contact."""
         return self.model.location is not None
+
+    @property
+    def recorded(self) -> str:
+        """ISO time of the newest log that the calibration rests on; empty if it is not known."""
+        names = ("recalibrated_utc", "recorded_utc", "created_utc")
+        return next((self.provenance[name] for name in names if name in self.provenance), "")
 
     @property
     def groups(self) -> str:
@@ -115,13 +127,13 @@ class CalibrationTracker:
     """`LogCalibration.predict` for one reading after the other."""
 
     def __init__(self, calibration: LogCalibration):
-        self._kept, self._tracker = calibration.kept, LogTracker(calibration.model)
+        self._calibration, self._tracker = calibration, LogTracker(calibration.model)
 
     def step(
         self, time: float, values: Float[np.ndarray, " columns"], place: Float[np.ndarray, " 2"] | None = None
     ) -> LogPrediction:
         """Force, standard error, interval and validity of one reading, at a time (ns) that rises."""
-        return self._tracker.step(time, values[self._kept], place)
+        return self._calibration._moved(self._tracker.step(time, values[self._calibration.kept], place))
 
 
 def load_log_calibration(path: str | Path) -> LogCalibration:

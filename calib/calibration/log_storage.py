@@ -16,6 +16,7 @@ from ..fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogMo
 from ..fitting.selection import Candidate
 from ..session import Archive
 from .log_evaluation import LogEvaluation
+from .log_recalibration import LogShift
 from .storage import SEAL, field_arrays, field_from, seal
 
 Described = dict[str, tuple[Any, str, str]]
@@ -61,6 +62,9 @@ def log_archive(given: Mapping[str, Any]) -> tuple[dict[str, Any], Described]:
     }
     arrays = {"channels/kept": (given["kept"], "", "numbers of the channels that are used"), **_model_arrays(model)}
     arrays |= {f"evaluation/{name}": about for name, about in evaluation.arrays().items()}
+    shift: LogShift | None = given["shift"]
+    if shift is not None:
+        attrs, arrays = attrs | shift.attributes(), arrays | shift.arrays()
     plain = {k: (np.asarray(v), unit, text) for k, (v, unit, text) in arrays.items()}
     return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in plain.items()})}, plain
 
@@ -109,6 +113,7 @@ def fields_of_log(archive: Archive) -> dict[str, Any]:
         "provenance": {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")},
         "simulated": bool(attrs["simulated"]),
         "notes": tuple(filter(None, str(attrs["notes"]).split("\n"))),
+        "shift": LogShift.restore(attrs, arrays),
         "why": str(attrs["why"]),
         "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs["tried"]))),
     }

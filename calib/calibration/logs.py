@@ -93,7 +93,7 @@ def curves_of(recipe: Recipe) -> tuple[AbstractCurve, ...]:
 
 def _series(sessions: Sequence[Session], recipe: Recipe) -> LogSeries:
     """The samples of the sessions, with the places of the stage if the recipe asks for them."""
-    logs = [_log(session) for session in sessions]
+    logs = [log_of(session) for session in sessions]
     if not recipe.locates:
         return series_of(logs)
     return series_of(logs, places=[place_of(session, session.stream("force").time) for session in sessions])
@@ -187,7 +187,7 @@ def _unit(signal: Stream) -> str:
     return "count" if signal.variable == "counts" else signal.unit
 
 
-def _log(session: Session) -> Log:
+def log_of(session: Session) -> Log:
     """Times, values and force of a session, at the times of the force."""
     force, signal = session.stream("force"), _signal(session)
     return force.time, resample(signal.time, signal.read(), force.time), force.read()[:, 0]
@@ -227,6 +227,7 @@ def _provenance(
 ) -> dict[str, str]:
     return {
         **({"ignored_errors": "\n".join(ignored)} if ignored else {}),
+        "recorded_utc": max((s.epoch for s in sessions), default=""),
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": f"jaxeit {je.__version__}, jax {jax.__version__}, Python {platform.python_version()}",
         "sessions": "\n".join(f"{s.hash}  {s.name}" for s in sessions),
@@ -238,7 +239,7 @@ def _provenance(
     }
 
 
-def _stream_of(calibration: LogCalibration, session: Session) -> Stream:
+def stream_of(calibration: LogCalibration, session: Session) -> Stream:
     signal = session.stream(calibration.stream)
     if signal.channels != calibration.columns or _unit(signal) != calibration.unit:
         raise SessionError(
@@ -255,7 +256,7 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
         SessionError: if a stream is missing, or the sensor is another.
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
     """
-    signal = _stream_of(calibration, session)
+    signal = stream_of(calibration, session)
     ignored = accept([session], None, ignore_errors=ignore_errors)
     found = _predicted(calibration, session, signal)
     force = session.stream("force")
@@ -280,7 +281,7 @@ def apply_log(
         SessionError: if the stream of the signal is missing, or the sensor is another.
         RecordingError: if `check_session` finds an error in that stream, unless errors are ignored.
     """
-    signal = _stream_of(calibration, session)
+    signal = stream_of(calibration, session)
     ignored = accept([session], None, ignore_errors=ignore_errors, where=(f"/streams/{signal.name}",))
     found = _predicted(calibration, session, signal)
     attrs: dict[str, str | int] = {

@@ -34,6 +34,24 @@ class Advice(enum.StrEnum):
     RECALIBRATE = "recalibrate"
     CALIBRATE = "calibrate again: a gain of each pad does not explain what it reads"
     UNKNOWN = "not determined; press every pad three times or more with a load cell"
+    CALIBRATE_LOG = "calibrate again: a gain and an offset do not explain what the sensor reads"
+    UNKNOWN_LOG = "not determined; press with several forces over a longer time"
+
+
+def days_between(since: str, until: str) -> float:
+    """Days between two ISO times; NaN if one is not known."""
+    try:
+        span = datetime.fromisoformat(until) - datetime.fromisoformat(since)
+    except (ValueError, TypeError):  # no time, or only one of both has a time zone
+        return math.nan
+    return span.total_seconds() / 86_400
+
+
+def health_line(since: str, until: str, days: float, moves: str, advice: Advice) -> str:
+    """How far off a calibration was, since when, and what to do."""
+    when = f"{_day(until)} against {_day(since)}"
+    when += f" ({days:.1f} days)" if math.isfinite(days) and days > 0 else ""
+    return f"calibration health, {when}: {moves}: {advice}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +121,7 @@ class Recalibration:
     @property
     def days(self) -> float:
         """Days between the recordings; NaN if a time is not known."""
-        try:
-            span = datetime.fromisoformat(self.until) - datetime.fromisoformat(self.since)
-        except (ValueError, TypeError):  # no time, or only one of both has a time zone
-            return math.nan
-        return span.total_seconds() / 86_400
+        return days_between(self.since, self.until)
 
     @property
     def advice(self) -> Advice:
@@ -123,9 +137,7 @@ class Recalibration:
     @property
     def health(self) -> str:
         """How far off the calibration was, since when, and what to do, in one line."""
-        when = f"{_day(self.until)} against {_day(self.since)}"
-        when += f" ({self.days:.1f} days)" if math.isfinite(self.days) and self.days > 0 else ""
-        return f"calibration health, {when}: {self._moves()}: {self.advice}"
+        return health_line(self.since, self.until, self.days, self._moves(), self.advice)
 
     def _moves(self) -> str:
         known = np.flatnonzero(self.determined)

@@ -51,7 +51,7 @@ class ReceivedFrame(NamedTuple):
     host: int
 
 
-class RestLevels:
+class RestAverage:
     """Rest levels: means of voltages and pressures over `seconds` of frames without contact, of finite values only.
 
     ``levels`` are these means: voltages (readings,) V and pressures (pads,) Pa, or None until the time is over.
@@ -213,7 +213,7 @@ class Engine:
         recalibrator: LiveRecalibrator | None = None,
     ):
         self._rest = rest
-        self._rest_levels = RestLevels(rest)
+        self._rest_levels = RestAverage(rest)
         self._number = 0
         self._negative_since: int | None = None
         self.restless = False
@@ -250,7 +250,7 @@ class Engine:
 
     def tare(self) -> None:
         """Measure the rest levels again."""
-        self._rest_levels, self._negative_since, self.restless = RestLevels(self._rest), None, False
+        self._rest_levels, self._negative_since, self.restless = RestAverage(self._rest), None, False
         if self._recalibrator is not None:
             self._recalibrator.tared()
 

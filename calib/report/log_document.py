@@ -50,6 +50,7 @@ def _page(calibration: LogCalibration, found: Mapping[str, LogEvaluation]) -> st
         _coverage(found),
         *(_figures(name, one) for name, one in found.items()),
         _gain(calibration),
+        _health(calibration),
         _curve(calibration),
         _choice(calibration),
         _notes(calibration, found),
@@ -151,6 +152,23 @@ def _gain(calibration: LogCalibration) -> str:
         "the gain; its geometric mean over the fitted places is 1."
     )
     return _picture("Gain by place", png(place_figure(location.gain, location.box)), about)
+
+
+def _health(calibration: LogCalibration) -> str:
+    """How the sensor has moved since the calibration; empty if it was never recalibrated."""
+    found = calibration.shift
+    if found is None:
+        return ""
+    gain, offset = found.errors
+    rows = [
+        ("gain", number_text(found.before[0], 4), f"{found.gain:.4f} {PLUS_MINUS} {gain:.4f}", ""),
+        ("offset", number_text(found.before[1], 3), f"{found.offset:.3f} {PLUS_MINUS} {offset:.2g}", "N"),
+    ]
+    about = (
+        "Results, figures and curve are those of the calibration itself; forces have this offset and gain taken off."
+    )
+    table = html_table(["", "before", "now", "unit"], {"": rows})
+    return f"<h2>Calibration health</h2><p>{escape(found.health)}.</p>{table}<p class='small'>{escape(about)}</p>"
 
 
 def _curve(calibration: LogCalibration) -> str:

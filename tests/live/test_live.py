@@ -29,7 +29,7 @@ from calib.calibration.force_maps import ForceLaw, fused
 from calib.cli import main
 from calib.fitting.pads import PadModel
 from calib.live import loop as live_module
-from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestLevels
+from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
 from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
@@ -155,7 +155,7 @@ def test_what_is_missing_stays_where_it_is(calibration):
 
 
 def test_levels_do_not_count_what_is_missing():
-    resting = RestLevels(1.0)
+    resting = RestAverage(1.0)
     for n, value in enumerate([1.0, np.nan, 3.0]):
         resting.add(arrival([value, np.nan], n * S))
         if n:

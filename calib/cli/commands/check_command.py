@@ -51,14 +51,15 @@ def _health_by(path: str | None) -> "Callable[[Session], str] | None":
     """How a session's health is told by a calibration; None without one."""
     if path is None:
         return None
-    from ...calibration import assess
-    from ...calibration.calibration import load_calibration
+    from ...calibration import LogCalibration, assess, assess_log, load_calibration
     from ...session import SessionError
 
     calibration = load_calibration(path)
 
     def health(session: "Session") -> str:
         try:
+            if isinstance(calibration, LogCalibration):
+                return assess_log(calibration, session).health
             return assess(calibration, session).health
         except SessionError as error:
             return f"calibration health: not determined: {one_line(error)}"

@@ -1,9 +1,14 @@
 """`jaxeit recalibrate`."""
 
 import argparse
+from typing import TYPE_CHECKING
 
 from ..arguments import above_zero, prepare_outputs
 from ..terminal import title
+
+if TYPE_CHECKING:
+    from ...calibration import LogCalibration
+    from ...fitting.gain_update import GainDrift
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,8 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    from ...calibration import KnownForces, OrdinaryUse, recalibrate
-    from ...calibration.calibration import load_calibration
+    from ...calibration import KnownForces, LogCalibration, OrdinaryUse, load_calibration, recalibrate
     from ...calibration.recalibration import render
     from ...fitting.gain_update import GainDrift
     from ...session import open_session
@@ -39,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
     drift = GainDrift(args.drift / 100, args.drift / 100)
     ways = {"force": KnownForces(drift), "use": OrdinaryUse(drift)}
     calibration = load_calibration(args.calibration)
+    if isinstance(calibration, LogCalibration):
+        return _recalibrate_log(args, calibration, drift)
     with open_session(args.session) as session:
         way = args.evidence or ("force" if "force" in session.streams else "use")
         moved = recalibrate(calibration, session, ways[way], ignore_errors=args.force)
@@ -47,4 +53,21 @@ def run(args: argparse.Namespace) -> int:
     found = moved.recalibration
     assert found is not None
     print(found.to_json() if args.json else f"{heading}\n{render(found)}")
+    return 0
+
+
+def _recalibrate_log(args: argparse.Namespace, calibration: "LogCalibration", drift: "GainDrift") -> int:
+    """Write the moved calibration of a log, and print what has changed."""
+    from ...calibration import recalibrate_log
+    from ...calibration.log_recalibration import render_shift
+    from ...session import open_session
+
+    if args.evidence == "use":
+        raise ValueError(f"{args.calibration}: the calibration of a log, which only known force can move; record force")
+    with open_session(args.session) as session:
+        moved = recalibrate_log(calibration, session, drift, ignore_errors=args.force)
+        heading = title(session.name, session.simulated)
+    moved.save(args.output)
+    assert moved.shift is not None
+    print(moved.shift.to_json() if args.json else f"{heading}\n{render_shift(moved.shift)}")
     return 0
