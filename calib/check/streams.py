@@ -16,6 +16,7 @@ from .report import Finding, Severity, StreamRow, counted
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 MAX_MISSING = 0.001  # tolerated fraction of missing values
+MIN_MADE_UP = 0.5  # of the time of gaps that short intervals make up for, where they are jitter
 IRREGULAR_FRACTION = 0.1  # of the intervals: more gaps than that are the rule of the stream, not its exception
 MAX_RATE_ERROR = 0.02  # tolerated relative difference from the nominal rate
 MEDIAN_SAMPLES = 64  # of a block, of which the typical sample is the median
@@ -179,7 +180,9 @@ def stream_findings(stats: StreamStatistics) -> Iterator[Finding]:
     """Wrong rates, gaps, lost samples, missing values, copies, impossible values and status flags of one stream."""
     row, where = stats.row, f"/streams/{stats.row.name}"
     yield from _rate_findings(stats)
-    if row.gaps > IRREGULAR_FRACTION * row.samples and _as_many_as_stated(stats):
+    if row.gaps and (
+        _gaps_are_jitter(stats) if row.gaps <= IRREGULAR_FRACTION * row.samples else _as_many_as_stated(stats)
+    ):
         what = f"its time stamps jitter by {1e3 * row.jitter:.3g} ms, but it holds as many samples as its rate states"
         yield Finding(Severity.OK, where, what, "stamp samples by the device's clock")
     elif row.gaps > IRREGULAR_FRACTION * row.samples:
@@ -223,6 +226,14 @@ def _mean_rate(stats: StreamStatistics) -> float:
     """Samples a second (Hz) over the whole stream."""
     seconds = stats.row.seconds
     return (len(stats.time) - 1) / seconds if seconds > 0 else float("nan")
+
+
+def _gaps_are_jitter(stats: StreamStatistics) -> bool:
+    """Whether samples that came early make up for gaps: a lost sample leaves a gap and no short interval."""
+    steps, period = np.diff(stats.time) / SECOND, 1 / stats.row.rate
+    long, short = steps > 1.5 * period, steps < 0.5 * period
+    early, late = float((period - steps[short]).sum()), float((steps[long] - period).sum())
+    return _as_many_as_stated(stats) and early > MIN_MADE_UP * late
 
 
 def _as_many_as_stated(stats: StreamStatistics) -> bool:

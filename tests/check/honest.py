@@ -24,12 +24,13 @@ def honest_bench(number: int) -> Bench:
     kept = tuple(_reseeded(e, rng) for e in bench.scene.effects if rng.random() < KEPT or type(e).__name__ in ALWAYS)
     if not any(isinstance(e, je.effects.ContactPiezoresistance) for e in kept):
         kept += (je.effects.ContactPiezoresistance(), je.effects.Noise(std=1e-5))
+    hold = max(float(rng.uniform(0.8, 2.0)), 1.0) + max((c.delay for c in bench.companions), default=0.0)
     return replace(
         bench,
         scene=je.Scene(skin, kept),
         sites=_sites(skin, rng, bench),
         forces=np.round(rng.uniform(3.0, 25.0, rng.integers(1, 4)), 1),
-        timing=replace(QUICK, ramp=float(rng.uniform(0.2, 0.8)), hold=max(float(rng.uniform(0.8, 2.0)), 1.0)),
+        timing=replace(QUICK, ramp=float(rng.uniform(0.2, 0.8)), hold=hold),
         blank=float(rng.uniform(1.0, 5.0)),
         eit_rate=float(rng.uniform(10.0, 50.0)),
         pad_rate=float(rng.uniform(50.0, 200.0)),

@@ -470,6 +470,21 @@ def test_an_irregular_log_of_force_alone_is_no_error(parts, look):
     assert report.ok
 
 
+@pytest.mark.parametrize(
+    ("lost", "severity", "words"), [(False, Severity.OK, "jitter"), (True, Severity.WARNING, "20 gaps")]
+)
+def test_gaps_that_early_samples_make_up_for_are_jitter(lost, severity, words, parts, look):
+    """Each fifteenth sample comes late, and the next ones together; or each fortieth is lost."""
+    variable, units, rate, time, values = parts.streams["pressure"]
+    k = np.arange(len(time))
+    late = time + np.where(k % 15 == 7, 9 * SECOND // 1000, 0)
+    keep = k % (len(k) // 20) != 9
+    given = (time[keep][: len(k)], values[keep]) if lost else (late, values)
+    parts.streams["pressure"] = (variable, units, rate, *given)
+    has_words = [f for f in look(parts).findings if f.where == "/streams/pressure" and words in f.what]
+    assert [f.severity for f in has_words] == [severity]
+
+
 def test_lost_samples_are_counted_from_sequence_numbers(parts, look):
     seq = np.arange(1800, dtype=np.int64) + 2**32 - 900  # wraps half-way
     seq[1000:] += 5
