@@ -245,7 +245,7 @@ def apply(
             found = force_map(calibration, frames - levels["eit"](time), pressed, before=before)
             if calibration.curves.curve.path:
                 before = remembered(np.concatenate([before, calibration.own_pressures(pressed)]))
-            rows = _of_block(time, found)
+            rows = _of_block(time, found, calibration.pads.multiple)
             for name in kinds:
                 writer.append(name, rows[name])
     return Path(path)
@@ -260,6 +260,9 @@ def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str
         "force_se": (pixels, "N", "standard error of a pixel's force, for the shape as it is", "f4"),
         "pad_force": (pads, "N", "force on each pad", "f8"),
         "pad_force_se": (pads, "N", "standard error of a pad's force", "f8"),
+        "pad_force_half": (pads, "N", "half the interval that 90 % of readings of a pad's force fall into", "f8"),
+        "total_force": ((), "N", "sum of the forces on the pads", "f8"),
+        "total_force_half": ((), "N", "half the 90 % interval of a reading of the sum", "f8"),
         "pad_valid": (pads, "1", "pressure in the calibrated range", "u1"),
         "shape_valid": (pads, "1", "1: shape from the image; 0: even", "u1"),
     }
@@ -272,14 +275,20 @@ def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str
     }
 
 
-def _of_block(time: np.ndarray, found: ForceEstimate) -> dict[str, np.ndarray]:
-    """Rows under the names of `_rows`."""
+def _of_block(time: np.ndarray, found: ForceEstimate, multiple: float) -> dict[str, np.ndarray]:
+    """Rows under the names of `_rows`; half the 90 % interval is a multiple of the standard error.
+
+    Errors of different pads count as independent.
+    """
     parts = {
         "time": time,
         "force": found.map.force,
         "force_se": found.map.standard_error,
         "pad_force": found.force,
         "pad_force_se": found.standard_error,
+        "pad_force_half": multiple * found.standard_error,
+        "total_force": found.force.sum(1),
+        "total_force_half": multiple * np.sqrt((found.standard_error**2).sum(1)),
         "pad_valid": found.valid,
         "shape_valid": found.map.valid,
         "contact_position": found.position,

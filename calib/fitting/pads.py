@@ -169,6 +169,11 @@ class PadModel(eqx.Module):
         return force, noise.half_widths(force, error)
 
     @property
+    def multiple(self) -> float:
+        """Half the 90 % interval of a reading, in its standard errors (`with_noise`)."""
+        return float(self._noise.multiple)
+
+    @property
     def _noise(self) -> NoiseLaw:
         """The noise of a reading; without a law, that of the residuals of the fitted samples for all forces."""
         if self.noise is not None:

@@ -221,6 +221,7 @@ class Engine:
         self._used_readings, self._centres = np.asarray(recon.channels), np.asarray(recon.centres)
         self._pad_weights = np.asarray(calibration.masks.weights)
         self._recalibrator = recalibrator
+        self._multiple = calibration.pads.multiple
         self._law = law_of(calibration) if recalibrator is None else recalibrator.moved(law_of(calibration))
         self._programs = programs(self._law)
         self._programs.warm_up()
@@ -305,6 +306,7 @@ class Engine:
             latency=(time.monotonic_ns() - arrival.host) / 1e9,
             force=force,
             standard_error=error,
+            half_width=self._multiple * error,
             valid=found.valid & ~silent & ~found.negative,
             centre=self._centre(found.map, force > TOUCH_SIGNIFICANCE * error),
             map=found.map,

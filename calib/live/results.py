@@ -51,6 +51,7 @@ class FrameResult:
     | latency        | from arrival to this result                                            | ()        | s    |
     | force          | on each pad; NaN without pressure                                      | (pads,)   | N    |
     | standard_error | of the force                                                           | (pads,)   | N    |
+    | half_width     | half the interval that 90 % of readings of the force fall into         | (pads,)   | N    |
     | valid          | whether the pressure is within the calibrated range                    | (pads,)   |      |
     | centre         | mean position of the force on each pressed pad; NaN on the others      | (pads, 2) | m    |
     | map            | force on each pixel; its sum is that of the pad forces                 | (pixels,) | N    |
@@ -66,6 +67,7 @@ class FrameResult:
     latency: float
     force: np.ndarray
     standard_error: np.ndarray
+    half_width: np.ndarray
     valid: np.ndarray
     centre: np.ndarray
     map: np.ndarray
@@ -83,6 +85,7 @@ class FrameResult:
             "latency_ms": round(1e3 * self.latency, 3),
             "force": _json_numbers(self.force),
             "standard_error": _json_numbers(self.standard_error),
+            "half_width": _json_numbers(self.half_width),
             "valid": self.valid.tolist(),
             "centre": [_json_numbers(row) for row in self.centre],
             "missing": self.missing,

@@ -264,6 +264,13 @@ def test_apply_writes_the_force_of_every_frame(calibration, grid, folder):
     assert archive.arrays["shape_valid"][held].any()
     assert np.abs(pads[:8].sum(1)).max() < 0.5  # the blank
     np.testing.assert_allclose(archive.arrays["force_se"].sum(1), archive.arrays["pad_force_se"].sum(1), rtol=1e-5)
+    with calib.open_session(grid) as session:
+        known = session.stream("force")
+        reference = np.interp(archive.arrays["time"], known.time, known.read()[:, 0])
+    total, half = archive.arrays["total_force"], archive.arrays["total_force_half"]
+    np.testing.assert_allclose(total, pads.sum(1))
+    assert np.mean(np.abs(total - reference)[reference > 1] <= half[reference > 1]) > 0.85
+    np.testing.assert_allclose(archive.arrays["pad_force_half"].max(1) <= half, True)
     assert "contact_force" not in archive.arrays  # without a correction by location no contact is looked for
 
 

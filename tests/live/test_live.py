@@ -108,7 +108,7 @@ def calibration(monkeypatch, skin):
         recon=recon,
         masks=SimpleNamespace(weights=weights),
         simulated=True,
-        pads=SimpleNamespace(curves=curves, field=None, gains=None),
+        pads=SimpleNamespace(curves=curves, field=None, gains=None, multiple=1.6),
         curves=curves,
         locator=None,
         evaluation=None,

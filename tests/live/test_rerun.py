@@ -50,6 +50,7 @@ def result(number, **changes):
         "latency": 0.001 * number,
         "force": np.array([float(number), np.nan]),
         "standard_error": np.array([0.1, np.nan]),
+        "half_width": np.array([0.16, np.nan]),
         "valid": np.array([True, False]),
         "centre": np.array([[0.02, 0.01], [np.nan, np.nan]]),
         "map": np.arange(ROWS * COLUMNS, dtype=float),
