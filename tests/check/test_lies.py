@@ -143,6 +143,7 @@ def at_rest(name):
     def tell(r):
         values, table, time = r.values(name), r.presses, r.streams[name].time
         rest = values[time < table.t_press[0] - SECOND]
+        rest = rest if len(rest) else values[:1]  # the table was moved before, and lists no rest
         return r.change(name, rest[np.random.default_rng(1).integers(0, len(rest), len(values))])
 
     return tell
