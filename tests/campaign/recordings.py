@@ -124,7 +124,7 @@ def table_numbers(rng: Random, honest: Honest) -> Change:
     return pick(rng, (
         lambda r: r.pressed(tip_diameter=abs(factor) * r.presses.tip_diameter),
         lambda r: r.pressed(target_force=factor * r.presses.target_force),
-        lambda r: r.pressed(pad=np.full(16, pad)),
+        lambda r: r.pressed(pad=np.full(len(r.presses.pad), pad)),
         lambda r: r.pressed(pad=np.roll(r.presses.pad, 2)),
     ))  # fmt: skip
 
