@@ -1,5 +1,6 @@
 """Where the skin is touched, and by how many contacts."""
 
+from .loads import LoadFitter, LoadKind, Loads, LoadSettings, LoadShape, prepare_loads
 from .preparation import prepare_contacts
 from .refinement import refine_contacts
 from .regions import RegionError, Regions, find_regions
@@ -12,10 +13,16 @@ __all__ = [
     "ContactResult",
     "ContactSettings",
     "Contacts",
+    "LoadFitter",
+    "LoadKind",
+    "LoadSettings",
+    "LoadShape",
+    "Loads",
     "RegionError",
     "Regions",
     "find_regions",
     "prepare_contacts",
+    "prepare_loads",
     "refine_contacts",
     "strongest",
 ]

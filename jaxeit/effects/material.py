@@ -92,8 +92,12 @@ class ContactPiezoresistance(AbstractSheetEffect):
     exponent: Float[Array, ""] = parameter(1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
-        x = power(sheet.pressure / self.half_pressure, self.exponent)
-        return _conducting(sheet, 1 + self.amplitude * x / (1 + x))
+        return _conducting(sheet, self.factor(sheet.pressure))
+
+    def factor(self, pressure: Float[Array, "..."]) -> Float[Array, "..."]:
+        """By what a pressure (Pa) multiplies the conductivity."""
+        x = power(pressure / self.half_pressure, self.exponent)
+        return 1 + self.amplitude * x / (1 + x)
 
 
 class HomogenisedIslands(AbstractSheetEffect):
@@ -253,7 +257,7 @@ def _logarithm(load: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.log(jnp.maximum(load, jnp.finfo(load.dtype).tiny))
 
 
-def power(x: Float[Array, " elements"], exponent: Float[Array, ""]) -> Float[Array, " elements"]:
+def power(x: Float[Array, "..."], exponent: Float[Array, ""]) -> Float[Array, "..."]:
     """``x^exponent``, and 0 with zero slope without pressure, where a power below one has an infinite slope."""
     touched = x > 0
     return jnp.where(touched, jnp.where(touched, x, 1.0) ** exponent, 0.0)

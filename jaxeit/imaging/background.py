@@ -65,9 +65,8 @@ def fit_background(
         raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
     image = Pixels(columns).on(model) if basis is None else basis
     physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
-    prior = GaussianSmooth(cast(float, jnp.asarray(length, model.dtype))).precision(
-        jnp.zeros((1, image.size), model.dtype), image.picture
-    )
+    spread = float(np.asarray(length)) if _is_known(length) else cast(float, length)
+    prior = GaussianSmooth(spread).precision(jnp.zeros((1, image.size), model.dtype), image.picture)
     floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
     error = jnp.hypot(model_error * known, floor)
     penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)
