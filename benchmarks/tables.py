@@ -204,6 +204,12 @@ TABLES: dict[str, Table] = {
         "{0[pairs_40mm_1:1]:.0f %} | {0[pairs_40mm_1:3]:.0f %} | {frame_ms:ms}",
         _images,
     ),
+    "loads": listed(
+        "loads",
+        "one frame of | frames | told by loads | told by bumps | error of place, mm | ellipse of 90 % covers",
+        "{touch} | {frames} | {told:.0f %} | {by_bumps:.0f %} | {error_mm:.1f} | {covered:.0f %}",
+        lambda loads: loads["rows"],
+    ),
     "scenes": listed(
         "scene",
         "scene | recording | frames | simulated in | times real time",

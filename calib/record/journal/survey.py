@@ -37,6 +37,11 @@ class FrameBlock:
         self.flags.append(record.flags | more_flags)
 
 
+TOGETHER = 1_000_000  # ns: frames that come nearer to each other than that came at once
+MIN_TOGETHER = 0.5  # of the frames, from which on they come in bursts
+MAX_PERIOD_OF_BURSTS = 5.0  # ms between frames: bursts of faster frames move times by less
+
+
 class UnpackedBlock:
     """A block of frames as arrays: values (n, channels), and (n,) times, flags, missing frames, ticks and steps."""
 
@@ -89,6 +94,7 @@ class StreamSurvey:
     ticking: bool = True
     first: int = 0
     last: int = 0
+    together: int = 0  # frames that came at once with the one before
     bits: int = 32
     pongs: list[tuple[int, int, int]] = field(default_factory=list)  # sent, received, ticks
 
@@ -111,6 +117,7 @@ class StreamSurvey:
             return
         batch = UnpackedBlock(block, self.tracker)
         self.first = block.host[0] if not self.frames else self.first
+        self.together += int((np.diff(batch.host, prepend=self.last or batch.host[0]) < TOGETHER).sum())
         self.last = block.host[-1]
         self.frames += len(batch)
         self.lost += int(batch.missing.sum())
@@ -148,8 +155,19 @@ class StreamSurvey:
         if fit is not None:
             steps, drift, rest = self.tracker.clock.steps, 1e6 * fit.skew, fit.residual_p95 / 1e6
             latency = self.latency(fit)
-            return StreamSummary(self.plan.name, self.frames, self.lost, steps, drift, rest, METHOD, latency=latency)
+            note = self.burst_note()
+            return StreamSummary(self.plan.name, self.frames, self.lost, steps, drift, rest, METHOD, note, latency)
         return StreamSummary(self.plan.name, self.frames, self.lost, 0, 0.0, 0.0, ARRIVAL_CLOCK, self.clock_note())
+
+    def burst_note(self) -> str:
+        """By how much times may be off because the device holds frames back; an empty text where that is little.
+
+        The earliest frame of a burst came as late as up to a period of the frames after it was taken.
+        """
+        period = (self.tracker.clock.period or 0.0) / 1e6
+        if self.together < MIN_TOGETHER * self.frames or period < MAX_PERIOD_OF_BURSTS:
+            return ""
+        return f"its frames come in bursts, so that times may be off by {period:.3g} ms: let it send each at once"
 
     def clock_note(self) -> str:
         """What is wrong with the device's clock if its time stamps cannot be used, or an empty text."""
