@@ -25,6 +25,7 @@ from ..presses.streams import resample
 from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session, SessionError, Stream
 from .calibration import Calibration
+from .load_windows import WindowedFrames, fit_windows
 from .localisation import AbstractLocator
 
 FORMAT = "skin-forcemap"
@@ -197,6 +198,8 @@ def apply(
     processing: Processing | None = None,
     ignore_errors: bool = False,
     progress: Progress = iter,
+    loads: float | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Write the force map of every EIT frame of a session; memory does not grow with its length.
 
@@ -206,6 +209,8 @@ def apply(
         processing: how the session is corrected; default: as the sessions of the calibration.
         ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
             file then names the errors.
+        loads: also tell what touches the skin, none, one, two or an edge, in windows of so many s; None: do not.
+        tell: called with a line about the loads.
 
     Raises:
         SessionError: if the session was recorded on another skin, lacks a stream, or holds no frame.
@@ -229,6 +234,7 @@ def apply(
     }
     attrs |= {"ignored_errors": "\n".join(ignored)} if ignored else {}
     kinds = _rows(calibration)
+    windows = None if loads is None else WindowedFrames(loads, recon.readings)
     with ArchiveWriter(path, FORMAT, attrs) as writer:
         writer.add("centres", np.asarray(recon.centres), "m", "centres of the pixels")
         writer.add("areas", np.asarray(recon.areas), "m2", "areas of the pixels")
@@ -248,6 +254,15 @@ def apply(
             rows = _of_block(time, found, calibration.pads.multiple)
             for name in kinds:
                 writer.append(name, rows[name])
+            if windows is not None:
+                touched = np.asarray(np.asarray(is_loaded(law_of(calibration), jnp.asarray(pressed))).any(1))
+                windows.add(time, frames, frames - levels["eit"](time), touched, found.force.sum(1))
+        if windows is not None:
+            windows.close()
+            seen = fit_windows(calibration, windows, progress)
+            for name, about in seen.arrays.items():
+                writer.add(name, *about)
+            tell(seen.render())
     return Path(path)
 
 

@@ -5,10 +5,10 @@ that turns pressure into conductivity, which saturates; bumps that add leave mis
 noise is 1. With p the pressure of all loads and f the law, the readings are those of the conductivity sigma f(p g).
 
 The gain g = exp(std field) of the contact layer is not known, and it is what errs: it moves a load, bends it and splits
-it. It is marginalised to first order. With G the slopes of the whitened readings in the modes of the field at the fit,
-errors have the covariance I + G G', and each kind of load is fitted again with it. Kinds are compared by their
-evidence in Laplace's approximation (MacKay 1992, Neural Comput. 4), so that probabilities and covariances hold the
-model's error as well as the noise.
+it. It is marginalised to first order. With G the slopes of the r whitened readings y in the modes of the field at the
+fit, and e the part of the signal by which all else errs, errors have the covariance (1 + e^2 |y|^2 / r) I + G G', and
+each kind of load is fitted again with it. Kinds are compared by their evidence in Laplace's approximation (MacKay 1992,
+Neural Comput. 4), so that probabilities and covariances hold the model's error as well as the noise.
 """
 
 from dataclasses import dataclass, field
@@ -59,6 +59,7 @@ class LoadSettings:
     | law: factor of conductivity by pressure                                      | Hill, 20 kPa |      |
     | gain: standard deviation of the log gain of the contact layer                | 0.12         | 1    |
     | gain_length: over which it changes                                           | 0.015        | m    |
+    | model_error: part of the signal by which mesh, coat and shape of a load err  | 0.005        | 1    |
     | width, width_spread: median of a load's width, standard deviation of its log | 0.012, 0.4   | m, 1 |
     | force, force_spread: median of a force, standard deviation of its log        | 8, 1.2       | N, 1 |
     | length: standard deviation of half an edge, in each direction                | 0.02         | m    |
@@ -71,6 +72,7 @@ class LoadSettings:
     law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
     gain: float = 0.12
     gain_length: float = 0.015
+    model_error: float = 0.005
     width: float = 0.012
     width_spread: float = 0.4
     force: float = 8.0
@@ -82,8 +84,9 @@ class LoadSettings:
         for name in ("gain_length", "width", "width_spread", "force", "force_spread", "length"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
-        if not 0 <= self.gain < np.inf:
-            raise InverseError(f"gain is {self.gain}; give 0 or more")
+        for name in ("gain", "model_error"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InverseError(f"{name} is {getattr(self, name)}; give 0 or more")
         if len(self.prior) != 4 or min(self.prior) < 0 or not np.isclose(sum(self.prior), 1):
             raise InverseError(f"prior is {self.prior}; give four probabilities whose sum is 1")
 
@@ -161,6 +164,7 @@ class LoadFitter(eqx.Module):
     spread: Float[Array, "2"]
     length: Float[Array, ""]
     prior: Float[Array, "4"]
+    model_error: Float[Array, ""]
 
     def __call__(self, dv: Float[ArrayLike, " readings"], contacts: Contacts) -> Loads:
         """Loads of one difference frame (readings,) V, from the contacts that a `ContactFinder` saw in it.
@@ -247,15 +251,16 @@ class LoadFitter(eqx.Module):
         four = jnp.append(self.low, self.usual - 4 * self.spread), jnp.append(self.high, self.usual + 4 * self.spread)
         return jnp.append(jnp.tile(four[0], rows), -edge), jnp.append(jnp.tile(four[1], rows), edge)
 
-    def errors_of_gain(self, flat: Float[Array, " m"]) -> Float[Array, "r r"]:
-        """Cholesky factor of I + G G', with the slopes G of the readings in the modes of the gain."""
+    def errors_of_model(self, y: Float[Array, " r"], flat: Float[Array, " m"]) -> Float[Array, "r r"]:
+        """Cholesky factor of the covariance of errors: noise, slopes of the readings in the modes of the gain, rest."""
         slopes = jax.jacfwd(lambda gain: self.response(flat, gain))(jnp.zeros(self.modes.shape[-1], flat.dtype))
-        found: Array = lapack.cholesky(jnp.eye(len(slopes), dtype=flat.dtype) + slopes @ slopes.T, lower=True)
+        even = 1 + self.model_error**2 * (y @ y) / len(y)
+        found: Array = lapack.cholesky(even * jnp.eye(len(y), dtype=y.dtype) + slopes @ slopes.T, lower=True)
         return found
 
     def finished(self, y: Float[Array, " r"], start: Float[Array, " m"]) -> tuple[LoadShape, Float[Array, ""]]:
         """The loads fitted with the errors of the gain, and the log of their evidence."""
-        root = self.errors_of_gain(start)
+        root = self.errors_of_model(y, start)
         found = self.fit(y, start, FULL // 2, root)
         size, count = len(found.flat), 1 if len(found.flat) == 6 else len(found.flat) // 4
         area = jnp.prod(self.high - self.low)
@@ -384,6 +389,7 @@ def prepare_loads(
         "spread": [settings.width_spread, settings.force_spread],
         "length": settings.length,
         "prior": settings.prior,
+        "model_error": settings.model_error,
     }
     return LoadFitter(
         model=model,

@@ -18,6 +18,6 @@ def test_frames_in_bursts_are_said_to_have_uncertain_times(held, words, tmp_path
         sent[0] = in_bursts(sent[0], rng)
     received(sent, tmp_path / "s.h5.part", 0, bytes)
     said = tell("recover", tmp_path / "s.h5.part", "-o", tmp_path / "s.h5").out
-    lines = [line for line in said.splitlines() if "bursts" in line]
+    lines = [line for line in said.splitlines() if "come in bursts" in line]
     assert words in said
     assert len(lines) == held

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import prepare_outputs
+from ..arguments import above_zero, prepare_outputs
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar
 
@@ -14,6 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
     text = "continue despite errors that `jaxeit check` finds; the results name them"
     parser.add_argument("--force", action="store_true", help=text)
+    text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of so many seconds"
+    parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
     add_low_pass_argument(parser)
 
 
@@ -29,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     calibration = load_calibration(args.calibration)
     if isinstance(calibration, LogCalibration):
         refuse_low_pass(args)
+        if args.loads is not None:
+            raise ValueError("--loads: the calibration of a log has no EIT, which tells where contacts are")
         with open_session(args.session) as session:
             found = apply_log(calibration, session, args.output, ignore_errors=args.force)
         outside = (~found.valid).mean() if len(found.valid) else 0.0
@@ -42,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
             processing=processing_of(args, calibration.processing),
             ignore_errors=args.force,
             progress=progress_bar("frames"),
+            loads=args.loads,
+            tell=print,
         )
         frames = len(session.stream("eit"))
     print(f"{args.output}: {frames} force maps in newtons")

@@ -1,0 +1,72 @@
+"""What touches the skin over time, by `apply --loads`: windows, shares of the pads' force, and the command line."""
+
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.bench import load_bench, simulate
+from calib.calibration.load_windows import WindowedFrames
+from calib.cli import main
+
+from ..place_logs import place_log, write_place_log
+
+S = 10**9
+
+
+def test_windows_hold_touched_frames_of_the_length_asked_for():
+    seen = WindowedFrames(1.0, 2)
+    time = np.arange(60) * S // 10
+    loaded = (time >= 1 * S) & (time < 4.2 * S)
+    frames = np.where(loaded[:, None], 5.0, 3.0) + 0.1 * (np.arange(60) % 2)[:, None] * [1, -1]
+    for part in np.array_split(np.arange(60), 7):
+        seen.add(time[part], frames[part], frames[part] - 3.05, loaded[part], np.full(len(part), 4.0))
+    seen.close()
+    assert [round((w.end - w.begin) / S, 1) for w in seen.windows] == [0.9, 0.9, 0.9]
+    assert [w.frames for w in seen.windows] == [10, 10, 10]
+    np.testing.assert_allclose(seen.windows[0].frame, [2.0, 1.9], atol=0.01)
+    assert seen.windows[0].force == 4.0
+    np.testing.assert_allclose(seen.untouched, [3.05, 2.95], atol=0.01)
+    assert seen.noise is not None
+    assert WindowedFrames(1.0, 2).noise is None
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A press of two contacts at 45 mm, 15 and 10 N, one after the other."""
+    bench = load_bench("two_contacts")
+    few = type(bench)(**{**bench.__dict__, "sites": bench.sites[:1], "blank": 2.0, "eit_rate": 20.0})
+    return simulate(few, tmp_path_factory.mktemp("two") / "two.h5", fidelity=je.Fidelity.draft())
+
+
+def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
+    """From the command line: first one, then two, then the other one, each with its share of the force."""
+    c, out = str(tmp_path / "c.h5"), tmp_path / "out.h5"
+    grid = "data/sessions/testbed_grid.h5"
+    assert main(["calibrate", grid, "-o", c, "--fidelity", "draft", "--pixels", "20"]) == 0
+    assert main(["apply", c, str(session), "-o", str(out), "--loads", "0.7"]) == 0
+    assert "loads of " in capsys.readouterr().out
+    arrays = calib.session.read_archive(out, "skin-forcemap").arrays
+    middle = arrays["loads/time"].mean(1) / S
+    probability, position, force = (arrays[f"loads/{name}"] for name in ("probability", "position", "force"))
+    np.testing.assert_allclose(probability.sum(1), 1)
+    with calib.open_session(session) as opened:
+        known = opened.stream("force")
+        reference = np.interp(middle * S, known.time, known.read()[:, 0])
+    both = reference > 24
+    assert both.any()
+    assert (probability[both, 2] > 0.9).all()
+    order = np.argsort(position[both, :, 0], axis=1)
+    first = np.take_along_axis(position[both], order[..., None], 1)
+    sites = np.array([[0.03, 0.03], [0.075, 0.03]])
+    near = np.linalg.norm(first - sites, axis=2).max(1) < 0.004
+    assert near.sum() >= 1
+    share = np.take_along_axis(force[both], order, 1)[near]
+    np.testing.assert_allclose(share, np.tile([15.0, 10.0], (len(share), 1)), rtol=0.25)
+
+
+def test_a_log_has_no_loads(tmp_path, capsys):
+    log, c = str(write_place_log(tmp_path / "log.h5", place_log(0))), str(tmp_path / "c.h5")
+    assert main(["calibrate", log, "-o", c, "--curve", "affine"]) == 0
+    assert main(["apply", c, log, "-o", str(tmp_path / "f.h5"), "--loads", "1"]) == 2
+    assert "has no EIT" in capsys.readouterr().err
