@@ -13,6 +13,7 @@ import pytest
 from benchmarks import (
     bench_calibration,
     bench_growth,
+    bench_loads,
     bench_pipeline,
     bench_protocol,
     bench_start,
@@ -314,6 +315,13 @@ def test_smoke_growth():
     data = bench_growth.main(["--smoke"])
     assert len(data["fits"]) == 3
     assert all(row["median_ms"] > 0 and row["megabytes"] > 0 for row in data["rows"])
+
+
+@pytest.mark.slow
+def test_smoke_loads():
+    data = bench_loads.main(["--smoke"])
+    assert {row["touch"].split(",")[0] for row in data["rows"]} == {"one", "two", "edge"}
+    assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data["rows"])
 
 
 @pytest.mark.slow

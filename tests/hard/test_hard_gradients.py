@@ -39,6 +39,8 @@ HOST = {
     "is_covariance": "says yes or no",
     "parse_values": "reads a text",
     "fidelity_choices": _PREPARES,
+    "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
+    "prepare_loads": _PREPARES,
     "find_regions": "counts the regions of an image, on the host, and says so under jit",
     "fit_fidelity": _PREPARES,
     "from_numbers": _DESCRIBES,

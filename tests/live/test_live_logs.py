@@ -54,9 +54,9 @@ def test_forces_from_the_command_line_are_those_of_the_calibration(files, log, n
     forces = calibration.predict(time, values, place).force
     seen = np.array([row["force"][0] for row in found])
     assert all(row["low"][0] <= row["force"][0] <= row["high"][0] for row in found)
-    # The stage's reading that is the newest at a frame may be one of the press before.
+    # Of the stage, the mean since the frame before counts; on a busy machine it holds some of the way between presses.
     nearest = np.abs(seen[:, None] - forces).min(1)
-    assert np.mean(nearest < 1e-4) > (0.99 if name == "plain" else 0.9)
+    assert np.mean(nearest < 1e-4) > (0.99 if name == "plain" else 0.5)
 
 
 def test_the_zero_is_that_of_the_calibration_until_another_one_is_measured(files, log):
