@@ -38,6 +38,14 @@ FAULTS = {
 }
 
 
+@pytest.fixture(autouse=True)
+def attended():
+    """A terminal that hangs up: tests that run under `nohup` inherit that it is ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture(scope="module")
 def calibrated(bundled, tmp_path_factory):
     path = tmp_path_factory.mktemp("calibrated") / "calibration.h5"
@@ -92,6 +100,14 @@ def test_a_command_that_is_cut_short_leaves_what_was_there(name, fault, commands
         monkeypatch.undo()
         assert main(arguments) == 0
         assert (tmp_path / output).stat().st_size > len(EARLIER)
+
+
+def test_a_command_under_nohup_outlives_its_terminal(commands, tmp_path, monkeypatch):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    arguments, option, output = commands["import"]
+    monkeypatch.setattr(storage, "sync", spoilt(FAULTS["SIGHUP"][0], tmp_path))
+    assert main([*map(str, arguments), option, str(tmp_path / output)]) == 0
+    assert (tmp_path / output).is_file()
 
 
 def spoilt(cause, folder):
