@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..fitting.curves import CURVES
-from ..fitting.logs import LogModel, LogPrediction, LogTracker
+from ..fitting.logs import LogModel, LogPrediction, LogTracker, travel_of, unseen_direction
 from ..fitting.selection import Candidate
 from ..session import SessionError, read_archive, write_archive
 from .log_evaluation import LogEvaluation
@@ -89,6 +89,10 @@ class LogCalibration:
     def needs_place(self) -> bool:
         """Whether the force depends on the place of contact."""
         return self.model.location is not None
+
+    def unseen(self, force: Float[np.ndarray, " n"]) -> str:
+        """What forces over time (N) do that those of the calibration did not, in a sentence; empty: nothing."""
+        return unseen_direction(self.model.travel, travel_of(force))
 
     @property
     def recorded(self) -> str:

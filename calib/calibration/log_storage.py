@@ -12,7 +12,7 @@ import jaxeit as je
 
 from ..fitting.curves import CURVES, FittedCurve
 from ..fitting.fields import FIELDS
-from ..fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise
+from ..fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise, Travel
 from ..fitting.selection import Candidate
 from ..session import Archive
 from .log_evaluation import LogEvaluation
@@ -83,6 +83,7 @@ def _model_arrays(model: LogModel) -> Described:
     if model.location is not None:
         arrays["location/box"] = (model.location.box, "m", "lowest and highest corner of the presses")
         arrays |= {} if model.location.gain is None else field_arrays(model.location.gain)
+    arrays["force/travel"] = (np.array(model.travel), "N", "largest rise and fall of the fitted force")
     return arrays | {f"noise/{name}": (getattr(model.noise, name), *about) for name, about in NOISE_FIELDS.items()}
 
 
@@ -130,7 +131,8 @@ def _model(attrs: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LogMod
     noise = LogNoise(**{name: jnp.asarray(given[f"noise/{name}"]) for name in NOISE_FIELDS})
     fitted = FittedCurve(curve=curve, **numbers)
     location = _location(str(attrs.get("location", NO_PLACE)), arrays)
-    return LogModel(_combination(attrs, arrays), fitted, noise, arrays["channels/reach"], location)
+    travel = Travel(*map(float, arrays.get("force/travel", Travel())))  # as the lag
+    return LogModel(_combination(attrs, arrays), fitted, noise, arrays["channels/reach"], location, travel)
 
 
 def _location(name: str, arrays: Mapping[str, np.ndarray]) -> LogLocation | None:

@@ -20,7 +20,18 @@ from ..check.acceptance import accept
 from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ..fitting.curves import CURVES, AbstractCurve
 from ..fitting.fields import FIELDS, AbstractField, PadEdge
-from ..fitting.logs import MIN_PLACES, FittedLog, LogPrediction, LogSeries, fit_series, series_of, ways_of
+from ..fitting.logs import (
+    MIN_PLACES,
+    FittedLog,
+    LogPrediction,
+    LogSeries,
+    fit_series,
+    missing_direction,
+    series_of,
+    travel_of,
+    unseen_direction,
+    ways_of,
+)
 from ..fitting.results import FitError
 from ..presses.streams import resample
 from ..session import Session, SessionError, Stream, write_archive
@@ -77,7 +88,7 @@ def calibrate_logs(
         evaluation=_second_halves(sessions, series, half, thin),
         provenance=_provenance(sessions, recipe, half, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=tuple(filter(None, [*ignored, note, placed, thin])),
+        notes=tuple(filter(None, [*ignored, note, placed, thin, missing_direction(whole.model.travel)])),
         why=half.why,
         tried=half.tried,
     )
@@ -219,7 +230,8 @@ def _second_halves(sessions: Sequence[Session], series: LogSeries, half: FittedL
     found = LogPrediction(*(part[rows] for part in half.predicted))
     which = "second half" if len(sessions) == 1 else "second half of each log"
     title = f"{which}, by the model of the first" if series.site is None else "a third of the places, by the others"
-    return log_evaluation(title, series.time[rows], series.force[rows], found, (thin,) if thin else ())
+    unseen = unseen_direction(half.model.travel, travel_of(series.force[rows], series.log[rows]))
+    return log_evaluation(title, series.time[rows], series.force[rows], found, tuple(filter(None, (thin, unseen))))
 
 
 def _provenance(
@@ -264,7 +276,9 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
     predicted, error, low, high = resample(signal.time, np.stack(numbers, 1), force.time).T
     nearest = np.clip(np.searchsorted(signal.time, force.time), 0, len(signal.time) - 1)
     at_force = LogPrediction(predicted, error, low, high, found.valid[nearest] & np.isfinite(predicted))
-    return log_evaluation(session.name, force.time, force.read()[:, 0], at_force, ignored)
+    recorded = force.read()[:, 0]
+    notes = tuple(filter(None, [*ignored, calibration.unseen(recorded)]))
+    return log_evaluation(session.name, force.time, recorded, at_force, notes)
 
 
 def _predicted(calibration: LogCalibration, session: Session, signal: Stream) -> LogPrediction:
@@ -292,6 +306,7 @@ def apply_log(
         "calibration_created_utc": calibration.provenance["created_utc"],
     }
     attrs |= {"ignored_errors": "\n".join(ignored)} if ignored else {}
+    attrs["note"] = calibration.unseen(found.force)
     write_archive(path, FORCE_FORMAT, attrs, _force_arrays(signal.time, found))
     return found
 

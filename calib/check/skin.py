@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 import jaxeit as je
 
@@ -11,6 +12,8 @@ from .report import Finding, Severity, listed
 
 RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrodes are looked at
 MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
+MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
+PAD_POINTS = 32  # along the rim of a pad's box, at which that share is counted
 
 
 def check_skin(session: Session, given: je.Skin | None, findings: list[Finding]) -> je.Skin | None:
@@ -61,16 +64,41 @@ def _flat(value: object, key: str = "") -> dict[str, object]:
 
 
 def _size_findings(skin: je.Skin) -> Iterator[Finding]:
-    """A sheet that reaches far beyond its electrodes has its size in another unit than their positions, or a typo."""
+    """A sheet or a pad that reaches far beyond the electrodes: their positions have a typo, or another unit."""
     electrodes = np.asarray(skin.electrode_positions)[:, :2]
     rim = skin.domain.boundary_point(np.linspace(0, skin.domain.perimeter, RIM_POINTS, endpoint=False))
     between = np.linalg.norm(electrodes[:, None] - electrodes, axis=-1)
     np.fill_diagonal(between, np.inf)
     pitch = float(np.median(between.min(1)))
+    if not np.isfinite(pitch):
+        return
     beyond = float(np.linalg.norm(rim[:, None] - electrodes, axis=-1).min(1).max())
-    if np.isfinite(pitch) and beyond > MAX_RIM_PITCHES * pitch:
+    if beyond > MAX_RIM_PITCHES * pitch:
         what = f"the sheet reaches {beyond:.3g} m beyond its electrodes, which are {pitch:.3g} m apart"
         yield Finding(Severity.WARNING, "/device", what, "correct the size of the sheet or the positions of electrodes")
+    try:
+        hull = ConvexHull(electrodes).equations
+    except QhullError:  # all electrodes lie on a line
+        return
+    for pad in skin.pads:
+        share = _share_beyond(pad, hull, pitch)
+        if share > MAX_PAD_BEYOND:
+            what = (
+                f"{100 * share:.0f} % of pad {pad.name!r} lies more than {pitch:.3g} m, the distance between two "
+                "electrodes, outside of all electrodes: EIT tells no place there"
+            )
+            yield Finding(Severity.WARNING, "/device", what, "correct the positions of the electrodes or the pad")
+
+
+def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:
+    """Share of a pad that lies more than a pitch outside of a hull, given by `ConvexHull.equations`."""
+    low, high = pad.outline.min(0), pad.outline.max(0)
+    at = (np.arange(PAD_POINTS) + 0.5) / PAD_POINTS
+    box = low + np.stack(np.meshgrid(at, at), -1).reshape(-1, 2) * (high - low)
+    points = box[je.geometry.Polygon(pad.outline).contains(box)]
+    if not len(points):
+        return 0.0
+    return float(np.mean((points @ hull[:, :2].T + hull[:, 2]).max(1) > pitch))
 
 
 def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:

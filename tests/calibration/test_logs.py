@@ -211,3 +211,24 @@ def test_errors_and_coverage_by_hand():
     assert s["coverage"] == 0.5
     assert (s["coverage_low"], s["coverage_high"]) == (1.0, 0.0)
     assert np.isnan(s["coverage_middle"])
+
+
+@pytest.mark.usefixtures("one_way")
+def test_a_log_that_only_loads_says_that_hysteresis_is_not_in_its_intervals(tmp_path, capsys):
+    """Filled in the first half and emptied in the second: neither direction is in what the other is tried on."""
+    rng = np.random.default_rng(4)
+    force = 10 * np.concatenate([np.linspace(0, 1, 1500), np.linspace(1, 0, 1500)])
+    values = 100 * force[:, None] + rng.normal(0, 5, (3000, 1))
+    both = calibrated(write_log(tmp_path / "both.h5", force, values), AFFINE)
+    assert both.notes == ()
+    assert any("the force falls by 10 N here" in note for note in both.evaluation.notes)
+
+    filled = calibrated(write_log(tmp_path / "filled.h5", force[:1500], values[:1500]), AFFINE)
+    assert any("the force rises and never falls" in note for note in filled.notes)
+    filled.save(tmp_path / "calibration.h5")
+    emptied = write_log(tmp_path / "emptied.h5", force[1500:], values[1500:])
+    assert main(["evaluate", str(tmp_path / "calibration.h5"), str(emptied)]) == 0
+    assert "note: the force falls by 10 N here" in capsys.readouterr().out
+    assert main(["apply", str(tmp_path / "calibration.h5"), str(emptied), "-o", str(tmp_path / "f.h5")]) == 0
+    assert "note: the force falls by 10" in capsys.readouterr().out
+    assert "falls by 10" in read_archive(tmp_path / "f.h5", FORCE_FORMAT).attrs["note"]

@@ -114,8 +114,12 @@ def places(rng: Random, honest: Honest) -> Change:
 
 def table_order(rng: Random, honest: Honest) -> Change:
     """The rows of the table late, in falling order or shuffled."""
-    shift, order = int(rng.integers(1, 15)), rng.permutation(16)
-    return lies.rows(pick(rng, (lambda c: np.roll(c, shift), lambda c: c[::-1], lambda c: c[order])))
+    shift, seed = int(rng.integers(1, 15)), int(rng.integers(2**32))
+
+    def shuffled(column: np.ndarray) -> np.ndarray:
+        return column[np.random.default_rng(seed).permutation(len(column))]  # another lie may have added rows
+
+    return lies.rows(pick(rng, (lambda c: np.roll(c, shift), lambda c: c[::-1], shuffled)))
 
 
 def table_numbers(rng: Random, honest: Honest) -> Change:

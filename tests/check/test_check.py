@@ -395,6 +395,16 @@ def test_a_sheet_that_reaches_far_beyond_its_electrodes_is_named(size, parts, lo
     has(look(parts), Severity.WARNING, "m beyond its electrodes, which are 0.04 m apart")
 
 
+def test_a_pad_beyond_all_electrodes_is_named(parts, look):
+    """A pitch that is half the true one: three of four pads have hardly an electrode."""
+    assert "pitch = 0.04" in parts.toml
+    parts.toml = parts.toml.replace("pitch = 0.04", "pitch = 0.02")
+    report = look(parts)
+    for pad in ("lower right", "upper left", "upper right"):
+        has(report, Severity.WARNING, f"of pad {pad!r} lies more than 0.02 m", "EIT tells no place there")
+    assert not any("pad 'lower left'" in finding.what for finding in report.findings)
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_a_sheet_resistance_that_is_ten_times_wrong_is_suspected(factor, parts, look):
     variable, units, rate, time, eit = parts.streams["eit"]

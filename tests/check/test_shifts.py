@@ -101,6 +101,13 @@ def test_a_device_that_repeats_its_last_values_stands_still(findings):
     assert any("/streams/force: stands still for 1.18 s, 10.00 s after" in text for text in found), found
 
 
+def test_noise_that_stops_at_its_own_extreme_stands_still(findings):
+    """No signal could have driven the sensor to an end of its range: it does not clip."""
+    noise = np.round(np.random.default_rng(3).normal(0.0, 1.0, (ROWS, 2)))
+    noise[200:] = noise[:200].min(0) - 1
+    assert any("/streams/pressure: stands still" in text for text in findings(table()[:, 0], noise))
+
+
 @pytest.mark.parametrize("step", [0.05, 0.5])
 def test_a_coarse_load_cell_rests_and_does_not_stand_still(step, findings):
     values = table()

@@ -37,6 +37,8 @@ def run(args: argparse.Namespace) -> int:
             found = apply_log(calibration, session, args.output, ignore_errors=args.force)
         outside = (~found.valid).mean() if len(found.valid) else 0.0
         print(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
+        if unseen := calibration.unseen(found.force):
+            print(f"note: {unseen}")
         return 0
     with open_session(args.session) as session:
         apply(

@@ -2,6 +2,7 @@
 
 from .blend import BestChannel, BlendChannels, WithPlace
 from .combination import COMBINATIONS, AbstractCombination, Blend, OneChannel, SmoothSignal
+from .directions import Travel, missing_direction, travel_of, unseen_direction
 from .fit import LogFit, fit_log, time_split
 from .gaussian_process import SmoothChannels
 from .location import MIN_PLACES, LogLocation
@@ -29,11 +30,15 @@ __all__ = [
     "OneChannel",
     "SmoothChannels",
     "SmoothSignal",
+    "Travel",
     "WithPlace",
     "fit_log",
     "fit_log_noise",
     "fit_series",
+    "missing_direction",
     "series_of",
     "time_split",
+    "travel_of",
+    "unseen_direction",
     "ways_of",
 ]

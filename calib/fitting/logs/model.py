@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from ..curves.fitted import FittedCurve, predict_pads
 from ..curves.samples import bucket
 from .combination import AbstractCombination
+from .directions import Travel
 from .location import LogLocation
 from .noise import LogNoise
 
@@ -49,6 +50,7 @@ class LogModel:
     | noise       | of readings about the curve, which no fit had seen            |               |          |
     | reach       | lowest and highest fitted value of each channel               | (2, channels) | sensor's |
     | location    | how the place of contact is used; None: it is not             |               |          |
+    | travel      | largest rise and fall of the fitted force                     |               | N        |
 
     The covariance is that of the curve for the combination as it is. What the combination's own numbers are uncertain
     by is part of the noise, because both were fitted without the samples that the noise was estimated from.
@@ -59,6 +61,7 @@ class LogModel:
     noise: LogNoise
     reach: Float[np.ndarray, "2 channels"]
     location: LogLocation | None = None
+    travel: Travel = Travel()
 
     @property
     def words(self) -> str:

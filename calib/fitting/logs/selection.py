@@ -27,6 +27,7 @@ from ..results import FitError, FitResult
 from ..selection import Candidate, Tried, simplest
 from .blend import BestChannel, BlendChannels, WithPlace
 from .combination import AbstractCombination, one_channel
+from .directions import travel_of
 from .gaussian_process import SmoothChannels
 from .location import LogLocation, box_of, fit_gains, inside, ratios, relative
 from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, with_noise, within
@@ -319,7 +320,8 @@ def _fitted(
     gains = None if fits.gains is None else _row(fits.gains, 0)
     location = LogLocation(problem.box, gains) if gains is not None or isinstance(way, WithPlace) else None
     reach = reach_of(series.values[problem.used])
-    model = LogModel(fits.combination, fits.curves.pad(0), noise, reach, location)
+    travel = travel_of(np.where(problem.used, series.force, np.nan), series.log)
+    model = LogModel(fits.combination, fits.curves.pad(0), noise, reach, location, travel)
     predicted = with_noise(noise, series.time, fits.force[0], fits.error[0], fits.valid[0])
     return FittedLog(model, predicted, held, way, curve, field, why, tried)
 

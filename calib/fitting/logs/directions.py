@@ -1,0 +1,48 @@
+"""Whether a log loads and unloads its sensor: what is calibrated on a rise alone knows nothing of hysteresis."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+LEAST = 0.5  # of the larger of rise and fall, above which a direction counts as seen
+
+
+class Travel(NamedTuple):
+    """The largest rise of the force after any earlier sample of the same log, and the largest fall, N."""
+
+    rise: float = float("nan")
+    fall: float = float("nan")
+
+
+def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> Travel:
+    """Rise and fall of forces (N); NaN: not known. `log`: number (n,) of the log of each sample; default: one log."""
+    number = np.zeros(len(force), int) if log is None else log
+    parts = [force[(number == k) & np.isfinite(force)] for k in np.unique(number)]
+    rises = [(part - np.minimum.accumulate(part)).max(initial=0.0) for part in parts]
+    falls = [(np.maximum.accumulate(part) - part).max(initial=0.0) for part in parts]
+    return Travel(float(max(rises, default=0.0)), float(max(falls, default=0.0)))
+
+
+def unseen_direction(calibrated: Travel, found: Travel) -> str:
+    """What the forces found do that those calibrated did not, in a sentence; empty: nothing."""
+    least = LEAST * max(calibrated)
+    for name, before, now in zip(("rises", "falls"), calibrated, found, strict=True):
+        if before < least <= now:
+            return (
+                f"the force {name} by {now:.3g} N here, and by {before:.3g} N at most in what was fitted: the intervals "
+                "leave out the hysteresis between the two directions; calibrate with loads that rise and fall"
+            )
+    return ""
+
+
+def missing_direction(calibrated: Travel) -> str:
+    """The direction that no calibrated log has, in a sentence; empty: none."""
+    least = LEAST * max(calibrated)
+    for name, other, size in (("falls", "rises", calibrated.fall), ("rises", "falls", calibrated.rise)):
+        if size < least:
+            return (
+                f"the force {other} and never {name} by more than {size:.3g} N: hysteresis was not seen, and the "
+                "intervals leave it out; calibrate with loads that rise and fall"
+            )
+    return ""
