@@ -10,6 +10,7 @@ from ..presses.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
 from .clocks import compare_clocks, lag_findings
+from .dropouts import dropout_findings
 from .eit import check_eit
 from .evidence import PressEvidence
 from .force import force_findings
@@ -48,7 +49,7 @@ def check_session(
     for stats in statistics.values():
         findings += stream_findings(stats)
         if not session.simulated:  # a simulation may be free of noise
-            findings += [*copy_findings(stats), *stuck_findings(stats)]
+            findings += [*copy_findings(stats), *stuck_findings(stats), *dropout_findings(stats)]
     findings += shift_findings(statistics)
     presses, source = list_presses(session, statistics, findings)
     evidence = press_evidence(statistics, presses, findings)

@@ -119,3 +119,20 @@ def test_sensors_that_clip_do_not_stand_still(findings):
     values = table()
     pressure = np.clip(values[:, 1:] - 30.0, 0.0, None)
     assert not any("stands still" in text for text in findings(values[:, 0], pressure))
+
+
+@pytest.mark.parametrize("every", [2, 3, 8, 100])
+def test_frames_of_zeros_in_place_of_readings_are_named(every, findings):
+    values = table()
+    values[5::every, 1:] = 0.0
+    values[:, 1:] += 3000.0 * (values[:, 1:] != 0)
+    found = findings(values[:, 0], values[:, 1:])
+    assert any("/streams/pressure" in text and "one and the same, all 0, between" in text for text in found), found
+
+
+def test_taps_and_missing_frames_are_no_zeros_of_the_device(findings):
+    values = table()
+    values[5::20, 1:] += 2000.0 * np.random.default_rng(2).uniform(0.5, 1, (40, 1))
+    assert not any("one and the same" in text for text in findings(values[:, 0], values[:, 1:]))
+    values[5::20, 1:] = np.nan
+    assert not any("one and the same" in text for text in findings(values[:, 0], values[:, 1:]))
