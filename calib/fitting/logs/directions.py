@@ -15,6 +15,10 @@ class Travel(NamedTuple):
     fall: float = float("nan")
 
 
+UNKNOWN = Travel()
+"""Of calibrations that early versions saved."""
+
+
 def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> Travel:
     """Rise and fall of forces (N); NaN: not known. `log`: number (n,) of the log of each sample; default: one log."""
     number = np.zeros(len(force), int) if log is None else log
@@ -30,8 +34,8 @@ def unseen_direction(calibrated: Travel, found: Travel) -> str:
     for name, before, now in zip(("rises", "falls"), calibrated, found, strict=True):
         if before < least <= now:
             return (
-                f"the force {name} by {now:.3g} N here, and by {before:.3g} N at most in what was fitted: the intervals "
-                "leave out the hysteresis between the two directions; calibrate with loads that rise and fall"
+                f"the force {name} by {now:.3g} N here, and by {before:.3g} N at most in what was fitted: the "
+                "intervals leave out the hysteresis between the two directions; calibrate with loads that rise and fall"
             )
     return ""
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from ..curves.fitted import FittedCurve, predict_pads
 from ..curves.samples import bucket
 from .combination import AbstractCombination
-from .directions import Travel
+from .directions import UNKNOWN, Travel
 from .location import LogLocation
 from .noise import LogNoise
 
@@ -61,7 +61,7 @@ class LogModel:
     noise: LogNoise
     reach: Float[np.ndarray, "2 channels"]
     location: LogLocation | None = None
-    travel: Travel = Travel()
+    travel: Travel = UNKNOWN
 
     @property
     def words(self) -> str:
