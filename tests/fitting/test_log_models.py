@@ -60,7 +60,7 @@ def test_noise_that_grows_with_the_rate_is_recovered_and_covered():
         late = np.repeat(rng.normal(0, 0.03, 40), 150)  # of each stretch
         residual = 0.05 * rng.normal(size=6000) + late * rate
         group, fitted = np.arange(6000) // 150, np.arange(6000) < 4500
-        noise = fit_log_noise(np.where(fitted, residual, np.nan), time, force, np.zeros(6000), group)
+        noise = fit_log_noise(np.where(fitted, residual, np.nan), time, force, np.zeros(6000), group, 20)
         half = noise.multiple * np.sqrt(noise.variance(time, force))
         moving = np.abs(rate) > 1
         covered.append([np.mean(np.abs(residual) <= half, where=~fitted & (moving == k)) for k in (False, True)])

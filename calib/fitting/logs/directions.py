@@ -1,10 +1,14 @@
-"""Whether a log loads and unloads its sensor: what is calibrated on a rise alone knows nothing of hysteresis."""
+"""How often a log loads and unloads its sensor.
+
+What is calibrated on a rise alone knows nothing of hysteresis, and few cycles tell little of how much cycles differ.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+SWING = 0.25  # of the range of the forces, from which a rise or a fall counts
 LEAST = 0.5  # of the larger of rise and fall, above which a direction counts as seen
 
 
@@ -26,6 +30,27 @@ def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None 
     rises = [(part - np.minimum.accumulate(part)).max(initial=0.0) for part in parts]
     falls = [(np.maximum.accumulate(part) - part).max(initial=0.0) for part in parts]
     return Travel(float(max(rises, default=0.0)), float(max(falls, default=0.0)))
+
+
+def cycles_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> int:
+    """Number of cycles, each a rise and a fall of at least `SWING` of the range of all forces; at least one."""
+    number = np.zeros(len(force), int) if log is None else log
+    known = np.isfinite(force)
+    swing = SWING * float(np.ptp(force[known])) if known.any() else 0.0
+    strokes = sum(_strokes(force[known & (number == k)].tolist(), swing) for k in np.unique(number))
+    return max(strokes // 2, 1)
+
+
+def _strokes(force: list[float], swing: float) -> int:
+    """Number of rises and falls of at least `swing`, between turning points."""
+    count, way, low, high = 0, 0, np.inf, -np.inf
+    for value in force:
+        low, high = min(low, value), max(high, value)
+        if way <= 0 and value - low >= swing > 0:
+            count, way, high = count + 1, 1, value
+        elif way >= 0 and high - value >= swing > 0:
+            count, way, low = count + 1, -1, value
+    return count
 
 
 def unseen_direction(calibrated: Travel, found: Travel) -> str:

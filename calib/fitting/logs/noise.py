@@ -4,9 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.stats import t as student_t
 
 from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, most_likely_sizes
 
+STRETCHES = 0.75  # share of the stretches of time in which the interval covers the readings
 WINDOW = 0.2  # s before and after a sample, over which the rate of its force is taken
 
 
@@ -22,7 +24,8 @@ class LogNoise(eqx.Module):
     | lag      | standard deviation per rate of the force                 | ()    | s    |
     | multiple | half the interval, in standard deviations; see below     | ()    | 1    |
 
-    The interval covers 90 % of the readings in nine of ten stretches of time.
+    The interval covers 90 % of the readings in three of four stretches of time, and is wider where the log has few
+    cycles of load: these tell little of how much the next one differs (Student's distribution).
     """
 
     floor: Float[Array, ""]
@@ -42,6 +45,7 @@ def fit_log_noise(
     force: Float[np.ndarray, " n"],
     variance: Float[np.ndarray, " n"],
     group: np.ndarray,
+    repetitions: int,
 ) -> LogNoise:
     """The noise of held-out residuals; floor, fraction and lag have the largest normal likelihood.
 
@@ -51,6 +55,8 @@ def fit_log_noise(
         force: predicted, N.
         variance: of the predicted force, by the model, N^2.
         group: stretch of time (n,) of each row. Rows of a group count as one, because they err together.
+        repetitions: cycles of load, or places, that the residuals are of. The fewer they are, the less is known of how
+            much the next one differs: the interval is wider, as that of Student's distribution.
     """
     terms = _terms(force, force_rate(time, force))
     sound = np.isfinite(residual) & np.isfinite(terms).all(1) & np.isfinite(variance)
@@ -59,11 +65,12 @@ def fit_log_noise(
     sizes = most_likely_sizes(residual, variance, 1 / count[group], terms)
     deviation = np.sqrt(np.maximum(variance + terms @ sizes**2, np.finfo(float).tiny))
     floor, fraction, lag = map(jnp.asarray, sizes)
-    return LogNoise(floor, fraction, lag, jnp.asarray(_multiple(np.abs(residual) / deviation, group)))
+    wider = float(student_t.ppf(0.5 + COVERAGE / 2, repetitions)) / NORMAL_MULTIPLE
+    return LogNoise(floor, fraction, lag, jnp.asarray(wider * _multiple(np.abs(residual) / deviation, group)))
 
 
 def _multiple(pull: Float[np.ndarray, " n"], group: np.ndarray) -> float:
-    """The multiple that covers 90 % of the readings in nine of ten stretches of time.
+    """The multiple that covers 90 % of the readings in three of four stretches of time.
 
     One that covers 90 % of all readings is exceeded by whole stretches: sensors drift, so that what comes after a log
     is seldom as near to the model as the log is to itself.
@@ -71,7 +78,7 @@ def _multiple(pull: Float[np.ndarray, " n"], group: np.ndarray) -> float:
     stretches = np.unique(group)
     if len(stretches) < MIN_GROUPS:
         return NORMAL_MULTIPLE
-    return float(np.quantile([np.quantile(pull[group == k], COVERAGE) for k in stretches], COVERAGE))
+    return float(np.quantile([np.quantile(pull[group == k], COVERAGE) for k in stretches], STRETCHES))
 
 
 def force_rate(time: np.ndarray, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

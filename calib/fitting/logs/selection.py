@@ -27,7 +27,7 @@ from ..results import FitError, FitResult
 from ..selection import Candidate, Tried, simplest
 from .blend import BestChannel, BlendChannels, WithPlace
 from .combination import AbstractCombination, one_channel
-from .directions import travel_of
+from .directions import cycles_of, travel_of
 from .gaussian_process import SmoothChannels
 from .location import LogLocation, box_of, fit_gains, inside, ratios, relative
 from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, with_noise, within
@@ -316,11 +316,13 @@ def _fitted(
     series, (way, curve, field), held = problem.series, chosen, problem.held_out(fits)
     residual = np.where(held.valid & problem.decides, series.force - held.force, np.nan)
     groups = series.blocks(problem.used, NOISE_BLOCKS)
-    noise = fit_log_noise(residual, series.time, held.force, held.error**2, groups)
+    used = np.where(problem.used, series.force, np.nan)
+    repetitions = cycles_of(used, series.log) if series.site is None else len(np.unique(series.sites[problem.used]))
+    noise = fit_log_noise(residual, series.time, held.force, held.error**2, groups, repetitions)
     gains = None if fits.gains is None else _row(fits.gains, 0)
     location = LogLocation(problem.box, gains) if gains is not None or isinstance(way, WithPlace) else None
     reach = reach_of(series.values[problem.used])
-    travel = travel_of(np.where(problem.used, series.force, np.nan), series.log)
+    travel = travel_of(used, series.log)
     model = LogModel(fits.combination, fits.curves.pad(0), noise, reach, location, travel)
     predicted = with_noise(noise, series.time, fits.force[0], fits.error[0], fits.valid[0])
     return FittedLog(model, predicted, held, way, curve, field, why, tried)
