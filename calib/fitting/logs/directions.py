@@ -60,7 +60,7 @@ def unseen_direction(calibrated: Travel, found: Travel) -> str:
         if before < least <= now:
             return (
                 f"the force {name} by {now:.3g} N here, and by {before:.3g} N at most in what was fitted: the "
-                "intervals leave out the hysteresis between the two directions; calibrate with loads that rise and fall"
+                "model leaves out the hysteresis between the two directions; calibrate with loads that rise and fall"
             )
     return ""
 
@@ -72,6 +72,6 @@ def missing_direction(calibrated: Travel) -> str:
         if size < least:
             return (
                 f"the force {other} and never {name} by more than {size:.3g} N: hysteresis was not seen, and the "
-                "intervals leave it out; calibrate with loads that rise and fall"
+                "model leaves it out; calibrate with loads that rise and fall"
             )
     return ""
