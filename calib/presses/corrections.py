@@ -208,7 +208,8 @@ def _window_mean(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _block_edges(rows: int) -> np.ndarray:
-    return np.linspace(0, rows, min(BLOCKS_PER_WINDOW, rows) + 1).astype(int)[:-1]
+    blocks = min(BLOCKS_PER_WINDOW, rows)
+    return np.arange(blocks) * rows // max(blocks, 1)
 
 
 def _scatter_of_blocks(residual: np.ndarray) -> np.ndarray:

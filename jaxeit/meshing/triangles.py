@@ -57,7 +57,7 @@ class Mesh:
         """Centroids of the triangles in space, (m, 2 or 3) m."""
         return np.asarray(self.nodes[self.triangles].mean(1))
 
-    @property
+    @cached_property
     def chart_centroids(self) -> np.ndarray:
         """Centroids of the triangles on the flat sheet, (m, 2) m."""
         return np.asarray(self.chart[self.triangles].mean(1))
