@@ -32,7 +32,8 @@ _MESSAGES = {
     FitResult.MAX_STEPS: "the solver ran out of steps: raise max_steps, or choose a curve with fewer parameters",
     FitResult.NO_RESPONSE: "force does not rise with pressure, or there is only one pressure: check the pad's tube, "
     "its sign and its number, and record presses at more load levels",
-    FitResult.SINGULAR: "the samples do not determine all parameters: record presses at more load levels",
+    FitResult.SINGULAR: "the samples do not determine all parameters: record presses at more load levels, or choose a "
+    "curve with fewer parameters (affine, power)",
     FitResult.AT_BOUND: "somewhere the force falls with pressure or does not rise, and this curve must: choose a curve "
     "with fewer parameters, and check the range of the pressure sensor",
 }
