@@ -16,6 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import jaxeit as je
+from calib.calibration.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, Loads, LoadShape
 
 from .bench_images import matched
@@ -134,7 +135,7 @@ def _by_bumps(touch: Touch, seen: Any) -> bool:
 
 def measure(run: Run) -> Iterator[Row]:
     seeds, singles, others = run.sizes((4, 40, 10), (1, 2, 1))
-    model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
     every: list[Row] = []
     for seed in range(100, 100 + seeds):
         every += measured(model, seed, list(touches(np.random.default_rng(seed), singles, others)))

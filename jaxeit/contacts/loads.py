@@ -33,6 +33,7 @@ from ..model.discretisation import Model
 from ..model.forward_model import conductivity, forward
 from .bump_responses import mean_conductivity, points_of
 from .fit import SOLVER
+from .preparation import sheet_of
 from .result import Contacts
 
 FULL, TRIAL = 25, 4  # steps of a fit, and of one that is compared with other starts
@@ -356,21 +357,23 @@ def prepare_loads(
     settings: LoadSettings | None = None,
     *,
     noise: Float[ArrayLike, "..."],
+    untouched: Float[ArrayLike, " readings"] | None = None,
     sigma: Float[Array, " elements"] | None = None,
     channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> LoadFitter:
     """Prepare the fit of loads to frames of a skin, for use offline.
 
     Args:
+        model: of edges not above 0.04 of the sheet; a draft moves a load by 0.15 mm, which is in no covariance.
         settings: default `LoadSettings()`.
-        noise, channels: as for `prepare_contacts`.
-        sigma: conductivity of the untouched sheet, (elements,) S, best from `fit_background`; default: the even sheet.
+        noise, untouched, sigma, channels: as for `prepare_contacts`.
 
     Raises:
-        InverseError: if the noise is out of range or no channel is left.
+        InverseError: as for `prepare_contacts`.
     """
-    require_known("prepare_loads", InverseError, model, noise, sigma, channels)
+    require_known("prepare_loads", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or LoadSettings()
+    sigma = sheet_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
     sigma = conductivity(model) if sigma is None else jnp.asarray(sigma, model.dtype)
     points, weights = points_of(model, settings.width)

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known, verb
+from ..imaging.background import fit_background
 from ..imaging.noise import InverseError, Whitened, whitened_readings
 from ..model.bases import Elements
 from ..model.discretisation import Model
@@ -31,6 +32,7 @@ def prepare_contacts(
     settings: ContactSettings | None = None,
     *,
     noise: Float[ArrayLike, "..."],
+    untouched: Float[ArrayLike, " readings"] | None = None,
     sigma: Float[Array, " elements"] | None = None,
     channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> ContactFinder:
@@ -54,15 +56,19 @@ def prepare_contacts(
     Args:
         settings: default `ContactSettings()`.
         noise: standard deviation of each reading, (readings,) V, or their covariance, (readings, readings) V^2.
-        sigma: conductivity to linearise at, (elements,) S, best from `fit_background`: on an uneven coating the error
-            of place is otherwise more than twice as large; default: the even sheet.
+        untouched: mean frame of the untouched sheet, (readings,) V, to which `fit_background` fits the sheet. Give it
+            wherever there is one: on an uneven coating the error of place is otherwise more than twice as large.
+        sigma: conductivity of the untouched sheet, (elements,) S, if it is known already; without either, the sheet is
+            even.
         channels: readings to use; a dead reading is left out, never taken for zero.
 
     Raises:
-        InverseError: if the noise is out of range or no channel is left.
+        InverseError: if the noise is out of range, no channel is left, both ``untouched`` and ``sigma`` are given, or
+            no coating explains the untouched frame.
     """
-    require_known("prepare_contacts", InverseError, model, noise, sigma, channels)
+    require_known("prepare_contacts", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or ContactSettings()
+    sigma = sheet_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
     nodes = nodes_of(model, settings.widths, settings.columns)
     slopes, background = _slopes(model, found, sigma)
@@ -86,6 +92,23 @@ def prepare_contacts(
     )
     ready: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, settings.false_alarm)))
     return ready
+
+
+def sheet_of(
+    model: Model,
+    untouched: Float[ArrayLike, " readings"] | None,
+    sigma: Float[Array, " elements"] | None,
+    channels: Bool[ArrayLike, " readings"] | None,
+) -> Float[Array, " elements"] | None:
+    """The conductivity of the untouched sheet, (elements,) S, from what is known of it; None: it is even."""
+    if untouched is None:
+        return sigma
+    if sigma is not None:
+        raise InverseError("untouched and sigma both tell the sheet; give one of them")
+    frame = np.asarray(untouched, float)
+    if channels is not None and frame.shape == np.shape(channels):
+        frame = np.where(channels, frame, np.nan)
+    return fit_background(model, frame)
 
 
 def _slopes(model: Model, found: Whitened, sigma: Float[Array, " elements"] | None) -> tuple[np.ndarray, float]:

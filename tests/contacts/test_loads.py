@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from calib.calibration.load_windows import FIDELITY
 from benchmarks.problems import pressed
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
 from jaxeit.imaging import InverseError
@@ -54,9 +55,8 @@ def ready():
     """The fitter, the finder, and the frames of `TOUCHES`."""
     model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
     frames, noise, blank = frames_of([touch for _, touch in TOUCHES.values()])
-    sheet = je.fit_background(model, blank)
-    finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
-    return prepare_loads(model, noise=noise, sigma=sheet), finder, frames, noise
+    finder = je.prepare_contacts(model, noise=noise, untouched=blank)
+    return prepare_loads(model, noise=noise, untouched=blank), finder, frames, noise
 
 
 def seen(ready, number):
@@ -123,10 +123,14 @@ def test_covariances_grow_with_the_gain_that_is_not_known(ready):
 
 
 def test_what_cannot_be_fitted_is_refused(ready):
-    fitter, finder, frames, _ = ready
+    fitter, finder, frames, noise = ready
     contacts = finder(frames[0])
     with pytest.raises(InverseError, match="fit one frame of 550 readings at a time"):
         fitter(frames[:2], contacts)
+    with pytest.raises(InverseError, match="both tell the sheet"):
+        prepare_loads(fitter.model, noise=noise, untouched=np.ones(550), sigma=fitter.sigma)
+    with pytest.raises(InverseError, match="give the 550 readings of one frame"):
+        je.prepare_contacts(fitter.model, noise=noise, untouched=np.ones(5))
     with pytest.raises(InverseError, match="reading 3 is not finite"):
         fitter(np.where(np.arange(550) == 3, np.nan, frames[0]), contacts)
     for bad in ({"width": 0.0}, {"gain": -1.0}, {"prior": (1.0, 0.0, 0.0)}, {"prior": (0.5, 0.5, 0.5, 0.5)}):
@@ -135,9 +139,9 @@ def test_what_cannot_be_fitted_is_refused(ready):
 
 
 @pytest.mark.slow
-def test_ellipses_hold_most_places():
-    """Single touches anywhere, three sheets known from v0: ellipses of 90 % hold about 80 % (docs/methods.md)."""
-    model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
+def test_ellipses_hold_nine_of_ten_places():
+    """Single touches anywhere, three sheets known from v0, on a mesh whose own error is small beside the gain's."""
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
     inside = []
     for seed in range(3):
         rng = np.random.default_rng(100 + seed)
@@ -147,11 +151,10 @@ def test_ellipses_hold_most_places():
         )
         places = rng.uniform(0.02, 0.18, (25, 2))
         frames, noise, blank = frames_of([single(*place) for place in places], effects, seed)
-        sheet = je.fit_background(model, blank)
-        finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
-        fitter = prepare_loads(model, noise=noise, sigma=sheet)
+        finder = je.prepare_contacts(model, noise=noise, untouched=blank)
+        fitter = prepare_loads(model, noise=noise, untouched=blank)
         for place, frame in zip(places, frames, strict=True):
             one = fitter(frame, finder(frame)).one
             away = np.asarray(one.position[0]) - place
             inside.append(away @ np.linalg.solve(np.asarray(one.covariance)[:2, :2], away) < 4.605)
-    assert 0.7 < np.mean(inside) < 0.97
+    assert 0.82 < np.mean(inside) < 0.98
