@@ -8,6 +8,7 @@ trusts the size of a chunk, and returns zeros for a chunk that was never written
 import itertools
 import math
 import zlib
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -19,6 +20,7 @@ from .guard import DAMAGED, Node, plain_type, translated, type_kind
 MAX_RANK = 4
 MAX_CHUNK_BYTES = 16 << 20
 MAX_CHUNKS = 1 << 20
+KEPT_BYTES = 16 << 20  # of decoded chunks of a dataset
 MAX_COMPACT_BYTES = 64 << 10
 MAX_TEXT_BYTES = 4096
 WRITE_AS = "write it chunked with gzip, shuffle and fletcher32, or convert the file with `jaxeit import hdf5`"
@@ -38,7 +40,7 @@ class GuardedArray:
     dtype: np.dtype = field(init=False)
     chunk: tuple[int, ...] = field(init=False)
     filters: tuple[int, ...] = field(init=False, default=())
-    _last: tuple[tuple[int, ...], np.ndarray] | None = field(init=False, default=None)
+    _decoded: OrderedDict[tuple[int, ...], np.ndarray] = field(init=False, default_factory=OrderedDict, repr=False)
 
     def __post_init__(self) -> None:
         with translated(self.node.path, self.node.where):
@@ -143,9 +145,13 @@ class GuardedArray:
         return itertools.product(rows, *rest)
 
     def _chunk_at(self, origin: tuple[int, ...]) -> np.ndarray:
-        if self._last is None or self._last[0] != origin:
-            self._last = (origin, self._decode(origin))
-        return self._last[1]
+        """A chunk; the last few are kept, because check and calibration read a session press by press, in turn."""
+        if origin not in self._decoded:
+            self._decoded[origin] = self._decode(origin)
+            while len(self._decoded) > 1 and len(self._decoded) * self._decoded[origin].nbytes > KEPT_BYTES:
+                self._decoded.popitem(last=False)
+        self._decoded.move_to_end(origin)
+        return self._decoded[origin]
 
     def _decode(self, origin: tuple[int, ...]) -> np.ndarray:
         size = math.prod(self.chunk) * self.dtype.itemsize

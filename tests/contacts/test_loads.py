@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from calib.calibration.load_windows import FIDELITY
 from benchmarks.problems import pressed
+from calib.calibration.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
 from jaxeit.imaging import InverseError
 
