@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, weighted, window_means
+from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, weighted
 from .means import read_press
-from .streams import ReadableStream, index_ranges, resample
+from .streams import ReadableStream, finite_mean, index_ranges, resample
 from .times import PressColumns
 from .windows import PressWindows
 
@@ -42,7 +42,7 @@ def remove_baseline(
     """Time stamps (n,) ns and values (n, channels) of press `i`, with the baseline subtracted from every sample."""
     time, values = read_press(stream, windows, i, corrections)
     rests = np.stack([windows.rest_before[i], windows.rest_after[i]])
-    before, after = window_means(values, index_ranges(time, rests)).mean
+    before, after = (finite_mean(values[a:b]) for a, b in index_ranges(time, rests))
     w0, w1 = rule.weights(time.astype(float), *rests.astype(float).mean(axis=1))
     return time, values - (weighted(w0[:, None], before) + weighted(w1[:, None], after))
 
