@@ -36,6 +36,19 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / "
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+MOST_MAPS = 40_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _bounded_maps():
+    """A compiled program takes some 14 memory maps, of which Linux allows a process 65,530; beyond them XLA crashes."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
+
+
 @pytest.fixture(scope="session")
 def skin():
     return je.load_skin("testbed")
