@@ -13,7 +13,6 @@ import jaxeit as je
 from ..fitting.curves import CURVES, FittedCurve
 from ..fitting.fields import FIELDS
 from ..fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise, Travel
-from ..fitting.logs.directions import UNKNOWN
 from ..fitting.selection import Candidate
 from ..session import Archive
 from .log_evaluation import LogEvaluation
@@ -132,7 +131,7 @@ def _model(attrs: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LogMod
     noise = LogNoise(**{name: jnp.asarray(given[f"noise/{name}"]) for name in NOISE_FIELDS})
     fitted = FittedCurve(curve=curve, **numbers)
     location = _location(str(attrs.get("location", NO_PLACE)), arrays)
-    travel = Travel(*map(float, arrays.get("force/travel", UNKNOWN)))
+    travel = Travel(*map(float, arrays.get("force/travel", ())))  # early versions did not store it
     return LogModel(_combination(attrs, arrays), fitted, noise, arrays["channels/reach"], location, travel)
 
 

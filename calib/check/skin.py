@@ -13,7 +13,7 @@ from .report import Finding, Severity, listed
 RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrodes are looked at
 MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
 MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
-PAD_POINTS = 32  # along the rim of a pad's box, at which that share is counted
+PAD_POINTS = 32  # along each side of a pad's box, at which that share is counted
 
 
 def check_skin(session: Session, given: je.Skin | None, findings: list[Finding]) -> je.Skin | None:

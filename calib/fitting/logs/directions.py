@@ -19,14 +19,9 @@ class Travel(NamedTuple):
     fall: float = float("nan")
 
 
-UNKNOWN = Travel()
-"""Of calibrations that early versions saved."""
-
-
 def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> Travel:
     """Rise and fall of forces (N); NaN: not known. `log`: number (n,) of the log of each sample; default: one log."""
-    number = np.zeros(len(force), int) if log is None else log
-    parts = [force[(number == k) & np.isfinite(force)] for k in np.unique(number)]
+    parts = _logs(force, log)
     rises = [(part - np.minimum.accumulate(part)).max(initial=0.0) for part in parts]
     falls = [(np.maximum.accumulate(part) - part).max(initial=0.0) for part in parts]
     return Travel(float(max(rises, default=0.0)), float(max(falls, default=0.0)))
@@ -34,11 +29,15 @@ def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None 
 
 def cycles_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> int:
     """Number of cycles, each a rise and a fall of at least `SWING` of the range of all forces; at least one."""
+    known = force[np.isfinite(force)]
+    swing = SWING * float(np.ptp(known)) if len(known) else 0.0
+    return max(sum(_strokes(part.tolist(), swing) for part in _logs(force, log)) // 2, 1)
+
+
+def _logs(force: np.ndarray, log: np.ndarray | None) -> list[np.ndarray]:
+    """The forces of each log that are known."""
     number = np.zeros(len(force), int) if log is None else log
-    known = np.isfinite(force)
-    swing = SWING * float(np.ptp(force[known])) if known.any() else 0.0
-    strokes = sum(_strokes(force[known & (number == k)].tolist(), swing) for k in np.unique(number))
-    return max(strokes // 2, 1)
+    return [force[(number == k) & np.isfinite(force)] for k in np.unique(number)]
 
 
 def _strokes(force: list[float], swing: float) -> int:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from ..curves.fitted import FittedCurve, predict_pads
 from ..curves.samples import bucket
 from .combination import AbstractCombination
-from .directions import UNKNOWN, Travel
+from .directions import Travel
 from .location import LogLocation
 from .noise import LogNoise
 
@@ -60,8 +60,8 @@ class LogModel:
     curve: FittedCurve
     noise: LogNoise
     reach: Float[np.ndarray, "2 channels"]
-    location: LogLocation | None = None
-    travel: Travel = UNKNOWN
+    location: LogLocation | None
+    travel: Travel
 
     @property
     def words(self) -> str:
