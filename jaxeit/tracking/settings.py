@@ -1,0 +1,48 @@
+"""What is known of contacts over time before they are followed."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..imaging.noise import InverseError
+from ..contacts.loads import LoadSettings
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How contacts move and press, and how closely they are followed.
+
+    | meaning                                                                        | default | unit      |
+    |--------------------------------------------------------------------------------|---------|-----------|
+    | loads: the law of pressure, the gain of the contact layer, usual sizes and forces |       |           |
+    | level: standard deviation of the log of the gain that all places share         | 0.3     | 1         |
+    | persistence: time over which errors of mesh and load shape stay as they are    | 0.5     | s         |
+    | acceleration: change of a contact's velocity                                   | 0.3     | m/s/sqrt(s) |
+    | width_rate, force_rate: change of the logs of width and force                  | 0.5, 5  | 1/sqrt(s) |
+    | birth_rate: of contacts anywhere on the skin                                   | 0.5     | 1/s       |
+    | most: contacts followed at once                                                | 3       |           |
+    | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
+    | modes: of the gain around a contact that a frame updates                       | 24      |           |
+
+    Raises:
+        InverseError: for a value out of range.
+    """
+
+    loads: LoadSettings = field(default_factory=LoadSettings)
+    level: float = 0.3
+    persistence: float = 0.5
+    acceleration: float = 0.3
+    width_rate: float = 0.5
+    force_rate: float = 5.0
+    birth_rate: float = 0.5
+    most: int = 3
+    unknowns: int = 96
+    modes: int = 24
+
+    def __post_init__(self) -> None:
+        for name in ("level", "persistence", "acceleration", "width_rate", "force_rate", "birth_rate"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
+        for name in ("most", "unknowns", "modes"):
+            if getattr(self, name) < 1:
+                raise InverseError(f"{name} is {getattr(self, name)}; give one or more")
