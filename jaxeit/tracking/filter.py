@@ -22,10 +22,10 @@ from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import verb
+from ..contacts.search import ContactFinder, Frame
 from ..effects.material import ContactPiezoresistance
 from ..least_squares import ImplicitStep, LevenbergMarquardt
 from ..linalg import lapack
-from ..contacts.search import ContactFinder, Frame
 from .reanalysis import Reanalysis
 
 # Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
@@ -41,7 +41,7 @@ SOLVER = LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=FALL)
 
 
 class Pads(NamedTuple):
-    """Forces that the pads tell in a frame, and their standard errors, (pads,) N; infinite for a pad that tells none."""
+    """Forces on the pads in a frame, and their standard errors, (pads,) N; infinite for a pad that tells none."""
 
     force: Float[Array, " pads"]
     error: Float[Array, " pads"]
@@ -81,6 +81,13 @@ class Update(NamedTuple):
     loudness: Float[Array, " K"]
 
 
+class LogGain(NamedTuple):
+    """Log gain of elements (e,) and pixels (n,)."""
+
+    elements: Float[Array, " e"]
+    pixels: Float[Array, " n"]
+
+
 class ContactFilter(eqx.Module):
     """What frames tell of contacts; made by `prepare_tracker`.
 
@@ -88,10 +95,14 @@ class ContactFilter(eqx.Module):
     |--------------------------------------------------------------------------|------------------|------|
     | finder: whitens frames; its atoms are where contacts may begin           |                  |      |
     | sheet: readings of a changed sheet                                       |                  |      |
-    | sigma: of the untouched sheet; centroids of the elements                 | (elements,), (elements, 2) | S, m |
+    | sigma: of the untouched sheet                                            | (elements,)      | S    |
     | points, weights: of the elements                                         | (elements, q, 2), (q,) | m |
-    | modes: of the log gain of each element, and where each mode lies; the first is the level | (elements, g), (g, 2) | 1, m |
-    | pixels, pad_area: places, and area of each pad in each                   | (p, 2), (pads, p) | m, m^2 |
+    | modes: of the log gain of each element; the first is the level           | (elements, g)    | 1    |
+    | places: where the modes lie                                              | (g, 2)           | m    |
+    | pixels: their middles                                                    | (p, 2)           | m    |
+    | pixel_response: readings per relative change of each, to first order     | (p, r)           | 1    |
+    | pixel_modes: of the log gain of each                                     | (p, g)           | 1    |
+    | pad_area: area of each pad in each pixel                                 | (pads, p)        | m^2  |
     | law: factor of conductivity by pressure                                  |                  |      |
     | model_error: part of the signal by which mesh, sheet and load shape err  | ()               | 1    |
     | persistence of that error                                                | ()               | s    |
@@ -101,12 +112,13 @@ class ContactFilter(eqx.Module):
     finder: ContactFinder
     sheet: Reanalysis
     sigma: Float[Array, " elements"]
-    centroids: Float[Array, "elements 2"]
     points: Float[Array, "elements q 2"]
     weights: Float[Array, " q"]
     modes: Float[Array, "elements g"]
     places: Float[Array, "g 2"]
     pixels: Float[Array, "p 2"]
+    pixel_response: Float[Array, "p r"]
+    pixel_modes: Float[Array, "p g"]
     pad_area: Float[Array, "pads p"]
     law: ContactPiezoresistance
     model_error: Float[Array, ""]
@@ -114,30 +126,40 @@ class ContactFilter(eqx.Module):
     rates: Float[Array, "8"]
     unknowns: int = eqx.field(static=True)
     active_modes: int = eqx.field(static=True)
-    near_elements: int = eqx.field(static=True)
+    near_pixels: int = eqx.field(static=True)
 
     def pressure(self, contacts: Float[Array, "K 6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
         """Pressure of all contacts at points, Pa."""
         pressures = [_edge(one, points) for one in contacts]
         return jnp.sum(jnp.stack(pressures), 0) if pressures else jnp.zeros(points.shape[:-1], points.dtype)
 
-    def near(self, contacts: Float[Array, "K 6"]) -> Int[Array, " e"]:
-        """The elements under and around contacts, a constant number of each; pressure elsewhere is next to nothing."""
-        size = min(self.near_elements * len(contacts), len(self.centroids))
-        return jax.lax.top_k(self.pressure(contacts, self.centroids), size)[1]
+    def near(self, contacts: Float[Array, "K 6"]) -> tuple[Int[Array, " e"], Int[Array, " n"]]:
+        """Elements under contacts, and pixels under and around them; pressure elsewhere is next to nothing."""
+        quick, count = contacts.astype(self.points.dtype), len(contacts)
+        middles = self.points.mean(1)
+        elements = jax.lax.top_k(self.pressure(quick, middles), min(2 * self.unknowns * count, len(middles)))[1]
+        pixels = jax.lax.top_k(self.pressure(quick, self.pixels), min(self.near_pixels * count, len(self.pixels)))[1]
+        return elements, pixels
 
     def response(
-        self, contacts: Float[Array, "K 6"], elements: Int[Array, " e"], log_gain: Float[Array, " e"]
+        self, contacts: Float[Array, "K 6"], near: tuple[Int[Array, " e"], Int[Array, " n"]], gain: "LogGain"
     ) -> Float[Array, " r"]:
-        """Whitened readings of contacts, from the elements near them and the gain there."""
-        pressure = self.pressure(contacts, self.points[elements]) * jnp.exp(log_gain)[:, None]
-        change = self.sigma[elements] * (self.law.factor(pressure) @ self.weights - 1)
+        """Whitened readings of contacts, from what is near them and the gain there."""
+        elements, pixels = near
+        quick = self.points.dtype
+        law = jax.tree.map(lambda leaf: leaf.astype(quick), self.law)
+        loads = contacts.astype(quick)
+        of_pixels = self.pressure(loads, self.pixels[pixels]) * jnp.exp(gain.pixels.astype(quick))
+        first = (law.factor(of_pixels) - 1) @ self.pixel_response[pixels]
+        of_points = self.pressure(loads, self.points[elements]) * jnp.exp(gain.elements.astype(quick))[:, None]
+        change = self.sigma[elements] * (law.factor(of_points) @ self.weights - 1)
         size = min(self.unknowns * len(contacts), len(self.sheet.green))
-        return self.sheet.readings(elements, change.astype(self.sheet.green.dtype), size).astype(contacts.dtype)
+        found: Array = (first + self.sheet.beyond(elements, change, size)).astype(contacts.dtype)
+        return found
 
     def pad_forces(self, contacts: Float[Array, "K 6"]) -> Float[Array, " pads"]:
         """Force of the contacts on each pad, N."""
-        return self.pad_area @ self.pressure(contacts, self.pixels)
+        return self.pad_area @ self.pressure(contacts, self.pixels.astype(contacts.dtype))
 
 
 def _edge(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
@@ -148,7 +170,8 @@ def _edge(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array,
     across = jnp.sum(away**2, -1) - along**2
     root = np.sqrt(2.0) * width
     spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
-    return jnp.exp(one[3] - 0.5 * across / width**2) * spread / (np.sqrt(2 * np.pi) * width)
+    found: Array = jnp.exp(one[3] - 0.5 * across / width**2) * spread / (np.sqrt(2 * np.pi) * width)
+    return found
 
 
 @verb
@@ -179,18 +202,19 @@ class _Problem(NamedTuple):
     active: Int[Array, " a"]
     factor: Float[Array, "a a"]
     scale: Float[Array, ""]
-    elements: Int[Array, " e"]
+    near: tuple[Int[Array, " e"], Int[Array, " n"]]
 
     def contacts(self, change: Float[Array, " a"]) -> Float[Array, "K 6"]:
         """Contacts after a change of the active numbers."""
         before = self.belief.contacts[:, :SEEN]
         return before + change[: before.size].reshape(-1, SEEN)
 
-    def log_gain(self, change: Float[Array, " a"]) -> Float[Array, " e"]:
-        """Log gain of the elements near the contacts after a change of the active numbers."""
-        modes, size = self.tracker.modes[self.elements], self.belief.contacts.size
-        seen = SEEN * len(self.belief.contacts)
-        return modes @ self.belief.gain + modes[:, self.active[seen:] - size] @ change[seen:]
+    def log_gain(self, change: Float[Array, " a"]) -> LogGain:
+        """Log gain near the contacts after a change of the active numbers."""
+        size, seen = self.belief.contacts.size, SEEN * len(self.belief.contacts)
+        tables = self.tracker.modes[self.near[0]], self.tracker.pixel_modes[self.near[1]]
+        moved = [modes @ self.belief.gain + modes[:, self.active[seen:] - size] @ change[seen:] for modes in tables]
+        return LogGain(*moved)
 
 
 def _residual(z: Float[Array, " a"], problem: _Problem) -> tuple[Float[Array, " n"], Float[Array, " r"]]:
@@ -198,7 +222,7 @@ def _residual(z: Float[Array, " a"], problem: _Problem) -> tuple[Float[Array, " 
     the first of these."""
     change, tracker = problem.factor @ z, problem.tracker
     contacts = problem.contacts(change)
-    found = tracker.response(contacts, problem.elements, problem.log_gain(change))
+    found = tracker.response(contacts, problem.near, problem.log_gain(change))
     mixed = jax.lax.cond(problem.whole, lambda r: r, lambda r: problem.frame.root @ r, found)
     left = (problem.frame.y - mixed) / problem.scale
     on_pads = (tracker.pad_forces(contacts) - problem.pads.force) / problem.pads.error
@@ -237,10 +261,11 @@ def updated(
         return _nothing(belief, frame.y, pads, alone, scale)
     active = _active(tracker, belief.contacts)
     factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
-    elements = tracker.near(belief.contacts[:, :SEEN])
-    problem = _Problem(tracker, frame, whole, pads, belief, active, factor, scale, elements)
+    near = tracker.near(belief.contacts[:, :SEEN])
+    problem = _Problem(tracker, frame, whole, pads, belief, active, factor, scale, near)
+    residual: Any = _residual  # the types of optimistix know no auxiliary output
     found: optx.Solution[Array, Any] = optx.least_squares(
-        _residual,
+        residual,
         SOLVER,
         jnp.zeros(len(active), factor.dtype),
         problem,

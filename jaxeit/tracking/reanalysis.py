@@ -9,7 +9,10 @@ unknowns S of the changed elements, the transfer matrix changes exactly by (Wood
 
 and the fields among these unknowns become ``U = P - G_SS Y``, from which the adjoint identity of `forward_model` gives
 the derivative of dZ in each element's conductivity: an m by m matrix is factored in place of the whole. What changes
-beyond the m unknowns, the tails of a contact, is taken to first order about the untouched sheet.
+beyond the m unknowns, the tails of a contact, counts to first order only.
+
+The error of a coarse mesh is mostly one of first order: it is half as long as a contact is wide. So the first order is
+left to an image on a fine mesh, and a coarse one tells what is beyond the first order.
 """
 
 from functools import partial
@@ -26,7 +29,7 @@ from scipy.sparse.linalg import splu
 from ..linalg import lapack
 from ..model.bases import Elements
 from ..model.discretisation import Model
-from ..model.forward_model import assemble, coefficients, fields
+from ..model.forward_model import Coefficients, assemble, coefficients, fields
 from ..model.sensitivity import pair_jacobian
 
 
@@ -52,17 +55,18 @@ class Reanalysis(eqx.Module):
     mixing: Float[Array, "p r"]
     linear: Float[Array, "elements r"]
 
-    def readings(self, elements: Int[Array, " e"], change: Float[Array, " e"], size: int) -> Float[Array, " r"]:
-        """Readings of the changed sheet less those of the untouched one.
+    def beyond(self, elements: Int[Array, " e"], change: Float[Array, " e"], size: int) -> Float[Array, " r"]:
+        """Readings of the changed sheet less those of the untouched one, less the first order of this difference.
 
         Derivatives of first order with respect to ``change`` cost no further factorisation.
 
         Args:
             elements: that change, each once.
             change: of their conductivity, S.
-            size: number m of unknowns around the largest changes that are solved anew.
+            size: number m of unknowns around the largest changes that are solved anew; those of other elements count
+                as unchanged.
         """
-        found: Array = _readings(change, elements, self, size)
+        found: Array = _beyond(change, elements, self, size)
         return found
 
 
@@ -71,61 +75,51 @@ class _Solved(NamedTuple):
 
     | meaning                                                                  | shape     |
     |--------------------------------------------------------------------------|-----------|
-    | readings                                                                 | (r,)      |
-    | core: places among the elements of those that are solved anew            | (c,)      |
-    | inside: whether an element of the core is, with all its unknowns         | (c,)      |
-    | products: of the fields after the change, for each pair of electrodes    | (c, p)    |
+    | readings beyond the first order                                          | (r,)      |
+    | inside: whether an element has all its unknowns among those solved anew  | (e,)      |
+    | products: of the fields after the change, for each pair of electrodes    | (e, p)    |
     """
 
     readings: Float[Array, " r"]
-    core: Int[Array, " c"]
-    inside: Bool[Array, " c"]
-    products: Float[Array, "c p"]
+    inside: Bool[Array, " e"]
+    products: Float[Array, "e p"]
 
 
 def _solve(change: Float[Array, " e"], elements: Int[Array, " e"], sheet: Reanalysis, size: int) -> _Solved:
-    unknowns = len(sheet.green)
-    dofs = sheet.dofs[elements]
+    unknowns, dofs, slopes = len(sheet.green), sheet.dofs[elements], sheet.slopes[elements]
     around = jnp.zeros(unknowns, change.dtype).at[dofs].max(jnp.abs(change)[:, None])
     chosen = jax.lax.top_k(around, size)[1]
-    place = jnp.full(unknowns, size).at[chosen].set(jnp.arange(size))
-    core = jax.lax.top_k(jnp.abs(change), min(2 * size, len(change)))[1]
-    local = place[dofs[core]]
-    inside = jnp.all(local < size, 1)
-    own, slopes = jnp.where(inside, change[core], 0), sheet.slopes[elements[core]]
-    blocks = jnp.einsum("c,cks,cls->ckl", own, slopes, slopes)
-    matrix = jnp.zeros((size + 1, size + 1), change.dtype).at[local[:, :, None], local[:, None, :]].add(blocks)
+    place = jnp.full(unknowns, size).at[chosen].set(jnp.arange(size))[dofs]
+    inside = jnp.all(place < size, 1)
+    own = jnp.where(inside, change, 0)
+    blocks = jnp.einsum("e,eks,els->ekl", own, slopes, slopes)
+    matrix = jnp.zeros((size + 1, size + 1), change.dtype).at[place[:, :, None], place[:, None, :]].add(blocks)
     matrix = matrix[:size, :size]
     green, before = sheet.green[chosen[:, None], chosen], sheet.potential[chosen]
     y = lapack.solve(jnp.eye(size, dtype=change.dtype) + matrix @ green, matrix @ before)
-    first, second = sheet.pairs.T
-    moved = -before.T @ y
     after = jnp.concatenate([before - green @ y, jnp.zeros_like(before[:1])])
-    fields = jnp.einsum("cks,cka->csa", slopes, after[local])
+    fields = jnp.einsum("eks,eka->esa", slopes, after[place])
+    first, second = sheet.pairs.T
     products = jnp.sum(fields[..., first] * fields[..., second], 1)
-    readings = moved[first, second] @ sheet.mixing + change.at[core].add(-own) @ sheet.linear[elements]
-    return _Solved(readings, core, inside, products)
+    moved = -before.T @ y
+    return _Solved(moved[first, second] @ sheet.mixing - own @ sheet.linear[elements], inside, products)
 
 
 @eqx.filter_custom_jvp
-def _readings(
-    change: Float[Array, " e"], elements: Int[Array, " e"], sheet: Reanalysis, size: int
-) -> Float[Array, " r"]:
+def _beyond(change: Float[Array, " e"], elements: Int[Array, " e"], sheet: Reanalysis, size: int) -> Float[Array, " r"]:
     return _solve(change, elements, sheet, size).readings
 
 
-def _readings_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Float[Array, " r"], Float[Array, " r"]]:
+def _beyond_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Float[Array, " r"], Float[Array, " r"]]:
     change, elements, sheet, size = primals
     found = _solve(change, elements, sheet, size)
     if tangents[0] is None:
         return found.readings, jnp.zeros_like(found.readings)
-    direction = tangents[0]
-    own = jnp.where(found.inside, direction[found.core], 0)
-    rest = direction.at[found.core].add(-own)
-    return found.readings, rest @ sheet.linear[elements] - (own @ found.products) @ sheet.mixing
+    own = jnp.where(found.inside, tangents[0], 0)
+    return found.readings, -(own @ found.products) @ sheet.mixing - own @ sheet.linear[elements]
 
 
-_readings.def_jvp(_readings_jvp)
+_beyond.def_jvp(_beyond_jvp)
 
 
 def prepare_reanalysis(
@@ -141,27 +135,31 @@ def prepare_reanalysis(
         sigma: of the untouched sheet, (elements,) S.
         pairs, mixing: as in `Reanalysis`.
     """
-    system = model.system
     theta = coefficients(model, sigma)
-    matrix = assemble(system, theta)
-    share = np.append(np.asarray(matrix.share, float), 0.0)[np.asarray(system.under)]
-    unknowns = system.unknowns
-    electrode = np.append(np.asarray(system.electrode_dof), 0)[np.asarray(system.under)]
-    lift = sp.eye_array(unknowns, format="csr") + sp.csr_array(
-        (share, (np.arange(unknowns), electrode)), (unknowns, unknowns)
-    )
-    rows, cols = np.asarray(system.plan.rows), np.asarray(system.plan.cols)
-    lower = sp.csc_array((np.asarray(matrix.values, float), (rows, cols)), (unknowns, unknowns))
-    whole = lower + sp.tril(lower, -1).T
-    green = lift @ splu(sp.csc_array(whole)).solve(lift.T.toarray())
     put = partial(jnp.asarray, dtype=dtype)
-    slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(pairs), jnp.asarray(mixing, model.dtype))
+    image, wanted = Elements().on(model), jnp.asarray(mixing, model.dtype)
     return Reanalysis(
-        green=put(green),
+        green=put(_green(model, theta)),
         potential=put(fields(model, theta).potential),
-        dofs=jnp.asarray(system.dofs, jnp.int32),
-        slopes=put(system.slopes),
+        dofs=jnp.asarray(model.system.dofs, jnp.int32),
+        slopes=put(model.system.slopes),
         pairs=jnp.asarray(pairs, jnp.int32),
         mixing=put(mixing.T),
-        linear=put(slopes.T),
+        linear=put(pair_jacobian(model, sigma, image, jnp.asarray(pairs), wanted).T),
     )
+
+
+def _green(model: Model, theta: Coefficients) -> Float[np.ndarray, "n n"]:
+    """Potential of each unknown per ampere into each other, ohm.
+
+    The unknowns of the matrix are potentials but for a share of the electrode's above them (`Unknowns`).
+    """
+    system, matrix = model.system, assemble(model.system, theta)
+    count, under = system.unknowns, np.asarray(system.under)
+    share = np.append(np.asarray(matrix.share, float), 0.0)[under]
+    electrode = np.append(np.asarray(system.electrode_dof), 0)[under]
+    potential = sp.eye_array(count) + sp.csr_array((share, (np.arange(count), electrode)), (count, count))
+    place = np.asarray(system.plan.rows), np.asarray(system.plan.cols)
+    lower = sp.csc_array((np.asarray(matrix.values, float), place), (count, count))
+    inverse = splu(sp.csc_array(lower + sp.tril(lower, -1).T))
+    return np.asarray(potential @ inverse.solve(potential.T.toarray()))

@@ -4,8 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..imaging.noise import InverseError
 from ..contacts.loads import LoadSettings
+from ..imaging.noise import InverseError
+from ..model.fidelity import Fidelity
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,9 @@ class TrackerSettings:
     | most: contacts followed at once                                                | 3       |           |
     | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
     | modes: of the gain around a contact that a frame updates                       | 24      |           |
+    | columns: pixels along x of the first order; pixels: around a contact           | 50, 400 |           |
+    | fidelity: of the mesh that is solved anew; its first order is the model's      | draft   |           |
+    | dtype: of these solutions; errors of float32 are far below noise               | float32 |           |
 
     Raises:
         InverseError: for a value out of range.
@@ -38,11 +42,15 @@ class TrackerSettings:
     most: int = 3
     unknowns: int = 96
     modes: int = 24
+    columns: int = 50
+    pixels: int = 400
+    fidelity: Fidelity = field(default_factory=Fidelity.draft)
+    dtype: str = "float32"
 
     def __post_init__(self) -> None:
         for name in ("level", "persistence", "acceleration", "width_rate", "force_rate", "birth_rate"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
-        for name in ("most", "unknowns", "modes"):
+        for name in ("most", "unknowns", "modes", "columns", "pixels"):
             if getattr(self, name) < 1:
                 raise InverseError(f"{name} is {getattr(self, name)}; give one or more")

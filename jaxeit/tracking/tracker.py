@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -21,7 +20,8 @@ from ..contacts.preparation import sheet_of
 from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
-from .filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update, predicted, updated
+from .events import inserted, jumped, lengthened, without
+from .filter import SIZE, Belief, ContactFilter, Pads, Update, predicted, updated
 from .preparation import prepare_filter
 from .settings import TrackerSettings
 
@@ -34,12 +34,10 @@ PATIENCE, WORSE = 10, 1.3
 EVENTS = 4
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
 FAINT, FAINT_FRAMES = 4.0, 2
-# Half length of an edge that is tried, m, and the directions in which.
-HALF, DIRECTIONS = 0.012, np.pi * np.arange(4) / 4
+# Directions of an edge that are tried.
+DIRECTIONS = np.pi * np.arange(4) / 4
 # Prior deviations of the place and the velocity of a contact that begins, m and m/s.
 PLACE, VELOCITY = 0.012, 0.05
-# How far contacts may jump: x, y, log width, log force, half length, velocity.
-JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, 0.1, 0.1])
 # Half an edge that is none: what keeps its covariance definite, m.
 ROUND = 1e-4
 
@@ -125,10 +123,10 @@ class _Hypothesis(NamedTuple):
 class Tracker:
     """Follows contacts through the frames of a skin; made by `prepare_tracker`. ::
 
-        now = tracker.start()
-        for frame, forces in ...:
-            now = tracker.step(now, frame, seconds=0.01, pad_forces=forces, pad_errors=errors)
-            print(now.tracks)
+    now = tracker.start()
+    for frame, forces in ...:
+        now = tracker.step(now, frame, seconds=0.01, pad_forces=forces, pad_errors=errors)
+        print(now.tracks)
     """
 
     def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float):
@@ -193,14 +191,17 @@ class Tracker:
             return Pads(jnp.zeros(count), jnp.full(count, jnp.inf))
         force, error = np.asarray(forces, float), np.asarray(errors, float)
         if force.shape != (count,) or error.shape != (count,):
-            raise InverseError(f"pad_forces and pad_errors have shapes {force.shape} and {error.shape}; give ({count},)")
+            raise InverseError(
+                f"pad_forces and pad_errors have shapes {force.shape} and {error.shape}; give ({count},)"
+            )
         known = np.isfinite(force) & np.isfinite(error)
         if not (error[known] > 0).all():
             raise InverseError("a pad has the standard error zero; give a number above zero, in newtons")
         return Pads(jnp.asarray(np.where(known, force, 0)), jnp.asarray(np.where(known, error, np.inf)))
 
     def _update(self, belief: Belief, frame: Array, pads: Pads, seconds: float, many: bool = False) -> Update:
-        return jax.block_until_ready(updated(self._filter, belief, frame, pads, jnp.asarray(seconds), many=many))
+        found: Update = updated(self._filter, belief, frame, pads, jnp.asarray(seconds), many=many)
+        return found
 
     def _is_unexpected(self, now: Tracking, update: Update, left: float) -> bool:
         size = len(update.left)
@@ -221,7 +222,10 @@ class Tracker:
         best = self._update(now.belief, frame, pads, alone, many=True)
         taken = ordinary
         for _ in range(EVENTS):
-            tried = [(one, self._update(one.belief, frame, pads, alone, many=True)) for one in self._events(now, best, seconds)]
+            tried = [
+                (one, self._update(one.belief, frame, pads, alone, many=True))
+                for one in self._events(now, best, seconds)
+            ]
             if not tried:
                 break
             event, update = max(tried, key=lambda pair: float(pair[1].evidence) + pair[0].prior)
@@ -245,13 +249,13 @@ class Tracker:
     def _events(self, now: Tracking, best: Update, seconds: float) -> Iterator[_Hypothesis]:
         rare = float(np.log(self._settings.birth_rate * seconds))
         if now.numbers:
-            yield _Hypothesis(_jumped(now.belief), now.numbers, now.edges, rare)
+            yield _Hypothesis(jumped(now.belief), now.numbers, now.edges, rare)
         for k in range(len(now.numbers)):
-            yield _Hypothesis(_without(now.belief, k), *_left_out(now, k), rare)
+            yield _Hypothesis(without(now.belief, k), *_left_out(now, k), rare)
             if not now.edges[k]:
                 edges = tuple(edge or j == k for j, edge in enumerate(now.edges))
                 for angle in DIRECTIONS:
-                    yield _Hypothesis(_lengthened(now.belief, k, angle), now.numbers, edges, rare - np.log(4.0))
+                    yield _Hypothesis(lengthened(now.belief, k, angle), now.numbers, edges, rare - np.log(4.0))
         if len(now.numbers) < self._settings.most:
             # The prior of a place is even over the skin, that of the fit is normal about where it begins.
             even = float(np.log(2 * np.pi * PLACE**2 / self._area))
@@ -266,7 +270,7 @@ class Tracker:
         place = np.asarray(finder.starts)[best, :2]
         row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])
         spread = np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
-        return _inserted(belief, row, spread)
+        return inserted(belief, row, spread)
 
     # --- deaths
 
@@ -277,45 +281,12 @@ class Tracker:
             if faint[k] >= FAINT_FRAMES:
                 numbers, edges = _left_out(now, k)
                 rest = tuple(count for j, count in enumerate(now.faint) if j != k)
-                now = replace(now, belief=_without(now.belief, k), numbers=numbers, edges=edges, faint=rest)
+                now = replace(now, belief=without(now.belief, k), numbers=numbers, edges=edges, faint=rest)
         return now
 
 
 def _left_out(now: Tracking, k: int) -> tuple[tuple[int, ...], tuple[bool, ...]]:
     return now.numbers[:k] + now.numbers[k + 1 :], now.edges[:k] + now.edges[k + 1 :]
-
-
-def _without(belief: Belief, k: int) -> Belief:
-    kept = np.delete(np.arange(len(belief.covariance)), np.s_[SIZE * k : SIZE * (k + 1)])
-    contacts = np.delete(np.asarray(belief.contacts), k, 0)
-    return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(np.asarray(belief.covariance)[np.ix_(kept, kept)]))
-
-
-def _inserted(belief: Belief, row: np.ndarray, spread: np.ndarray) -> Belief:
-    """With a contact after the others that is independent of all else."""
-    place = belief.contacts.size
-    old = np.asarray(belief.covariance)
-    kept = np.concatenate([np.arange(place), np.arange(place + SIZE, len(old) + SIZE)])
-    covariance = np.zeros((len(old) + SIZE,) * 2, old.dtype)
-    covariance[np.ix_(kept, kept)] = old
-    covariance[place : place + SIZE, place : place + SIZE] = np.diag(spread**2)
-    contacts = np.concatenate([np.asarray(belief.contacts), row[None]]).astype(old.dtype)
-    return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
-
-
-def _jumped(belief: Belief) -> Belief:
-    spread = np.zeros(len(belief.covariance))
-    spread[: belief.contacts.size] = np.tile(JUMP, len(belief.contacts))
-    return belief._replace(covariance=belief.covariance + jnp.diag(jnp.asarray(spread**2, belief.covariance.dtype)))
-
-
-def _lengthened(belief: Belief, k: int, angle: float) -> Belief:
-    contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
-    own = np.arange(SIZE * k, SIZE * (k + 1))
-    contacts[k, 4:6] = HALF * np.cos(angle), HALF * np.sin(angle)
-    contacts[k, 2] -= 0.3  # an edge is narrower than the round load in its place
-    covariance[own, own] += (np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, 0.0, 0.0])) ** 2
-    return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
 
 
 def prepare_tracker(
