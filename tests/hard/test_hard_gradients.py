@@ -40,6 +40,7 @@ HOST = {
     "fidelity_choices": _PREPARES,
     "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
     "prepare_loads": _PREPARES,
+    "prepare_tracker": _PREPARES,
     "find_regions": "counts the regions of an image, on the host, and says so under jit",
     "from_numbers": _DESCRIBES,
     "image_choices": _PREPARES,
