@@ -21,7 +21,8 @@ class Comparison:
     they are called.
 
     ``images``: onto what, as the ends of the tools' names; ``work``: flops and bytes of a problem onto an image;
-    ``before``: numbers by tool, checked at each size before anything is timed, which go into the rows as ``checked``.
+    ``before``: numbers by tool, checked at each size before anything is timed, which go into the rows as ``checked``;
+    ``largest``: cells a side of the largest problem.
     """
 
     tools: str
@@ -30,6 +31,7 @@ class Comparison:
     work: Callable[[Problem, str], Row]
     repeats: int
     images: tuple[str, ...] = ("",)
+    largest: int = SIZES[-1]
     checked: str = ""
     before: Callable[[int], Mapping[str, float]] = lambda cells: {}
 
@@ -37,7 +39,8 @@ class Comparison:
         """Rows and work of all sizes, then the peak memory of each tool at the largest."""
         machine = limits()
         yield {"limits": machine, "rows": [], "work": []}
-        for cells in run.sizes(SIZES, (SMOKE,)):
+        sizes = [cells for cells in run.sizes(SIZES, (SMOKE,)) if cells <= self.largest]
+        for cells in sizes:
             before, problem = self.before(cells), Problem(cells)
             for image in self.images:
                 rows = self.rows(problem, image, 3 if run.smoke else self.repeats)
@@ -46,7 +49,7 @@ class Comparison:
                         row[self.checked] = before.get(row["tool"].split(",")[0])
                     yield {"rows": rows, "work": [with_limits(rows, machine, self.work(problem, image))]}
         if not run.smoke:
-            self._add_peaks(run.data["rows"], SIZES[-1])
+            self._add_peaks(run.data["rows"], sizes[-1])
             yield {}
 
     def rows(self, problem: Problem, image: str, repeats: int, budget: float = 8.0) -> list[Row]:
