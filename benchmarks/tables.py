@@ -114,6 +114,13 @@ def _images(results: Row) -> Iterator[Row]:
         yield {"seeds": results["seeds"]} | row | {"error": min(row[name] for name in names if name in row)}
 
 
+def _ktc(results: Row) -> list[Row]:
+    """Mean scores by method and level, and their total."""
+    by_level = [row | {"head": f"level {row['level']}", "score": f"{row['mean']:.3f}"} for row in results["rows"]]
+    totals = results["of_21"].items()
+    return by_level + [{"method": name, "head": "of 21", "score": f"{total:.2f}"} for name, total in totals]
+
+
 def _paper(results: Row) -> Iterator[Row]:
     """Mean ± standard deviation over the seeds, a row for each load spreading."""
     for row in results["rows"]:
@@ -181,6 +188,7 @@ ROWS: dict[str, Callable] = {
     "onto": _onto,
     "repeat": _repeat,
     "images": _images,
+    "ktc": _ktc,
     "paper": _paper,
     "ladder_testbed": _ladder(0),
     "ladder_chest": _ladder(1),
