@@ -14,23 +14,16 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from scipy.io import loadmat
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from scipy.optimize import minimize_scalar
 
 import jaxeit as je
-from calib.report.figures import write_figure
 
 from .clock import seconds
-from .figures import panels
-from .harness import ROOT, Question, Run
+from .harness import Question, Run
 from .rows import Row, grouped
 
-PICTURE = ROOT / "docs" / "ktc.png"
 RADIUS, ELECTRODES, GRID = 0.115, 32, 256
 LEVELS, SMOKE_LEVELS = tuple(range(1, 8)), (1, 7)
 WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
@@ -219,13 +212,13 @@ def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method
 # --- results
 
 
-def scored(data: Data, ways: dict[str, Method], level: int) -> Iterator[tuple[Row, list[np.ndarray]]]:
-    """Scores of every method at a level, and the labels behind them."""
+def scored(data: Data, ways: dict[str, Method], level: int) -> Iterator[Row]:
+    """Scores of every method at a level."""
     for name, way in ways.items():
         spent, found = seconds(way, with_level(data, level))
         scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(found, data.truth, strict=True)]
         row: Row = {"level": level, "method": name, "seconds": round(spent, 2)}
-        yield row | {"scores": np.round(scores, 3).tolist(), "mean": round(float(np.mean(scores)), 3)}, found
+        yield row | {"scores": np.round(scores, 3).tolist(), "mean": round(float(np.mean(scores)), 3)}
 
 
 def totals(rows: list[Row]) -> dict[str, float]:
@@ -234,62 +227,18 @@ def totals(rows: list[Row]) -> dict[str, float]:
     return {name: round(21 * float(np.mean([row["mean"] for row in mine])), 2) for name, mine in by_method.items()}
 
 
-RIM = "#333333"
-COLOURS = ListedColormap(["#dfeaf2", "#c2571a", "#1f4e79"])
-SHOWN = {"linear": "linear", "variation": "total variation"}
-
-
-def picture(data: Data, found: dict[tuple[int, str], list[np.ndarray]]) -> Figure:
-    """Truth beside what each method makes of it, at the first and the last level found."""
-    levels = sorted({level for level, _ in found})
-    columns = [(level, name) for level in (levels[0], levels[-1]) for name in SHOWN]
-    rows, width = len(data.truth), 1 + len(columns)
-    figure, axes = panels(2.1 * width, 2.3 * rows, rows, width, squeeze=False)
-    for number, truth in enumerate(data.truth):
-        first, *others = axes[number * width : (number + 1) * width]
-        _panel(first, truth, 1)
-        first.set_ylabel(f"frame {number + 1}", fontsize=10)
-        for panel, key in zip(others, columns, strict=True):
-            _panel(panel, found[key][number], key[0])
-            panel.set_xlabel(f"score {float(je.metrics.ktc_score(found[key][number], truth)):.2f}", fontsize=9)
-    axes[0].set_title("truth", fontsize=10)
-    for panel, (level, name) in zip(axes[1:width], columns, strict=True):
-        panel.set_title(f"{SHOWN[name]}\nlevel {level}", fontsize=10)
-    kinds = [Patch(color=COLOURS(kind), label=name) for kind, name in enumerate(("water", "resistive", "conductive"))]
-    rim = Line2D([], [], color=RIM, linewidth=2, label="electrodes in use")
-    figure.legend(handles=[*kinds, rim], loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
-    return figure
-
-
-def _panel(axes: Any, labels: np.ndarray, level: int) -> None:
-    """Labels in the tank, with the electrodes that are left."""
-    line = np.linspace(-RADIUS, RADIUS, GRID)
-    inside = np.hypot(*np.meshgrid(line, line)) <= RADIUS
-    extent = (-RADIUS, RADIUS, -RADIUS, RADIUS)
-    shown = np.ma.masked_where(~inside, labels)
-    axes.imshow(shown, cmap=COLOURS, vmin=0, vmax=2, extent=extent, interpolation="nearest")
-    for electrode in range(2 * (level - 1), ELECTRODES):
-        angle = np.pi / 2 + 2 * np.pi * electrode / ELECTRODES + np.linspace(-1, 1, 5) * np.pi / ELECTRODES / 2
-        axes.plot(1.03 * RADIUS * np.cos(angle), 1.03 * RADIUS * np.sin(angle), color=RIM, linewidth=2)
-    axes.set(xlim=(-1.1 * RADIUS, 1.1 * RADIUS), ylim=(-1.1 * RADIUS, 1.1 * RADIUS), xticks=[], yticks=[])
-    axes.set_frame_on(False)
-
-
 def challenge(run: Run) -> Iterator[Row]:
-    """All levels, and the picture of the first and the last."""
+    """All levels."""
     data = load(run.args.data)
-    model, found = tank(data), {}
+    model = tank(data)
     ways = methods(model, homogeneous(model, data.reference, data.channel))
     if run.smoke:
         data = replace(data, frames=data.frames[:1], truth=data.truth[:1])
     yield {"published_of_21": PUBLISHED, "rows": []}
     for level in run.sizes(LEVELS, SMOKE_LEVELS):
-        for row, labels in scored(data, ways, level):
-            found[level, row["method"]] = labels
+        for row in scored(data, ways, level):
             print(row, flush=True)
             yield {"rows": [row], "of_21": totals([*run.data["rows"], row])}
-    if not run.smoke:
-        write_figure(picture(data, found), PICTURE)
 
 
 DATA: Row = {"type": Path, "required": True, "help": "folder with training/ and groundtruth_training/"}

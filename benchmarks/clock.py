@@ -1,13 +1,10 @@
 """The clock that every question shares: seconds of calls, tools in turn, agreement before timing, memory, limits."""
 
 import os
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -129,29 +126,7 @@ def require_agreement(
     return found
 
 
-# --- memory and limits of the machine
-
-
-def peak_megabytes() -> float:
-    """Peak memory of this process so far. On Linux getrusage would start at the parent's peak."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        (line,) = (line for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM"))
-        return int(line.split()[1]) / 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
-
-
-def peaks(before: float, now: float | None = None) -> dict[str, int]:
-    """Peak memory of this process in MB, in all and beyond what it was before."""
-    now = peak_megabytes() if now is None else now
-    return {"peak_mb": round(now), "beyond_imports_mb": round(now - before)}
-
-
-def alone() -> ProcessPoolExecutor:
-    """A pool of one process that starts anew."""
-    return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
-
+# --- fresh processes, and limits of the machine
 
 CACHE = {  # as the command line sets it, calib/runtime.py
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",

@@ -8,8 +8,8 @@ import numpy as np
 
 import jaxeit as je
 
-from .clock import alone, interleaved, limits, peak_megabytes, peaks, require_agreement, seconds, spread, taken
-from .harness import Run, set_up
+from .clock import interleaved, limits, require_agreement, seconds, spread, taken
+from .harness import Run
 from .problems import SIZES, SMOKE, Problem
 from .rows import Row
 from .tools import PIXELS, TOOLS, basis_of, present
@@ -35,11 +35,10 @@ class Comparison:
     voltages: Callable[[int], Row] | None = None
 
     def __call__(self, run: Run) -> Iterator[Row]:
-        """Rows and work of all sizes, then the peak memory of each tool at the largest."""
+        """Rows and work of all sizes."""
         machine = limits()
         yield {"limits": machine, "rows": [], "work": []}
-        sizes = [cells for cells in run.sizes(SIZES, (SMOKE,)) if cells <= self.largest]
-        for cells in sizes:
+        for cells in run.sizes([cells for cells in SIZES if cells <= self.largest], (SMOKE,)):
             problem, off = Problem(cells), self.voltages(cells) if self.voltages else None
             for image in self.images:
                 rows = self.rows(problem, image, 3 if run.smoke else self.repeats)
@@ -47,9 +46,6 @@ class Comparison:
                     row["voltage_difference"] = off.get(row["tool"].split(",")[0])
                 if rows:
                     yield {"rows": rows, "work": [with_limits(rows, machine, self.work(problem, image))]}
-        if not run.smoke:
-            self._add_peaks(run.data["rows"], sizes[-1])
-            yield {}
 
     def rows(self, problem: Problem, image: str, repeats: int, budget: float = 8.0) -> list[Row]:
         """A row for each tool: agreement with the reference first, then the clocks."""
@@ -79,23 +75,6 @@ class Comparison:
             }
             for (name, (spent, _)), own in zip(ready.items(), turns, strict=True)
         ]
-
-    def _add_peaks(self, rows: list[Row], cells: int) -> None:
-        """Peak memory of each tool at one size, alone in a process, into its row."""
-        for row in rows:
-            if row["nodes"] == (cells + 1) ** 2:
-                with alone() as process:
-                    row |= process.submit(peaks_of, self.tools, row["tool"], cells).result()
-
-
-def peaks_of(tools: str, name: str, cells: int) -> dict[str, int]:
-    """Peak memory of this process, MB, by one tool at one size: preparation, compilation and one call."""
-    set_up()
-    before, problem = peak_megabytes(), Problem(cells)
-    entry = next(e for e in TOOLS[tools] if e.name == name)
-    tool: Any = entry.prepare(problem)
-    tool(problem.sigma)
-    return tool.peaks() if hasattr(tool, "peaks") else peaks(before)
 
 
 # --- the least work, and the time that the machine needs for it

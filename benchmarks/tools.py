@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 import jaxeit as je
 
-from .clock import MAX_DIFFERENCE, Tool, peak_megabytes, peaks, seconds
+from .clock import MAX_DIFFERENCE, Tool, seconds
 from .peers import adjoint, cholmod, eidors, pyeit, superlu
 from .problems import Problem
 
@@ -164,20 +164,15 @@ class Reconstruction:
     """`prepare`, whose clock stops when the reconstructor is there; Q is written out for comparison only."""
 
     def __init__(self, problem: Problem, pixels: bool, dtype: str = "float64") -> None:
-        self.before, self.dtype = peak_megabytes(), dtype
-        self.model = problem.model(dtype)
+        self.dtype, self.model = dtype, problem.model(dtype)
         self.basis = basis_of(self.model, pixels)
 
     def __call__(self, sigma: np.ndarray) -> np.ndarray:
         self.last_seconds, recon = seconds(self.reconstructor, sigma)
-        self.peak = peak_megabytes()
         return np.asarray(recon.matrix)
 
     def reconstructor(self, sigma: np.ndarray) -> je.Reconstructor:
         return jax.block_until_ready(reconstructor(self.model, self.basis, jnp.asarray(sigma, self.dtype)))
-
-    def peaks(self) -> dict[str, int]:
-        return peaks(self.before, self.peak)
 
 
 def noser(j: np.ndarray) -> tuple[np.ndarray, float]:
