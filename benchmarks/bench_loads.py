@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import jaxeit as je
-from calib.calibration.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, Loads, LoadShape
 
 from .bench_images import matched

@@ -6,7 +6,7 @@ import pytest
 
 import jaxeit as je
 from benchmarks.problems import pressed
-from calib.calibration.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
 from jaxeit.imaging import InverseError
 

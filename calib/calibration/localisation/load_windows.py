@@ -15,8 +15,8 @@ from jaxtyping import Float
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Loads
 
-from ..presses.streams import finite_mean
-from .calibration import Calibration
+from ...presses.streams import finite_mean
+from ..calibration import Calibration
 from .press_images import fit_untouched_sheet
 
 # A draft moves a load by 0.15 mm, so that its ellipse of 90 % covers 81 %; finer meshes than this move it by 0.01 mm.

@@ -1,16 +1,16 @@
-"""Recalibration of a log's calibration from a log with known force; see `log_recalibration`."""
+"""Recalibration of a log's calibration from a log with known force; see `shift`."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from ..check.acceptance import accept
-from ..fitting.gain_update import GainDrift
-from ..fitting.logs import series_of
-from ..session import Session, SessionError
-from .log_calibration import LogCalibration
-from .log_recalibration import LogShift, fit_shift, full_scale_of, shift_prior
-from .logs import log_of, place_of, stream_of
+from ...check.acceptance import accept
+from ...fitting.gain_update import GainDrift
+from ...fitting.logs import series_of
+from ...session import Session, SessionError
+from .calibration import LogCalibration
+from .procedure import log_of, place_of, stream_of
+from .shift import LogShift, fit_shift, full_scale_of, shift_prior
 
 
 def assess_log(

@@ -11,8 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..fitting.gain_update import relative
-from ..fitting.pad_gains import PadGains
+from ...fitting.gain_update import relative
+from ...fitting.pad_gains import PadGains
 
 NOTICEABLE = 0.02  # change of a gain below which a recalibration is not worth it
 SIGNIFICANT = 2.0  # standard errors

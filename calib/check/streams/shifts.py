@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ..session.units import SECOND
-from .report import Finding, Severity
-from .streams import StreamStatistics
+from ...session.units import SECOND
+from ..report import Finding, Severity
+from .statistics import StreamStatistics
 
 MAX_COLUMNS, MAX_CELLS = 64, 1 << 26  # of one table: a wider one holds arrays, whose channels have one noise
 MIN_WINDOW, MAX_WINDOWS = 8, 4096  # samples whose noise is one number; windows overlap by half

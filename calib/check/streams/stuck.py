@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..presses.streams import true_runs
-from ..session.units import SECOND
-from .report import Finding, Severity
-from .streams import MIN_FRAME_CHANNELS, StreamStatistics
+from ...presses.streams import true_runs
+from ...session.units import SECOND
+from ..report import Finding, Severity
+from .statistics import MIN_FRAME_CHANNELS, StreamStatistics
 
 EXAMINED = ("force", "pressure", "voltage", "counts")  # a stage or a thermometer may stand still
 MAX_EQUAL = 0.3  # of the frames beside the run: above it the noise is less than a step of the converter

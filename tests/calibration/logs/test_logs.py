@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import calib
-from calib.calibration.log_calibration import FORMAT
-from calib.calibration.log_evaluation import log_evaluation
-from calib.calibration.log_storage import CURVE_FIELDS
-from calib.calibration.logs import FORCE_FORMAT, apply_log, calibrate_logs, evaluate_log, render_log
+from calib.calibration.logs.calibration import FORMAT
+from calib.calibration.logs.evaluation import log_evaluation
+from calib.calibration.logs.procedure import FORCE_FORMAT, apply_log, calibrate_logs, evaluate_log, render_log
+from calib.calibration.logs.storage import CURVE_FIELDS
 from calib.calibration.storage import SEAL, seal
 from calib.cli import main
 from calib.fitting.curves import Affine, Linear
@@ -70,7 +70,7 @@ def calibrated(path, recipe=LINEAR):
 @pytest.fixture
 def one_way(monkeypatch):
     """Tests of what does not depend on how channels are combined do not compare the ways."""
-    monkeypatch.setattr("calib.calibration.logs.ways_of", lambda *_: {"best channel": BestChannel()})
+    monkeypatch.setattr("calib.calibration.logs.procedure.ways_of", lambda *_: {"best channel": BestChannel()})
 
 
 @pytest.mark.usefixtures("one_way")
@@ -132,7 +132,7 @@ def test_a_file_gives_back_the_calibration_and_its_forces(few, tmp_path):
 @pytest.mark.parametrize("way", [BlendChannels(), SmoothChannels((2,), (3.0,))], ids=["blend", "gaussian process"])
 def test_weights_of_combined_channels_are_kept(way, array, tmp_path, monkeypatch):
     force, values = array
-    monkeypatch.setattr("calib.calibration.logs.ways_of", lambda *_: {"chosen": way})
+    monkeypatch.setattr("calib.calibration.logs.procedure.ways_of", lambda *_: {"chosen": way})
     made = calibrated(write_log(tmp_path / "two.h5", force, values[:, :2]), AFFINE)
     assert made.units == ("N/N", "N")
     made.save(tmp_path / "c.h5")

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from ..errors import printable, problem
+from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, Unit
 from .chunks import GuardedArray
-from .errors import printable, problem
 from .guard import Node, translated
-from .units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, Unit
 
 SCHEMA = "see data/schema/README.md"
 

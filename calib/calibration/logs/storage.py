@@ -10,14 +10,14 @@ import numpy as np
 
 import jaxeit as je
 
-from ..fitting.curves import CURVES, FittedCurve
-from ..fitting.fields import FIELDS
-from ..fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise, Travel
-from ..fitting.selection import Candidate
-from ..session import Archive
-from .log_evaluation import LogEvaluation
-from .log_recalibration import LogShift
-from .storage import SEAL, field_arrays, field_from, seal
+from ...fitting.curves import CURVES, FittedCurve
+from ...fitting.fields import FIELDS
+from ...fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise, Travel
+from ...fitting.selection import Candidate
+from ...session import Archive
+from ..storage import SEAL, field_arrays, field_from, seal
+from .evaluation import LogEvaluation
+from .shift import LogShift
 
 Described = dict[str, tuple[Any, str, str]]
 

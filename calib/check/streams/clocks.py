@@ -5,12 +5,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from scipy import ndimage, signal
 
-from ..presses.onsets import OnsetDelay, onset_delays
-from ..session import Stream
-from ..session.units import SECOND
-from .evidence import PressEvidence
-from .report import Finding, Severity
-from .streams import StreamStatistics
+from ...presses.onsets import OnsetDelay, onset_delays
+from ...session import Stream
+from ...session.units import SECOND
+from ..evidence import PressEvidence
+from ..report import Finding, Severity
+from .statistics import StreamStatistics
 
 ALLOWED_SHIFT = 0.3  # of the ramp, beyond which a shift of the whole rise is no property of the skin
 MIN_ALLOWED_SHIFT = 0.05  # s

@@ -24,7 +24,7 @@ from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 
 from jaxeit.files import open_regular
 
-from .errors import printable, problem
+from ..errors import printable, problem
 from .guard import MAX_ATTRIBUTE_BYTES
 
 try:

@@ -19,7 +19,7 @@ from jaxtyping import Array
 import jaxeit as je
 from jaxeit.registry import Registry
 
-from ..fitting.fields import Places, single_places
+from ...fitting.fields import Places, single_places
 
 
 class AbstractLocator(eqx.Module):

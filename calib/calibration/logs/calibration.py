@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..fitting.curves import CURVES
-from ..fitting.logs import LogModel, LogPrediction, LogTracker, travel_of, unseen_direction
-from ..fitting.selection import Candidate
-from ..session import SessionError, read_archive, write_archive
-from .log_evaluation import LogEvaluation
-from .log_recalibration import LogShift
-from .log_storage import fields_of_log, location_name, log_archive
+from ...fitting.curves import CURVES
+from ...fitting.logs import LogModel, LogPrediction, LogTracker, travel_of, unseen_direction
+from ...fitting.selection import Candidate
+from ...session import SessionError, read_archive, write_archive
+from .evaluation import LogEvaluation
+from .shift import LogShift
+from .storage import fields_of_log, location_name, log_archive
 
 FORMAT = "log-calibration"
 

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..fitting.gain_update import DETERMINED, GainDrift
-from ..fitting.logs import LogModel, LogPrediction
-from .recalibration import LARGE_MISFIT, NOTICEABLE, SIGNIFICANT, Advice, days_between, health_line
+from ...fitting.gain_update import DETERMINED, GainDrift
+from ...fitting.logs import LogModel, LogPrediction
+from ..recalibration.changes import LARGE_MISFIT, NOTICEABLE, SIGNIFICANT, Advice, days_between, health_line
 
 MIN_BLOCKS = 5  # of time, with which a standard error over them means something
 

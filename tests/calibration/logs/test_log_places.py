@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.calibration.logs import calibrate_logs, evaluate_log
+from calib.calibration.logs.procedure import calibrate_logs, evaluate_log
 from calib.cli import main
 from calib.fitting.curves import Affine, MonotonePolynomial
 from calib.fitting.fields import GaussianProcess, PadEdge, RadialBasis, TensorSpline
@@ -12,7 +12,7 @@ from calib.fitting.logs.location import box_of, sites_of
 from calib.fitting.results import FitError
 from calib.session import SessionError, open_session, read_archive
 
-from ..place_logs import SIDE, grid, place_log, true_gain, write_place_log
+from ...place_logs import SIDE, grid, place_log, true_gain, write_place_log
 
 GAIN = calib.Recipe(curve=MonotonePolynomial(), location=GaussianProcess())
 

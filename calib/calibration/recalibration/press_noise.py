@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.distance import cdist
 
-from ..fitting.pads import FAINT_FORCE
-from ..presses.streams import MAD_TO_SIGMA
-from .evaluation import Evaluation
+from ...fitting.pads import FAINT_FORCE
+from ...presses.streams import MAD_TO_SIGMA
+from ..evaluation import Evaluation
 
 DEFAULT_SHARE = 0.8  # of the variance that presses at one place have in common, where no place was pressed twice
 MIN_FRACTION = 1e-3  # of the force

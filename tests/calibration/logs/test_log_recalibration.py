@@ -8,8 +8,8 @@ from scipy import signal
 
 import calib
 from calib.calibration import assess_log, recalibrate_log
-from calib.calibration.log_recalibration import fit_shift, shift_prior
-from calib.calibration.logs import calibrate_logs, evaluate_log
+from calib.calibration.logs.procedure import calibrate_logs, evaluate_log
+from calib.calibration.logs.shift import fit_shift, shift_prior
 from calib.cli import main
 from calib.fitting.curves import Affine
 from calib.fitting.gain_update import GainDrift

@@ -17,21 +17,21 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 
-from ..check.acceptance import accept
-from ..fitting.curves.fitted import predict_pads
-from ..fitting.curves.samples import bucket
-from ..fitting.fields import Places
-from ..fitting.gain_update import GainDrift, GainPrior, GainUpdate, update_gains
-from ..fitting.image_reference import ImageReference, fit_reference
-from ..fitting.pad_gains import gain_slopes
-from ..presses.table import measure, require_skin
-from ..session import Session, SessionError
-from .calibration import Calibration
-from .force_maps import USED, ForceLaw, law_of, unmoved_forces
+from ...check.acceptance import accept
+from ...fitting.curves.fitted import predict_pads
+from ...fitting.curves.samples import bucket
+from ...fitting.fields import Places
+from ...fitting.gain_update import GainDrift, GainPrior, GainUpdate, update_gains
+from ...fitting.pad_gains import gain_slopes
+from ...presses.table import measure, require_skin
+from ...session import Session, SessionError
+from ..calibration import Calibration
+from ..force_maps import USED, ForceLaw, law_of, unmoved_forces
+from ..localisation.press_images import Imager
+from .changes import Evidence, Recalibration
+from .image_reference import ImageReference, fit_reference
 from .ordinary_use import use_contacts
-from .press_images import Imager
 from .press_noise import PressNoise, press_noise
-from .recalibration import Evidence, Recalibration
 
 MIN_PRESSES = 3  # of a session that can be used; fewer are refused
 BEYOND = 0.3  # of the calibrated range of pressure, by which the pads may read more than was calibrated

@@ -8,10 +8,10 @@ import numpy as np
 
 import jaxeit as je
 
-from ..fitting.fields import Places
-from ..presses.pooled import PooledPresses
-from .localisation import AbstractLocator, AbstractLocatorChoice, locate
-from .recipe import Recipe
+from ...fitting.fields import Places
+from ...presses.pooled import PooledPresses
+from ..recipe import Recipe
+from .locators import AbstractLocator, AbstractLocatorChoice, locate
 
 
 class PressImages(NamedTuple):

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..presses.means import press_means
-from ..presses.streams import MAD_TO_SIGMA, finite_mean, true_runs
-from ..presses.windows import PressWindows
-from ..session import Session, Stream
-from ..session.units import SECOND
-from .calibration import Calibration
-from .force_maps import is_loaded, law_of
+from ...presses.means import press_means
+from ...presses.streams import MAD_TO_SIGMA, finite_mean, true_runs
+from ...presses.windows import PressWindows
+from ...session import Session, Stream
+from ...session.units import SECOND
+from ..calibration import Calibration
+from ..force_maps import is_loaded, law_of
 
 BIN = SECOND // 10  # over which pressures are averaged
 REST = 5 * BIN  # averaged before and after a contact

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..fitting.logs import LogPrediction
+from ...fitting.logs import LogPrediction
 
 # Share of the range of forces above which relative errors count; below it they say nothing.
 RELATIVE_FROM = 0.1

@@ -6,13 +6,13 @@ import numpy as np
 
 import jaxeit as je
 
-from ..presses.streams import finite_mean, true_runs
-from ..presses.times import PressColumns
-from ..session import Session, Status
-from ..session.units import SECOND
+from ...presses.streams import finite_mean, true_runs
+from ...presses.times import PressColumns
+from ...session import Session, Status
+from ...session.units import SECOND
+from ..report import ChannelTable, Finding, Severity, listed
+from ..streams.statistics import StreamStatistics
 from .reading_order import OrderCheck, check_order, transfer_matrix
-from .report import ChannelTable, Finding, Severity, listed
-from .streams import StreamStatistics
 
 MIN_SNR = 40.0  # dB; healthy benches reach 50 to 60
 NOISE_RATIO = 5.0  # over the median noise of the readings

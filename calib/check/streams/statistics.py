@@ -8,10 +8,10 @@ import numpy as np
 
 import jaxeit as je
 
-from ..presses.streams import finite_mean, true_runs
-from ..session import Session, SessionError, Status, Stream
-from ..session.units import SECOND
-from .report import Finding, Severity, StreamRow, counted
+from ...presses.streams import finite_mean, true_runs
+from ...session import Session, SessionError, Status, Stream
+from ...session.units import SECOND
+from ..report import Finding, Severity, StreamRow, counted
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 

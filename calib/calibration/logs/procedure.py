@@ -16,11 +16,11 @@ import numpy as np
 import jaxeit as je
 from jaxeit.budget import current_budget
 
-from ..check.acceptance import accept
-from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
-from ..fitting.curves import CURVES, AbstractCurve
-from ..fitting.fields import FIELDS, AbstractField, PadEdge
-from ..fitting.logs import (
+from ...check.acceptance import accept
+from ...fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
+from ...fitting.curves import CURVES, AbstractCurve
+from ...fitting.fields import FIELDS, AbstractField, PadEdge
+from ...fitting.logs import (
     MIN_PLACES,
     FittedLog,
     LogPrediction,
@@ -32,14 +32,14 @@ from ..fitting.logs import (
     unseen_direction,
     ways_of,
 )
-from ..fitting.results import FitError
-from ..presses.streams import resample
-from ..session import Session, SessionError, Stream, write_archive
-from .log_calibration import LogCalibration
-from .log_evaluation import LogEvaluation, log_evaluation
-from .log_storage import location_name
-from .recipe import Recipe
-from .recipe_text import AUTO_CURVES
+from ...fitting.results import FitError
+from ...presses.streams import resample
+from ...session import Session, SessionError, Stream, write_archive
+from ..recipe import Recipe
+from ..recipe_text import AUTO_CURVES
+from .calibration import LogCalibration
+from .evaluation import LogEvaluation, log_evaluation
+from .storage import location_name
 
 FORCE_FORMAT = "log-forces"
 _NOT_SIGNALS = ("force", "stage", "temperature", "barometer")

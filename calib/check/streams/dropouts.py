@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .report import Finding, Severity
-from .streams import StreamStatistics
+from ..report import Finding, Severity
+from .statistics import StreamStatistics
 from .stuck import EXAMINED
 
 MIN_FRAMES = 5  # with the value

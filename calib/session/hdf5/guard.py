@@ -20,7 +20,7 @@ from h5py import h5a, h5d, h5g, h5l, h5o, h5t
 from jaxeit.budget import current_budget
 from jaxeit.files import open_regular
 
-from .errors import SessionError, printable, problem
+from ..errors import SessionError, printable, problem
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MAX_ATTRIBUTES = 256
