@@ -38,7 +38,7 @@ SIDE = 15  # of the pool's grid
 CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib.PowerLaw()}
 RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))  # curve, and location field
 SMOKE = calib.Recipe(
-    location=calib.Bilinear(nodes=2, shared=True),
+    location=calib.fitting.Bilinear(nodes=2, shared=True),
     locator=calib.ImageCentroid("half"),
     fidelity=je.Fidelity.draft(),
     folds=2,

@@ -36,7 +36,7 @@ USUAL: Row = {"basis": je.Pixels(40), "hyperparameter": 0.1}
 ITERATIVE: Row = {"basis": je.Pixels(24)}
 FITS: dict[str, Row] = {"contacts, fitted": {}, "contacts, fitted, sheet known": {"sheet_known": True}}
 METHODS: dict[str, Row] = {
-    "back-projection": {"method": je.BackProjection()},
+    "back-projection": {"method": je.imaging.BackProjection()},
     "one step, Tikhonov": {"prior": je.Tikhonov()},
     "one step, NOSER": {},
     "one step, Laplace": {"prior": je.Laplace()},
@@ -112,7 +112,7 @@ def _both(found: np.ndarray, pair: np.ndarray, reach: float) -> bool:
 
 
 def in_regions(recon: Any, images: np.ndarray, level: float) -> Found:
-    return [je.find_regions(image, recon, level=level, least=(1 - level) / 2).centres for image in images]
+    return [je.contacts.find_regions(image, recon, level=level, least=(1 - level) / 2).centres for image in images]
 
 
 def chosen_level(recon: Any, images: np.ndarray) -> float:

@@ -85,7 +85,7 @@ class Bench:
     def order(self, signal: jax.Array, selection: Any = None, switch: float = 0.0) -> np.ndarray:
         """All readings, the best first."""
         pattern = self.skin.protocol.pattern
-        return np.asarray(je.choose_readings(signal, len(signal), selection, pattern=pattern, switch=switch).rows)
+        return np.asarray(je.scan.choose_readings(signal, len(signal), selection, pattern=pattern, switch=switch).rows)
 
     def ways(self) -> dict[str, Orders]:
         """Ways to choose readings, by name."""
@@ -95,7 +95,7 @@ class Bench:
             "D-optimal": self.order(whole),
             "D-optimal, cost per drive": self.order(whole, switch=SWITCH),
             "most sensitive": self.order(whole, je.scan.Sensitive()),
-            "largest volume": np.asarray(je.choose_readings(whole, INDEPENDENT, je.scan.Volume()).rows),
+            "largest volume": np.asarray(je.scan.choose_readings(whole, INDEPENDENT, je.scan.Volume()).rows),
         }
         return {name: [order] * len(near) for name, order in for_all.items()} | {
             "around the pad": [by_pad[pad] for pad in self.pads_at(near)],
@@ -109,9 +109,10 @@ class Bench:
 
     def row(self, name: str, count: int, orders: Orders) -> Row:
         rows = [np.sort(order[:count]) for order in orders]
-        frames = np.full(self.frames.shape, np.nan)
-        for number, kept in enumerate(rows):
-            frames[number, kept] = self.frames[number, kept]
+        readings = self.skin.protocol.readings
+        frames = jnp.stack(
+            [je.scan.in_frame(frame[kept], kept, readings) for frame, kept in zip(self.frames, rows, strict=True)]
+        )
         fitted = np.asarray(je.localisation_error(je.contacts.strongest(self.fit(frames)), self.sites))
         pictured = np.asarray(je.localisation_error(ESTIMATOR(self.image(frames), self.image), self.sites))
         return {
@@ -150,7 +151,7 @@ def measure(run: Run) -> Iterator[Row]:
 def events(bench: Bench, idle: int, local: int) -> Row:
     """Readings and errors by frame: at rest, for the pad that is pressed, then around the contact found."""
     settings = je.scan.EventScanSettings(onset=500.0, idle=idle, local=local)
-    scan = je.prepare_event_scan(bench.model, bench.skin, settings)
+    scan = je.scan.prepare_event_scan(bench.model, bench.skin, settings)
     step = eqx.filter_jit(lambda state, pressure, places: scan.step(state, pressure, places))
     masks: dict[str, list] = {"rest": [], "first": [], "next": []}
     errors: dict[str, list[float]] = {"first": [], "next": []}

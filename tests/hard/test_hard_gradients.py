@@ -32,7 +32,6 @@ HOST = {
     "bind": "what it is given has",
     "compiler_options": _DESCRIBES,
     "discretise": _GEOMETRY,
-    "disc_resistance": "one number, on the host; in the forward map it is `series_resistance`, case 'forward'",
     "drives": _DESCRIBES,
     "expected_mesh_nodes": _GEOMETRY,
     "few_choices": _PREPARES,
@@ -41,8 +40,8 @@ HOST = {
     "fidelity_choices": _PREPARES,
     "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
     "prepare_loads": _PREPARES,
+    "prepare_tracker": _PREPARES,
     "find_regions": "counts the regions of an image, on the host, and says so under jit",
-    "fit_fidelity": _PREPARES,
     "from_numbers": _DESCRIBES,
     "image_choices": _PREPARES,
     "ktc_score": "labels are integers; structural_similarity has the derivative",
@@ -221,7 +220,7 @@ LINEAR = {
     "one step, Laplace": (je.Laplace(), je.OneStep()),
     "one step, Gaussian": (je.GaussianSmooth(0.05, noser=True), je.OneStep()),
     "truncated": (je.Noser(), je.TruncatedSvd()),
-    "back projection": (je.Noser(), je.BackProjection()),
+    "back projection": (je.Noser(), je.imaging.BackProjection()),
     "GREIT": (je.Noser(), je.Greit(0.05, 0.06, 0.02)),
 }
 
@@ -239,7 +238,7 @@ def _gains(t):
     signal = je.scan.signal_covariance(t.model, basis=t.basis)
 
     def gains(x):
-        return je.choose_readings(x[0] * signal, 5).gain
+        return je.scan.choose_readings(x[0] * signal, 5).gain
 
     return Case(gains, [jnp.ones(1)], [])
 
@@ -344,7 +343,7 @@ CASES = {
     **{f"prepare, hyperparameter, {name}": _by_hyperparameter(*how) for name, how in LINEAR.items()},
     "signal_covariance": _signal,
     "choose_readings": _gains,
-    "Peak": _estimator(je.Peak()),
+    "Peak": _estimator(je.metrics.Peak()),
     "LevelCentroid": _estimator(je.LevelCentroid()),
     "PositiveCentroid": _estimator(je.metrics.PositiveCentroid()),
     "localisation_error": _length,
@@ -576,12 +575,12 @@ def test_what_decides_by_values_says_so_where_they_are_hidden(tiny):
         "the protocol": lambda x: je.prepare(eqx.tree_at(lambda m: m.pattern, model, x), basis=basis),
         "NoiseFigure chooses": lambda x: je.prepare(model, basis=basis, noise=x, hyperparameter=je.NoiseFigure()),
         "prepare_contacts decides": lambda x: je.prepare_contacts(model, noise=x),
-        "refine_contacts decides": lambda x: je.refine_contacts(model, x, None, noise=frame),
-        "prepare_event_scan decides": lambda x: je.prepare_event_scan(model, skin, je.scan.EventScanSettings(x)),
-        "noise_covariance decides": lambda x: je.noise_covariance(jnp.stack([x] * 5)),
+        "refine_contacts decides": lambda x: je.contacts.refine_contacts(model, x, None, noise=frame),
+        "prepare_event_scan decides": lambda x: je.scan.prepare_event_scan(model, skin, je.scan.EventScanSettings(x)),
+        "noise_covariance decides": lambda x: je.imaging.noise_covariance(jnp.stack([x] * 5)),
         "pad_masks decides": lambda x: je.pad_masks(skin, eqx.tree_at(lambda r: r.picture.areas, recon, x)),
-        "find_regions decides": lambda x: je.find_regions(x, recon),
-        "drives decides": lambda x: je.choose_readings(jnp.eye(18), 3, pattern=x, switch=1.0),
+        "find_regions decides": lambda x: je.contacts.find_regions(x, recon),
+        "drives decides": lambda x: je.scan.choose_readings(jnp.eye(18), 3, pattern=x, switch=1.0),
         "on_host decides": lambda x: eqx.tree_at(lambda r: r.factor, recon, x).on_host(),
         "to_numbers decides": lambda x: je.imaging.to_numbers(eqx.tree_at(lambda r: r.factor, recon, x)),
     }

@@ -267,7 +267,7 @@ def test_the_rank_is_told_and_never_above_what_four_terminals_hold(model, pixels
 METHODS = {
     "one step": je.OneStep(),
     "truncated": je.TruncatedSvd(),
-    "back projection": je.BackProjection(),
+    "back projection": je.imaging.BackProjection(),
     "GREIT": je.Greit(),
     "not negative": je.NonNegative(),
     "reweighted": je.Reweighted(),
@@ -602,7 +602,7 @@ def test_a_noise_that_is_none_is_refused_by_the_number_of_its_reading(model, pix
 def test_a_covariance_of_frames_that_share_next_to_nothing(second):
     """Then the formula for the weight of the diagonal divides by next to nothing: the weight is one, not 1e6."""
     blank = np.array([[1, 0, -1, 0] if second[0] == 0 else [1, -1, 1, -1], second], float).T
-    np.testing.assert_allclose(je.noise_covariance(blank), np.diag(np.var(blank, 0, ddof=1)), rtol=1e-12)
+    np.testing.assert_allclose(je.imaging.noise_covariance(blank), np.diag(np.var(blank, 0, ddof=1)), rtol=1e-12)
 
 
 def test_one_channel_too_quiet_is_told(model, pixels):
