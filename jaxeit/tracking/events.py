@@ -10,6 +10,8 @@ HALF = 0.012
 # How far contacts may jump: x, y, log width, log force, half length, velocity.
 JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, 0.1, 0.1])
 # How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
+# Half length of an edge over the distance of the two contacts that were taken for it.
+BETWEEN = 0.8
 EDGE, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, 0.0, 0.0]), 0.3
 
 
@@ -47,3 +49,16 @@ def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     contacts[k, 2] -= NARROWER
     covariance[own, own] += EDGE**2
     return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
+
+
+def joined(belief: Belief, first: int, second: int) -> Belief:
+    """With one edge in the place of two contacts, from the one to the other; it takes the place of the first."""
+    contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
+    pair = contacts[[first, second]]
+    force = np.exp(pair[:, 3])
+    contacts[first, :3] = force @ pair[:, :3] / force.sum()
+    contacts[first, 3], contacts[first, 4:6] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
+    contacts[first, 6:] = pair[:, 6:].mean(0)
+    own = np.arange(SIZE * first, SIZE * (first + 1))
+    covariance[own, own] += EDGE**2
+    return without(Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance)), second)

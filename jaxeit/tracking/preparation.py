@@ -21,11 +21,11 @@ from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
 from .filter import SIZE, ContactFilter
 from .reanalysis import prepare_reanalysis
-from .response import LoadedSheet, Neighbours
+from .response import LoadedSheet, Neighbours, half_lengths
 from .settings import TrackerSettings
 
 # Cells of the grid of neighbours, along the longer side.
-GRID = 25
+GRID = 20
 
 
 def prepare_filter(
@@ -108,8 +108,12 @@ def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: Tracke
     middles, unknowns = chart[np.asarray(model.triangles)].mean(1), _places_of_unknowns(model)
 
     def nearest(places: np.ndarray, count: int) -> Array:
-        found = cKDTree(places).query(cells, k=min(count, len(places)))[1]
-        return jnp.asarray(found.reshape(len(cells), -1), jnp.int32)
+        count = min(count, len(places))
+        along = np.linspace(-1, 1, 5)[:, None, None, None] * half_lengths()[:, None]  # (5, edges, 1, 2)
+        squares = np.full((along.shape[1], len(cells), len(places)), np.inf, np.float32)
+        for part in along:
+            squares = np.minimum(squares, _squares(cells + part, places))
+        return jnp.asarray(np.argpartition(squares, count - 1, -1)[..., :count], jnp.int32)
 
     return Neighbours(
         low=jnp.asarray(low, settings.dtype),
@@ -119,6 +123,12 @@ def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: Tracke
         pixels=nearest(pixels, settings.pixels),
         shape=(shape[0], shape[1]),
     )
+
+
+def _squares(first: Float[np.ndarray, "... n 2"], second: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "... n p"]:
+    """Squared distances of places, m^2."""
+    both = (first**2).sum(-1)[..., None] + (second**2).sum(-1) - 2 * first @ second.T
+    return np.asarray(both, np.float32)
 
 
 def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:

@@ -19,6 +19,8 @@ from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
 SHORTEST = 1e-4
+# Half lengths, m, and number of directions of the edges whose neighbours are looked up.
+LENGTHS, ANGLES = (0.015, 0.03), 4
 
 
 class Near(NamedTuple):
@@ -35,26 +37,43 @@ class Near(NamedTuple):
 
 
 class Neighbours(eqx.Module):
-    """Elements, unknowns and pixels nearest to the middle of each cell of a grid, (cells, ...).
+    """Elements, unknowns and pixels nearest to the middle of each cell of a grid, or to an edge that has its middle
+    there, (edges, cells, ...).
 
     ``low`` (2,) m is the corner of the grid, ``pitch`` m its cells' side, ``shape`` their number along y and x.
     """
 
     low: Float[Array, "2"]
     pitch: Float[Array, ""]
-    elements: Int[Array, "cells e"]
-    unknowns: Int[Array, "cells m"]
-    pixels: Int[Array, "cells n"]
+    elements: Int[Array, "edges cells e"]
+    unknowns: Int[Array, "edges cells m"]
+    pixels: Int[Array, "edges cells n"]
     shape: tuple[int, int] = eqx.field(static=True)
 
-    def near(self, places: Float[Array, "K 2"], elements: int, pixels: int) -> Near:
-        """What is near places, of a mesh of so many elements and an image of so many pixels."""
+    def near(self, loads: Float[Array, "K 6"], elements: int, pixels: int) -> Near:
+        """What is near loads, of a mesh of so many elements and an image of so many pixels."""
         rows, columns = self.shape
-        x, y = jnp.floor((places - self.low) / self.pitch).astype(jnp.int32).T
+        x, y = jnp.floor((loads[:, :2] - self.low) / self.pitch).astype(jnp.int32).T
         cell = jnp.clip(y, 0, rows - 1) * columns + jnp.clip(x, 0, columns - 1)
-        under, unknowns, around = (table[cell].ravel() for table in (self.elements, self.unknowns, self.pixels))
-        count = len(places)
+        edge = _edge_number(loads[:, 4:])
+        under, unknowns, around = (table[edge, cell].ravel() for table in (self.elements, self.unknowns, self.pixels))
+        count = len(loads)
         return Near(under, unknowns, around, _once(under, count, elements), _once(around, count, pixels))
+
+
+def half_lengths() -> Float[np.ndarray, "edges 2"]:
+    """Half the edges of `Neighbours`, m: none, then of each length in each direction."""
+    angles = np.pi * np.arange(ANGLES) / ANGLES
+    along = np.stack([np.cos(angles), np.sin(angles)], 1)
+    return np.concatenate([np.zeros((1, 2)), *(length * along for length in LENGTHS)])
+
+
+def _edge_number(half: Float[Array, "K 2"]) -> Int[Array, " K"]:
+    """The row of `half_lengths` that is nearest to each half edge, whose sign does not matter."""
+    rows = jnp.asarray(half_lengths(), half.dtype)
+    squares = [jnp.sum((half[:, None] - sign * rows) ** 2, -1) for sign in (1, -1)]
+    nearest: Array = jnp.argmin(jnp.minimum(*squares), 1)
+    return nearest
 
 
 def _once(indices: Int[Array, " e"], lists: int, size: int) -> Float[Array, " e"]:
@@ -114,8 +133,7 @@ class LoadedSheet(eqx.Module):
 
     def near(self, contacts: Float[Array, "K 6"]) -> Near:
         """What is near contacts."""
-        places = contacts[:, :2].astype(self.points.dtype)
-        return self.neighbours.near(places, len(self.sigma), len(self.pixels))
+        return self.neighbours.near(contacts.astype(self.points.dtype), len(self.sigma), len(self.pixels))
 
     def shown(
         self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near

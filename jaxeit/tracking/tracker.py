@@ -1,13 +1,14 @@
 """Contacts followed from frame to frame: they are born, move, press, lift and die, and keep their numbers.
 
 Where a frame is not what the contacts so far lead to expect, the belief before it is updated in several ways: as it is;
-with contacts that have jumped; without one of them; with one that has become an edge; with one more. The way under
+with contacts that have jumped; without one of them; with one, or two, that are an edge; with one more. The way under
 which the frame was most probable is taken, with the rates of such events as prior (evidence by Laplace's approximation,
 MacKay 1992, Neural Comput. 4). An ordinary frame is one update.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from ..contacts.preparation import sheet_of
 from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
-from .events import inserted, jumped, lengthened, without
+from .events import inserted, joined, jumped, lengthened, without
 from .filter import SIZE, Belief, ContactFilter, Pads, Update, predicted, unexplained, updated
 from .preparation import prepare_filter
 from .settings import TrackerSettings
@@ -34,6 +35,8 @@ PATIENCE, WORSE = 10, 1.3
 EVENTS = 4
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
 FAINT, FAINT_FRAMES = 4.0, 2
+# Signal of a contact that begins beside others, at least: in standard deviations of the noise, and over that of all.
+MIN_LOUDNESS, RIPPLE = 12.0, 0.05
 # Directions of an edge that are tried.
 DIRECTIONS = np.pi * np.arange(4) / 4
 # Prior deviations of the place and the velocity of a contact that begins, m and m/s.
@@ -224,7 +227,8 @@ class Tracker:
         for _ in range(EVENTS):
             left = np.asarray(unexplained(self.filter, best.belief, frame, pads))
             events = self._events(now, left, seconds)
-            tried = [(one, self._update(one.belief, frame, pads, alone, many=True)) for one in events]
+            every = [(one, self._update(one.belief, frame, pads, alone, many=True)) for one in events]
+            tried = [(event, update) for event, update in every if not _is_ripple(now, event, update)]
             if not tried:
                 break
             event, update = max(tried, key=lambda pair: float(pair[1].evidence) + pair[0].prior)
@@ -255,6 +259,9 @@ class Tracker:
                 edges = tuple(edge or j == k for j, edge in enumerate(now.edges))
                 for angle in DIRECTIONS:
                     yield _Hypothesis(lengthened(now.belief, k, angle), now.numbers, edges, rare - np.log(4.0))
+        for j, k in combinations(range(len(now.numbers)), 2):
+            numbers, edges = _left_out(replace(now, edges=(*now.edges[:j], True, *now.edges[j + 1 :])), k)
+            yield _Hypothesis(joined(now.belief, j, k), numbers, edges, rare)
         if len(now.numbers) < self._settings.most:
             # The prior of a place is even over the skin, that of the fit is normal about where it begins.
             even = float(np.log(2 * np.pi * PLACE**2 / self._area))
@@ -282,6 +289,13 @@ class Tracker:
                 rest = tuple(count for j, count in enumerate(now.faint) if j != k)
                 now = replace(now, belief=without(now.belief, k), numbers=numbers, edges=edges, faint=rest)
         return now
+
+
+def _is_ripple(now: Tracking, event: _Hypothesis, update: Update) -> bool:
+    """Whether a contact beside others would begin so weak that it may be an error of their model."""
+    born = len(event.numbers) > len(now.numbers) > 0
+    loudness = np.asarray(update.loudness)
+    return born and bool(loudness[-1] < max(MIN_LOUDNESS, RIPPLE * loudness[:-1].sum()))
 
 
 def _left_out(now: Tracking, k: int) -> tuple[tuple[int, ...], tuple[bool, ...]]:

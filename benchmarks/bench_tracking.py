@@ -1,0 +1,226 @@
+"""What contacts followed through time tell: two that come one after the other, crossing, edges, and what is learned.
+
+For each seed the testbed is coated anew, on another mesh than that of the tracker, with noise 60 dB below the readings
+and the sheet fitted to the mean of 100 untouched frames. Frames come at 100 Hz, the force of a tip rises within 0.1 s,
+and the pads tell their forces, from the load on their rectangles, to 3 % and 0.1 N. "told": at the end there are as
+many contacts as tips, each within half their distance of its own, at most 15 mm; of an edge, one. "kept": the number of
+each contact is the same in all frames at full force. "covered": the ellipse of 90 % holds the place, in these frames.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+import jaxeit as je
+from calib.calibration.localisation.load_windows import FIDELITY
+from jaxeit.tracking import Tracker, Tracking, prepare_tracker
+
+from .clock import seconds
+from .harness import Question, Run
+from .problems import matched, pressed, uneven
+from .rows import Row, averaged, grouped
+
+RATE, RISE = 100.0, 0.1  # frames a second; s until a tip presses with its full force
+LOAD, SPREAD = 15.0, 0.012  # N; m, width of the load of a tip
+DISTANCES, LENGTHS = (0.015, 0.02, 0.025, 0.03, 0.04), (0.03, 0.04, 0.06)  # m
+GAP, SPEED = 0.04, 0.1  # m between contacts that cross, and m/s
+TIPS = 9  # of an edge
+PAD_ERROR = (0.03, 0.1)  # relative, and N
+INSIDE = float(chi2.ppf(0.9, 2))
+PRESSES = 40  # of a seed, one after the other, from which the gain of the contact layer is learned
+
+
+class Scene(NamedTuple):
+    """Name, places (frames, k, 2) m and loads (frames, k) N of tips, and whether they are one edge."""
+
+    name: str
+    places: np.ndarray
+    loads: np.ndarray
+    edge: bool = False
+
+    def truth(self, frame: int) -> np.ndarray:
+        """Places (n, 2) m of the contacts of a frame: of an edge, its middle."""
+        there = self.places[frame][self.loads[frame] > 0]
+        return there.mean(0)[None] if self.edge and len(there) else there
+
+
+def _force(frames: int, begin: int, end: int | None = None) -> np.ndarray:
+    """Force of a tip that presses between two frames, (frames,) N."""
+    time = np.arange(frames)
+    down = 1.0 if end is None else np.clip((end - time) / (RATE * RISE), 0, 1)
+    return LOAD * np.clip((time - begin) / (RATE * RISE), 0, 1) * down
+
+
+def _line(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    angle = rng.uniform(0, np.pi)
+    return rng.uniform(0.06, 0.14, 2), np.array([np.cos(angle), np.sin(angle)])
+
+
+def sequence(rng: np.random.Generator, distance: float) -> Scene:
+    """A tip, and 0.15 s later a second one at a distance."""
+    middle, along = _line(rng)
+    places = middle + np.array([[-0.5], [0.5]]) * distance * along
+    loads = np.stack([_force(40, 2), _force(40, 17)], 1)
+    return Scene(f"two in sequence, {1e3 * distance:.0f} mm", np.broadcast_to(places, (40, 2, 2)), loads)
+
+
+def crossing(rng: np.random.Generator) -> Scene:
+    """Two tips that slide past each other."""
+    time = np.arange(90) / RATE
+    run = SPEED * np.clip(time - 0.15, 0, 0.7) - 0.035
+    left, right = rng.uniform(0.075, 0.125, 2)
+    there = [
+        np.stack([left + run, np.full(90, right - GAP / 2)], 1),
+        np.stack([left - run, np.full(90, right + GAP / 2)], 1),
+    ]
+    loads = np.stack([_force(90, 2), _force(90, 5)], 1)
+    return Scene("crossing at 40 mm, 100 mm/s", np.stack(there, 1), loads)
+
+
+def edge(rng: np.random.Generator, length: float) -> Scene:
+    """A row of tips pressed at once."""
+    middle, along = _line(rng)
+    places = middle + np.linspace(-0.5, 0.5, TIPS)[:, None] * length * along
+    loads = np.repeat(_force(25, 2)[:, None] / TIPS, TIPS, 1)
+    return Scene(f"edge, {1e3 * length:.0f} mm", np.broadcast_to(places, (25, TIPS, 2)), loads, edge=True)
+
+
+def presses(rng: np.random.Generator, count: int) -> Scene:
+    """Presses at random places, one after the other."""
+    frames = 26
+    places = np.repeat(rng.uniform(0.02, 0.18, (count, 1, 2)), frames, 0)
+    return Scene("presses", places, np.tile(_force(frames, 1, 23), count)[:, None])
+
+
+def pad_loads(skin: je.Skin, scene: Scene) -> np.ndarray:
+    """Force on each pad, (frames, pads) N: of Gaussian loads on rectangles."""
+    out = []
+    for pad in skin.pads:
+        low, high = np.min(pad.outline, 0), np.max(pad.outline, 0)
+        share = norm.cdf((high - scene.places) / SPREAD) - norm.cdf((low - scene.places) / SPREAD)
+        out.append((share.prod(2) * scene.loads).sum(1))
+    return np.stack(out, 1)
+
+
+class Bench:
+    """A skin of one seed, its tracker, and how frames of a scene are simulated on it."""
+
+    def __init__(self, model: je.Model, seed: int):
+        self.skin, self._seed, self._effects = je.load_skin("testbed"), seed, uneven(seed)
+        self.rng = np.random.default_rng([seed, 7])
+        blank = pressed(self._effects, np.full((1, 1, 2), 0.1), np.zeros((1, 1)))
+        untouched, _ = blank.frames(self.rng)
+        self.noise = np.full(untouched.size, blank.noise)
+        self.tracker: Tracker = prepare_tracker(
+            model, self.skin, noise=self.noise, sigma=je.fit_background(model, untouched)
+        )
+
+    def followed(self, scene: Scene, now: Tracking | None = None) -> Iterator[tuple[int, Tracking, float]]:
+        """The number of each frame, what is known after it, and the seconds of the update."""
+        found = pressed(self._effects, scene.places, scene.loads)
+        exact = pad_loads(self.skin, scene)
+        now = self.tracker.start() if now is None else now
+        for number, change in enumerate(found.change):
+            frame = change + self.noise * self.rng.normal(size=change.size)
+            errors = np.hypot(PAD_ERROR[0] * exact[number], PAD_ERROR[1])
+            forces = exact[number] + errors * self.rng.normal(size=errors.size)
+            spent, now = seconds(lambda f=frame, n=now, p=forces, e=errors: self.tracker.step(n, f, 1 / RATE, p, e))
+            yield number, now, spent
+
+
+def _nearest(now: Tracking, truth: np.ndarray) -> list[tuple[float, bool]]:
+    """Distance, m, of each true place from the nearest contact, and whether its ellipse of 90 % holds the place."""
+    out = []
+    for place in truth:
+        track = min(now.tracks, key=lambda t, p=place: float(np.linalg.norm(t.position - p)))
+        away = track.position - place
+        out.append((float(np.linalg.norm(away)), float(away @ np.linalg.solve(track.covariance, away)) < INSIDE))
+    return out
+
+
+def judged(bench: Bench, scene: Scene) -> Row:
+    """What was told of a scene."""
+    numbers: list[tuple[int, ...]] = []
+    away: list[tuple[float, bool]] = []
+    spent: list[float] = []
+    for frame, now, took in bench.followed(scene):
+        full = scene.loads[frame] > 0.99 * scene.loads.max()
+        if full.all() and now.tracks:
+            away += _nearest(now, scene.truth(frame))
+            numbers.append(now.numbers)
+            spent.append(took)
+    truth, places = scene.truth(len(scene.places) - 1), np.array([t.position for t in now.tracks]).reshape(-1, 2)
+    told = len(places) == 1 if scene.edge else matched(places, truth)
+    return {
+        "scene": scene.name,
+        "told": float(told),
+        "kept": float(len(set(numbers)) == 1),
+        "error_mm": 1e3 * float(np.mean([error for error, _ in away])) if away else None,
+        "covered": float(np.mean([inside for _, inside in away])) if away else None,
+        "ms": 1e3 * float(np.median(spent)) if spent else None,
+    }
+
+
+def scenes(run: Run) -> Iterator[Row]:
+    """Each kind of scene on several skins."""
+    seeds, trials = run.sizes((4, 5), (1, 1))
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    rows: list[Row] = []
+    for seed in range(400, 400 + seeds):
+        bench, rng = Bench(model, seed), np.random.default_rng(seed)
+        for _ in range(trials):
+            every = [crossing(rng), *(sequence(rng, d) for d in DISTANCES), *(edge(rng, length) for length in LENGTHS)]
+            rows += [judged(bench, scene) for scene in every]
+        print(f"seed {seed}", flush=True)
+    yield {
+        "seeds": seeds,
+        "scenes": [averaged(same) | {"trials": len(same)} for same in grouped(rows, "scene").values()],
+    }
+
+
+def learning(run: Run) -> Iterator[Row]:
+    """Presses at unknown places, one after the other: place and force, as the gain of the contact layer is learned."""
+    seeds, count = run.sizes((4, PRESSES), (1, 2))
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    rows: list[Row] = []
+    for seed in range(500, 500 + seeds):
+        bench = Bench(model, seed)
+        for learns in (True, False):
+            scene = presses(np.random.default_rng(seed), count)
+            now, per_press = bench.tracker.start(), len(scene.places) // count
+            for press in range(count):
+                part = Scene(scene.name, *(a[press * per_press : (press + 1) * per_press] for a in scene[1:3]))
+                errors, inside, extra = [], [], 0
+                begin = now if learns else bench.tracker.start()
+                for frame, now, _ in bench.followed(part, begin):
+                    extra = max(extra, len(now.tracks) - 1)
+                    if part.loads[frame, 0] > 0.99 * LOAD and now.tracks:
+                        ((error, held),) = _nearest(now, part.truth(frame))
+                        errors.append(error)
+                        inside.append(held)
+                rows.append(
+                    {
+                        "learned": "yes" if learns else "no",
+                        "presses": _stage(press),
+                        "error_mm": 1e3 * float(np.mean(errors)) if errors else None,
+                        "covered": float(np.mean(inside)) if inside else None,
+                        "false_seconds": float(extra > 0),
+                        "missed": float(not errors),
+                    }
+                )
+        print(f"seed {seed}", flush=True)
+    yield {"presses": [averaged(same, "none") for same in grouped(rows, "learned", "presses").values()]}
+
+
+def _stage(press: int) -> str:
+    edges = (0, 5, 10, 20, PRESSES)
+    place = int(np.searchsorted(edges, press, side="right"))
+    return f"{edges[place - 1]} to {edges[place] - 1}"
+
+
+main = Question("tracking", __doc__, {"scenes": scenes, "learning": learning})
+
+if __name__ == "__main__":
+    main()
