@@ -1,9 +1,10 @@
 """Calibrations: made from sessions, evaluated, applied to frames, saved and loaded."""
 
+from .application import apply
 from .calibration import Calibration
 from .evaluation import Evaluation
 from .files import load_calibration
-from .force_maps import ForceEstimate, apply, force_map
+from .force_maps import ForceEstimate, force_map
 from .localisation.locators import (
     LOCATORS,
     AbstractLocator,

@@ -21,6 +21,7 @@ from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .press_examples import press_examples
+from .recalibration.agreement import agreement_of_presses
 from .recipe import Recipe
 from .storage import describe
 
@@ -134,6 +135,9 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a calibration on the presses of another session.
 
+    The notes tell what lies outside of what was calibrated. Where the pads disagree with the image, intervals are wider
+    by as much.
+
     Args:
         processing: how the session is cut and corrected; default: as the sessions of the calibration.
         ignore_errors: evaluate also on a session in which `check_session` finds an error, and note it.
@@ -146,7 +150,8 @@ def evaluate(
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
-    force, half_width = calibration.pads.hold_forces(found.pressure, images.places)
+    agreement = agreement_of_presses(calibration, found, images)
+    force, half_width = agreement.calibration.pads.hold_forces(found.pressure, images.places)
     return Evaluation(
         position=found.position,
         estimated=images.estimated,
@@ -157,7 +162,7 @@ def evaluate(
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
         held_out_by="session",
-        notes=(*ignored, *found.notes),
+        notes=(*ignored, *found.notes, *agreement.notes),
         others=_compared_forces(calibration, found, images.integral),
         recipe=calibration.evaluation.recipe,
     )

@@ -185,3 +185,17 @@ def test_one_reading_after_the_other_gives_the_forces_of_the_whole_log():
     two = series_of([(time, values, force)])
     smooth = fit_series(two, two.complete, [curve], {"smooth": SmoothChannels((2,))}, Squared()).model
     assert_tracked(smooth, time[45:], np.where(np.isnan(missing[45:]), np.nan, values[45:]))
+
+
+def test_a_spike_of_one_reading_does_not_last_in_a_curve_with_hysteresis():
+    n = 300
+    time, load = np.arange(n) * 1e8, 1 - np.cos(np.arange(n) / 30)
+    curve = AffinePlay(np.array([0.2, 0.4, 0.8]))
+    force = np.asarray(curve(jnp.array([1.0, 2.0, 3.0, 4.0, 0.0]), jnp.asarray(load)))
+    series = series_of([(time, load[:, None], force)])
+    model = fit_series(series, series.complete, [curve], ways_of(1, 128), Squared()).model
+    spoilt = load.copy()
+    spoilt[100] += 1.5  # while the load falls
+    sound, struck = (model.predict(time, one[:, None]).force for one in (load, spoilt))
+    assert np.abs(struck - sound).max() < 0.05 * force.max()
+    assert np.sqrt(np.mean((sound - force) ** 2)) < 0.01 * force.max()

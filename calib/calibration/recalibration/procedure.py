@@ -126,7 +126,7 @@ class KnownForces(AbstractEvidence):
         notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=_parts(session)))
         images = _imager(calibration).presses(found.dv)
         known = np.isfinite(found.position).all(1, keepdims=True)
-        place = np.where(known, found.position, images.estimated[_estimator(calibration)])
+        place = np.where(known, found.position, images.estimated[estimator_of(calibration)])
         time = found.presses.t_hold0[found.presses.accepted]
         loads = LoadedPads(found.pressure, np.log(found.force), place, images.places, found.rest, time)
         return loads, notes + list(found.notes)
@@ -157,12 +157,7 @@ class OrdinaryUse(AbstractEvidence):
     def read(self, calibration: Calibration, session: Session, ignore_errors: bool) -> tuple[LoadedPads, list[str]]:
         require_skin(session, calibration.skin, {name: session.stream(name) for name in ("eit", "pressure")})
         notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED))
-        found = use_contacts(session, calibration)
-        sound = np.isfinite(found.pressure).all(1) & np.isfinite(
-            found.dv[:, np.asarray(calibration.recon.channels)]
-        ).all(1)
-        loads = contact_loads(calibration, found.dv[sound], found.pressure[sound])
-        return loads._replace(rest=found.rest, time=found.time), notes
+        return use_loads(calibration, session), notes
 
     def update(self, calibration: Calibration, loads: LoadedPads, noise: PressNoise) -> GainUpdate:
         prior = gain_prior(calibration, self.drift, together=True)
@@ -170,10 +165,19 @@ class OrdinaryUse(AbstractEvidence):
         return update_from_use(prior, image_reference(calibration), noise, seen)
 
 
+def use_loads(calibration: Calibration, session: Session) -> LoadedPads:
+    """Single contacts of a session, each between two rests, and the levels of the pads at rest."""
+    found = use_contacts(session, calibration)
+    sound = np.isfinite(found.pressure).all(1)
+    sound &= np.isfinite(found.dv[:, np.asarray(calibration.recon.channels)]).all(1)
+    loads = contact_loads(calibration, found.dv[sound], found.pressure[sound])
+    return loads._replace(rest=found.rest, time=found.time)
+
+
 def contact_loads(calibration: Calibration, dv: np.ndarray, pressure: np.ndarray) -> LoadedPads:
     """Single contacts, from changes of frames (n, readings) V and of pressures (n, pads) Pa."""
     images = _imager(calibration).presses(dv)
-    place = images.estimated[_estimator(calibration)]
+    place = images.estimated[estimator_of(calibration)]
     single = np.isfinite(place).all(1) & (images.integral > 0)
     every = calibration.locate(dv)
     if every is not None:
@@ -196,7 +200,7 @@ def image_reference(calibration: Calibration) -> ImageReference:
     """
     found = calibration.evaluation
     try:
-        return fit_reference(found.estimated[_estimator(calibration)], found.force, found.image_sum)
+        return fit_reference(found.estimated[estimator_of(calibration)], found.force, found.image_sum)
     except ValueError as error:
         raise SessionError(f"calibration: {error}; recalibrate from presses of known force") from None
 
@@ -265,12 +269,23 @@ def assess(
         )
     way = evidence or (KnownForces() if "force" in session.streams else OrdinaryUse())
     loads, notes = way.read(calibration, session, ignore_errors)
+    return judge(calibration, way, loads, session, notes)
+
+
+def judge(
+    calibration: Calibration, way: AbstractEvidence, loads: LoadedPads, session: Session, notes: Sequence[str] = ()
+) -> Recalibration:
+    """How far presses or contacts of a session are off a calibration.
+
+    Raises:
+        SessionError: if too few of them can be used.
+    """
     noise = press_noise(calibration.evaluation)
     loads, update, more = _updated(calibration, way, loads, noise, session)
     force = np.maximum(_expected(calibration, loads, update.mean)[0], 0)
     count = (force / force.sum(1, keepdims=True)).sum(0)
     origin = session.epoch, f"{session.hash}  {session.name}"
-    return recorded(calibration, way.kind, update, count, rest_levels(loads.rest, loads.time), origin, notes + more)
+    return recorded(calibration, way.kind, update, count, rest_levels(loads.rest, loads.time), origin, [*notes, *more])
 
 
 def _updated(
@@ -416,7 +431,7 @@ def _imager(calibration: Calibration) -> Imager:
     return Imager(calibration.recon, calibration.masks, calibration.locator)
 
 
-def _estimator(calibration: Calibration) -> str:
+def estimator_of(calibration: Calibration) -> str:
     """The estimator of the place that the calibration knows best."""
     return "fitted" if calibration.locator is not None and "fitted" in calibration.evaluation.estimated else "half"
 

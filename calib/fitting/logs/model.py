@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..curves.base import AbstractCurve
 from ..curves.fitted import FittedCurve, predict_pads
 from ..curves.samples import bucket
 from .combination import AbstractCombination
@@ -85,7 +86,8 @@ class LogModel:
         where = self.location
         place = np.full((len(values), 2), np.nan) if place is None else place
         inputs = values if where is None else where.inputs(values, place)
-        signals = self.with_starts(self.combination.possible_signals(time, inputs))
+        possible = self.combination.possible_signals(time, inputs)
+        signals = self.with_starts(signals_for(self.curve.curve, possible))
         return with_noise(self.noise, time, *self.forces(signals, values, place))
 
     def forces(
@@ -115,6 +117,27 @@ class LogModel:
             return signals
         ends = [np.full((len(signals), 1), end) for end in (low, high)]
         return np.concatenate([np.concatenate([end, signals], 1) for end in ends])
+
+
+def signals_for(curve: AbstractCurve, signals: Float[np.ndarray, "fits n"]) -> Float[np.ndarray, "fits n"]:
+    """The signals as a curve takes them: for one with hysteresis, medians of three readings in turn.
+
+    Such a curve remembers extremes: one reading that is a spike would shift its force until the signal turns again. The
+    first and the last reading stay as they are, so that the newest force waits for no reading after it. Missing
+    readings are passed over.
+    """
+    if not curve.path:
+        return signals
+    known, out = np.isfinite(signals[0]), signals.copy()
+    x = signals[:, known]
+    if x.shape[1] > 2:
+        out[:, np.flatnonzero(known)[1:-1]] = median_of_three(x[:, :-2], x[:, 1:-1], x[:, 2:])
+    return out
+
+
+def median_of_three(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Element by element."""
+    return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
 
 
 def with_noise(

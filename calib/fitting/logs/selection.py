@@ -30,7 +30,7 @@ from .combination import AbstractCombination, one_channel
 from .directions import cycles_of, travel_of
 from .gaussian_process import SmoothChannels
 from .location import LogLocation, box_of, fit_gains, inside, ratios, relative
-from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, with_noise, within
+from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, signals_for, with_noise, within
 from .noise import fit_log_noise
 from .series import LogSeries
 
@@ -174,6 +174,7 @@ class _Problem:
         key = _key(way), CURVES.name_of(curve), "" if field is None else FIELDS.name_of(field)
         if key not in self._fits:
             combination, signals = self.signals(way)
+            signals = signals_for(curve, signals)
             fitted, gains, gain, spread = self._fitted(curve, field, signals)
             force, error, _ = curve_forces(fitted, signals)
             error = gain * np.hypot(np.nan_to_num(error), np.nan_to_num(force) * spread)

@@ -1,13 +1,22 @@
 """The model of a log for one reading after the other, as a running sensor sends them."""
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..curves.play_operators import remembered
-from .model import LogModel, LogPrediction, with_noise
+from .model import LogModel, LogPrediction, median_of_three, with_noise
 from .noise import WINDOW
+
+
+class _Reading(NamedTuple):
+    """A reading of channels (1, channels) at a place (1, 2) m, and its entry of `LogTracker`'s recent forces."""
+
+    values: np.ndarray
+    place: np.ndarray
+    entry: list[float]
 
 
 class LogTracker:
@@ -19,9 +28,11 @@ class LogTracker:
 
     def __init__(self, model: LogModel):
         self._model, self._signals = model, model.combination.tracker()
-        self._past = np.zeros((0, 0))  # turning points of the signals, (points, histories)
+        self._past = np.zeros((0, 0))  # turning points of the signals before the last, (points, histories)
+        self._latest: deque[np.ndarray] = deque(maxlen=3)  # the last signals, (histories,) each
+        self._before: _Reading | None = None  # the last one, whose force is final once the next one is known
         self._copies = 1
-        self._recent: deque[tuple[float, float, float, bool]] = deque()
+        self._recent: deque[list[float]] = deque()  # time, force, standard error and validity
 
     def step(
         self, time: float, values: Float[np.ndarray, " channels"], place: Float[np.ndarray, " 2"] | None = None
@@ -30,25 +41,38 @@ class LogTracker:
         where = self._model.location
         at = np.full((1, 2), np.nan) if place is None else place[None]
         inputs = values[None] if where is None else where.inputs(values[None], at)
-        signals = self._signals.step(time / 1e9, inputs[0])
-        force, error, valid = self._model.forces(self._with_past(signals), values[None], at)
-        self._recent.append((time, float(force[0]), float(error[0]), bool(valid[0])))
+        reading = _Reading(values[None], at, [time, 0.0, 0.0, 0.0])
+        self._recent.append(reading.entry)
+        self._estimate(self._signals.step(time / 1e9, inputs[0]), reading)
         while len(self._recent) > 2 and self._recent[1][0] <= time - 1e9 * WINDOW:
             self._recent.popleft()
-        found = with_noise(self._model.noise, *(np.array(column) for column in zip(*self._recent, strict=True)))
+        when, force, error, valid = (np.array(column) for column in zip(*self._recent, strict=True))
+        found = with_noise(self._model.noise, when, force, error, valid > 0)
         return LogPrediction(*(part[-1:] for part in found))
 
+    def _estimate(self, signals: Float[np.ndarray, " histories"], reading: _Reading) -> None:
+        """Enter the force of a reading and, where the curve remembers, that of the reading before it again."""
+        rows = [reading]
+        series = signals[:, None]
+        if self._model.curve.curve.path and np.isfinite(signals[0]):
+            series = self._with_past(signals)
+            rows = [row for row in (self._before, reading) if row is not None]
+            self._before = reading
+        values, place = (np.concatenate(column) for column in list(zip(*rows, strict=True))[:2])
+        for row, found in zip(rows, zip(*self._model.forces(series, values, place), strict=True), strict=True):
+            row.entry[1:] = map(float, found)
+
     def _with_past(self, signals: Float[np.ndarray, " histories"]) -> Float[np.ndarray, "more m"]:
-        """The signals after the turning points of each history, where the curve remembers."""
-        now = signals[:, None]
-        if not self._model.curve.curve.path or not np.isfinite(signals[0]):
-            return now
-        if not len(self._past):
-            begun = self._model.with_starts(now)
-            self._copies = len(begun) // len(now)
-            self._past = remembered(begun.T)
-            return begun
-        now = np.tile(now, (self._copies, 1))
-        past = np.concatenate([self._past, now.T])
-        self._past = remembered(past)
-        return past.T
+        """The signals after the turning points of each history.
+
+        A reading becomes part of the past as the median of three (`signals_for`), once the next one is known.
+        """
+        if not self._latest:
+            begun = self._model.with_starts(signals[:, None])
+            self._copies = len(begun) // len(signals)
+            self._past = remembered(begun[:, :-1].T)
+        self._latest.append(np.tile(signals, self._copies))
+        if len(self._latest) > 1:
+            settled = median_of_three(*self._latest) if len(self._latest) > 2 else self._latest[0]
+            self._past = remembered(np.concatenate([self._past, settled[None]]))
+        return np.concatenate([self._past, self._latest[-1][None]]).T
