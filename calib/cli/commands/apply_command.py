@@ -16,6 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help=text)
     text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of so many seconds"
     parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
+    text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
+    parser.add_argument("--track", action="store_true", help=text)
     add_low_pass_argument(parser)
 
 
@@ -31,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
     calibration = load_calibration(args.calibration)
     if isinstance(calibration, LogCalibration):
         refuse_low_pass(args)
-        if args.loads is not None:
-            raise ValueError("--loads: the calibration of a log has no EIT, which tells where contacts are")
+        if args.loads is not None or args.track:
+            option = "--track" if args.track else "--loads"
+            raise ValueError(f"{option}: the calibration of a log has no EIT, which tells where contacts are")
         with open_session(args.session) as session:
             found = apply_log(calibration, session, args.output, ignore_errors=args.force)
         outside = (~found.valid).mean() if len(found.valid) else 0.0
@@ -49,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
             ignore_errors=args.force,
             progress=progress_bar("frames"),
             loads=args.loads,
+            track=args.track,
             tell=print,
         )
         frames = len(session.stream("eit"))
