@@ -18,15 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import verb
 from ..contacts.search import ContactFinder, Frame
-from ..effects.material import ContactPiezoresistance
-from ..least_squares import ImplicitStep, LevenbergMarquardt
+from ..least_squares import ImplicitStep, LevenbergMarquardt, normal_equations
 from ..linalg import lapack
-from .reanalysis import Reanalysis
+from .response import LoadedSheet, Near, Shown
 
 # Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
 SIZE, SEEN = 8, 6
@@ -34,8 +32,6 @@ SIZE, SEEN = 8, 6
 FALL = 1.0
 # Evaluations of an update, and of one that begins far from its end.
 STEPS, MANY_STEPS = 6, 20
-# Least half length, m: an edge of length zero has no direction.
-SHORTEST = 1e-3
 
 SOLVER = LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=FALL)
 
@@ -69,23 +65,16 @@ class Update(NamedTuple):
     |---------------------------------------------------------------------------|-------|
     | belief                                                                    |       |
     | evidence: log of the frame's probability before it came, up to a constant | ()    |
-    | left: what no contact explains, in standard deviations of a single frame  | (r,)  |
+    | misfit: chi-square of the frame and the pads                              | ()    |
     | surprise: square of the change of the belief, in its standard deviations  | ()    |
     | loudness: of each contact's signal, in standard deviations                | (K,)  |
     """
 
     belief: Belief
     evidence: Float[Array, ""]
-    left: Float[Array, " r"]
+    misfit: Float[Array, ""]
     surprise: Float[Array, ""]
     loudness: Float[Array, " K"]
-
-
-class LogGain(NamedTuple):
-    """Log gain of elements (e,) and pixels (n,)."""
-
-    elements: Float[Array, " e"]
-    pixels: Float[Array, " n"]
 
 
 class ContactFilter(eqx.Module):
@@ -94,84 +83,22 @@ class ContactFilter(eqx.Module):
     | meaning                                                                  | shape            | unit |
     |--------------------------------------------------------------------------|------------------|------|
     | finder: whitens frames; its atoms are where contacts may begin           |                  |      |
-    | sheet: readings of a changed sheet                                       |                  |      |
-    | sigma: of the untouched sheet                                            | (elements,)      | S    |
-    | points, weights: of the elements                                         | (elements, q, 2), (q,) | m |
-    | modes: of the log gain of each element; the first is the level           | (elements, g)    | 1    |
-    | places: where the modes lie                                              | (g, 2)           | m    |
-    | pixels: their middles                                                    | (p, 2)           | m    |
-    | pixel_response: readings per relative change of each, to first order     | (p, r)           | 1    |
-    | pixel_modes: of the log gain of each                                     | (p, g)           | 1    |
-    | pad_area: area of each pad in each pixel                                 | (pads, p)        | m^2  |
-    | law: factor of conductivity by pressure                                  |                  |      |
+    | compress: whitened readings of a frame that lacks none                   | (r, readings)    | 1/V  |
+    | sheet: what contacts show                                                |                  |      |
+    | places: where the modes of the gain lie; the first is the level          | (g, 2)           | m    |
     | model_error: part of the signal by which mesh, sheet and load shape err  | ()               | 1    |
     | persistence of that error                                                | ()               | s    |
     | rates: random walk of each number of a contact                           | (8,)             | per sqrt(s) |
     """
 
     finder: ContactFinder
-    sheet: Reanalysis
-    sigma: Float[Array, " elements"]
-    points: Float[Array, "elements q 2"]
-    weights: Float[Array, " q"]
-    modes: Float[Array, "elements g"]
+    compress: Float[Array, "r readings"]
+    sheet: LoadedSheet
     places: Float[Array, "g 2"]
-    pixels: Float[Array, "p 2"]
-    pixel_response: Float[Array, "p r"]
-    pixel_modes: Float[Array, "p g"]
-    pad_area: Float[Array, "pads p"]
-    law: ContactPiezoresistance
     model_error: Float[Array, ""]
     persistence: Float[Array, ""]
     rates: Float[Array, "8"]
-    unknowns: int = eqx.field(static=True)
     active_modes: int = eqx.field(static=True)
-    near_pixels: int = eqx.field(static=True)
-
-    def pressure(self, contacts: Float[Array, "K 6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
-        """Pressure of all contacts at points, Pa."""
-        pressures = [_edge(one, points) for one in contacts]
-        return jnp.sum(jnp.stack(pressures), 0) if pressures else jnp.zeros(points.shape[:-1], points.dtype)
-
-    def near(self, contacts: Float[Array, "K 6"]) -> tuple[Int[Array, " e"], Int[Array, " n"]]:
-        """Elements under contacts, and pixels under and around them; pressure elsewhere is next to nothing."""
-        quick, count = contacts.astype(self.points.dtype), len(contacts)
-        middles = self.points.mean(1)
-        elements = jax.lax.top_k(self.pressure(quick, middles), min(2 * self.unknowns * count, len(middles)))[1]
-        pixels = jax.lax.top_k(self.pressure(quick, self.pixels), min(self.near_pixels * count, len(self.pixels)))[1]
-        return elements, pixels
-
-    def response(
-        self, contacts: Float[Array, "K 6"], near: tuple[Int[Array, " e"], Int[Array, " n"]], gain: "LogGain"
-    ) -> Float[Array, " r"]:
-        """Whitened readings of contacts, from what is near them and the gain there."""
-        elements, pixels = near
-        quick = self.points.dtype
-        law = jax.tree.map(lambda leaf: leaf.astype(quick), self.law)
-        loads = contacts.astype(quick)
-        of_pixels = self.pressure(loads, self.pixels[pixels]) * jnp.exp(gain.pixels.astype(quick))
-        first = (law.factor(of_pixels) - 1) @ self.pixel_response[pixels]
-        of_points = self.pressure(loads, self.points[elements]) * jnp.exp(gain.elements.astype(quick))[:, None]
-        change = self.sigma[elements] * (law.factor(of_points) @ self.weights - 1)
-        size = min(self.unknowns * len(contacts), len(self.sheet.green))
-        found: Array = (first + self.sheet.beyond(elements, change, size)).astype(contacts.dtype)
-        return found
-
-    def pad_forces(self, contacts: Float[Array, "K 6"]) -> Float[Array, " pads"]:
-        """Force of the contacts on each pad, N."""
-        return self.pad_area @ self.pressure(contacts, self.pixels.astype(contacts.dtype))
-
-
-def _edge(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    """Pressure of one load: even along a line, blurred by a Gaussian; of a length near zero, a Gaussian."""
-    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + SHORTEST**2)
-    away = points - one[:2]
-    along = away @ one[4:] / half
-    across = jnp.sum(away**2, -1) - along**2
-    root = np.sqrt(2.0) * width
-    spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
-    found: Array = jnp.exp(one[3] - 0.5 * across / width**2) * spread / (np.sqrt(2 * np.pi) * width)
-    return found
 
 
 @verb
@@ -192,7 +119,17 @@ def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""])
 
 
 class _Problem(NamedTuple):
-    """One update: the filter, the frame, whether it is whole, pads, the belief before, active numbers, their factor."""
+    """One update.
+
+    | meaning                                                          |
+    |------------------------------------------------------------------|
+    | tracker, frame, pads; whole: whether the frame lacks no reading  |
+    | belief before the frame                                          |
+    | active: numbers of the belief that the frame tells of            |
+    | factor C of their covariance                                     |
+    | scale: standard deviation of a whitened reading                  |
+    | near: what is near the contacts before the frame                 |
+    """
 
     tracker: ContactFilter
     frame: Frame
@@ -202,31 +139,36 @@ class _Problem(NamedTuple):
     active: Int[Array, " a"]
     factor: Float[Array, "a a"]
     scale: Float[Array, ""]
-    near: tuple[Int[Array, " e"], Int[Array, " n"]]
+    near: Near
 
-    def contacts(self, change: Float[Array, " a"]) -> Float[Array, "K 6"]:
-        """Contacts after a change of the active numbers."""
-        before = self.belief.contacts[:, :SEEN]
-        return before + change[: before.size].reshape(-1, SEEN)
+    def shown(self, z: Float[Array, " a"]) -> Shown:
+        """What the frame and the pads show if the active numbers change by C z; with slopes in z."""
+        change, before = self.factor @ z, self.belief.contacts[:, :SEEN]
+        modes = self.active[before.size :] - self.belief.contacts.size
+        gain = self.belief.gain.at[modes].add(change[before.size :])
+        contacts = before + change[: before.size].reshape(-1, SEEN)
+        found = self.tracker.sheet.shown(contacts, gain, modes, self.near)
 
-    def log_gain(self, change: Float[Array, " a"]) -> LogGain:
-        """Log gain near the contacts after a change of the active numbers."""
-        size, seen = self.belief.contacts.size, SEEN * len(self.belief.contacts)
-        tables = self.tracker.modes[self.near[0]], self.tracker.pixel_modes[self.near[1]]
-        moved = [modes @ self.belief.gain + modes[:, self.active[seen:] - size] @ change[seen:] for modes in tables]
-        return LogGain(*moved)
+        def mixed(*a: Array) -> tuple[Array, ...]:
+            return tuple(one @ self.frame.root.T for one in a)
+
+        seen = jax.lax.cond(self.whole, lambda *a: a, mixed, found.readings, found.reading_slopes)
+        return Shown(seen[0], found.pads, self.factor.T @ seen[1], self.factor.T @ found.pad_slopes)
+
+    def residual(self, z: Float[Array, " a"], shown: Shown) -> Float[Array, " n"]:
+        """What is left of the frame, of the pads and of the belief before, in standard deviations."""
+        left = (shown.readings - self.frame.y) / self.scale
+        return jnp.concatenate([left, (shown.pads - self.pads.force) / self.pads.error, z])
 
 
-def _residual(z: Float[Array, " a"], problem: _Problem) -> tuple[Float[Array, " n"], Float[Array, " r"]]:
-    """What the belief after z leaves of the frame, of the pads and of the belief before, in standard deviations; and
-    the first of these."""
-    change, tracker = problem.factor @ z, problem.tracker
-    contacts = problem.contacts(change)
-    found = tracker.response(contacts, problem.near, problem.log_gain(change))
-    mixed = jax.lax.cond(problem.whole, lambda r: r, lambda r: problem.frame.root @ r, found)
-    left = (problem.frame.y - mixed) / problem.scale
-    on_pads = (tracker.pad_forces(contacts) - problem.pads.force) / problem.pads.error
-    return jnp.concatenate([left, on_pads, z]), left
+def _quadratic(z: Float[Array, " a"], problem: _Problem) -> Any:
+    shown = problem.shown(z)
+    slopes = [shown.reading_slopes / problem.scale, shown.pad_slopes / problem.pads.error, jnp.eye(len(z))]
+    return normal_equations(problem.residual(z, shown), jnp.concatenate(slopes, 1).T)
+
+
+def _residual(z: Float[Array, " a"], problem: _Problem) -> Float[Array, " n"]:
+    return problem.residual(z, problem.shown(z))
 
 
 def _active(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
@@ -236,6 +178,27 @@ def _active(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array,
     square = jnp.min(jnp.sum((tracker.places[1:, None] - contacts[None, :, :2]) ** 2, -1), 1)
     around = 1 + jax.lax.top_k(-square, min(tracker.active_modes * count, square.size))[1]
     return jnp.concatenate([jnp.asarray(own), jnp.asarray([SIZE * count]), SIZE * count + around])
+
+
+def _seen(tracker: ContactFilter, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""], Float[Array, ""]]:
+    """A frame as it is fitted, whether it lacks no reading, and the share of the model in the variance of a number."""
+    dv = jnp.asarray(dv, tracker.compress.dtype)
+    y = tracker.compress @ dv  # of channels that are not used the matrix is zero, but not its product with NaN
+    whole = jnp.all(jnp.isfinite(y))
+    none = jnp.zeros((), y.dtype)
+    quick = Frame(y, none, none, tracker.finder.root)
+    frame = jax.lax.cond(whole, lambda dv: quick, lambda dv: tracker.finder.compressed(dv)[0], dv)
+    whole = whole | jnp.all(jnp.isfinite(dv) | ~tracker.finder.whitening.channels)
+    return frame, whole, tracker.model_error**2 * (frame.y @ frame.y) / len(frame.y)
+
+
+def _problem(
+    tracker: ContactFilter, belief: Belief, frame: Frame, whole: Bool[Array, ""], pads: Pads, scale: Float[Array, ""]
+) -> _Problem:
+    active = _active(tracker, belief.contacts)
+    factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
+    near = tracker.sheet.near(belief.contacts[:, :SEEN])
+    return _Problem(tracker, frame, whole, pads, belief, active, factor, scale, near)
 
 
 @verb
@@ -253,56 +216,63 @@ def updated(
         seconds: since the last frame. Errors of the model that stay for n frames are told n times, and count once.
         many: a step of full length may be too long, as for a contact that has just been put somewhere.
     """
-    frame, whole = tracker.finder.compressed(jnp.asarray(dv, tracker.finder.compress.dtype))
-    share = tracker.model_error**2 * (frame.y @ frame.y) / len(frame.y)
-    alone = jnp.sqrt(1 + share)
-    scale = jnp.sqrt(1 + jnp.maximum(tracker.persistence / seconds, 1) * share)
+    frame, whole, share = _seen(tracker, dv)
+    repeats = jnp.maximum(tracker.persistence / seconds, 1)
+    scale, alone = jnp.sqrt(1 + repeats * share), jnp.sqrt(1 + share)
     if not len(belief.contacts):
         return _nothing(belief, frame.y, pads, alone, scale)
-    active = _active(tracker, belief.contacts)
-    factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
-    near = tracker.near(belief.contacts[:, :SEEN])
-    problem = _Problem(tracker, frame, whole, pads, belief, active, factor, scale, near)
-    residual: Any = _residual  # the types of optimistix know no auxiliary output
+    problem = _problem(tracker, belief, frame, whole, pads, scale)
     found: optx.Solution[Array, Any] = optx.least_squares(
-        residual,
+        _residual,
         SOLVER,
-        jnp.zeros(len(active), factor.dtype),
+        jnp.zeros(len(problem.active), problem.factor.dtype),
         problem,
-        has_aux=True,
+        {"quadratic": _quadratic},
         max_steps=MANY_STEPS if many else STEPS,
         adjoint=ImplicitStep(),
         throw=False,
     )
-    z, normal = found.value, found.state.quadratic.hessian.matrix
-    # The step that has not been evaluated changes what is left by less than the square root of FALL.
+    z, normal, square = found.value, found.state.quadratic.hessian.matrix, found.state.square
+    root = lapack.cholesky(normal, lower=True)
     return Update(
-        belief=_followed(belief, active, factor, z, normal),
-        evidence=-0.5 * found.state.square - jnp.sum(jnp.log(jnp.diag(lapack.cholesky(normal, lower=True)))),
-        left=found.aux * scale / alone,
+        belief=_followed(belief, problem, z, root),
+        evidence=-0.5 * square - jnp.sum(jnp.log(jnp.diag(root))),
+        misfit=(square - z @ z) * (scale / alone) ** 2,
         surprise=z @ z,
-        loudness=_loudness(normal, factor, len(belief.contacts)) * scale / alone,
+        loudness=_loudness(normal, problem.factor, len(belief.contacts)) * scale / alone,
     )
+
+
+@verb
+def unexplained(
+    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads
+) -> Float[Array, " r"]:
+    """What the contacts leave of a frame, (r,), in standard deviations of one frame."""
+    frame, whole, share = _seen(tracker, dv)
+    alone = jnp.sqrt(1 + share)
+    if not len(belief.contacts):
+        return frame.y / alone
+    problem = _problem(tracker, belief, frame, whole, pads, alone)
+    left = (frame.y - problem.shown(jnp.zeros(len(problem.active))).readings) / alone
+    found: Array = jax.lax.cond(whole, lambda left: left, lambda left: frame.root @ left, left)
+    return found
 
 
 def _nothing(
     belief: Belief, y: Float[Array, " r"], pads: Pads, alone: Float[Array, ""], scale: Float[Array, ""]
 ) -> Update:
     """The update of a belief without contacts: nothing is learned."""
-    square = jnp.sum((y / scale) ** 2) + jnp.sum((pads.force / pads.error) ** 2)
-    return Update(belief, -0.5 * square, y / alone, jnp.zeros((), y.dtype), jnp.zeros(0, y.dtype))
+    on_pads = jnp.sum((pads.force / pads.error) ** 2)
+    none = jnp.zeros((), y.dtype)
+    evidence = -0.5 * (jnp.sum((y / scale) ** 2) + on_pads)
+    return Update(belief, evidence, jnp.sum((y / alone) ** 2) + on_pads, none, jnp.zeros(0, y.dtype))
 
 
-def _followed(
-    belief: Belief,
-    active: Int[Array, " a"],
-    factor: Float[Array, "a a"],
-    z: Float[Array, " a"],
-    normal: Float[Array, "a a"],
-) -> Belief:
-    """The belief whose active numbers have changed by C z and have the covariance C N^-1 C^T."""
-    across = lapack.solve_triangular(factor, belief.covariance[active], lower=True)
-    learned = jnp.eye(len(z), dtype=z.dtype) - lapack.cho_solve(lapack.cho_factor(normal, lower=True), jnp.eye(len(z)))
+def _followed(belief: Belief, problem: _Problem, z: Float[Array, " a"], root: Float[Array, "a a"]) -> Belief:
+    """The belief whose active numbers have changed by C z and have the covariance C N^-1 C^T, with N = R R^T."""
+    across = lapack.solve_triangular(problem.factor, belief.covariance[problem.active], lower=True)
+    unit = jnp.eye(len(z), dtype=z.dtype)
+    learned = unit - lapack.cho_solve((root, True), unit)
     covariance = belief.covariance - across.T @ (learned @ across)
     flat = jnp.concatenate([belief.contacts.ravel(), belief.gain]) + across.T @ z
     size = belief.contacts.size

@@ -21,7 +21,11 @@ from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
 from .filter import SIZE, ContactFilter
 from .reanalysis import prepare_reanalysis
+from .response import LoadedSheet, Neighbours
 from .settings import TrackerSettings
+
+# Cells of the grid of neighbours, along the longer side.
+GRID = 25
 
 
 def prepare_filter(
@@ -38,42 +42,92 @@ def prepare_filter(
     finder = prepare_contacts(model, ContactSettings(most=1), noise=noise, sigma=sigma, channels=channels)
     # E C^T = 1, so that the directions which the finder kept are its rows times C^T.
     kept = np.asarray(finder.compress, float) @ found.factor.T
-    mixing = kept @ found.factor
-    coarse = discretise(Scene(skin), settings.fidelity)
+    put = partial(jnp.asarray, dtype=model.dtype)
     whole = conductivity(model) if sigma is None else sigma
-    fine = Pixels(settings.columns).on(model)
-    response = pair_jacobian(model, whole, fine, jnp.asarray(found.electrodes), jnp.asarray(mixing)).T
-    background = np.asarray(fine.restrict(whole)) / np.asarray(fine.restrict(jnp.ones_like(whole)))
-    masks = pad_masks(skin, fine)
-    points, weights = points_of(coarse, loads.width)
-    places, of_elements, of_pixels = _gain_modes(coarse, np.asarray(fine.centres, float), loads.gain_length)
-    heavy = np.dtype(settings.dtype)
-    put, light = partial(jnp.asarray, dtype=model.dtype), partial(jnp.asarray, dtype=heavy)
-    mean = _carried(model, whole, coarse)
-
-    def with_level(modes: np.ndarray) -> Array:
-        return put(np.concatenate([np.full((len(modes), 1), settings.level), loads.gain * modes], 1))
-
+    places, sheet = _loaded_sheet(model, skin, settings, whole, found.electrodes, kept @ found.factor)
+    unit = jnp.eye(len(finder.whitening.channels), dtype=model.dtype)
     return ContactFilter(
         finder=finder,
-        sheet=prepare_reanalysis(coarse, put(mean), found.electrodes, mixing, heavy),
+        compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
+        sheet=sheet,
+        places=put(places),
+        model_error=put(loads.model_error),
+        persistence=put(settings.persistence),
+        rates=put(_rates(settings)),
+        active_modes=settings.modes,
+    )
+
+
+def _loaded_sheet(
+    model: Model,
+    skin: Skin,
+    settings: TrackerSettings,
+    sigma: Float[Array, " elements"],
+    pairs: np.ndarray,
+    mixing: np.ndarray,
+) -> tuple[np.ndarray, LoadedSheet]:
+    """Where the modes of the gain lie, (g, 2) m, and what contacts show."""
+    loads, light = settings.loads, partial(jnp.asarray, dtype=np.dtype(settings.dtype))
+    coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(settings.columns).on(model)
+    response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
+    background = np.asarray(fine.restrict(sigma)) / np.asarray(fine.restrict(jnp.ones_like(sigma)))
+    mean, masks, (points, weights) = (
+        _carried(model, sigma, coarse),
+        pad_masks(skin, fine),
+        points_of(coarse, loads.width),
+    )
+    centres = np.asarray(fine.centres, float)
+    places, of_elements, of_pixels = _gain_modes(coarse, centres, loads.gain_length)
+
+    def with_level(modes: np.ndarray) -> Array:
+        return light(np.concatenate([np.full((len(modes), 1), settings.level), loads.gain * modes], 1))
+
+    sheet = LoadedSheet(
+        sheet=prepare_reanalysis(coarse, jnp.asarray(mean, coarse.dtype), pairs, mixing, light(0).dtype),
+        neighbours=_neighbours(coarse, centres, settings),
         sigma=light(mean),
         points=light(points),
         weights=light(weights),
         modes=with_level(of_elements),
-        places=put(np.concatenate([np.full((1, 2), np.inf), places])),
-        pixels=light(fine.centres),
+        pixels=light(centres),
         pixel_response=light(response * background[:, None]),
         pixel_modes=with_level(of_pixels),
-        pad_area=put(masks.weights * masks.areas),
+        pad_area=light((masks.weights * masks.areas).T),
         law=loads.law,
-        model_error=put(loads.model_error),
-        persistence=put(settings.persistence),
-        rates=put(_rates(settings)),
-        unknowns=settings.unknowns,
-        active_modes=settings.modes,
-        near_pixels=settings.pixels,
     )
+    return np.concatenate([np.full((1, 2), np.inf), places]), sheet
+
+
+def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings) -> Neighbours:
+    chart = np.asarray(model.chart, float)
+    low, high = chart.min(0), chart.max(0)
+    pitch = float((high - low).max() / GRID)
+    shape = tuple(int(n) for n in np.ceil((high - low)[::-1] / pitch).astype(int))
+    y, x = np.meshgrid(*(pitch * (np.arange(n) + 0.5) for n in shape), indexing="ij")
+    cells = low + np.stack([x.ravel(), y.ravel()], 1)
+    middles, unknowns = chart[np.asarray(model.triangles)].mean(1), _places_of_unknowns(model)
+
+    def nearest(places: np.ndarray, count: int) -> Array:
+        found = cKDTree(places).query(cells, k=min(count, len(places)))[1]
+        return jnp.asarray(found.reshape(len(cells), -1), jnp.int32)
+
+    return Neighbours(
+        low=jnp.asarray(low, settings.dtype),
+        pitch=jnp.asarray(pitch, settings.dtype),
+        elements=nearest(middles, 2 * settings.unknowns),
+        unknowns=nearest(unknowns, settings.unknowns),
+        pixels=nearest(pixels, settings.pixels),
+        shape=(shape[0], shape[1]),
+    )
+
+
+def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:
+    """About where each unknown lies: the mean middle of its elements."""
+    dofs = np.asarray(model.system.dofs)
+    middles = np.asarray(model.chart, float)[np.asarray(model.triangles)].mean(1)
+    count = np.maximum(np.bincount(dofs.ravel(), minlength=model.system.unknowns), 1)
+    sums = [np.bincount(dofs.ravel(), np.repeat(axis, dofs.shape[1]), len(count)) for axis in middles.T]
+    return np.stack(sums, 1) / count[:, None]
 
 
 def _carried(model: Model, sigma: Float[Array, " elements"], other: Model) -> np.ndarray:

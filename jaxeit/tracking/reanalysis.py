@@ -16,10 +16,9 @@ left to an image on a fine mesh, and a coarse one tells what is beyond the first
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -55,27 +54,48 @@ class Reanalysis(eqx.Module):
     mixing: Float[Array, "p r"]
     linear: Float[Array, "elements r"]
 
-    def beyond(self, elements: Int[Array, " e"], change: Float[Array, " e"], size: int) -> Float[Array, " r"]:
+    def beyond(
+        self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
+    ) -> "BeyondFirstOrder":
         """Readings of the changed sheet less those of the untouched one, less the first order of this difference.
 
-        Derivatives of first order with respect to ``change`` cost no further factorisation.
-
         Args:
-            elements: that change, each once.
-            change: of their conductivity, S.
-            size: number m of unknowns around the largest changes that are solved anew; those of other elements count
-                as unchanged.
+            elements: that change. One that occurs twice has a change of zero once.
+            unknowns: m of them, solved anew; an element some of whose unknowns are not among them counts as unchanged.
+                One may occur twice.
+            change: of the conductivity of each element, S.
         """
-        found: Array = _beyond(change, elements, self, size)
-        return found
+        dofs, slopes, size = self.dofs[elements], self.slopes[elements], len(unknowns)
+        place = jnp.full(len(self.green), size).at[unknowns].set(jnp.arange(size))[dofs]
+        inside = jnp.all(place < size, 1)
+        own = jnp.where(inside, change, 0)
+        blocks = jnp.einsum("e,eks,els->ekl", own, slopes, slopes)
+        matrix = jnp.zeros((size + 1, size + 1), change.dtype).at[place[:, :, None], place[:, None, :]].add(blocks)
+        matrix = matrix[:size, :size]
+        green, before = self.green[unknowns[:, None], unknowns], self.potential[unknowns]
+        y = lapack.solve(jnp.eye(size, dtype=change.dtype) + matrix @ green, matrix @ before)
+        after = jnp.concatenate([before - green @ y, jnp.zeros_like(before[:1])])
+        fields = jnp.einsum("eks,eka->esa", slopes, after[place])
+        first, second = self.pairs.T
+        products = jnp.sum(fields[..., first] * fields[..., second], 1)
+        moved = -(before.T @ y)[first, second]
+        readings = moved @ self.mixing - own @ self.linear[elements]
+        return BeyondFirstOrder(readings, inside, products)
+
+    def beyond_slopes(
+        self, elements: Int[Array, " e"], found: "BeyondFirstOrder", directions: Float[Array, "d e"]
+    ) -> Float[Array, "d r"]:
+        """Derivatives of the readings of `beyond` with respect to changes of the elements, by the adjoint identity."""
+        own = jnp.where(found.inside, directions, 0)
+        return -(own @ found.products) @ self.mixing - own @ self.linear[elements]
 
 
-class _Solved(NamedTuple):
-    """What a change of the elements does.
+class BeyondFirstOrder(NamedTuple):
+    """What a change of some elements does beyond the first order.
 
     | meaning                                                                  | shape     |
     |--------------------------------------------------------------------------|-----------|
-    | readings beyond the first order                                          | (r,)      |
+    | readings                                                                 | (r,)      |
     | inside: whether an element has all its unknowns among those solved anew  | (e,)      |
     | products: of the fields after the change, for each pair of electrodes    | (e, p)    |
     """
@@ -83,43 +103,6 @@ class _Solved(NamedTuple):
     readings: Float[Array, " r"]
     inside: Bool[Array, " e"]
     products: Float[Array, "e p"]
-
-
-def _solve(change: Float[Array, " e"], elements: Int[Array, " e"], sheet: Reanalysis, size: int) -> _Solved:
-    unknowns, dofs, slopes = len(sheet.green), sheet.dofs[elements], sheet.slopes[elements]
-    around = jnp.zeros(unknowns, change.dtype).at[dofs].max(jnp.abs(change)[:, None])
-    chosen = jax.lax.top_k(around, size)[1]
-    place = jnp.full(unknowns, size).at[chosen].set(jnp.arange(size))[dofs]
-    inside = jnp.all(place < size, 1)
-    own = jnp.where(inside, change, 0)
-    blocks = jnp.einsum("e,eks,els->ekl", own, slopes, slopes)
-    matrix = jnp.zeros((size + 1, size + 1), change.dtype).at[place[:, :, None], place[:, None, :]].add(blocks)
-    matrix = matrix[:size, :size]
-    green, before = sheet.green[chosen[:, None], chosen], sheet.potential[chosen]
-    y = lapack.solve(jnp.eye(size, dtype=change.dtype) + matrix @ green, matrix @ before)
-    after = jnp.concatenate([before - green @ y, jnp.zeros_like(before[:1])])
-    fields = jnp.einsum("eks,eka->esa", slopes, after[place])
-    first, second = sheet.pairs.T
-    products = jnp.sum(fields[..., first] * fields[..., second], 1)
-    moved = -before.T @ y
-    return _Solved(moved[first, second] @ sheet.mixing - own @ sheet.linear[elements], inside, products)
-
-
-@eqx.filter_custom_jvp
-def _beyond(change: Float[Array, " e"], elements: Int[Array, " e"], sheet: Reanalysis, size: int) -> Float[Array, " r"]:
-    return _solve(change, elements, sheet, size).readings
-
-
-def _beyond_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Float[Array, " r"], Float[Array, " r"]]:
-    change, elements, sheet, size = primals
-    found = _solve(change, elements, sheet, size)
-    if tangents[0] is None:
-        return found.readings, jnp.zeros_like(found.readings)
-    own = jnp.where(found.inside, tangents[0], 0)
-    return found.readings, -(own @ found.products) @ sheet.mixing - own @ sheet.linear[elements]
-
-
-_beyond.def_jvp(_beyond_jvp)
 
 
 def prepare_reanalysis(

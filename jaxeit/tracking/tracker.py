@@ -21,7 +21,7 @@ from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import inserted, jumped, lengthened, without
-from .filter import SIZE, Belief, ContactFilter, Pads, Update, predicted, updated
+from .filter import SIZE, Belief, ContactFilter, Pads, Update, predicted, unexplained, updated
 from .preparation import prepare_filter
 from .settings import TrackerSettings
 
@@ -77,7 +77,7 @@ class Tracking:
     | edges: which of them are edges                                        |
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
-    | left: square of what is left of the last frame, by which it was unexpected, and frames since it was looked into |
+    | misfit: chi-square of the last frame that was looked into, and frames since then |
     """
 
     belief: Belief
@@ -85,7 +85,7 @@ class Tracking:
     edges: tuple[bool, ...] = ()
     faint: tuple[int, ...] = ()
     begun: int = 0
-    left: float = 0.0
+    misfit: float = 0.0
     since: int = field(default=0)
 
     @property
@@ -141,8 +141,8 @@ class Tracker:
 
     def start(self) -> Tracking:
         """No contact, and the gain as it is known before the first frame."""
-        size = self._filter.modes.shape[1]
-        dtype = self._filter.modes.dtype
+        size = len(self._filter.places)
+        dtype = self._filter.places.dtype
         return Tracking(Belief(jnp.zeros((0, SIZE), dtype), jnp.zeros(size, dtype), jnp.eye(size, dtype=dtype)))
 
     def step(
@@ -169,10 +169,9 @@ class Tracker:
         moved = predicted(self._filter, now.belief, jnp.asarray(seconds, frame.dtype))
         now = replace(now, belief=moved)
         update = self._update(moved, frame, pads, seconds)
-        left = float(update.left @ update.left)
-        if self._is_unexpected(now, update, left):
+        if self._is_unexpected(now, update):
             now, update = self._explained(now, update, frame, pads, seconds)
-            now = replace(now, since=0, left=float(update.left @ update.left))
+            now = replace(now, since=0, misfit=float(update.misfit))
         else:
             now = replace(now, since=now.since + 1)
         return self._without_faint(replace(now, belief=update.belief), np.asarray(update.loudness))
@@ -180,13 +179,13 @@ class Tracker:
     # --- one frame
 
     def _frame(self, dv: Float[ArrayLike, " readings"]) -> Float[Array, " readings"]:
-        frame, readings = jnp.asarray(dv, self._filter.modes.dtype), self._filter.finder.readings
+        frame, readings = jnp.asarray(dv, self._filter.places.dtype), self._filter.finder.readings
         if frame.shape != (readings,):
             raise InverseError(f"dv has shape {frame.shape}; give one frame of {readings} readings")
         return frame
 
     def _pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
-        count = len(self._filter.pad_area)
+        count = self._filter.sheet.pad_area.shape[1]
         if forces is None:
             return Pads(jnp.zeros(count), jnp.full(count, jnp.inf))
         force, error = np.asarray(forces, float), np.asarray(errors, float)
@@ -203,11 +202,12 @@ class Tracker:
         found: Update = updated(self._filter, belief, frame, pads, jnp.asarray(seconds), many=many)
         return found
 
-    def _is_unexpected(self, now: Tracking, update: Update, left: float) -> bool:
-        size = len(update.left)
-        if left < size + UNEXPECTED * np.sqrt(2 * size) and float(update.surprise) < SURPRISING:
-            return False
-        return now.since >= PATIENCE or left > WORSE * now.left or float(update.surprise) >= SURPRISING
+    def _is_unexpected(self, now: Tracking, update: Update) -> bool:
+        size, misfit, surprise = len(self._filter.compress), float(update.misfit), float(update.surprise)
+        if surprise >= SURPRISING:
+            return True
+        unexpected = misfit > size + UNEXPECTED * np.sqrt(2 * size)
+        return unexpected and (now.since >= PATIENCE or misfit > WORSE * now.misfit)
 
     # --- events
 
@@ -222,10 +222,9 @@ class Tracker:
         best = self._update(now.belief, frame, pads, alone, many=True)
         taken = ordinary
         for _ in range(EVENTS):
-            tried = [
-                (one, self._update(one.belief, frame, pads, alone, many=True))
-                for one in self._events(now, best, seconds)
-            ]
+            left = np.asarray(unexplained(self._filter, best.belief, frame, pads))
+            events = self._events(now, left, seconds)
+            tried = [(one, self._update(one.belief, frame, pads, alone, many=True)) for one in events]
             if not tried:
                 break
             event, update = max(tried, key=lambda pair: float(pair[1].evidence) + pair[0].prior)
@@ -246,7 +245,7 @@ class Tracker:
             begun=max([now.begun, *event.numbers]),
         )
 
-    def _events(self, now: Tracking, best: Update, seconds: float) -> Iterator[_Hypothesis]:
+    def _events(self, now: Tracking, left: np.ndarray, seconds: float) -> Iterator[_Hypothesis]:
         rare = float(np.log(self._settings.birth_rate * seconds))
         if now.numbers:
             yield _Hypothesis(jumped(now.belief), now.numbers, now.edges, rare)
@@ -260,7 +259,7 @@ class Tracker:
             # The prior of a place is even over the skin, that of the fit is normal about where it begins.
             even = float(np.log(2 * np.pi * PLACE**2 / self._area))
             number = now.begun + 1
-            belief = self._with_another(now.belief, np.asarray(best.left))
+            belief = self._with_another(now.belief, left)
             yield _Hypothesis(belief, (*now.numbers, number), (*now.edges, False), rare + even)
 
     def _with_another(self, belief: Belief, left: np.ndarray) -> Belief:
