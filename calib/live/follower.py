@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxeit.tracking import Track, Tracker, TrackerSettings, Tracking
-from jaxeit.tracking.compilation import compile_tracker
+from jaxeit.tracking import Track, Tracker, TrackerSettings, Tracking, compile_tracker
 
 from ..calibration.calibration import Calibration
 from ..calibration.localisation.contact_tracks import MIN_SECONDS, pad_errors, prepare_calibrated_tracker

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxeit as je
-from jaxeit.tracking import Track, Tracker
-from jaxeit.tracking.smoothing import Smoother, TimedTracks
+from jaxeit.tracking import Smoother, TimedTracks, Track, Tracker
 
 from ..calibration import Calibration
 from .load_windows import FIDELITY
