@@ -1,4 +1,5 @@
-"""The paper's figures 5, 6 and 8 for both skins, SIMULATED, into docs/figures: SKIN-places, -sensitivity, -contacts.
+"""The paper's figures 5, 6 and 8 for both skins, SIMULATED, into docs/figures: SKIN-places, -sensitivity, -contacts;
+and contacts that slide over the testbed: testbed-sliding.
 
 Figures 5 and 6 show a calibration of the bench (scenes `paper_bench` and `chest_bench`): true and estimated places, and
 sensitivity over the sheet.
@@ -6,9 +7,12 @@ sensitivity over the sheet.
 Figure 8 shows two contacts that come and go one by one: force over time, its error, and interference.  Its scenes
 (`two_contacts` and `chest_two_contacts`): press 1, press 2, release 1, release 2, some with both tips on one pad, the
 others on neighbouring ones.  The calibration is of single presses on a grid over the same sheet, as a bench
-makes them: it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump, and
-beside it that of the force map's pixels nearest to it.  A pad's true force is that of the tips above it, so that what
-spreads to its neighbours counts as interference; it means nothing for tips that stand on a border of pads.
+makes them: it has seen no second contact.  A contact's force is that of the contact that was followed there
+(`apply --track`); beside it its share of the pads' forces by its fitted bump, and that of the force map's pixels
+nearest to it.  A pad's true force is that of the tips above it, so that what spreads to its neighbours counts as
+interference; it means nothing for tips that stand on a border of pads.
+
+Sliding contacts (scene `sliding`, every third stroke): paths and forces as they are followed, beside the true ones.
 """
 
 import tempfile
@@ -22,9 +26,11 @@ import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
+from calib.calibration.localisation.contact_tracks import ABOUT, Rows
 from calib.report.curved_figure import curved_figure
 from calib.report.figures import localisation_figure, sensitivity_figure, write_figure
 from calib.report.force_series import ForceSeries, force_series_figure
+from calib.report.track_report import tracks_figure
 from calib.runtime import set_up
 
 from .harness import ROOT, Question, Run
@@ -52,7 +58,7 @@ def alone(bench: Bench, smoke: bool) -> Bench:
 
 def force_map(bench: Bench, smoke: bool) -> dict[str, np.ndarray]:
     """What `calib.apply` writes: time (n,) ns, force (n, pixels) N, pad_force (n, pads) N, centres (pixels, 2) m,
-    contact_position (n, K, 2) m, contact_force (n, K) N."""
+    contact_position (n, K, 2) m, contact_force (n, K) N; and contacts that are followed, tracks/..."""
     fidelity = je.Fidelity.draft() if smoke else je.Fidelity.standard()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -61,8 +67,18 @@ def force_map(bench: Bench, smoke: bool) -> dict[str, np.ndarray]:
         with calib.open_session(grid) as session:
             calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge(), fidelity=fidelity))
         with calib.open_session(pair) as session:
-            calib.apply(calibration, session, folder / "map.h5")
+            calib.apply(calibration, session, folder / "map.h5", track=True)
         return dict(calib.session.read_archive(folder / "map.h5", "skin-forcemap").arrays)
+
+
+def by_frame(forces: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, K, 2) m and forces (n, K) N of the contacts that are followed in each frame; NaN: none."""
+    frame = np.searchsorted(forces["time"], forces["tracks/time"])
+    place = np.arange(len(frame)) - np.searchsorted(frame, frame)
+    position = np.full((len(forces["time"]), max(place, default=0) + 1, 2), np.nan)
+    force = np.zeros(position.shape[:2])
+    position[frame, place], force[frame, place] = forces["tracks/position"], forces["tracks/force"]
+    return position, force
 
 
 class Press:
@@ -72,7 +88,8 @@ class Press:
     |------------------------------------------------------------------|---------------|------|
     | time; rows: of the force map                                     | (n,)          | s    |
     | tips                                                             | (contacts, 2) | m    |
-    | contacts: true forces; by_fit: of the contacts that were fitted; | (n, contacts) | N    |
+    | contacts: true forces; by_track: of the contacts followed;       | (n, contacts) | N    |
+    | by_fit: of the contacts that were fitted;                        | (n, contacts) | N    |
     | by_map: of the pixels of the force map                           | (n, contacts) | N    |
     | under: pad under each tip                                        | (contacts,)   |      |
     | pads: true forces; found: those of the force map                 | (n, pads)     | N    |
@@ -88,6 +105,7 @@ class Press:
         self.under = np.argmax([outline.contains(self.tips) for outline in self.outlines], 0)
         self.pads = np.zeros(self.found.shape)
         np.add.at(self.pads.T, self.under, self.contacts.T)
+        self.by_track = self._to_tips(*(part[rows] for part in by_frame(forces)))
         self.by_fit = self._to_tips(forces["contact_position"][rows], forces["contact_force"][rows])
         self.by_map = self._to_tips(np.broadcast_to(forces["centres"], (*force.shape, 2)), force)
 
@@ -112,6 +130,7 @@ class Press:
             "press": self.number,
             "tips_on": self.kind,
             "pad_rmse_N": _rms((self.found - self.pads)[:, ~idle]),
+            "followed_rmse_N": _rms(self.by_track - self.contacts),
             "contact_rmse_N": _rms(self.by_fit - self.contacts),
             "map_contact_rmse_N": _rms(self.by_map - self.contacts),
             "total_rmse_N": _rms(off),
@@ -125,7 +144,7 @@ class Press:
         down = timing.rest + timing.ramp + timing.hold
         events = dict(zip(EVENTS, (timing.rest, timing.rest + late, down, down + late), strict=True))
         names = ("contact 1", "contact 2", "pads not touched, together")
-        true, found = (np.column_stack(parts) for parts in ((self.contacts, 0 * others), (self.by_fit, others)))
+        true, found = (np.column_stack(parts) for parts in ((self.contacts, 0 * others), (self.by_track, others)))
         return ForceSeries(title, names, self.time - self.start, true, found, events)
 
 
@@ -147,8 +166,10 @@ def measure(run: Run) -> Iterator[Row]:
     for skin, (bench, contacts) in run.sizes(list(SCENES.items()), list(SCENES.items())[:1]):
         single = bench_figures(skin, bench, run.smoke)
         rows = contact_figure(skin, contacts, run.smoke)
+        slides = slide_figure(smoke=run.smoke) if skin == "testbed" else []
         means = [{"skin": skin, "tips_on": kind} | row for kind, row in summary(rows).items()]
-        yield {"bench": [{"skin": skin} | single], "contacts": means, "rows": [{"skin": skin} | row for row in rows]}
+        rows = [{"skin": skin} | row for row in rows]
+        yield {"bench": [{"skin": skin} | single], "contacts": means, "rows": rows, "sliding": slides}
 
 
 def bench_figures(skin: str, scene: str, smoke: bool) -> Row:
@@ -186,6 +207,36 @@ def contact_figure(skin: str, scene: str, smoke: bool) -> list[Row]:
         cases = [press.series(title) for press, title in zip(firsts, CASES, strict=True)]
         write_figure(force_series_figure(cases, simulated=True), PICTURES / f"{skin}-contacts.png")
     return [press.row() for press in presses]
+
+
+def slide_figure(*, smoke: bool) -> list[Row]:
+    """The figure of contacts that slide, and a row for each stroke."""
+    bench = load_bench("sliding")
+    sites, rate = (bench.sites[:1], 20.0) if smoke else (bench.sites[::3], bench.eit_rate)
+    bench = replace(bench, sites=sites, eit_rate=rate, blank=2.0)
+    forces, motion = force_map(bench, smoke), planned_motion(bench)
+    state = loads_at(motion, forces["time"] / 1e9)
+    position = motion.places[state.press] + np.array(bench.slide) * state.progress[..., None]
+    true = {"time": forces["time"], "position": position, "force": state.load}
+    tracks = {name: forces[f"tracks/{name}"] for name in ABOUT}
+    if not smoke:
+        write_figure(
+            tracks_figure(tracks, bench.scene.skin, true=true, simulated=True), PICTURES / "testbed-sliding.png"
+        )
+    frame = np.searchsorted(forces["time"], tracks["time"])
+    return [_stroke(number, tracks, true, frame, state.press[frame] == number) for number in range(len(sites))]
+
+
+def _stroke(number: int, tracks: Rows, true: Rows, frame: np.ndarray, mine: np.ndarray) -> Row:
+    """Errors of a stroke while at least 2 N press, and how many contacts were seen in it."""
+    press = mine & (true["force"][frame, 0] > 2)
+    away = np.linalg.norm(tracks["position"] - true["position"][frame, 0], axis=1)[press]
+    return {
+        "stroke": number,
+        "numbers": len(set(tracks["number"][press].tolist())),
+        "place_mean_mm": float(1e3 * away.mean()) if len(away) else None,
+        "force_rmse_N": _rms((tracks["force"] - true["force"][frame, 0])[press]) if len(away) else None,
+    }
 
 
 main = Question("paper_figures", __doc__, {"rows": measure}, prepare=set_up)

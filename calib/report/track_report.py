@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INSIDE = 2.1460  # standard deviations to the ellipse that holds 90 % of a normal distribution in the plane
-LARGER = 10  # times the ellipses are drawn larger, since they would hardly be seen
-ELLIPSES = 6  # of a contact
+LARGER = 5  # times the ellipses are drawn larger, since they would hardly be seen
+ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
 MOST_POINTS = 2000  # of a contact's line
 ANGLES = np.linspace(0, 2 * np.pi, 61)
 CAPTION = (
-    f"Paths of the contacts, each with its number where it begins and a dot where it ends; ellipses of 90 %, drawn "
-    f"{LARGER} times larger; an edge is a line. Beside them the forces, with two standard errors on either side."
+    "Paths of the contacts, each with its number where it begins and a dot where it ends; an edge is a line. Ellipses "
+    f"of 90 %, drawn {LARGER} times larger, where a contact presses with at least half of its largest force. Beside "
+    "them the forces, with two standard errors on either side."
 )
 
 
@@ -85,7 +86,7 @@ def _row(number: int, one: Rows) -> tuple[str, ...]:
         number_text(time[0], 2),
         number_text(time[-1], 2),
         *places,
-        with_error(one["force"][largest], one["force_se"][largest], 2),
+        with_error(float(one["force"][largest]), float(one["force_se"][largest]), 2),
         number_text(float(np.linalg.norm(one["velocity"], axis=1).max()) * MM, 0),
     )
 
@@ -109,6 +110,7 @@ def tracks_figure(rows: Rows, skin: je.Skin, *, true: Rows | None = None, simula
     figure = new_figure(10.4, 5.4, simulated)
     sheet, forces = figure.subplots(1, 2, width_ratios=[1, 1.25])
     draw_sheet(sheet, skin)
+    sheet.set(xlim=sheet.get_xlim(), ylim=sheet.get_ylim())  # also where an ellipse is larger
     if true is not None:
         _draw_truth(sheet, forces, true)
     for k, (number, one) in enumerate(by_number(rows).items()):
@@ -134,8 +136,8 @@ def _draw_path(axes: Any, number: int, one: Rows, colour: str) -> None:
     axes.plot(*place[thin].T, color=colour, lw=1.4, zorder=4)
     axes.plot(*place[-1], "o", ms=3, color=colour, zorder=5)
     axes.annotate(str(number), place[0], xytext=(4, 4), textcoords="offset points", color=colour, fontsize=9)
-    for k in _thinned(len(thin), ELLIPSES):
-        at = thin[k]
+    pressing = np.flatnonzero(one["force"] >= one["force"].max() / 2)
+    for at in pressing[_thinned(len(pressing), ELLIPSES)]:
         axes.plot(*_ellipse(place[at], one["position_covariance"][at] * MM**2).T, color=colour, lw=0.7, alpha=0.8)
         ends = place[at] + np.outer([-1, 1], one["half"][at] * MM)
         axes.plot(*ends.T, color=colour, lw=2.4, alpha=0.5)

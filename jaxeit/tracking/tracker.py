@@ -207,7 +207,7 @@ class Tracker:
         if surprise >= SURPRISING:
             return True
         unexpected = misfit > size + UNEXPECTED * np.sqrt(2 * size)
-        return unexpected and (now.since >= PATIENCE or misfit > WORSE * now.misfit)
+        return bool(unexpected and (now.since >= PATIENCE or misfit > WORSE * now.misfit))
 
     # --- events
 
