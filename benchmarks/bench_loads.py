@@ -19,17 +19,15 @@ import jaxeit as je
 from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, Loads, LoadShape
 
-from .bench_images import matched
 from .clock import seconds
 from .harness import Question, Run
-from .problems import pressed
-from .rows import Row
+from .problems import matched, pressed, uneven
+from .rows import Row, grouped
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.015, 0.02, 0.025, 0.03, 0.04), (1.0, 1 / 3)
 LENGTHS = (0.02, 0.03, 0.04, 0.06)
 TIPS = 9  # of an edge
-BLANKS = 100
 INSIDE = float(chi2.ppf(0.9, 2))
 
 
@@ -78,14 +76,9 @@ def _touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> 
 def measured(model: je.Model, seed: int, given: list[Touch]) -> Iterator[Row]:
     """What both see of each touch of a seed."""
     rng = np.random.default_rng([seed, 1])
-    effects = (
-        je.effects.CoatingNonUniformity(0.15, 0.03, seed=2 * seed),
-        je.effects.ContactGain(0.12, 0.015, seed=2 * seed + 1),
-    )
-    found = pressed(effects, np.stack([t.places for t in given]), np.stack([t.loads for t in given]))
-    noise = np.full(found.untouched.size, found.noise)
-    sheet = je.fit_background(model, found.untouched + noise / np.sqrt(BLANKS) * rng.normal(size=noise.size))
-    frames = found.change + noise * rng.normal(size=found.change.shape)
+    found = pressed(uneven(seed), np.stack([t.places for t in given]), np.stack([t.loads for t in given]))
+    blank, frames = found.frames(rng)
+    noise, sheet = np.full(blank.size, found.noise), je.fit_background(model, blank)
     finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
     fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
     bumps = finder(frames)
@@ -101,7 +94,7 @@ def _judged(touch: Touch, loads: Loads) -> Row:
     place, order = _ordered(np.asarray(shape.position), touch.truth)
     told = loads.kind is touch.kind
     if touch.kind is LoadKind.TWO:
-        told = told and bool(matched([place], touch.truth[None])[0])
+        told = told and matched(place, touch.truth)
     inside = [_square(shape, k, t) < INSIDE for k, t in zip(order, touch.truth, strict=True)]
     return {
         "told": told,
@@ -112,10 +105,10 @@ def _judged(touch: Touch, loads: Loads) -> Row:
     }
 
 
-def _ordered(place: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Places in the order of the true ones."""
-    orders = [list(range(len(place))), list(range(len(place)))[::-1]]
-    best = min(orders, key=lambda order: float(np.linalg.norm(place[order] - truth, axis=1).sum()))
+def _ordered(place: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places in the order of the true ones, and that order."""
+    order = np.arange(len(place))
+    best = min((order, order[::-1]), key=lambda k: float(np.linalg.norm(place[k] - truth, axis=1).sum()))
     return place[best], best
 
 
@@ -129,7 +122,7 @@ def _by_bumps(touch: Touch, seen: Any) -> bool:
     """Whether the finder tells one from two; an edge is one."""
     there = np.asarray(seen.position)[np.asarray(seen.present)]
     if touch.kind is LoadKind.TWO:
-        return bool(matched([there], touch.truth[None])[0])
+        return matched(there, touch.truth)
     return len(there) == 1
 
 
@@ -140,12 +133,10 @@ def measure(run: Run) -> Iterator[Row]:
     for seed in range(100, 100 + seeds):
         every += measured(model, seed, list(touches(np.random.default_rng(seed), singles, others)))
         print(f"seed {seed}", flush=True)
-    names = dict.fromkeys(row["name"] for row in every)
     rows = []
-    for name in names:
-        mine = [row for row in every if row["name"] == name]
-        means = {key: float(np.mean([row[key] for row in mine])) for key in mine[0] if key != "name"}
-        rows.append({"touch": name, "frames": len(mine)} | {key: round(value, 4) for key, value in means.items()})
+    for name, mine in grouped(every, "name").items():
+        means = {key: round(float(np.mean([row[key] for row in mine])), 4) for key in mine[0] if key != "name"}
+        rows.append({"touch": name, "frames": len(mine)} | means)
     yield {"seeds": seeds, "rows": rows}
 
 

@@ -15,10 +15,10 @@ def compile_tracker(tracker: Tracker) -> None:
     Each number of contacts has programs of its own: for an ordinary frame, and for the events that explain an
     unexpected one. A frame that no contact explains is shown to each number of contacts, so that all of them run.
     """
-    finder, start = tracker._filter.finder, tracker.start()
+    finder, start = tracker.filter.finder, tracker.start()
     atoms, belief = np.asarray(finder.atoms), start.belief
     frame = np.random.default_rng(0).normal(size=finder.readings)
-    whitened = np.asarray(tracker._filter.compress) @ frame
+    whitened = np.asarray(tracker.filter.compress) @ frame
     frame *= LOUD / np.sqrt(np.mean(whitened**2))
     most = tracker.settings.most
     for count in range(most + 1):

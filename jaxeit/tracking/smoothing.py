@@ -48,9 +48,9 @@ class State(NamedTuple):
 
 def transition(tracker: Tracker, seconds: float) -> Transition:
     """How the filter predicts a contact so many seconds later."""
-    gain = jnp.zeros(0, tracker._filter.places.dtype)
+    gain = jnp.zeros(0, tracker.filter.places.dtype)
     unit = jnp.eye(SIZE, dtype=gain.dtype)
-    found = predicted(tracker._filter, Belief(unit, gain, jnp.zeros((SIZE**2,) * 2, gain.dtype)), jnp.asarray(seconds))
+    found = predicted(tracker.filter, Belief(unit, gain, jnp.zeros((SIZE**2,) * 2, gain.dtype)), jnp.asarray(seconds))
     return Transition(np.asarray(found.contacts).T, np.asarray(found.covariance)[:SIZE, :SIZE])
 
 

@@ -1,9 +1,7 @@
 """Contacts followed through a recording, by `apply --track`: rows of the file, report, and the command line."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -16,14 +14,15 @@ from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
 from calib.session import read_archive, write_archive
-from jaxeit.tracking import Track
+from jaxeit.tracking import Track, Tracker, Tracking
 
+from ..helpers import stand_in
 from ..place_logs import place_log, write_place_log
 
 S = 10**9
 
 
-class FakeTracker:
+class FakeTracker(Tracker):
     """As many contacts as a frame's first reading says, which move by their number of mm from frame to frame."""
 
     def __init__(self):
@@ -33,11 +32,12 @@ class FakeTracker:
         return self._after(0, 0.0)
 
     def _after(self, count, x):
-        return SimpleNamespace(
+        return stand_in(
+            Tracking,
             tracks=tuple(
                 Track(n + 1, np.array([x * (n + 1), 0.0]), 1e-6 * np.eye(2), 0.01, 5.0, 0.1, np.zeros(2), np.zeros(2))
                 for n in range(count)
-            )
+            ),
         )
 
     def step(self, now, change, seconds, force, error):
@@ -45,13 +45,6 @@ class FakeTracker:
         return self._after(int(np.nan_to_num(change[0])), 1e-3 * len(self.seconds))
 
 
-@pytest.fixture
-def stand_ins(monkeypatch):
-    """Annotations are not checked: the tracker is a stand-in."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-
-
-@pytest.mark.usefixtures("stand_ins")
 def test_rows_are_the_contacts_of_each_frame():
     """In blocks; a frame at the time of another, and one without readings, are frames too."""
     tracker = FakeTracker()

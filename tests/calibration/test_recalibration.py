@@ -21,6 +21,7 @@ from calib.fitting.pad_gains import PadGains
 from calib.fitting.pads import PadModel
 from calib.live.engine import Engine, ReceivedFrame
 from calib.live.recalibrator import LiveRecalibrator
+from calib.session import read_archive
 
 from .weeks import SLOPE, S, Skin
 
@@ -395,3 +396,47 @@ def test_the_reference_of_the_image_knows_where_it_was_made():
     _, outside, _ = fitted.predict(np.array([[0.1, 0.1], [0.6, 0.1], [0.1, 0.1]]), np.array([10.0, 10.0, 200.0]))
     assert outside[1, 1] > 3 * outside[0, 0]
     assert outside[2, 2] > 10 * outside[0, 0]
+
+
+def press_many(later, path, **how):
+    rng = np.random.default_rng(11)
+    place, force = rng.uniform(0.02, 0.18, (60, 2)), rng.uniform(5, 18, 60)
+    return later.record(path, place, force, load_cell=force, **how)
+
+
+def test_evaluate_tells_what_has_moved_and_widens_intervals(calibration, later, tmp_path):
+    paths = [
+        press_many(later, tmp_path / "same.h5"),
+        press_many(later, tmp_path / "moved.h5", gains=GAINS, offset=2 * OFFSET),
+    ]
+    found = []
+    for path in paths:
+        with calib.open_session(path) as session:
+            found.append(calib.evaluate(calibration, session))
+    same, moved = found
+    assert not [note for note in same.notes if "health" in note or "at rest" in note or "outside" in note]
+    assert any("health" in note and note.endswith(": recalibrate") for note in moved.notes)
+    assert any("at rest" in note and "+80 Pa (lower left)" in note for note in moved.notes)
+    force, plain = calibration.pads.hold_forces(moved.pressure)
+    np.testing.assert_allclose(moved.pad_force, force)  # forces stay: to move them is what a recalibration does
+    inside = np.abs(force.sum(1) - moved.force) <= plain
+    assert inside.mean() < 0.6 < 0.85 <= moved.summary()["coverage"]
+    np.testing.assert_allclose(same.half_width, calibration.pads.hold_forces(same.pressure)[1], rtol=0.15)
+
+
+def test_apply_tells_what_has_moved_in_the_file_too(calibration, use, tmp_path):
+    said = []
+    with calib.open_session(use) as session:
+        calib.apply(calibration, session, tmp_path / "map.h5", tell=said.append)
+    (line,) = [one for one in said if "health" in one]
+    outside = read_archive(tmp_path / "map.h5", "skin-forcemap").attrs["outside"]
+    assert line == f"note: {outside}"
+
+
+def test_presses_beyond_the_calibrated_pressures_are_told(calibration, later, tmp_path):
+    place, force = np.full((6, 2), 0.05), np.full(6, 12.0)
+    force[2:4] = 30.0
+    path = later.record(tmp_path / "far.h5", place, force, load_cell=force)
+    with calib.open_session(path) as session:
+        notes = calib.evaluate(calibration, session).notes
+    assert any("outside the calibrated pressures: 2 of 6 presses" in note for note in notes)

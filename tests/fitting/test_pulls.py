@@ -111,3 +111,8 @@ def test_pulls_of_every_curve(name, skin):
 def test_pulls_of_every_field(name, skin):
     """A prior draws a field to zero: the truth is fixed here, so that the mean errs, and the deviation is less."""
     judge(pulls(skin, Linear(), FIELDS.make(name)), 0.8)
+
+
+@pytest.mark.slow
+def test_pulls_of_a_curve_that_bends_with_a_field(skin):
+    judge(pulls(skin, CURVES.make("polynomial"), FIELDS.make("edge")), 0.8)
