@@ -20,8 +20,8 @@ def compile_tracker(tracker: Tracker) -> None:
     frame = np.random.default_rng(0).normal(size=finder.readings)
     whitened = np.asarray(tracker.filter.compress) @ frame
     frame *= LOUD / np.sqrt(np.mean(whitened**2))
-    most = tracker.settings.most
+    most, pads = tracker.settings.most, tracker.filter.sheet.pad_area.shape[1]
     for count in range(most + 1):
         now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count)
-        tracker.step(now, frame, SECONDS)
+        tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
         belief = tracker._with_another(belief, atoms[count * len(atoms) // (most + 1)])

@@ -315,7 +315,7 @@ class FollowingPrograms(FakePrograms):
         self.followed = followed
 
     def placed(self, tracks):
-        return single_places([tracks[0].position], PADS) if tracks else NOWHERE
+        return single_places([tracks[0].position.tolist()], PADS) if tracks else NOWHERE
 
 
 class FakeTracker(Tracker):

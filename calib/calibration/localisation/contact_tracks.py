@@ -74,15 +74,17 @@ class ContactTracks:
         error: Float[np.ndarray, "n pads"],
     ) -> Rows:
         """Follow contacts through a block: times ns, change of the frames V, forces on the pads and their errors N."""
-        return self._rows([one for row in zip(time, change, force, error, strict=True) for one in self._followed(*row)])
+        return self._rows(
+            [one for row in zip(time.tolist(), change, force, error, strict=True) for one in self._followed(*row)]
+        )
 
     def end(self) -> Rows:
         """The rows that are left."""
         return self._rows([] if self._smoother is None else self._smoother.end())
 
     def _followed(self, time: int, change: np.ndarray, force: np.ndarray, error: np.ndarray) -> Iterable[TimedTracks]:
-        seconds = MIN_SECONDS if self._last is None else max((int(time) - self._last) / 1e9, MIN_SECONDS)
-        self._last = int(time)
+        seconds = MIN_SECONDS if self._last is None else max((time - self._last) / 1e9, MIN_SECONDS)
+        self._last = time
         self._now = self._tracker.step(self._now, change, seconds, force, pad_errors(force, error))
         if self._smoother is None:
             return [TimedTracks(self._last, self._now.tracks)]
