@@ -6,7 +6,7 @@ sensitivity over the sheet.
 Figure 8 shows two contacts that come and go one by one: force over time, its error, and interference.  Its scenes
 (`two_contacts` and `chest_two_contacts`): press 1, press 2, release 1, release 2, some with both tips on one pad, the
 others on neighbouring ones.  The calibration is of single presses on a grid over the same sheet, as a bench makes them:
-it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump.
+it has seen no second contact.  A contact's force is that of the contact that was followed there (`apply --track`).
 """
 
 import tempfile
@@ -80,7 +80,7 @@ def force_map(bench: Bench, folder: Path, fidelity: je.Fidelity, smoke: bool) ->
     calibration = calibrated(simulate(alone, folder / "alone.h5", fidelity=fidelity), fidelity)
     bench = replace(bench, eit_rate=10.0) if smoke else bench
     with calib.open_session(simulate(bench, folder / "pair.h5", fidelity=fidelity)) as session:
-        calib.apply(calibration, session, folder / "map.h5")
+        calib.apply(calibration, session, folder / "map.h5", track=True)
     return dict(calib.session.read_archive(folder / "map.h5", "skin-forcemap").arrays)
 
 
@@ -106,17 +106,27 @@ def series(title: str, bench: Bench, forces: dict[str, np.ndarray], number: int,
     """Forces of the two contacts of a press, and of the pads that are not touched, over its time."""
     start, every, motion = bench.blank + number * bench.period, forces["time"] / 1e9, planned_motion(bench)
     rows = (every >= start + 0.5) & (every < start + bench.period - 0.2)
-    place, share = forces["contact_position"][rows], forces["contact_force"][rows]  # (n, K, 2) m; (n, K) N
+    place, share = (part[rows] for part in by_frame(forces))
     far = np.linalg.norm(place[:, :, None] - motion.places[number], axis=-1)
     there, nearest = np.isfinite(far).all(-1), np.argmin(np.nan_to_num(far, nan=np.inf), -1)
-    by_fit = np.stack([np.where(there & (nearest == tip), share, 0).sum(1) for tip in (0, 1)], 1)
+    followed = np.stack([np.where(there & (nearest == tip), share, 0).sum(1) for tip in (0, 1)], 1)
     others = np.delete(forces["pad_force"][rows], under, 1).sum(1)
     timing, late = bench.timing, bench.companions[0].delay
     down = timing.rest + timing.ramp + timing.hold
     events = dict(zip(EVENTS, (timing.rest, timing.rest + late, down, down + late), strict=True))
     names = ("contact 1", "contact 2", "pads not touched, together")
     true = np.column_stack([loads_at(motion, every[rows]).load, 0 * others])
-    return ForceSeries(title, names, every[rows] - start, true, np.column_stack([by_fit, others]), events)
+    return ForceSeries(title, names, every[rows] - start, true, np.column_stack([followed, others]), events)
+
+
+def by_frame(forces: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n, K, 2) m and forces (n, K) N of the contacts that are followed in each frame; NaN: none."""
+    frame = np.searchsorted(forces["time"], forces["tracks/time"])
+    column = np.arange(len(frame)) - np.searchsorted(frame, frame)
+    place = np.full((len(forces["time"]), max(column, default=0) + 1, 2), np.nan)
+    force = np.zeros(place.shape[:2])
+    place[frame, column], force[frame, column] = forces["tracks/position"], forces["tracks/force"]
+    return place, force
 
 
 main = Question("paper_figures", __doc__, {"figures": measure}, prepare=set_up)

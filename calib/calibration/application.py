@@ -1,26 +1,25 @@
 """Applying a calibration to a session: the force map of every frame, in a file."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..check.acceptance import accept
 from ..fitting.curves.play_operators import remembered
-from ..presses.corrections import AbstractCorrection, correct
-from ..presses.streams import resample
 from ..presses.table import Processing, resting_levels
-from ..session import ArchiveWriter, Session, SessionError, Stream
+from ..session import ArchiveWriter, Session
 from .calibration import Calibration
-from .force_maps import USED, ForceEstimate, force_map, is_loaded, law_of
+from .force_maps import USED, ForceEstimate, force_map
+from .frame_blocks import FrameBlock, FrameBlocks
+from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, prepare_calibrated_tracker
 from .localisation.load_windows import WindowedFrames, fit_windows
+from .localisation.quiet_frames import ENOUGH, QuietFrames
 from .recalibration.agreement import agreement_of_use
 
 FORMAT = "skin-forcemap"
-_BLOCK = 512  # frames held in memory at once
-_MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
+TRACKS = "tracks/"  # group of the arrays of contacts that were followed
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
@@ -34,6 +33,7 @@ def apply(
     ignore_errors: bool = False,
     progress: Progress = iter,
     loads: float | None = None,
+    track: bool = False,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Write the force map of every EIT frame of a session; memory does not grow with its length.
@@ -46,7 +46,8 @@ def apply(
         ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
             file then names the errors.
         loads: also tell what touches the skin, none, one, two or an edge, in windows of so many s; None: do not.
-        tell: called with a line about the loads, and about each thing outside of what was calibrated.
+        track: also follow contacts from frame to frame, each with a number; smoothed over time.
+        tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
 
     Raises:
         SessionError: if the session was recorded on another skin, lacks a stream, or holds no frame.
@@ -56,10 +57,35 @@ def apply(
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     calibration, outside = agreement_of_use(calibration, session)
-    eit, pressure = session.stream("eit"), session.stream("pressure")
-    filters = {s.name: processing.of(s)[0] for s in (eit, pressure)}
+    attrs = _attributes(calibration, session) | {"ignored_errors": "\n".join(ignored), "outside": "\n".join(outside)}
+    for line in outside:
+        tell(f"note: {line}")
+    blocks = FrameBlocks(session, processing, levels)
+    with ArchiveWriter(path, FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
+        kinds = _rows(calibration)
+        writer.add("centres", np.asarray(calibration.recon.centres), "m", "centres of the pixels")
+        writer.add("areas", np.asarray(calibration.recon.areas), "m2", "areas of the pixels")
+        for name, kind in kinds.items():
+            writer.add_rows(name, *kind)
+        also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress)]
+        also += [_Tracks(calibration, writer, blocks)] if track else []
+        before = np.zeros((1, len(calibration.skin.pads)))
+        for block in progress(blocks):
+            found = force_map(calibration, block.change, block.pressed, before=before)
+            if calibration.curves.curve.path:
+                before = remembered(np.concatenate([before, calibration.own_pressures(block.pressed)]))
+            _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
+            for one in also:
+                one.add(block, found)
+        for one in also:
+            tell(one.end())
+    return Path(path)
+
+
+def _attributes(calibration: Calibration, session: Session) -> dict[str, str | int]:
+    """What a force map file says of its origin."""
     recon = calibration.recon
-    attrs: dict[str, str | int] = {
+    return {
         "skin": calibration.skin.name,
         "session": session.name,
         "session_sha256": session.hash,
@@ -69,41 +95,63 @@ def apply(
         "image_columns": recon.shape[1],
         "calibration_created_utc": calibration.provenance["created_utc"],
     }
-    attrs |= {"ignored_errors": "\n".join(ignored)} if ignored else {}
-    attrs |= {"outside": "\n".join(outside)} if outside else {}
-    for line in outside:
-        tell(f"note: {line}")
-    kinds = _rows(calibration)
-    windows = None if loads is None else WindowedFrames(loads, recon.readings)
-    with ArchiveWriter(path, FORMAT, attrs) as writer:
-        writer.add("centres", np.asarray(recon.centres), "m", "centres of the pixels")
-        writer.add("areas", np.asarray(recon.areas), "m2", "areas of the pixels")
-        for name, kind in kinds.items():
-            writer.add_rows(name, *kind)
-        before = np.zeros((1, len(calibration.skin.pads)))
-        for first in progress(range(0, len(eit), _BLOCK)):
-            span = slice(first, min(first + _BLOCK, len(eit)))
-            time, frames = _corrected(eit, span, filters["eit"])
-            around = _around(pressure, time)
-            pressure_time, values = _corrected(pressure, around, filters["pressure"])
-            at_frames = resample(pressure_time, values, time)
-            pressed = at_frames - levels["pressure"](time)
-            found = force_map(calibration, frames - levels["eit"](time), pressed, before=before)
-            if calibration.curves.curve.path:
-                before = remembered(np.concatenate([before, calibration.own_pressures(pressed)]))
-            rows = _of_block(time, found, calibration.pads.multiple)
-            for name in kinds:
-                writer.append(name, rows[name])
-            if windows is not None:
-                touched = np.asarray(np.asarray(is_loaded(law_of(calibration), jnp.asarray(pressed))).any(1))
-                windows.add(time, frames, frames - levels["eit"](time), touched, found.force.sum(1))
-        if windows is not None:
-            windows.close()
-            seen = fit_windows(calibration, windows, progress)
-            for name, about in seen.arrays.items():
-                writer.add(name, *about)
-            tell(seen.render())
-    return Path(path)
+
+
+def _append(writer: ArchiveWriter, rows: Mapping[str, np.ndarray], names: Iterable[str], group: str = "") -> None:
+    for name in names:
+        writer.append(group + name, rows[name])
+
+
+class _Loads:
+    """Loads in windows of so many seconds, beside the force maps."""
+
+    def __init__(self, calibration: Calibration, writer: ArchiveWriter, seconds: float, progress: Progress):
+        self._calibration, self._writer, self._progress = calibration, writer, progress
+        self._windows = WindowedFrames(seconds, calibration.recon.readings)
+
+    def add(self, block: FrameBlock, found: ForceEstimate) -> None:
+        loaded = block.loaded(self._calibration)
+        self._windows.add(block.time, block.frames, block.change, loaded, found.force.sum(1))
+
+    def end(self) -> str:
+        """Write the loads; returns what they are in one line."""
+        self._windows.close()
+        seen = fit_windows(self._calibration, self._windows, self._progress)
+        for name, about in seen.arrays.items():
+            self._writer.add(name, *about)
+        return seen.render()
+
+
+class _Tracks:
+    """Contacts followed from frame to frame, beside the force maps. The untouched frames are read first."""
+
+    def __init__(self, calibration: Calibration, writer: ArchiveWriter, blocks: FrameBlocks):
+        self._writer, self._why = writer, ""
+        self._tracks: ContactTracks | None = None
+        quiet = QuietFrames(calibration.recon.readings)
+        for block in blocks:
+            quiet.add(block.frames, block.change, block.loaded(calibration))
+            if quiet.count >= ENOUGH:
+                break
+        try:
+            self._tracks = ContactTracks(prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise))
+        except NotFollowed as error:
+            self._why = f"contacts: none followed: {error}"
+            return
+        for name, about in ABOUT.items():
+            writer.add_rows(TRACKS + name, *about)
+
+    def add(self, block: FrameBlock, found: ForceEstimate) -> None:
+        if self._tracks is not None:
+            rows = self._tracks.add(block.time, block.change, found.force, found.standard_error)
+            _append(self._writer, rows, ABOUT, TRACKS)
+
+    def end(self) -> str:
+        """Write the rows that are left; returns how many contacts there were in one line."""
+        if self._tracks is None:
+            return self._why
+        _append(self._writer, self._tracks.end(), ABOUT, TRACKS)
+        return self._tracks.render()
 
 
 def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str, str]]:
@@ -150,26 +198,3 @@ def _of_block(time: np.ndarray, found: ForceEstimate, multiple: float) -> dict[s
         "contact_force": found.contact_force,
     }
     return {name: np.asarray(part) for name, part in parts.items()}
-
-
-def _corrected(stream: Stream, span: slice, corrections: Sequence[AbstractCorrection]) -> tuple[np.ndarray, np.ndarray]:
-    """Times and corrected values of a block, read with a margin for the filters."""
-    time = stream.time
-    margin = round(_MARGIN * 1e9)
-    first = int(np.searchsorted(time, time[span.start] - margin))
-    last = int(np.searchsorted(time, time[span.stop - 1] + margin, side="right"))
-    values = correct(corrections, time[first:last], stream.read(first, last), stream.name)
-    kept = slice(span.start - first, span.stop - first)
-    return time[span], values[kept]
-
-
-def _around(stream: Stream, time: np.ndarray) -> slice:
-    """Samples of a stream that surround the given times."""
-    first = max(int(np.searchsorted(stream.time, time[0])) - 1, 0)
-    last = min(int(np.searchsorted(stream.time, time[-1])) + 1, len(stream))
-    if last <= first:
-        raise SessionError(
-            f"/streams/{stream.name}: no sample at the time of the EIT frames; the streams do not "
-            "overlap: check their clocks"
-        )
-    return slice(first, last)

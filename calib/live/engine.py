@@ -2,6 +2,7 @@
 
 The force map of a frame waits for nothing else. Contacts take several times as long to fit. They are fitted to the
 newest frame if there is time before the next one is due (`Engine.use_spare_time`), and are used until the next fit.
+Where contacts are followed instead (`follower`), each frame has contacts of its own, and its result waits for them.
 """
 
 import time
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxeit as je
+from jaxeit.tracking import Track
 
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of
@@ -24,6 +26,7 @@ from ..fitting.curves.play_operators import remembered
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
+from .follower import LiveFollower, followed_touches, padded
 from .recalibrator import LiveRecalibrator
 from .results import NO_TOUCHES, FrameResult, TouchEstimates
 
@@ -35,6 +38,7 @@ GATE = 0.6  # see `jaxeit.fuse`
 IMAGE_DTYPE = "float32"  # of the image product; its matrices are built in float64, but read in half the memory
 
 MEASURING = "measuring the rest levels: do not touch the skin"
+PREPARING = "preparing to follow contacts, once: frames are left out until then"
 
 T = TypeVar("T")
 
@@ -55,7 +59,8 @@ class RestAverage:
     """Rest levels: means of voltages and pressures over `seconds` of frames without contact, of finite values only.
 
     ``levels`` are these means: voltages (readings,) V and pressures (pads,) Pa, or None until the time is over.
-    ``change`` (pads,) Pa is the mean pressure of the second half of the frames less that of the first.
+    ``change`` (pads,) Pa is the mean pressure of the second half of the frames less that of the first, and ``frames``
+    (n, readings) V are the frames themselves.
     """
 
     def __init__(self, seconds: float):
@@ -64,6 +69,7 @@ class RestAverage:
         self._rows: list[tuple[np.ndarray, np.ndarray, int]] = []
         self.levels: tuple[np.ndarray, np.ndarray] | None = None
         self.change = np.zeros(0)
+        self.frames = np.zeros((0, 0))
 
     def add(self, arrival: ReceivedFrame) -> None:
         """Add a frame without contact."""
@@ -72,7 +78,8 @@ class RestAverage:
         if arrival.host - self._since >= self._seconds * 1e9:
             voltages, pressures, _ = zip(*self._rows, strict=True)
             first, second = np.array_split(np.stack(pressures), 2)
-            self.levels = finite_mean(np.stack(voltages)), finite_mean(np.stack(pressures))
+            self.frames = np.stack(voltages)
+            self.levels = finite_mean(self.frames), finite_mean(np.stack(pressures))
             self.change = finite_mean(second) - finite_mean(first) if len(second) else np.zeros_like(pressures[0])
 
     def slide(self) -> None:
@@ -110,7 +117,8 @@ class FramePrograms:
     program each. `warm_up` runs all of them once before the first frame arrives.
     """
 
-    def __init__(self, law: ForceLaw):
+    def __init__(self, law: ForceLaw, followed: int | None = None):
+        """`followed`: largest number of contacts that a tracker tells; None: the calibration's locator tells them."""
         self._law, self.gains = law, law.pads.gains
         self._image = law.recon.on_host(IMAGE_DTYPE)
         self._dtypes = law.recon.dtype, law.pads.dtype
@@ -121,12 +129,19 @@ class FramePrograms:
         search = _compiled(lambda leaves, *a: _find_contacts(jax.tree.unflatten(tree, leaves), *a))
         self._search = partial(search, leaves)  # not constants, because the table of responses takes megabytes
         contacts = law.locator.finder.most if isinstance(law.locator, ContactLocator) else 1
-        self.nowhere = nowhere(jnp.zeros((1, law.masks.weights.shape[0]), self._dtypes[0]), contacts)
+        self._followed = followed
+        self.nowhere = nowhere(
+            jnp.zeros((1, law.masks.weights.shape[0]), self._dtypes[0]), contacts if followed is None else followed
+        )
+        centres, masks = law.recon.centres, law.masks
+        self._shares = _compiled(
+            lambda position, width, force: je.fusion.contact_shares(position, width, force, centres, masks).share
+        )
 
     @property
     def searches(self) -> bool:
-        """Whether contacts are located."""
-        return self._law.locator is not None
+        """Whether contacts are located frame by frame."""
+        return self._law.locator is not None and self._followed is None
 
     def warm_up(self) -> None:
         """Run all programs once, also for a frame without readings."""
@@ -136,6 +151,8 @@ class FramePrograms:
         self._image(np.full(readings, np.nan))
         if self.searches:
             self.search(frame)
+        if self._followed is not None:
+            self.placed(())
 
     def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> FrameForces:
         """Forces from a difference frame (readings,) V, pressures (pads,) Pa and those ``before`` (m, pads)."""
@@ -147,6 +164,15 @@ class FramePrograms:
         """Locate the contacts of a difference frame (readings,) V."""
         places, found = self._search(self._row(frame, 0))
         return jax.block_until_ready(places), NO_TOUCHES if found is None else _touch_estimates(jax.device_get(found))
+
+    def placed(self, tracks: tuple[Track, ...]) -> Places:
+        """Places of contacts that are followed."""
+        assert self._followed is not None
+        if self._law.pads.field is None:
+            return self.nowhere
+        parts = [jnp.asarray(part, self._dtypes[0]) for part in padded(tracks, self._followed)]
+        position, width, force = parts
+        return Places(position, self._shares(position, width, force), width, force)
 
     def _row(self, values: np.ndarray, which: int) -> np.ndarray:
         return np.asarray(values[None], self._dtypes[which])
@@ -208,9 +234,10 @@ class Engine:
         self,
         calibration: Calibration,
         rest: float = 2.0,
-        programs: Callable[[ForceLaw], FramePrograms] = FramePrograms,
+        programs: Callable[..., FramePrograms] = FramePrograms,
         *,
         recalibrator: LiveRecalibrator | None = None,
+        follower: LiveFollower | None = None,
     ):
         self._rest = rest
         self._rest_levels = RestAverage(rest)
@@ -220,10 +247,10 @@ class Engine:
         recon = calibration.recon
         self._used_readings, self._centres = np.asarray(recon.channels), np.asarray(recon.centres)
         self._pad_weights = np.asarray(calibration.masks.weights)
-        self._recalibrator = recalibrator
+        self._recalibrator, self._follower = recalibrator, follower
         self._multiple = calibration.pads.multiple
         self._law = law_of(calibration) if recalibrator is None else recalibrator.moved(law_of(calibration))
-        self._programs = programs(self._law)
+        self._programs = programs(self._law) if follower is None else programs(self._law, follower.most)
         self._programs.warm_up()
         self._before = np.zeros((1, len(self._pad_weights)))
         self._waiting_frame: np.ndarray | None = None  # a touched frame whose contacts are not fitted yet
@@ -241,7 +268,7 @@ class Engine:
     def state(self) -> str:
         """What the engine does now, for the operator."""
         if not self.resting:
-            return "running"
+            return "running" if self._follower is None or self._follower.ready else PREPARING
         return "waiting for the skin to be at rest: do not touch it" if self.restless else MEASURING
 
     @property
@@ -254,6 +281,8 @@ class Engine:
         self._rest_levels, self._negative_since, self.restless = RestAverage(self._rest), None, False
         if self._recalibrator is not None:
             self._recalibrator.tared()
+        if self._follower is not None:
+            self._follower.restart()
 
     def has_wrong_zero(self, now: int) -> bool:
         """Whether pads read below zero for so long, at `now` (ns), that the skin was pressed when zero was measured."""
@@ -283,9 +312,12 @@ class Engine:
         return np.asarray(arrival.beside - self._rest_levels.levels[1] - offset)
 
     def step(self, arrival: ReceivedFrame, dropped: int = 0) -> FrameResult | None:
-        """Process one frame; None while the rest levels are being measured."""
+        """Process one frame; None while the rest levels are being measured, and once contacts can be followed."""
         if self._rest_levels.levels is None:
             self._add_rest(arrival)
+            return None
+        if self._follower is not None and not self._follower.ready:
+            self._follower.prepare(self._rest_levels.frames)
             return None
         frame, pressure = arrival.values - self._rest_levels.levels[0], self.pressed(arrival)
         lost, silent = ~np.isfinite(frame), ~np.isfinite(pressure)
@@ -299,6 +331,7 @@ class Engine:
         self._note_negative(found.negative & ~silent, found.loaded & ~silent, arrival.host)
         force = np.where(silent, np.nan, found.force)
         error = np.where(silent, np.nan, found.standard_error)
+        self._follow(frame, force, error, arrival.host)
         self._number += 1
         return FrameResult(
             number=self._number,
@@ -316,6 +349,13 @@ class Engine:
             touches=self._touches,
             unsearched=self.unsearched,
         )
+
+    def _follow(self, frame: np.ndarray, force: np.ndarray, error: np.ndarray, now: int) -> None:
+        """Follow contacts to this frame; the next frame's forces are corrected by their places."""
+        if self._follower is not None:
+            tracks = self._follower.step(frame, force, error, now)
+            self._touches, self._places = followed_touches(tracks), self._programs.placed(tracks)
+            self._search_end = time.monotonic()
 
     def _recalibrate(self, frame: np.ndarray, pressure: np.ndarray, loaded: bool, now: int) -> None:
         """Let the recalibrator see a frame, and use its gains from the next frame on."""

@@ -24,6 +24,7 @@ from ..record.recorder import Recorder
 from ..record.sources import Source
 from ..record.wire.messages import Frame
 from .engine import Engine, ReceivedFrame
+from .follower import LiveFollower
 from .log_engine import LogEngine
 from .recalibrator import LiveRecalibrator
 from .results import FrameResult, Result
@@ -125,6 +126,7 @@ class LiveSettings:
     | event_driven | whether to request readings frame by frame, which the device must support    | False   |      |
     | realtime     | whether to use real-time scheduling once everything is compiled              | False   |      |
     | recalibrate  | whether zero and gains of the pads follow their drift                        | False   |      |
+    | track        | whether contacts are followed from frame to frame                            | False   |      |
     | moved        | calibration file to which the moved calibration is written; None: none       | None    |      |
     """
 
@@ -133,6 +135,7 @@ class LiveSettings:
     event_driven: bool = False
     realtime: bool = False
     recalibrate: bool = False
+    track: bool = False
     moved: str | Path | None = None
 
 
@@ -160,6 +163,7 @@ def run_live(
 
     Raises:
         LiveError: if the streams do not fit the calibration, do not begin, or fail.
+        NotFollowed: if contacts are to be followed and the frames at rest do not tell the noise.
         PriorityError: if real-time scheduling is refused.
     """
     settings = settings or LiveSettings()
@@ -172,7 +176,8 @@ def run_live(
         _check(calibration, sources)
         if settings.recalibrate:
             recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn)
-        engine = Engine(calibration, settings.rest, recalibrator=recalibrator)
+        follower = LiveFollower(calibration) if settings.track else None
+        engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower)
     queue = FrameQueue(*(source.plan for source in sources))
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
     if settings.event_driven:
@@ -208,6 +213,8 @@ def _check_log(calibration: LogCalibration, sources: Sequence[Source], settings:
         )
     if calibration.needs_place and len(sources) < 2:
         raise LiveError("live: the calibration depends on the place of contact; give --stage, the URL of the stage")
+    if settings.track:
+        raise LiveError("live: --track: the calibration of a log has no EIT, which tells where contacts are")
     if settings.recalibrate or settings.event_driven:
         raise LiveError(
             "live: --recalibrate and --event-driven need a skin with EIT; move this calibration by `jaxeit "

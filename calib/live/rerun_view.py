@@ -125,11 +125,10 @@ class RerunView:
     def _contacts(self, touches: TouchEstimates, grid: "Grid") -> rr.LineStrips2D:
         """Contacts as ellipses of two standard errors, with coordinates as labels."""
         strips = [grid.pixels(ellipse(*at)) for at in zip(touches.position, touches.covariance, strict=True)]
+        errors, names = np.sqrt(np.diagonal(touches.covariance, axis1=1, axis2=2)), _names(touches)
         labels = [
-            f"{1e3 * x:.1f}, {1e3 * y:.1f} mm ± {1e3 * dx:.1f}, {1e3 * dy:.1f}" + ("" if sure else ", a guess")
-            for (x, y), (dx, dy), sure in zip(
-                touches.position, np.sqrt(np.diagonal(touches.covariance, axis1=1, axis2=2)), touches.sure, strict=True
-            )
+            f"{name}{1e3 * x:.1f}, {1e3 * y:.1f} mm ± {1e3 * dx:.1f}, {1e3 * dy:.1f}" + ("" if sure else ", a guess")
+            for name, (x, y), (dx, dy), sure in zip(names, touches.position, errors, touches.sure, strict=True)
         ]
         return rr.LineStrips2D(strips, labels=labels, show_labels=False, colors=MARK_COLOUR)
 
@@ -138,6 +137,13 @@ class RerunView:
         pressed = np.isfinite(result.centre).all(1)
         labels = [f"{self._pads[n]} {result.force[n]:.1f} N" for n in np.flatnonzero(pressed)]
         return rr.Points2D(grid.pixels(result.centre[pressed]), labels=labels, colors=MARK_COLOUR, radii=0.3)
+
+
+def _names(touches: TouchEstimates) -> list[str]:
+    """Number and force of contacts that are followed, as the beginning of a label."""
+    if touches.number is None:
+        return [""] * len(touches.position)
+    return [f"{number}: {force:.1f} N, " for number, force in zip(touches.number, touches.force, strict=True)]
 
 
 class Grid:

@@ -2,31 +2,39 @@
 
 import base64
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
 class TouchEstimates:
-    """Contacts fitted to a frame.
+    """Contacts fitted to a frame, or followed to it.
 
-    | field      | meaning                                                              | shape     | unit |
-    |------------|----------------------------------------------------------------------|-----------|------|
-    | position   | of the contact                                                       | (k, 2)    | m    |
-    | covariance | of the position                                                      | (k, 2, 2) | m^2  |
-    | sure       | whether the fit converged; otherwise the covariance is a guess       | (k,)      |      |
-    | age        | frames since the one of the fit; None if contacts were never fitted  | ()        |      |
+    | field       | meaning                                                              | shape     | unit |
+    |-------------|----------------------------------------------------------------------|-----------|------|
+    | position    | of the contact; of an edge, its middle                               | (k, 2)    | m    |
+    | covariance  | of the position                                                      | (k, 2, 2) | m^2  |
+    | sure        | whether the fit converged; otherwise the covariance is a guess       | (k,)      |      |
+    | age         | frames since the one of the fit; None if contacts were never fitted  | ()        |      |
+    | number      | of the contact, which it keeps while it is followed; None: not followed | (k,)   |      |
+    | force       | of a contact that is followed                                        | (k,)      | N    |
+    | force_error | standard error of the force                                          | (k,)      | N    |
+    | half        | from the middle of an edge to its end; zero for other contacts       | (k, 2)    | m    |
     """
 
     position: np.ndarray
     covariance: np.ndarray
     sure: np.ndarray
     age: int | None = None
+    number: np.ndarray | None = None
+    force: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    force_error: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    half: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def to_list(self) -> list[dict[str, object]]:
         """The contacts as values for JSON, each with the standard errors of x and y."""
-        return [
+        found: list[dict[str, object]] = [
             {
                 "position": _json_numbers(position),
                 "standard_error": _json_numbers(np.sqrt(np.diag(covariance))),
@@ -34,6 +42,15 @@ class TouchEstimates:
                 "sure": bool(sure),
             }
             for position, covariance, sure in zip(self.position, self.covariance, self.sure, strict=True)
+        ]
+        if self.number is None:
+            return found
+        follow = zip(self.number, self.force, self.force_error, self.half, strict=True)
+        return [
+            one
+            | {"number": int(number), "half": _json_numbers(half)}
+            | dict(zip(("force", "force_error"), _json_numbers(np.array([force, error])), strict=True))
+            for one, (number, force, error, half) in zip(found, follow, strict=True)
         ]
 
 
@@ -58,7 +75,7 @@ class FrameResult:
     | image          | change of sheet conductivity from which the map is made                | (pixels,) | S    |
     | missing        | number of readings that were not finite and were left out              | ()        |      |
     | dropped        | number of frames that were not processed so far                        | ()        |      |
-    | touches        | contacts, if the calibration fits contacts                             |           |      |
+    | touches        | contacts, if the calibration fits contacts or they are followed        |           |      |
     | unsearched     | number of frames so far for which there was no time to fit contacts    | ()        |      |
     """
 

@@ -1,6 +1,17 @@
 """Contacts followed through time, by frames and pad forces together."""
 
+from .compilation import compile_tracker
 from .settings import TrackerSettings
+from .smoothing import Smoother, TimedTracks
 from .tracker import Track, Tracker, Tracking, prepare_tracker
 
-__all__ = ["Track", "Tracker", "TrackerSettings", "Tracking", "prepare_tracker"]
+__all__ = [
+    "Smoother",
+    "TimedTracks",
+    "Track",
+    "Tracker",
+    "TrackerSettings",
+    "Tracking",
+    "compile_tracker",
+    "prepare_tracker",
+]

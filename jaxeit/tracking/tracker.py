@@ -190,7 +190,7 @@ class Tracker:
     def _pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
-            return Pads(jnp.zeros(count), jnp.full(count, jnp.inf))
+            return Pads(jnp.zeros(count), jnp.full(count, jnp.inf, float))  # as those that are known: no weak type
         force, error = np.asarray(forces, float), np.asarray(errors, float)
         if force.shape != (count,) or error.shape != (count,):
             raise InverseError(

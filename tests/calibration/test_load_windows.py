@@ -26,9 +26,9 @@ def test_windows_hold_touched_frames_of_the_length_asked_for():
     assert [w.frames for w in seen.windows] == [10, 10, 10]
     np.testing.assert_allclose(seen.windows[0].frame, [2.0, 1.9], atol=0.01)
     assert seen.windows[0].force == 4.0
-    np.testing.assert_allclose(seen.untouched, [3.05, 2.95], atol=0.01)
-    assert seen.noise is not None
-    assert WindowedFrames(1.0, 2).noise is None
+    np.testing.assert_allclose(seen.quiet.untouched, [3.05, 2.95], atol=0.01)
+    assert seen.quiet.noise is not None
+    assert WindowedFrames(1.0, 2).quiet.noise is None
 
 
 @pytest.fixture(scope="module")

@@ -23,12 +23,14 @@ import jaxeit as je
 from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.force_maps import ForceLaw, fused
+from calib.calibration.localisation.contact_tracks import PAD_SHARE, NotFollowed, prepare_calibrated_tracker
 from calib.cli import main
 from calib.fitting.curves.fitted import FittedCurve
 from calib.fitting.fields.places import single_places
 from calib.fitting.pads import PadModel
 from calib.live import engine as live_engine, loop as live_module
-from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
+from calib.live.engine import PREPARING, Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
+from calib.live.follower import LiveFollower
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
 from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
@@ -43,6 +45,7 @@ from calib.record.recorder import StopRequest, record_session
 from calib.record.wire import encoding
 from calib.record.wire.messages import Frame
 from jaxeit import effects as fx
+from jaxeit.tracking import Track, Tracker, Tracking
 from tests.helpers import stand_in
 
 S = 1_000_000_000
@@ -302,6 +305,113 @@ def test_missing_readings_are_counted_of_those_that_are_used(calibration):
     broken = ReceivedFrame(np.where(np.isin(np.arange(READINGS), [0, 2]), np.nan, 1.0), np.array([11.0, 20.0]), 0)
     assert engine.step(broken).missing == 1  # the first is not used
     assert engine.step(arrival([11.0, 20.0])).missing == 0
+
+
+class FollowingPrograms(FakePrograms):
+    """With places of contacts that are followed."""
+
+    def __init__(self, law, followed):
+        super().__init__(law)
+        self.followed = followed
+
+    def placed(self, tracks):
+        return single_places([tracks[0].position.tolist()], PADS) if tracks else NOWHERE
+
+
+class FakeTracker(Tracker):
+    """One contact while the first pad is pressed; a new one each time."""
+
+    def __init__(self, untouched, noise):
+        self.untouched, self.noise, self.steps = untouched, noise, []
+
+    def start(self):
+        return stand_in(Tracking, tracks=(), begun=0)
+
+    def step(self, now, change, seconds, force, error):
+        self.steps.append((change, seconds, force, error))
+        if not force[0] > 2:
+            return stand_in(Tracking, tracks=(), begun=now.begun)
+        begun = now.begun + (not now.tracks)
+        place, half = np.array([0.02, 0.03]), np.array([0.01, 0.0])
+        track = Track(begun, place, 4e-6 * np.eye(2), 0.01, float(force[0]), 0.1, half, np.zeros(2))
+        return stand_in(Tracking, tracks=(track,), begun=begun)
+
+
+@pytest.fixture
+def following(calibration, monkeypatch):
+    """An engine that follows contacts, at rest, and its tracker."""
+    monkeypatch.setattr("calib.live.follower.compile_tracker", lambda tracker: compiled.append(tracker))
+    compiled, made = [], []
+
+    def prepare(calibration, untouched, noise):
+        made.append(FakeTracker(untouched, noise))
+        return made[-1]
+
+    engine = Engine(calibration, 0.5, FollowingPrograms, follower=LiveFollower(calibration, prepare))
+    for n in range(11):
+        assert engine.step(arrival([10.0, 20.0], n * S // 20, voltage=n % 2)) is None
+    assert engine.state == PREPARING
+    assert engine.step(arrival([10.0, 20.0], S)) is None  # this frame is left out, and no later one
+    assert engine.state == "running"
+    assert compiled == made
+    return engine, made[0]
+
+
+def test_the_tracker_knows_the_sheet_and_the_noise_of_the_rest(following):
+    tracker = following[1]
+    np.testing.assert_allclose(tracker.untouched, 5 / 11)
+    np.testing.assert_allclose(tracker.noise, np.std(np.arange(11) % 2))
+
+
+def test_each_frame_has_contacts_that_keep_their_numbers(following):
+    engine, tracker = following
+    assert len(engine.step(arrival([10.0, 20.0], 2 * S)).touches.position) == 0
+    for host in (2 * S + S // 100, 3 * S):  # the second one late
+        result = engine.step(arrival([31.0, 20.0], host, voltage=1.0))
+        assert (result.touches.number.tolist(), result.touches.age) == ([1], 0)
+    np.testing.assert_allclose([step[1] for step in tracker.steps], [0.01, 0.01, 0.99])
+    np.testing.assert_allclose(tracker.steps[-1][0], 6 / 11)
+    np.testing.assert_allclose(tracker.steps[-1][2], [21.0, 0.0])
+    np.testing.assert_allclose(tracker.steps[-1][3], [np.hypot(0.1, PAD_SHARE * 21), 0.1])
+    contact = json.loads(result.to_json())["contacts"][0]
+    assert contact["number"] == 1
+    np.testing.assert_allclose([contact["force"], contact["force_error"], *contact["half"]], [21, 2.1, 0.01, 0])
+    np.testing.assert_allclose(engine._programs.places[-1].position, [[[0.02, 0.03]]])  # of the frame before
+    engine.step(arrival([10.0, 20.0], 4 * S))
+    assert engine.step(arrival([31.0, 20.0], 5 * S)).touches.number.tolist() == [2]
+
+
+def test_a_pad_without_pressure_tells_a_tracker_nothing(following):
+    engine, tracker = following
+    engine.step(ReceivedFrame(np.full(READINGS, np.nan), np.array([np.nan, 24.0]), 2 * S))
+    change, _, force, error = tracker.steps[-1]
+    assert np.isnan(change).all()
+    np.testing.assert_array_equal(np.isnan([force, error]), [[True, False]] * 2)
+
+
+def test_frames_that_arrive_at_once_are_followed(following):
+    engine, tracker = following
+    for _ in range(2):
+        engine.step(arrival([31.0, 20.0], 2 * S))
+    assert tracker.steps[-1][1] > 0
+
+
+def test_contacts_are_forgotten_when_zero_is_set_again(following):
+    engine, tracker = following
+    engine.step(arrival([31.0, 20.0], 2 * S))
+    engine.tare()
+    for host in (3 * S, 4 * S):
+        assert engine.step(arrival([10.0, 20.0], host)) is None
+    assert engine.step(arrival([31.0, 20.0], 5 * S)).touches.number.tolist() == [1]
+    assert len(tracker.steps) == 2
+
+
+def test_frames_at_rest_without_noise_are_refused(calibration):
+    follower = LiveFollower(calibration, lambda *a: prepare_calibrated_tracker(*a))
+    with pytest.raises(NotFollowed, match="no frames"):
+        follower.prepare(np.zeros((3, READINGS)))
+    with pytest.raises(NotFollowed, match="no reading has noise"):
+        follower.prepare(np.ones((20, READINGS)))
 
 
 @pytest.mark.slow

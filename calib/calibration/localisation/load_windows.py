@@ -18,11 +18,11 @@ from jaxeit.contacts import LoadKind, Loads
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
 from .press_images import fit_untouched_sheet
+from .quiet_frames import QuietFrames
 
 # A draft moves a load by 0.15 mm, so that its ellipse of 90 % covers 81 %; finer meshes than this move it by 0.01 mm.
 FIDELITY = je.Fidelity(edge_length=0.04, electrode_segments=12, growth=1.4)
 MOST = 2  # loads of a window
-MIN_QUIET = 8  # frames without contact, fewer do not tell the noise
 MAX_WINDOW_FRAMES = 4096  # of a window, so that memory stays bounded
 
 
@@ -37,23 +37,19 @@ class Window(NamedTuple):
 
 
 class WindowedFrames:
-    """Collects windows of touched frames, and mean and variance of the frames without contact, block by block."""
+    """Collects windows of touched frames, and the frames without contact, block by block."""
 
     def __init__(self, seconds: float, readings: int):
         self._length = round(1e9 * seconds)
         self.windows: list[Window] = []
         self._open: list[tuple[int, np.ndarray, float]] = []
-        self._quiet, self._level = 0, np.zeros(readings)
-        self._square = np.zeros(readings)
+        self.quiet = QuietFrames(readings)
 
     def add(
         self, time: np.ndarray, frames: np.ndarray, change: np.ndarray, loaded: np.ndarray, force: np.ndarray
     ) -> None:
         """Frames (n, readings) V, their change, which are touched (n,), and the force on all pads (n,) N."""
-        rest = ~loaded & np.isfinite(change).all(1)
-        self._quiet += int(rest.sum())
-        self._level += frames[rest].sum(0)
-        self._square += (change[rest] ** 2).sum(0)
+        self.quiet.add(frames, change, loaded)
         for row in range(len(time)):
             if not loaded[row] or (self._open and time[row] - self._open[0][0] >= self._length):
                 self.close()
@@ -68,16 +64,6 @@ class WindowedFrames:
                 Window(time[0], time[-1], finite_mean(np.stack(change)), float(np.mean(force)), len(time))
             )
         self._open = []
-
-    @property
-    def untouched(self) -> Float[np.ndarray, " readings"]:
-        """Mean frame without contact, V."""
-        return self._level / max(self._quiet, 1)
-
-    @property
-    def noise(self) -> Float[np.ndarray, " readings"] | None:
-        """Standard deviation of a reading without contact, V; None if there are too few frames."""
-        return np.sqrt(self._square / self._quiet) if self._quiet >= MIN_QUIET else None
 
 
 @dataclass(frozen=True)
@@ -98,14 +84,14 @@ class SeenLoads:
 
 def fit_windows(calibration: Calibration, seen: WindowedFrames, progress: Any = iter) -> SeenLoads:
     """Fit loads to each window."""
-    noise = seen.noise
+    noise = seen.quiet.noise
     if noise is None or not seen.windows:
         why = "no frames without contact tell the noise" if noise is None else "nothing touches the skin for that long"
         return SeenLoads({}, (), why)
     sound = np.isfinite([window.frame for window in seen.windows]).all(0)
     channels = np.asarray(calibration.recon.channels) & (noise > 0) & sound
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
-    sheet, _ = fit_untouched_sheet(model, seen.untouched, channels)
+    sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
     finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
     fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels)

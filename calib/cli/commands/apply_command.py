@@ -1,10 +1,14 @@
 """`jaxeit apply`."""
 
 import argparse
+from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_outputs
+from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar
+
+if TYPE_CHECKING:
+    from ...calibration import LogCalibration
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,6 +20,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help=text)
     text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of so many seconds"
     parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
+    text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
+    parser.add_argument("--track", action="store_true", help=text)
+    text = "write an HTML report of the contacts that are followed: paths and forces; needs --track"
+    parser.add_argument("--report", metavar="REPORT.html", help=text)
     add_low_pass_argument(parser)
 
 
@@ -24,22 +32,14 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    from ...calibration import LogCalibration, apply, apply_log, load_calibration
+    from ...calibration import LogCalibration, apply, load_calibration
     from ...session import open_session
 
-    prepare_outputs(args.output)
+    _check_report(args)
+    prepare_outputs(args.output, args.report)
     calibration = load_calibration(args.calibration)
     if isinstance(calibration, LogCalibration):
-        refuse_low_pass(args)
-        if args.loads is not None:
-            raise ValueError("--loads: the calibration of a log has no EIT, which tells where contacts are")
-        with open_session(args.session) as session:
-            found = apply_log(calibration, session, args.output, ignore_errors=args.force)
-        outside = (~found.valid).mean() if len(found.valid) else 0.0
-        print(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
-        if unseen := calibration.unseen(found.force):
-            print(f"note: {unseen}")
-        return 0
+        return _run_log(args, calibration)
     with open_session(args.session) as session:
         apply(
             calibration,
@@ -49,8 +49,37 @@ def run(args: argparse.Namespace) -> int:
             ignore_errors=args.force,
             progress=progress_bar("frames"),
             loads=args.loads,
+            track=args.track,
             tell=print,
         )
         frames = len(session.stream("eit"))
+    if args.report is not None:
+        from ...report.track_report import write_track_report
+
+        write_track_report(args.report, args.output, calibration.skin)
     print(f"{args.output}: {frames} force maps in newtons")
+    return 0
+
+
+def _check_report(args: argparse.Namespace) -> None:
+    if args.report is not None:
+        if not args.track:
+            raise ValueError("--report: it is about contacts that are followed; add --track")
+        require_matplotlib_for("--report")
+
+
+def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
+    from ...calibration import apply_log
+    from ...session import open_session
+
+    refuse_low_pass(args)
+    if args.loads is not None or args.track:
+        option = "--track" if args.track else "--loads"
+        raise ValueError(f"{option}: the calibration of a log has no EIT, which tells where contacts are")
+    with open_session(args.session) as session:
+        found = apply_log(calibration, session, args.output, ignore_errors=args.force)
+    outside = (~found.valid).mean() if len(found.valid) else 0.0
+    print(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
+    if unseen := calibration.unseen(found.force):
+        print(f"note: {unseen}")
     return 0

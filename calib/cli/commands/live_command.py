@@ -40,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record the streams at the same time")
     text = "request the next readings from the device: few at rest, those around the contact during a contact"
     parser.add_argument("--event-driven", action="store_true", help=text)
+    text = "follow contacts from frame to frame: each keeps its number, with ellipse and force"
+    parser.add_argument("--track", action="store_true", help=text)
     text = "let zero and relative gains of the pads follow their drift, and write the moved calibration"
     parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
     text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
@@ -85,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
                 realtime=args.realtime,
                 rest=args.rest,
                 wait=args.wait,
+                track=args.track,
                 recalibrate=args.recalibrate is not None,
                 moved=args.recalibrate,
             ),

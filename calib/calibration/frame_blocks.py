@@ -1,0 +1,74 @@
+"""Frames of a session in blocks, corrected, with the pressures at their times."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..presses.corrections import AbstractCorrection, correct
+from ..presses.streams import resample
+from ..presses.table import Processing
+from ..session import Session, SessionError, Stream
+from .calibration import Calibration
+from .force_maps import is_loaded, law_of
+
+BLOCK = 512  # frames held in memory at once
+MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
+
+
+class FrameBlock(NamedTuple):
+    """Frames of a session: times (n,) ns, frames and their change (n, readings) V, change of pressures (n, pads) Pa."""
+
+    time: np.ndarray
+    frames: np.ndarray
+    change: np.ndarray
+    pressed: np.ndarray
+
+    def loaded(self, calibration: Calibration) -> np.ndarray:
+        """Which frames are touched, (n,)."""
+        return np.array(is_loaded(law_of(calibration), jnp.asarray(self.pressed)).any(1))
+
+
+class FrameBlocks:
+    """Corrected frames of a session with the pressures at their times, in blocks; each pass reads them anew."""
+
+    def __init__(self, session: Session, processing: Processing, levels: Mapping[str, Any]):
+        self._eit, self._pressure = session.stream("eit"), session.stream("pressure")
+        self._filters = {s.name: processing.of(s)[0] for s in (self._eit, self._pressure)}
+        self._levels = levels
+
+    def __len__(self) -> int:
+        return len(range(0, len(self._eit), BLOCK))
+
+    def __iter__(self) -> Iterator[FrameBlock]:
+        for first in range(0, len(self._eit), BLOCK):
+            span = slice(first, min(first + BLOCK, len(self._eit)))
+            time, frames = _corrected(self._eit, span, self._filters["eit"])
+            around = _around(self._pressure, time)
+            pressure_time, values = _corrected(self._pressure, around, self._filters["pressure"])
+            pressed = resample(pressure_time, values, time) - self._levels["pressure"](time)
+            yield FrameBlock(time, frames, frames - self._levels["eit"](time), pressed)
+
+
+def _corrected(stream: Stream, span: slice, corrections: Sequence[AbstractCorrection]) -> tuple[np.ndarray, np.ndarray]:
+    """Times and corrected values of a block, read with a margin for the filters."""
+    time = stream.time
+    margin = round(MARGIN * 1e9)
+    first = int(np.searchsorted(time, time[span.start] - margin))
+    last = int(np.searchsorted(time, time[span.stop - 1] + margin, side="right"))
+    values = correct(corrections, time[first:last], stream.read(first, last), stream.name)
+    kept = slice(span.start - first, span.stop - first)
+    return time[span], values[kept]
+
+
+def _around(stream: Stream, time: np.ndarray) -> slice:
+    """Samples of a stream that surround the given times."""
+    first = max(int(np.searchsorted(stream.time, time[0])) - 1, 0)
+    last = min(int(np.searchsorted(stream.time, time[-1])) + 1, len(stream))
+    if last <= first:
+        raise SessionError(
+            f"/streams/{stream.name}: no sample at the time of the EIT frames; the streams do not "
+            "overlap: check their clocks"
+        )
+    return slice(first, last)

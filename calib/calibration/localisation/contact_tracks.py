@@ -1,0 +1,149 @@
+"""Contacts followed through a recording, by `jaxeit.tracking`, as arrays of a file.
+
+The untouched sheet and the noise are those of the session's own frames without contact. The forces on the pads and
+their standard errors, by the calibration, are data of each frame beside its readings.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+import jaxeit as je
+from jaxeit.tracking import Smoother, TimedTracks, Track, Tracker
+
+from ..calibration import Calibration
+from .load_windows import FIDELITY
+from .press_images import fit_untouched_sheet
+
+MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
+# Part of a pad's force by which curve and shape of the load may err; its standard error is that of the pressure alone.
+PAD_SHARE = 0.05
+
+Rows = dict[str, np.ndarray]
+
+
+class NotFollowed(ValueError):
+    """The frames do not allow contacts to be followed."""
+
+
+def prepare_calibrated_tracker(
+    calibration: Calibration, untouched: Float[np.ndarray, " readings"], noise: Float[np.ndarray, " readings"] | None
+) -> Tracker:
+    """A tracker of the calibrated skin.
+
+    Args:
+        untouched: mean frame without contact, V.
+        noise: standard deviation of the readings of a frame, V; readings without noise are left out.
+
+    Raises:
+        NotFollowed: if the noise is not known.
+    """
+    if noise is None:
+        raise NotFollowed("no frames without contact tell the noise")
+    channels = np.asarray(calibration.recon.channels) & (noise > 0) & np.isfinite(noise)
+    if not channels.any():
+        raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
+    model = je.discretise(je.Scene(calibration.skin), FIDELITY)
+    sheet, _ = fit_untouched_sheet(model, untouched, channels)
+    noise = np.where(channels, noise, 1.0)
+    return je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=sheet, channels=channels)
+
+
+def pad_errors(force: Float[np.ndarray, "*n pads"], error: Float[np.ndarray, "*n pads"]) -> np.ndarray:
+    """Standard errors of the forces on pads as data for a tracker, N."""
+    return np.asarray(np.hypot(error, PAD_SHARE * force))
+
+
+class ContactTracks:
+    """Follows contacts block by block, and gives back rows of the arrays `ABOUT`, one for each contact of a frame."""
+
+    def __init__(self, tracker: Tracker, *, smooth: bool = True):
+        self._tracker, self._now = tracker, tracker.start()
+        self._smoother = Smoother(tracker) if smooth else None
+        self._last: int | None = None
+        self._lives: dict[int, tuple[int, int]] = {}
+        self._most = 0
+
+    def add(
+        self,
+        time: Int[np.ndarray, " n"],
+        change: Float[np.ndarray, "n readings"],
+        force: Float[np.ndarray, "n pads"],
+        error: Float[np.ndarray, "n pads"],
+    ) -> Rows:
+        """Follow contacts through a block: times ns, change of the frames V, forces on the pads and their errors N."""
+        return self._rows(
+            [one for row in zip(time.tolist(), change, force, error, strict=True) for one in self._followed(*row)]
+        )
+
+    def end(self) -> Rows:
+        """The rows that are left."""
+        return self._rows([] if self._smoother is None else self._smoother.end())
+
+    def _followed(self, time: int, change: np.ndarray, force: np.ndarray, error: np.ndarray) -> Iterable[TimedTracks]:
+        seconds = MIN_SECONDS if self._last is None else max((time - self._last) / 1e9, MIN_SECONDS)
+        self._last = time
+        self._now = self._tracker.step(self._now, change, seconds, force, pad_errors(force, error))
+        if self._smoother is None:
+            return [TimedTracks(self._last, self._now.tracks)]
+        return list(self._smoother.add(self._last, self._now, seconds))
+
+    def _rows(self, found: Iterable[TimedTracks]) -> Rows:
+        rows = [_row(time, track) for time, tracks in found for track in self._noted(time, tracks)]
+        return {name: np.array([row[name] for row in rows]).reshape(-1, *about.shape) for name, about in ABOUT.items()}
+
+    def _noted(self, time: int, tracks: tuple[Track, ...]) -> Iterator[Track]:
+        self._most = max(self._most, len(tracks))
+        for track in tracks:
+            self._lives[track.number] = (self._lives.get(track.number, (time,))[0], time)
+            yield track
+
+    def render(self) -> str:
+        """How many contacts there were, for how long and when, in one line."""
+        if not self._lives:
+            return "contacts: none touched the skin"
+        begin, end = np.array(list(self._lives.values())).T / 1e9
+        seconds = np.sort(end - begin)
+        span = f"{begin.min():.2f} to {end.max():.2f} s"
+        return (
+            f"contacts: {len(seconds)} followed from {span}, at most {self._most} at once, for {seconds[0]:.2f} to "
+            f"{seconds[-1]:.2f} s (median {np.median(seconds):.2f} s)"
+        )
+
+
+class About(NamedTuple):
+    """An array with one row for each contact of a frame: shape of a row, unit, meaning and type."""
+
+    shape: tuple[int, ...]
+    units: str
+    meaning: str
+    dtype: str = "f8"
+
+
+ABOUT = {
+    "time": About((), "ns", "of the frame, since time_epoch_utc", "i8"),
+    "number": About((), "1", "of the contact, which it keeps while it lives", "i8"),
+    "position": About((2,), "m", "in the sheet's flat coordinates; of an edge, its middle"),
+    "position_covariance": About((2, 2), "m2", "of the position"),
+    "width": About((), "m", "standard deviation of the load, across an edge"),
+    "force": About((), "N", "of the contact"),
+    "force_se": About((), "N", "standard error of the force"),
+    "half": About((2,), "m", "from the middle of an edge to its end; zero for other contacts"),
+    "velocity": About((2,), "m/s", "of the position"),
+}
+
+
+def _row(time: int, track: Track) -> dict[str, object]:
+    return {
+        "time": time,
+        "number": track.number,
+        "position": track.position,
+        "position_covariance": track.covariance,
+        "width": track.width,
+        "force": track.force,
+        "force_se": track.force * track.log_force_error,
+        "half": track.half,
+        "velocity": track.velocity,
+    }

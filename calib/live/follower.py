@@ -1,0 +1,97 @@
+"""Contacts followed through the frames of a live view, by `jaxeit.tracking`."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxeit.tracking import Track, Tracker, TrackerSettings, Tracking, compile_tracker
+
+from ..calibration.calibration import Calibration
+from ..calibration.localisation.contact_tracks import MIN_SECONDS, pad_errors, prepare_calibrated_tracker
+from ..calibration.localisation.quiet_frames import QuietFrames
+from .results import TouchEstimates
+
+FIRST_SECONDS = 0.01  # before the first frame that is followed
+
+Prepare = Callable[[Calibration, np.ndarray, np.ndarray | None], Tracker]
+
+
+class LiveFollower:
+    """Follows contacts from frame to frame; they keep their numbers also where frames were dropped or are late.
+
+    The tracker is prepared once, with the sheet and the noise of the first rest, and all its programs are compiled
+    then: that takes longer than a frame, and no later frame waits for it.
+    """
+
+    def __init__(self, calibration: Calibration, prepare: Prepare = prepare_calibrated_tracker):
+        self._calibration, self._prepare = calibration, prepare
+        self._tracker: Tracker | None = None
+        self._now: Tracking | None = None
+        self._last: int | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether the tracker is prepared."""
+        return self._tracker is not None
+
+    @property
+    def most(self) -> int:
+        """Largest number of contacts that are followed at once."""
+        return TrackerSettings().most
+
+    def prepare(self, resting: np.ndarray) -> None:
+        """Prepare the tracker from frames without contact (n, readings) V, and compile its programs.
+
+        Raises:
+            NotFollowed: if the frames do not tell the noise.
+        """
+        quiet = QuietFrames(resting.shape[1])
+        untouched = np.zeros(len(resting), bool)
+        quiet.add(resting, resting, untouched)
+        spread = QuietFrames(resting.shape[1])
+        spread.add(resting, resting - quiet.untouched, untouched)
+        self._tracker = self._prepare(self._calibration, quiet.untouched, spread.noise)
+        compile_tracker(self._tracker)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the contacts, as after a new measurement of the rest levels."""
+        self._now, self._last = None, None
+
+    def step(self, change: np.ndarray, force: np.ndarray, error: np.ndarray, host: int) -> tuple[Track, ...]:
+        """The contacts after a frame.
+
+        Args:
+            change: of the frame against the rest level, (readings,) V.
+            force, error: on the pads and their standard errors, (pads,) N; NaN: not known.
+            host: time of arrival, ns.
+        """
+        assert self._tracker is not None
+        seconds = FIRST_SECONDS if self._last is None else max((host - self._last) / 1e9, MIN_SECONDS)
+        before = self._tracker.start() if self._now is None else self._now
+        self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error))
+        self._last = host
+        return self._now.tracks
+
+
+def followed_touches(tracks: tuple[Track, ...]) -> TouchEstimates:
+    """Tracks as results of a frame."""
+    force = np.array([one.force for one in tracks])
+    return TouchEstimates(
+        position=np.array([one.position for one in tracks]).reshape(-1, 2),
+        covariance=np.array([one.covariance for one in tracks]).reshape(-1, 2, 2),
+        sure=np.ones(len(tracks), bool),
+        age=0,
+        number=np.array([one.number for one in tracks], int),
+        force=force,
+        force_error=force * np.array([one.log_force_error for one in tracks]),
+        half=np.array([one.half for one in tracks]).reshape(-1, 2),
+    )
+
+
+def padded(tracks: tuple[Track, ...], most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions (1, most, 2), widths and forces (1, most) of tracks; NaN, and zero force, for absent ones."""
+    position, width, force = np.full((1, most, 2), np.nan), np.full((1, most), np.nan), np.zeros((1, most))
+    for k, one in enumerate(tracks):
+        position[0, k], width[0, k], force[0, k] = one.position, one.width, one.force
+    return position, width, force

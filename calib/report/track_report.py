@@ -1,0 +1,163 @@
+"""The report of contacts that were followed through a recording: paths over the sheet, and forces over time."""
+
+import base64
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import jaxeit as je
+
+from ..calibration.application import FORMAT, TRACKS
+from ..calibration.localisation.contact_tracks import ABOUT, Rows
+from ..session import open_archive, replacing
+from .figures import MM, draw_sheet, new_figure, png, require_matplotlib
+from .force_series import SERIES
+from .html_parts import PAGE, STYLE, html_table, number_text, with_error
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+INSIDE = 2.1460  # standard deviations to the ellipse that holds 90 % of a normal distribution in the plane
+LARGER = 5  # times the ellipses are drawn larger, since they would hardly be seen
+ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
+MOST_POINTS = 2000  # of a contact's line
+ANGLES = np.linspace(0, 2 * np.pi, 61)
+CAPTION = (
+    "Paths of the contacts, each with its number where it begins and a dot where it ends; an edge is a line. Ellipses "
+    f"of 90 %, drawn {LARGER} times larger, where a contact presses with at least half of its largest force. Beside "
+    "them the forces, with two standard errors on either side."
+)
+
+
+def write_track_report(path: str | Path, forces: str | Path, skin: je.Skin) -> Path:
+    """Write a page about the contacts that `calib.apply` followed, whole or not at all.
+
+    Args:
+        path: of the page.
+        forces: file of force maps with contacts that were followed.
+        skin: that was touched.
+
+    Raises:
+        ReportError: matplotlib is not installed.
+        SessionError, OSError: a file cannot be read or written.
+    """
+    require_matplotlib()
+    page = Path(path)
+    with open_archive(forces, FORMAT) as archive:
+        attrs, known = archive.attrs, archive.arrays
+        rows = {name: known[TRACKS + name].read() for name in ABOUT if TRACKS + name in known}
+    text = _page(rows, attrs, skin)
+    with replacing(page) as temporary:
+        temporary.write_bytes(text.encode())
+    return page
+
+
+def _page(rows: Rows, attrs: Mapping[str, Any], skin: je.Skin) -> str:
+    simulated = bool(attrs["simulated"])
+    title = f"Contacts in {attrs['session']}"
+    parts = [f"<h1>{escape(title)}</h1>"]
+    if simulated:
+        parts.append('<p class="banner" role="note"><strong>SIMULATED</strong> The recording is simulated.</p>')
+    if not rows or not len(rows["time"]):
+        parts.append("<p>No contact was followed.</p>")
+    else:
+        data = base64.b64encode(png(tracks_figure(rows, skin, simulated=simulated))).decode()
+        alt = "Paths of contacts over the sheet, and their forces over time"
+        picture = f'<img alt="{alt}" src="data:image/png;base64,{data}">'
+        parts += [f"<figure>{picture}<figcaption>{escape(CAPTION)}</figcaption></figure>", _table(rows)]
+    mark = "SIMULATED: " if simulated else ""
+    return PAGE.format(title=escape(mark + title), style=STYLE, body="\n".join(parts))
+
+
+def _table(rows: Rows) -> str:
+    """When each contact began and ended, where, and how hard it pressed at most."""
+    head = ["contact", "from, s", "to, s", "begins at, mm", "ends at, mm", "largest force, N", "speed at most, mm/s"]
+    return f"<h2>Contacts</h2>{html_table(head, {'': [_row(number, one) for number, one in by_number(rows).items()]})}"
+
+
+def _row(number: int, one: Rows) -> tuple[str, ...]:
+    time, largest = one["time"] / 1e9, int(np.argmax(one["force"]))
+    places = (", ".join(number_text(x * MM, 1) for x in one["position"][k]) for k in (0, -1))
+    return (
+        str(number),
+        number_text(time[0], 2),
+        number_text(time[-1], 2),
+        *places,
+        with_error(float(one["force"][largest]), float(one["force_se"][largest]), 2),
+        number_text(float(np.linalg.norm(one["velocity"], axis=1).max()) * MM, 0),
+    )
+
+
+def by_number(rows: Rows) -> dict[int, Rows]:
+    """The rows of each contact, by its number."""
+    numbers = dict.fromkeys(rows["number"].tolist())
+    return {number: {name: part[rows["number"] == number] for name, part in rows.items()} for number in numbers}
+
+
+def tracks_figure(rows: Rows, skin: je.Skin, *, true: Rows | None = None, simulated: bool = False) -> "Figure":
+    """Paths of contacts over the sheet, with ellipses of 90 %, and their forces over time.
+
+    Args:
+        rows: of the contacts, by the names of `ABOUT`.
+        true: time (n,) ns, position (n, contacts, 2) m and force (n, contacts) N of true contacts, drawn dashed.
+
+    Raises:
+        ReportError: matplotlib is not installed.
+    """
+    figure = new_figure(10.4, 5.4, simulated)
+    sheet, forces = figure.subplots(1, 2, width_ratios=[1, 1.25])
+    draw_sheet(sheet, skin)
+    sheet.set(xlim=sheet.get_xlim(), ylim=sheet.get_ylim())  # also where an ellipse is larger
+    if true is not None:
+        _draw_truth(sheet, forces, true)
+    for k, (number, one) in enumerate(by_number(rows).items()):
+        _draw_path(sheet, number, one, SERIES[k % len(SERIES)])
+        _draw_force(forces, number, one, SERIES[k % len(SERIES)])
+    forces.set_xlabel("time, s")
+    forces.set_ylabel("force, N")
+    forces.set_ylim(bottom=0)
+    forces.grid(alpha=0.25)
+    return figure
+
+
+def _draw_truth(sheet: Any, forces: Any, true: Rows) -> None:
+    for position, force in zip(true["position"].transpose(1, 0, 2), true["force"].T, strict=True):
+        there = np.where((force > 0)[:, None], position, np.nan) * MM
+        sheet.plot(*there.T, "--", color="black", lw=1.0, zorder=2)
+        forces.plot(true["time"] / 1e9, force, "--", color="black", lw=1.0, label="true")
+
+
+def _draw_path(axes: Any, number: int, one: Rows, colour: str) -> None:
+    thin = _thinned(len(one["time"]), MOST_POINTS)
+    place = one["position"] * MM
+    axes.plot(*place[thin].T, color=colour, lw=1.4, zorder=4)
+    axes.plot(*place[-1], "o", ms=3, color=colour, zorder=5)
+    axes.annotate(str(number), place[0], xytext=(4, 4), textcoords="offset points", color=colour, fontsize=9)
+    pressing = np.flatnonzero(one["force"] >= one["force"].max() / 2)
+    for at in pressing[_thinned(len(pressing), ELLIPSES)]:
+        axes.plot(*_ellipse(place[at], one["position_covariance"][at] * MM**2).T, color=colour, lw=0.7, alpha=0.8)
+        ends = place[at] + np.outer([-1, 1], one["half"][at] * MM)
+        axes.plot(*ends.T, color=colour, lw=2.4, alpha=0.5)
+
+
+def _ellipse(place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    scale, axes = np.linalg.eigh(covariance)
+    circle = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
+    return np.asarray(place + LARGER * INSIDE * (circle * np.sqrt(np.maximum(scale, 0))) @ axes.T)
+
+
+def _draw_force(axes: Any, number: int, one: Rows, colour: str) -> None:
+    thin = _thinned(len(one["time"]), MOST_POINTS)
+    time, force, error = (one[name][thin] for name in ("time", "force", "force_se"))
+    axes.fill_between(time / 1e9, force - 2 * error, force + 2 * error, color=colour, alpha=0.2, lw=0)
+    axes.plot(time / 1e9, force, color=colour, lw=1.3)
+    top = int(np.argmax(force))
+    axes.annotate(str(number), (time[top] / 1e9, force[top]), xytext=(0, 4), textcoords="offset points", color=colour)
+
+
+def _thinned(count: int, most: int) -> np.ndarray:
+    """At most so many of `count` rows, evenly, with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))

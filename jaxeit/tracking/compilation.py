@@ -1,0 +1,28 @@
+"""Compilation of a tracker's programs before the first frame."""
+
+import numpy as np
+
+from .tracker import Tracker, Tracking
+
+# A frame this many times as loud as noise is unexpected, whatever the contacts.
+LOUD = 30.0
+SECONDS = 0.01
+
+
+def compile_tracker(tracker: Tracker) -> None:
+    """Compile whatever the following of up to `TrackerSettings.most` contacts may need, so that no frame waits for it.
+
+    Each number of contacts has programs of its own: for an ordinary frame, and for the events that explain an
+    unexpected one. A frame that no contact explains is shown to each number of contacts, so that all of them run.
+    """
+    finder, start = tracker.filter.finder, tracker.start()
+    atoms, belief = np.asarray(finder.atoms), start.belief
+    frame = np.random.default_rng(0).normal(size=finder.readings)
+    whitened = np.asarray(tracker.filter.compress) @ frame
+    frame *= LOUD / np.sqrt(np.mean(whitened**2))
+    most, pads = tracker.settings.most, tracker.filter.sheet.pad_area.shape[1]
+    tracker.step(start, 0 * frame, SECONDS)  # without forces on pads
+    for count in range(most + 1):
+        now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count)
+        tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
+        belief = tracker._with_another(belief, atoms[count * len(atoms) // (most + 1)])
