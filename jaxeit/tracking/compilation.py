@@ -16,7 +16,7 @@ def compile_tracker(tracker: Tracker) -> None:
     unexpected one. A frame that no contact explains is shown to each number of contacts, so that all of them run.
     """
     finder, start = tracker.filter.finder, tracker.start()
-    atoms, belief = np.asarray(finder.atoms), start.belief
+    places, belief = np.asarray(finder.starts)[:, :2], start.belief
     frame = np.random.default_rng(0).normal(size=finder.readings)
     whitened = np.asarray(tracker.filter.compress) @ frame
     frame *= LOUD / np.sqrt(np.mean(whitened**2))
@@ -25,4 +25,4 @@ def compile_tracker(tracker: Tracker) -> None:
     for count in range(most + 1):
         now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count)
         tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
-        belief = tracker._with_another(belief, atoms[count * len(atoms) // (most + 1)])
+        belief = tracker.with_contact(belief, places[count * len(places) // (most + 1)])

@@ -31,7 +31,7 @@ SIZE, SEEN = 8, 6
 # An update is linear enough where a further step would lower half of chi-square by less than this.
 FALL = 1.0
 # Evaluations of an update, and of one that begins far from its end.
-STEPS, MANY_STEPS = 6, 20
+STEPS, MANY_STEPS = 6, 12
 
 SOLVER = LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=FALL)
 
@@ -175,9 +175,10 @@ def _active(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array,
     """Numbers of the belief that a frame tells of: of the contacts, the level, and the modes around contacts."""
     count = len(contacts)
     own = (SIZE * np.arange(count)[:, None] + np.arange(SEEN)).ravel()
+    known = jnp.asarray([*own, SIZE * count], jnp.int32)
     square = jnp.min(jnp.sum((tracker.places[1:, None] - contacts[None, :, :2]) ** 2, -1), 1)
     around = 1 + jax.lax.top_k(-square, min(tracker.active_modes * count, square.size))[1]
-    return jnp.concatenate([jnp.asarray(own), jnp.asarray([SIZE * count]), SIZE * count + around])
+    return jnp.concatenate([known, SIZE * count + around.astype(jnp.int32)])
 
 
 def _seen(tracker: ContactFilter, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""], Float[Array, ""]]:

@@ -5,6 +5,7 @@ first order of the readings is that of an image on a fine mesh, what is beyond i
 the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that an evaluation solves once.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,13 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import erf
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
 SHORTEST = 1e-4
+ROOT_OF_2, ROOT_OF_2PI = math.sqrt(2), math.sqrt(2 * math.pi)
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
 LENGTHS, ANGLES = (0.015, 0.03), 4
 
@@ -26,14 +28,14 @@ LENGTHS, ANGLES = (0.015, 0.03), 4
 class Near(NamedTuple):
     """What lies under and around contacts: elements (e,), their unknowns (m,), and pixels (n,).
 
-    ``own`` of elements and pixels is zero for one that also occurs before, near another contact, else one.
+    ``own`` of elements and pixels is false for one that also occurs before, near another contact.
     """
 
     elements: Int[Array, " e"]
     unknowns: Int[Array, " m"]
     pixels: Int[Array, " n"]
-    own_elements: Float[Array, " e"]
-    own_pixels: Float[Array, " n"]
+    own_elements: Bool[Array, " e"]
+    own_pixels: Bool[Array, " n"]
 
 
 class Neighbours(eqx.Module):
@@ -76,13 +78,13 @@ def _edge_number(half: Float[Array, "K 2"]) -> Int[Array, " K"]:
     return nearest
 
 
-def _once(indices: Int[Array, " e"], lists: int, size: int) -> Float[Array, " e"]:
-    """One for each index that no earlier list holds, else zero."""
+def _once(indices: Int[Array, " e"], lists: int, size: int) -> Bool[Array, " e"]:
+    """Which indices no earlier list holds."""
     rows, taken, out = indices.reshape(lists, -1), jnp.zeros(size, bool), []
     for row in rows:
         out.append(~taken[row])
         taken = taken.at[row].set(True)
-    return jnp.concatenate(out).astype(jnp.float32)
+    return jnp.concatenate(out)
 
 
 class Shown(NamedTuple):
@@ -161,10 +163,11 @@ class LoadedSheet(eqx.Module):
         """Forces on pads and their slopes (pads, a); readings of the image and their slopes (a, r)."""
         pixels, table = near.pixels, self.pixel_modes[near.pixels]
         pressure, slopes = _pressures(loads, self.pixels[pixels])
-        pressure, slopes = pressure * near.own_pixels, slopes * near.own_pixels[:, None]
+        own = near.own_pixels
+        pressure, slopes = jnp.where(own, pressure, 0), jnp.where(own[:, None], slopes, 0)
         area = self.pad_area[pixels].T
-        relative, along, by_gain = self._conducting(pressure, jnp.exp((table @ gain).astype(loads.dtype)))
-        moved = jnp.concatenate([along[:, None] * slopes, by_gain[:, None] * table[:, modes].astype(loads.dtype)], 1)
+        relative, along, by_gain = self._conducting(pressure, jnp.exp(table @ gain.astype(table.dtype)))
+        moved = jnp.concatenate([along[:, None] * slopes, by_gain[:, None] * table[:, modes]], 1)
         response = self.pixel_response[pixels]
         return (area @ pressure, area @ slopes), (relative @ response, moved.T @ response)
 
@@ -175,11 +178,11 @@ class LoadedSheet(eqx.Module):
         elements, table = near.elements, self.modes[near.elements]
         points = self.points[elements]
         pressure, slopes = _pressures(loads, points.reshape(-1, 2))
-        factor = jnp.exp((table @ gain).astype(loads.dtype))
+        factor = jnp.exp(table @ gain.astype(table.dtype))
         relative, along, by_gain = self._conducting(pressure.reshape(points.shape[:2]), factor[:, None])
-        scale = self.sigma[elements] * near.own_elements
+        scale = jnp.where(near.own_elements, self.sigma[elements], 0)
         by_load = jnp.einsum("eq,eqk->ek", along * self.weights, slopes.reshape(*points.shape[:2], -1))
-        by_mode = (by_gain @ self.weights)[:, None] * table[:, modes].astype(loads.dtype)
+        by_mode = (by_gain @ self.weights)[:, None] * table[:, modes]
         return scale * (relative @ self.weights), scale[:, None] * jnp.concatenate([by_load, by_mode], 1)
 
     def _conducting(
@@ -214,7 +217,7 @@ def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Flo
     away = points - load[:2]
     along = away @ load[4:] / half
     across = jnp.sum(away**2, -1) - along**2
-    root = np.sqrt(2.0) * width
+    root = ROOT_OF_2 * width
     spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
-    found: Array = jnp.exp(load[3] - 0.5 * across / width**2) * spread / (np.sqrt(2 * np.pi) * width)
+    found: Array = jnp.exp(load[3] - 0.5 * across / width**2) * spread / (ROOT_OF_2PI * width)
     return found

@@ -250,30 +250,29 @@ class Tracker:
         )
 
     def _events(self, now: Tracking, left: np.ndarray, seconds: float) -> Iterator[_Hypothesis]:
-        rare = float(np.log(self._settings.birth_rate * seconds))
+        rare, place = float(np.log(self._settings.birth_rate * seconds)), self._unexplained_place(left)
         if now.numbers:
             yield _Hypothesis(jumped(now.belief), now.numbers, now.edges, rare)
+            yield from _as_edge(now, int(np.argmin(_distances(now, place))), rare)
         for k in range(len(now.numbers)):
             yield _Hypothesis(without(now.belief, k), *_left_out(now, k), rare)
-            if not now.edges[k]:
-                edges = tuple(edge or j == k for j, edge in enumerate(now.edges))
-                for angle in DIRECTIONS:
-                    yield _Hypothesis(lengthened(now.belief, k, angle), now.numbers, edges, rare - np.log(4.0))
         for j, k in combinations(range(len(now.numbers)), 2):
             numbers, edges = _left_out(replace(now, edges=(*now.edges[:j], True, *now.edges[j + 1 :])), k)
             yield _Hypothesis(joined(now.belief, j, k), numbers, edges, rare)
         if len(now.numbers) < self._settings.most:
             # The prior of a place is even over the skin, that of the fit is normal about where it begins.
             even = float(np.log(2 * np.pi * PLACE**2 / self._area))
-            number = now.begun + 1
-            belief = self._with_another(now.belief, left)
-            yield _Hypothesis(belief, (*now.numbers, number), (*now.edges, False), rare + even)
+            belief = self.with_contact(now.belief, place)
+            yield _Hypothesis(belief, (*now.numbers, now.begun + 1), (*now.edges, False), rare + even)
 
-    def _with_another(self, belief: Belief, left: np.ndarray) -> Belief:
-        """With a contact where it explains most of what is left."""
+    def _unexplained_place(self, left: np.ndarray) -> np.ndarray:
+        """Where a contact would explain most of what is left, (2,) m."""
         finder = self.filter.finder
-        best = int(np.argmax(np.asarray(finder.atoms) @ left))
-        place = np.asarray(finder.starts)[best, :2]
+        place: np.ndarray = np.asarray(finder.starts)[int(np.argmax(np.asarray(finder.atoms) @ left)), :2]
+        return place
+
+    def with_contact(self, belief: Belief, place: np.ndarray) -> Belief:
+        """The belief with a contact more, that begins about a place, (2,) m."""
         row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])
         spread = np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
         return inserted(belief, row, spread)
@@ -289,6 +288,20 @@ class Tracker:
                 rest = tuple(count for j, count in enumerate(now.faint) if j != k)
                 now = replace(now, belief=without(now.belief, k), numbers=numbers, edges=edges, faint=rest)
         return now
+
+
+def _as_edge(now: Tracking, k: int, rare: float) -> Iterator[_Hypothesis]:
+    """Contact k as an edge in each of some directions, unless it is one."""
+    if not now.edges[k]:
+        edges = tuple(edge or j == k for j, edge in enumerate(now.edges))
+        for angle in DIRECTIONS:
+            prior = rare - float(np.log(len(DIRECTIONS)))
+            yield _Hypothesis(lengthened(now.belief, k, angle), now.numbers, edges, prior)
+
+
+def _distances(now: Tracking, place: np.ndarray) -> np.ndarray:
+    away = np.asarray(now.belief.contacts)[:, :2] - place
+    return np.asarray(np.linalg.norm(away, axis=1))
 
 
 def _is_ripple(now: Tracking, event: _Hypothesis, update: Update) -> bool:
