@@ -209,7 +209,7 @@ def apply(
         processing: how the session is corrected; default: as the sessions of the calibration.
         ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
             file then names the errors.
-        loads: also tell what touches the skin, none, one, two or an edge, in windows of so many s; None: do not.
+        loads: also tell what touches the skin, none, one, two, an edge or more, in windows of so many s; None: do not.
         tell: called with a line about the loads.
 
     Raises:
