@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
 import jaxeit as je
-from calib.calibration.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
 
 from .bench_images import matched

@@ -16,6 +16,7 @@ from . import (
     scan as scan,
     skin as skin,
     toml as toml,
+    tracking as tracking,
 )
 from ._compile import bind as bind, compiler_options as compiler_options, reuse_memory as reuse_memory, verb as verb
 from .accuracy import fit_fidelity as fit_fidelity, ladder as ladder

@@ -1,9 +1,9 @@
-"""Sessions without EIT in a batch: a calibration each, by `calib.calibration.logs`."""
+"""Sessions without EIT in a batch: a calibration each, by `calib.calibration.logs.procedure`."""
 
 import contextlib
 
-from ..calibration.log_calibration import LogCalibration, load_log_calibration
-from ..calibration.logs import calibrate_logs, with_batch_mark
+from ..calibration.logs.calibration import LogCalibration, load_log_calibration
+from ..calibration.logs.procedure import calibrate_logs, with_batch_mark
 from ..calibration.recipe import Recipe
 from ..session import Session, SessionError
 

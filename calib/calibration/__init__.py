@@ -4,13 +4,20 @@ from .calibration import Calibration
 from .evaluation import Evaluation
 from .files import load_calibration
 from .force_maps import ForceEstimate, apply, force_map
-from .localisation import LOCATORS, AbstractLocator, AbstractLocatorChoice, FittedContact, ImageCentroid, locate
-from .log_calibration import LogCalibration
-from .log_recalibrating import assess_log, recalibrate_log
-from .logs import apply_log, calibrate_logs, evaluate_log
+from .localisation.locators import (
+    LOCATORS,
+    AbstractLocator,
+    AbstractLocatorChoice,
+    FittedContact,
+    ImageCentroid,
+    locate,
+)
+from .logs.calibration import LogCalibration
+from .logs.procedure import apply_log, calibrate_logs, evaluate_log
+from .logs.recalibration import assess_log, recalibrate_log
 from .procedure import calibrate, evaluate
-from .recalibrating import AbstractEvidence, KnownForces, OrdinaryUse, assess, recalibrate
-from .recalibration import Recalibration
+from .recalibration.changes import Recalibration
+from .recalibration.procedure import AbstractEvidence, KnownForces, OrdinaryUse, assess, recalibrate
 from .recipe import Recipe, RecipeError
 
 __all__ = [

@@ -22,9 +22,9 @@ from ..presses.table import Processing
 from ..session import SessionError, read_archive, write_archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
-from .localisation import AbstractLocator, locate
+from .localisation.locators import AbstractLocator, locate
 from .press_examples import PressExamples
-from .recalibration import Recalibration
+from .recalibration.changes import Recalibration
 from .recipe import Recipe
 from .storage import fields_from_archive, recorded_processing, recorded_recipe, to_archive
 

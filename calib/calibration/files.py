@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from ..session.archive import archive_format
-from . import log_calibration
 from .calibration import Calibration, load_calibration as load_skin_calibration
-from .log_calibration import LogCalibration, load_log_calibration
+from .logs import calibration as log_calibration
+from .logs.calibration import LogCalibration, load_log_calibration
 
 
 def load_calibration(path: str | Path) -> Calibration | LogCalibration:

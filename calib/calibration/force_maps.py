@@ -25,8 +25,8 @@ from ..presses.streams import resample
 from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session, SessionError, Stream
 from .calibration import Calibration
-from .load_windows import WindowedFrames, fit_windows
-from .localisation import AbstractLocator
+from .localisation.load_windows import WindowedFrames, fit_windows
+from .localisation.locators import AbstractLocator
 
 FORMAT = "skin-forcemap"
 _BLOCK = 512  # frames held in memory at once

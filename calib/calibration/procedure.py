@@ -19,8 +19,8 @@ from ..session import Session, SessionError
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
+from .localisation.press_images import Imager, PressImages, prepare_imager
 from .press_examples import press_examples
-from .press_images import Imager, PressImages, prepare_imager
 from .recipe import Recipe
 from .storage import describe
 

@@ -11,7 +11,7 @@ from ..fitting.curves import AbstractCurve, Linear
 from ..fitting.fields import AbstractField
 from ..fitting.losses import AbstractLoss, SoftL1
 from ..presses.table import Processing
-from .localisation import AbstractLocatorChoice, FittedContact
+from .localisation.locators import AbstractLocatorChoice, FittedContact
 from .recipe_text import recipe_fields, recipe_to_toml
 
 

@@ -28,7 +28,7 @@ from ..fitting.losses import LOSSES
 from ..presses.corrections import BASELINES, CORRECTIONS
 from ..presses.table import Processing
 from ..presses.windows import WindowLengths
-from .localisation import LOCATORS
+from .localisation.locators import LOCATORS
 
 if TYPE_CHECKING:
     from .recipe import Recipe

@@ -23,9 +23,9 @@ from ..presses.table import Processing
 from ..session import Archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
-from .localisation import AbstractLocator, locator_from_numbers, locator_numbers
+from .localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
 from .press_examples import PressExamples
-from .recalibration import Recalibration
+from .recalibration.changes import Recalibration
 from .recipe import Recipe
 from .recipe_text import read_imaging, read_processing
 

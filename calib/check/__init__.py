@@ -1,7 +1,7 @@
 """Checks of a recording for `jaxeit check`: what is wrong, where, and what to do."""
 
 from .acceptance import RecordingError, accept
-from .reading_order import transfer_matrix
+from .eit.reading_order import transfer_matrix
 from .report import ChannelTable, CheckReport, Finding, Severity, to_json
 from .session import check_session
 from .text import render

@@ -6,7 +6,7 @@ import jaxeit as je
 
 from ..session import Session
 from ..session.errors import SessionError, printable
-from .reading_order import transfer_matrix
+from .eit.reading_order import transfer_matrix
 from .report import Finding, Severity, counted
 from .session import check_session
 

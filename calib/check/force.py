@@ -12,7 +12,7 @@ from ..session import PressTable
 from ..session.units import SECOND
 from .evidence import PressEvidence
 from .report import Finding, Severity, counted, listed
-from .streams import StreamStatistics
+from .streams.statistics import StreamStatistics
 
 WHERE = "/streams/force"
 TARGET_RATIO_RANGE = 0.5, 2.0

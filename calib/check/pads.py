@@ -10,7 +10,7 @@ from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ..presses.streams import resample
 from ..session import Stream
 from .report import Finding, PadRow, Severity, listed
-from .streams import MAX_MISSING, StreamStatistics
+from .streams.statistics import MAX_MISSING, StreamStatistics
 
 MIN_PRESSURE = 5.0  # Pa; no press is lighter, but bar and kPa recorded as Pa give such numbers
 # An array of many channels is searched for faults in so many pieces of so many samples, spread over the recording,

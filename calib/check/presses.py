@@ -8,7 +8,7 @@ from ..session import Session, SessionError
 from .evidence import PressEvidence, gather_evidence
 from .force import is_negative, negative_force
 from .report import Finding, PressSummary, Severity
-from .streams import StreamStatistics
+from .streams.statistics import StreamStatistics
 
 NAMES = ("eit", "pressure", "force")  # streams that every press needs samples of
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..presses.onsets import OnsetDelay
-from .reading_order import OrderCheck
+from .eit.reading_order import OrderCheck
 
 
 class Severity(enum.IntEnum):

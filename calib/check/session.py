@@ -9,21 +9,21 @@ import jaxeit as je
 from ..presses.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
-from .clocks import compare_clocks, lag_findings
-from .dropouts import dropout_findings
-from .eit import check_eit
+from .eit.reading_order import OrderCheck
+from .eit.readings import check_eit
 from .evidence import PressEvidence
 from .force import force_findings
 from .pads import check_pads
 from .places import place_findings
 from .presses import NAMES, list_presses, press_evidence, press_summary
-from .reading_order import OrderCheck
 from .report import ChannelTable, CheckReport, Finding, Severity
 from .responses import pad_response_findings, reading_response_findings
-from .shifts import shift_findings
 from .skin import check_skin
-from .streams import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
-from .stuck import stuck_findings
+from .streams.clocks import compare_clocks, lag_findings
+from .streams.dropouts import dropout_findings
+from .streams.shifts import shift_findings
+from .streams.statistics import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
+from .streams.stuck import stuck_findings
 
 
 def check_session(

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import jaxeit as je
 
 from ..calibration import Recipe
-from ..calibration.localisation import LOCATORS
+from ..calibration.localisation.locators import LOCATORS
 from ..calibration.recipe_text import (
     AUTO,
     LEVELS,

@@ -19,7 +19,7 @@ import jaxeit as je
 
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of
-from ..calibration.localisation import ContactLocator
+from ..calibration.localisation.locators import ContactLocator
 from ..fitting.curves.play_operators import remembered
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere

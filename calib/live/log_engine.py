@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from ..calibration.log_calibration import LogCalibration
+from ..calibration.logs.calibration import LogCalibration
 from ..fitting.logs import LogPrediction
 from .engine import ReceivedFrame
 from .results import LogResult

@@ -16,7 +16,7 @@ from typing import cast
 import numpy as np
 
 from ..calibration.calibration import Calibration
-from ..calibration.log_calibration import LogCalibration
+from ..calibration.logs.calibration import LogCalibration
 from ..record.intake import NullSink, RecordSink, explain_silence
 from ..record.plan import RecordingPlan, StreamPlan
 from ..record.priority import real_time

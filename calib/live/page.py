@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibration import Calibration
-from ..calibration.log_calibration import LogCalibration
+from ..calibration.logs.calibration import LogCalibration
 from .loop import LiveControl
 from .results import Result
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..calibration.calibration import Calibration
-from ..calibration.log_calibration import LogCalibration
+from ..calibration.logs.calibration import LogCalibration
 from ..record.broadcast import Broadcaster
 from ..record.plan import RecordingPlan
 from ..record.recorder import session_journal

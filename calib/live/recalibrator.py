@@ -17,9 +17,10 @@ import numpy as np
 
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw
-from ..calibration.ordinary_use import loaded_pressures
-from ..calibration.press_noise import press_noise
-from ..calibration.recalibrating import (
+from ..calibration.recalibration.changes import Evidence, Recalibration
+from ..calibration.recalibration.ordinary_use import loaded_pressures
+from ..calibration.recalibration.press_noise import press_noise
+from ..calibration.recalibration.procedure import (
     SeenContacts,
     contact_loads,
     gain_prior,
@@ -29,7 +30,6 @@ from ..calibration.recalibrating import (
     seen_contacts,
     update_from_use,
 )
-from ..calibration.recalibration import Evidence, Recalibration
 from ..fitting.gain_update import GainDrift, GainUpdate
 from ..fitting.pad_gains import PadGains
 

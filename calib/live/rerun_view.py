@@ -14,7 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ..calibration.calibration import Calibration
-from ..calibration.log_calibration import LogCalibration
+from ..calibration.logs.calibration import LogCalibration
 from .loop import LiveControl
 from .results import FrameResult, Result, TouchEstimates
 

@@ -10,7 +10,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from ..session.guard import MAX_ATTRIBUTE_BYTES
+from ..session.hdf5.guard import MAX_ATTRIBUTE_BYTES
 from .journal.file import JournalError
 from .wire.messages import Layout
 

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ..calibration.log_calibration import LogCalibration
-from ..calibration.log_evaluation import THIRDS, LogEvaluation
+from ..calibration.logs.calibration import LogCalibration
+from ..calibration.logs.evaluation import THIRDS, LogEvaluation
 from ..session import replacing
 from .figures import png, require_matplotlib
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text

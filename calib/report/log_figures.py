@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.log_evaluation import LogEvaluation
+from ..calibration.logs.evaluation import LogEvaluation
 from ..fitting.fields import FittedField
 from .figures import BLUE, GREY, MM, RED, cell_edges, label_y_once
 from .pad_figures import pad_gain, symmetric_limit

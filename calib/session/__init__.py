@@ -7,8 +7,8 @@
 from .archive import Archive, ArchiveReader, ArchiveWriter, open_archive, read_archive, write_archive
 from .errors import SessionError
 from .facts import SessionFacts, StreamFacts
+from .hdf5.storage import file_hash, replacing
 from .reader import Session, open_session
-from .storage import file_hash, replacing
 from .stream import Stream
 from .tables import ClockTable, Events, PressTable, Status
 from .writer import SessionWriter

@@ -19,11 +19,10 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxeit.budget import OR_RAISE, current_budget
 
-from .chunks import MAX_RANK, GuardedArray
 from .errors import printable, problem
-from .guard import Node, open_guarded, root_node, translated
-from .reader import check_version
-from .storage import (
+from .hdf5.chunks import MAX_RANK, GuardedArray
+from .hdf5.guard import Node, open_guarded, root_node, translated
+from .hdf5.storage import (
     DIMENSION_NAME,
     AttributeValue,
     FileWriter,
@@ -34,6 +33,7 @@ from .storage import (
     put_attributes,
     text_array,
 )
+from .reader import check_version
 from .tables import FORMAT
 
 ARCHIVE_VERSION = "1.0"

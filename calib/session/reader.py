@@ -10,11 +10,11 @@ from types import MappingProxyType
 import h5py
 import numpy as np
 
-from .chunks import GuardedArray
 from .errors import SessionError, printable, problem
-from .guard import Node, open_guarded, root_node
-from .members import SCHEMA, column, declared_unit, required, small_array
-from .storage import file_hash
+from .hdf5.chunks import GuardedArray
+from .hdf5.guard import Node, open_guarded, root_node
+from .hdf5.members import SCHEMA, column, declared_unit, required, small_array
+from .hdf5.storage import file_hash
 from .stream import Stream
 from .tables import CLOCK_ATTRIBUTES, FORMAT, PRESS_COLUMNS, ClockTable, Events, PressTable
 from .units import Unit

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .chunks import GuardedArray
-from .guard import Node
-from .members import declared_unit, required
+from .hdf5.chunks import GuardedArray
+from .hdf5.guard import Node
+from .hdf5.members import declared_unit, required
 from .tables import STREAM_EXTRAS
 
 LARGEST_VALUE = 1e18

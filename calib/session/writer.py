@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from calib.session.errors import SessionError, printable, problem
 from calib.session.facts import SessionFacts, StreamFacts
-from calib.session.storage import (
+from calib.session.hdf5.storage import (
     AttributeValue,
     FileWriter,
     GrowingArray,

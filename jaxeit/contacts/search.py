@@ -131,12 +131,18 @@ class ContactFinder(eqx.Module):
     def frame(self, dv: Float[Array, " readings"]) -> Contacts:
         """The contacts in one frame."""
         there = jnp.isfinite(dv) & self.whitening.channels
-        whole = jnp.all(there == self.whitening.channels)
-        seen = jax.lax.cond(whole, lambda dv: self._complete_frame(dv), lambda dv: self._incomplete_frame(dv), dv)
+        seen, whole = self.compressed(dv)
         bumps = self.bumps(seen.root, whole)
         search = _Search(self, bumps, seen.y)
         found = jax.lax.stop_gradient(search).contacts()  # derivatives: see `Bumps.sensitive`
         return self._contacts(bumps, seen, found, jnp.any(there))
+
+    def compressed(self, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""]]:
+        """A frame as it is searched, and whether no reading that is used is missing."""
+        channels = self.whitening.channels
+        whole = jnp.all((jnp.isfinite(dv) & channels) == channels)
+        seen = jax.lax.cond(whole, lambda dv: self._complete_frame(dv), lambda dv: self._incomplete_frame(dv), dv)
+        return seen, whole
 
     def _complete_frame(self, dv: Float[Array, " readings"]) -> Frame:
         sums = self.whitening.sums(dv)

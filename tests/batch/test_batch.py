@@ -17,7 +17,7 @@ import calib
 import calib.batch.sessions as batch
 import jaxeit as je
 from calib.batch import cluster
-from calib.calibration.logs import curves_of
+from calib.calibration.logs.procedure import curves_of
 from calib.calibration.recipe_text import curve_choice
 from calib.cli import main
 from calib.runtime import settings, take_over

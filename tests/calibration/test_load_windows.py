@@ -6,7 +6,7 @@ import pytest
 import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
-from calib.calibration.load_windows import WindowedFrames
+from calib.calibration.localisation.load_windows import WindowedFrames
 from calib.cli import main
 
 from ..place_logs import place_log, write_place_log

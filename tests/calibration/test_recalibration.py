@@ -10,13 +10,13 @@ import pytest
 
 import calib
 from calib.calibration import KnownForces, OrdinaryUse, assess
-from calib.calibration.ordinary_use import loaded_pressures, quiet_range, zero_and_loads
-from calib.calibration.press_noise import press_noise
-from calib.calibration.recalibrating import LoadedPads, contact_loads, recorded, rest_levels
-from calib.calibration.recalibration import Advice, Evidence, render
+from calib.calibration.recalibration.changes import Advice, Evidence, render
+from calib.calibration.recalibration.image_reference import fit_reference
+from calib.calibration.recalibration.ordinary_use import loaded_pressures, quiet_range, zero_and_loads
+from calib.calibration.recalibration.press_noise import press_noise
+from calib.calibration.recalibration.procedure import LoadedPads, contact_loads, recorded, rest_levels
 from calib.cli import main
 from calib.fitting.gain_update import GainDrift, GainPrior, GainUpdate, relative, update_gains
-from calib.fitting.image_reference import fit_reference
 from calib.fitting.pad_gains import PadGains
 from calib.fitting.pads import PadModel
 from calib.live.engine import Engine, ReceivedFrame

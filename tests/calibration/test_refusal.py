@@ -12,7 +12,7 @@ import calib
 import jaxeit as je
 from calib.batch.sessions import calibrate_many
 from calib.bench import Bench, Timing, simulate
-from calib.calibration import logs
+from calib.calibration.logs import procedure as logs
 from calib.check import RecordingError
 from calib.cli import main
 from calib.fitting import held_out, selection

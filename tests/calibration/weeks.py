@@ -12,7 +12,7 @@ import numpy as np
 import jaxeit as je
 from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation, centre_of
-from calib.calibration.press_images import Imager
+from calib.calibration.localisation.press_images import Imager
 from calib.fitting.curves import FittedCurve, Linear
 from calib.session import PressTable, SessionFacts, SessionWriter, StreamFacts
 

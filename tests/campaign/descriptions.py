@@ -12,7 +12,7 @@ import calib
 import jaxeit as je
 from calib.bench import load_bench
 from calib.check import transfer_matrix
-from calib.check.reading_order import predict_readings
+from calib.check.eit.reading_order import predict_readings
 
 from .honest import Honest
 from .telling import Verdict, judged, same, tell

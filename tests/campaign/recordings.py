@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.check.reading_order import predict_readings
+from calib.check.eit.reading_order import predict_readings
 from tests.check import test_lies as lies
 from tests.check.recording import SECOND, Recording
 

@@ -11,7 +11,7 @@ import pytest
 import calib.check.pads
 import jaxeit as je
 from calib.check import Severity, check_session, render, to_json, transfer_matrix
-from calib.check.reading_order import predict_readings
+from calib.check.eit.reading_order import predict_readings
 from calib.session import PressTable, SessionFacts, SessionWriter, Status, StreamFacts, open_session
 from jaxeit.linalg import Dense
 

@@ -10,7 +10,7 @@ import pytest
 import jaxeit as je
 from calib.bench import simulate
 from calib.check import Severity, check_session, render, transfer_matrix
-from calib.check.reading_order import predict_readings
+from calib.check.eit.reading_order import predict_readings
 from calib.session import StreamFacts, open_session
 
 from .honest import sixteen_presses

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.check import Severity, check_session
-from calib.check.shifts import column_shift
+from calib.check.streams.shifts import column_shift
 from calib.session import SessionFacts, StreamFacts, open_session
 
 from .recording import SECOND, Recording, Samples

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.cli import main
-from calib.session import storage
+from calib.session.hdf5 import storage
 from tests.record.test_full_disk import SCENE
 from tests.record.test_recorder import both, journal
 

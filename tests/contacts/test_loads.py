@@ -7,7 +7,7 @@ import pytest
 
 import jaxeit as je
 from benchmarks.problems import pressed
-from calib.calibration.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
 from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import MOST, SIZE, Form, elongations, line, pressure, shape_directions, spot

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calib.calibration.localisation import ImageCentroid
+from calib.calibration.localisation.locators import ImageCentroid
 from calib.fitting.fields import (
     FittedField,
     PadEdge,

@@ -161,7 +161,7 @@ def test_times_that_stand_still_are_refused_after_their_first_block(good, tmp_pa
 def test_what_is_beyond_the_budget_is_not_allocated(good, tmp_path, monkeypatch):
     path = make(tmp_path / "s.h5", 400)
     with open_session(path) as session:
-        monkeypatch.setattr("calib.session.chunks.GuardedArray._gather", None)  # nothing is read
+        monkeypatch.setattr("calib.session.hdf5.chunks.GuardedArray._gather", None)  # nothing is read
         monkeypatch.setenv("JAXEIT_BUDGET", "1e-6")
         with pytest.raises(SessionError) as caught:
             _ = session.streams["eit"].time

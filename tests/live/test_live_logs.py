@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.calibration.logs import calibrate_logs
+from calib.calibration.logs.procedure import calibrate_logs
 from calib.cli import main
 from calib.fitting.curves import AffinePlay, Linear, MonotonePolynomial
 from calib.fitting.fields import GaussianProcess

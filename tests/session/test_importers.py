@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from calib.calibration.logs import calibrate_logs, render_log
+from calib.calibration.logs.procedure import calibrate_logs, render_log
 from calib.cli import main
 from calib.session import SessionError, Status, file_hash, importers, open_session
 from calib.session.importers import About, CsvImporter, ImportReport, add_arguments, import_csv, run

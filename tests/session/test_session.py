@@ -34,7 +34,7 @@ from calib.session import (
     read_archive,
     write_archive,
 )
-from calib.session.chunks import checksum_holds
+from calib.session.hdf5.chunks import checksum_holds
 
 EPOCH = datetime(2025, 1, 1, 12, tzinfo=UTC)
 PATTERN = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 0]])

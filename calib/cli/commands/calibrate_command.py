@@ -130,8 +130,8 @@ _NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "low_pass", *IM
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
     """Fit one model to sessions without EIT; it is evaluated on their second halves and on the test sessions."""
-    from ...calibration.log_evaluation import render_evaluation
-    from ...calibration.logs import calibrate_logs, evaluate_log, render_log
+    from ...calibration.logs.evaluation import render_evaluation
+    from ...calibration.logs.procedure import calibrate_logs, evaluate_log, render_log
     from ...session import open_session
 
     given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, [], NONE)]

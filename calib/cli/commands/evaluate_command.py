@@ -50,8 +50,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _evaluate_logs(args: argparse.Namespace, calibration: "LogCalibration") -> int:
     """Evaluate the calibration of a sensor without EIT on logs."""
-    from ...calibration.log_evaluation import render_evaluation
-    from ...calibration.logs import evaluate_log
+    from ...calibration.logs.evaluation import render_evaluation
+    from ...calibration.logs.procedure import evaluate_log
     from ...session import open_session
 
     refuse_low_pass(args)

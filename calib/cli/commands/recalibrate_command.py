@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     set_up()
     from ...calibration import KnownForces, LogCalibration, OrdinaryUse, load_calibration, recalibrate
-    from ...calibration.recalibration import render
+    from ...calibration.recalibration.changes import render
     from ...fitting.gain_update import GainDrift
     from ...session import open_session
 
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
 def _recalibrate_log(args: argparse.Namespace, calibration: "LogCalibration", drift: "GainDrift") -> int:
     """Write the moved calibration of a log, and print what has changed."""
     from ...calibration import recalibrate_log
-    from ...calibration.log_recalibration import render_shift
+    from ...calibration.logs.shift import render_shift
     from ...session import open_session
 
     if args.evidence == "use":

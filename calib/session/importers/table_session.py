@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import SessionError, printable, problem
 from ..facts import SessionFacts, StreamFacts
-from ..storage import file_hash
+from ..hdf5.storage import file_hash
 from ..tables import Status
 from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT
 from ..writer import SessionWriter

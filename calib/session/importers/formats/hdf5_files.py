@@ -16,8 +16,7 @@ import h5py
 import numpy as np
 
 from ...errors import printable, problem
-from ...reader import Session, open_session
-from ...storage import (
+from ...hdf5.storage import (
     AttributeValue,
     make_array,
     make_dataset,
@@ -28,6 +27,7 @@ from ...storage import (
     text_array,
     writing,
 )
+from ...reader import Session, open_session
 from ...tables import FORMAT, STREAM_EXTRAS
 from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape
 from ..base import About

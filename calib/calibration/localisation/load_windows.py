@@ -1,0 +1,161 @@
+"""Loads over time: what touches the skin in short windows of a session, by `jaxeit.contacts.prepare_loads`.
+
+Frames are averaged over windows during which a pad is loaded. The untouched sheet is that of the session's own frames
+without contact, and the noise is theirs, so that the fit knows the coat as it is on that day. How much force there is,
+the pads tell; the fit divides it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+import jaxeit as je
+from jaxeit.contacts import LoadKind, Loads
+
+from ...presses.streams import finite_mean
+from ..calibration import Calibration
+from .press_images import fit_untouched_sheet
+
+# The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
+FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
+MOST = 3  # loads of a window
+MIN_QUIET = 8  # frames without contact, fewer do not tell the noise
+MAX_WINDOW_FRAMES = 4096  # of a window, so that memory stays bounded
+
+
+class Window(NamedTuple):
+    """Means over a window: begin and end (ns), change of the frames (readings,) V, force on the pads N, and frames."""
+
+    begin: int
+    end: int
+    frame: Float[np.ndarray, " readings"]
+    force: float
+    frames: int
+
+
+class WindowedFrames:
+    """Collects windows of touched frames, and mean and variance of the frames without contact, block by block."""
+
+    def __init__(self, seconds: float, readings: int):
+        self._length = round(1e9 * seconds)
+        self.windows: list[Window] = []
+        self._open: list[tuple[int, np.ndarray, float]] = []
+        self._quiet, self._level = 0, np.zeros(readings)
+        self._square = np.zeros(readings)
+
+    def add(
+        self, time: np.ndarray, frames: np.ndarray, change: np.ndarray, loaded: np.ndarray, force: np.ndarray
+    ) -> None:
+        """Frames (n, readings) V, their change, which are touched (n,), and the force on all pads (n,) N."""
+        rest = ~loaded & np.isfinite(change).all(1)
+        self._quiet += int(rest.sum())
+        self._level += frames[rest].sum(0)
+        self._square += (change[rest] ** 2).sum(0)
+        for row in range(len(time)):
+            if not loaded[row] or (self._open and time[row] - self._open[0][0] >= self._length):
+                self.close()
+            if loaded[row] and len(self._open) < MAX_WINDOW_FRAMES:
+                self._open.append((int(time[row]), change[row], float(force[row])))
+
+    def close(self) -> None:
+        """End the window that is open, if it is at least half as long as asked for."""
+        if self._open and self._open[-1][0] - self._open[0][0] >= self._length / 2 - 1:
+            time, change, force = zip(*self._open, strict=True)
+            self.windows.append(
+                Window(time[0], time[-1], finite_mean(np.stack(change)), float(np.mean(force)), len(time))
+            )
+        self._open = []
+
+    @property
+    def untouched(self) -> Float[np.ndarray, " readings"]:
+        """Mean frame without contact, V."""
+        return self._level / max(self._quiet, 1)
+
+    @property
+    def noise(self) -> Float[np.ndarray, " readings"] | None:
+        """Standard deviation of a reading without contact, V; None if there are too few frames."""
+        return np.sqrt(self._square / self._quiet) if self._quiet >= MIN_QUIET else None
+
+
+@dataclass(frozen=True)
+class SeenLoads:
+    """Loads of all windows, as arrays of a file; and why there are none."""
+
+    arrays: dict[str, tuple[Any, str, str]]
+    kinds: tuple[LoadKind, ...]
+    why_none: str = ""
+
+    def render(self) -> str:
+        """What touched the skin, in one line."""
+        if self.why_none:
+            return f"loads: none fitted: {self.why_none}"
+        counts = ((kind.name.lower(), self.kinds.count(kind)) for kind in LoadKind)
+        return f"loads of {len(self.kinds)} windows: " + ", ".join(f"{count} {name}" for name, count in counts if count)
+
+
+def fit_windows(calibration: Calibration, seen: WindowedFrames, progress: Any = iter) -> SeenLoads:
+    """Fit loads to each window."""
+    noise = seen.noise
+    if noise is None or not seen.windows:
+        why = "no frames without contact tell the noise" if noise is None else "nothing touches the skin for that long"
+        return SeenLoads({}, (), why)
+    sound = np.isfinite([window.frame for window in seen.windows]).all(0)
+    channels = np.asarray(calibration.recon.channels) & (noise > 0) & sound
+    model = je.discretise(je.Scene(calibration.skin), FIDELITY)
+    sheet, _ = fit_untouched_sheet(model, seen.untouched, channels)
+    of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
+    finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
+    fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels)
+    found = [_seen(fitter, finder, window, channels) for window in progress(seen.windows)]
+    return SeenLoads(_arrays(seen.windows, found), tuple(one.kind for one in found))
+
+
+def _seen(fitter: je.contacts.LoadFitter, finder: je.ContactFinder, window: Window, channels: np.ndarray) -> Loads:
+    frame = np.where(channels, window.frame, 0.0)
+    return fitter(frame, finder(frame))
+
+
+def _arrays(windows: list[Window], found: list[Loads]) -> dict[str, tuple[Any, str, str]]:
+    rows = [dict(_row(window, one)) for window, one in zip(windows, found, strict=True)]
+    columns = {name: np.stack([row[name] for row in rows]) for name in ABOUT}
+    return {f"loads/{name}": (columns[name], *about) for name, about in ABOUT.items()}
+
+
+ABOUT = {
+    "time": ("ns", "begin and end of each window, since time_epoch_utc"),
+    "probability": ("1", "of none, one, two, an edge and more"),
+    "position": ("m", "of each load of the most probable kind; of an edge, its middle; NaN: none"),
+    "position_covariance": ("m2", "of each position"),
+    "ends": ("m", "both ends of an edge; NaN: no edge"),
+    "ends_covariance": ("m2", "of x and y of the first end and of the second"),
+    "width": ("m", "standard deviation of each load, across an edge"),
+    "force": ("N", "of each load: its share, by the fit, of what the pads tell"),
+}
+
+
+EMPTY = {
+    "position": (MOST, 2),
+    "position_covariance": (MOST, 2, 2),
+    "ends": (2, 2),
+    "ends_covariance": (4, 4),
+    "width": (MOST,),
+    "force": (MOST,),
+}
+
+
+def _row(window: Window, found: Loads) -> Iterator[tuple[str, np.ndarray]]:
+    yield "time", np.array([window.begin, window.end])
+    yield "probability", np.asarray(found.probability)
+    out = {name: np.full(shape, np.nan) for name, shape in EMPTY.items()}
+    best = found.best
+    if best is not None:
+        count = len(best.force)
+        out["position"][:count], out["width"][:count] = best.position, best.width
+        out["force"][:count] = window.force * np.asarray(best.force / best.force.sum())
+        out["position_covariance"][:count] = best.position_covariance
+    if best is not None and found.kind is LoadKind.EDGE:
+        out["ends"][:], out["ends_covariance"][:] = best.ends, best.ends_covariance
+    yield from out.items()

@@ -1,0 +1,215 @@
+"""Estimators of the places of contacts in a frame, from its EIT readings alone.
+
+A choice of estimator (`FittedContact`, `ImageCentroid`) is prepared with a model. The result is a locator, which needs
+neither mesh nor solver.
+"""
+
+import abc
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, get_type_hints
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+import jaxeit as je
+from jaxeit.registry import Registry
+
+from ...fitting.fields import Places, single_places
+
+
+class AbstractLocator(eqx.Module):
+    """Estimates the `Places` of the contacts in frames."""
+
+    @abc.abstractmethod
+    def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+        """Places of difference frames (n, readings) V with their images (n, pixels) S."""
+
+    @property
+    def contacts(self) -> int:
+        """Largest number of contacts that the locator finds in a frame."""
+        return 1
+
+    def single(self) -> "AbstractLocator":
+        """The same locator for frames that hold exactly one contact, as presses on a bench do."""
+        return self
+
+
+class CentroidLocator(AbstractLocator):
+    """One contact per frame, at the position that an estimator of `jaxeit.metrics.ESTIMATORS` gives."""
+
+    estimator: str = eqx.field(static=True)
+
+    def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+        return single_places(je.metrics.ESTIMATORS[self.estimator](image, recon), masks.weights.shape[0])
+
+
+class ContactLocator(AbstractLocator):
+    """Contacts fitted to the readings; contacts on a pad are weighted by the integrals of their bumps over its mask."""
+
+    finder: je.ContactFinder
+
+    @property
+    def contacts(self) -> int:
+        return self.finder.most
+
+    def single(self) -> "ContactLocator":
+        return ContactLocator(replace(self.finder, most=1))
+
+    def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+        return self.placed(self.finder(dv), recon, masks)
+
+    def placed(self, found: je.Contacts, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+        """Convert fitted contacts to `Places`; position and width of absent contacts are NaN."""
+        position = jnp.where(found.present[..., None], found.position, jnp.nan)
+        width = jnp.where(found.present, found.width, jnp.nan)
+        if self.finder.most == 1:
+            return single_places(position[:, 0], masks.weights.shape[0], width[:, 0], found.amplitude[:, 0])
+        shares = je.fusion.contact_shares(position, width, found.amplitude, recon.centres, masks)
+        return Places(position, shares.share, width, found.amplitude)
+
+
+@je.verb
+def _located(
+    locator: AbstractLocator, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks
+) -> Places:
+    return locator(dv, image, recon, masks)
+
+
+class AbstractLocatorChoice(abc.ABC):
+    """Choice of an estimator of the place of a contact. `looks_through_sheet`: whether `prepare` uses `sigma`."""
+
+    looks_through_sheet: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def prepare(
+        self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
+    ) -> AbstractLocator:
+        """Prepare the locator for a model.
+
+        Args:
+            noise: standard deviation of the readings of a frame, (readings,) V.
+            channels: which readings are used, (readings,) bool.
+            sigma: conductivity of the untouched sheet, (elements,) S; default: uniform.
+        """
+
+
+@dataclass(frozen=True)
+class ImageCentroid(AbstractLocatorChoice):
+    """A named estimator of the image: quick to prepare; "half" has a mean error of 5 mm on the simulated testbed.
+
+    Raises: `ValueError` for a name that is not in `jaxeit.metrics.ESTIMATORS`.
+    """
+
+    looks_through_sheet: ClassVar[bool] = False
+
+    estimator: str = "half"
+
+    def __post_init__(self) -> None:
+        if self.estimator not in je.metrics.ESTIMATORS:
+            raise ValueError(f"no estimator {self.estimator!r}; there are: {', '.join(je.metrics.ESTIMATORS)}")
+
+    def prepare(
+        self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
+    ) -> CentroidLocator:
+        return CentroidLocator(self.estimator)
+
+
+@dataclass(frozen=True)
+class FittedContact(AbstractLocatorChoice):
+    """Contacts fitted through the forward map (`jaxeit.prepare_contacts`), with the sheet of the untouched frames.
+
+    | meaning                                                              | default    | unit |
+    |----------------------------------------------------------------------|------------|------|
+    | most: largest number of contacts per frame; 1 for presses of a bench | 2          |      |
+    | columns: nodes of the table along x                                  | 31         |      |
+    | widths: smallest and largest standard deviation of a contact         | 0.006, 0.03 | m   |
+    """
+
+    most: int = 2
+    columns: int = 31
+    widths: tuple[float, float] = (0.006, 0.03)
+
+    def prepare(
+        self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
+    ) -> ContactLocator:
+        settings = je.contacts.ContactSettings(most=self.most, widths=self.widths, columns=self.columns)
+        finder = je.prepare_contacts(model, settings, noise=noise, sigma=sigma, channels=channels)
+        return ContactLocator(jax.tree.map(_rounded, finder))
+
+
+LOCATORS = Registry(AbstractLocatorChoice, "locator", "calib.locators")
+"""Choices of locator by the names that the command line and recipes use."""
+
+
+# Arrays of at least this many numbers are stored in single precision. Only the table of a contact finder is so large,
+# and it makes up most of a calibration file.
+_SINGLE_PRECISION_SIZE = 1 << 18
+
+
+def _rounded(leaf: Array) -> Array:
+    """Round large tables to single precision, as they are stored, so that a loaded calibration gives equal numbers."""
+    single = leaf.ndim > 0 and leaf.size >= _SINGLE_PRECISION_SIZE and jnp.issubdtype(leaf.dtype, jnp.floating)
+    return leaf.astype(jnp.float32).astype(leaf.dtype) if single else leaf
+
+
+def locate(
+    locator: AbstractLocator,
+    dv: ArrayLike,
+    recon: je.imaging.AbstractReconstructor,
+    masks: je.PadMasks,
+    image: Array | None = None,
+) -> Places:
+    """`Places` of the contacts in difference frames (n, readings) V.
+
+    `image`: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
+    """
+    frames = jnp.asarray(dv, recon.dtype)
+    return _located(locator, frames, recon(frames) if image is None else image, recon, masks)
+
+
+# --- as numbers, for the calibration file ----------------------------------------------------------------------------
+
+
+def locator_numbers(locator: AbstractLocator) -> dict[str, np.ndarray]:
+    """Every array and setting of a locator, by its path of field names joined by hyphens."""
+    if isinstance(locator, CentroidLocator):
+        return {"estimator": np.array([locator.estimator])}
+    return dict(_numbers(locator))
+
+
+def _numbers(module: eqx.Module, at: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    for part in fields(module):
+        value = getattr(module, part.name)
+        if isinstance(value, eqx.Module):
+            yield from _numbers(value, f"{at}{part.name}-")
+        else:
+            array = np.asarray(value)
+            large = array.dtype == np.float64 and array.size >= _SINGLE_PRECISION_SIZE
+            yield at + part.name, array.astype(np.float32) if large else array
+
+
+def locator_from_numbers(numbers: dict[str, np.ndarray], dtype: Any) -> AbstractLocator:
+    """The locator that `locator_numbers` described; raises KeyError for a missing array."""
+    if "estimator" in numbers:
+        return CentroidLocator(str(numbers["estimator"][0]))
+    locator: ContactLocator = _module(ContactLocator, numbers, "", dtype)
+    return locator
+
+
+def _module(kind: type, numbers: dict[str, np.ndarray], at: str, dtype: Any) -> Any:
+    hints, parts = get_type_hints(kind), {}
+    for part in fields(kind):
+        hint = hints[part.name]
+        if isinstance(hint, type) and issubclass(hint, eqx.Module):
+            parts[part.name] = _module(hint, numbers, f"{at}{part.name}-", dtype)
+        elif hint is int:
+            parts[part.name] = int(numbers[at + part.name])
+        else:
+            array = numbers[at + part.name]
+            parts[part.name] = jnp.asarray(array, dtype if array.dtype.kind == "f" else None)
+    return kind(**parts)

@@ -1,0 +1,100 @@
+"""Images of the frames of presses, and the places of the presses estimated from these frames."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+
+from ...fitting.fields import Places
+from ...presses.pooled import PooledPresses
+from ..recipe import Recipe
+from .locators import AbstractLocator, AbstractLocatorChoice, locate
+
+
+class PressImages(NamedTuple):
+    """Images of presses, with estimated places.
+
+    | meaning                                                       | shape                | unit  |
+    |---------------------------------------------------------------|----------------------|-------|
+    | image                                                         | (presses, pixels)    | S     |
+    | integral of the image over the sheet                          | (presses,)           | S m^2 |
+    | estimated: positions by each named estimator of the image     | (presses, 2) each    | m     |
+    | places estimated by the locator; None: without a locator      |                      |       |
+    """
+
+    image: np.ndarray
+    integral: np.ndarray
+    estimated: dict[str, np.ndarray]
+    places: Places | None
+
+
+@dataclass(frozen=True, eq=False)
+class Imager:
+    """Computes images and places from frames, prepared for one skin.
+
+    | meaning                                                              |
+    |----------------------------------------------------------------------|
+    | recon: frames to images                                              |
+    | masks: which pad carries which pixel                                 |
+    | locator: estimator of places; None: no place is needed               |
+    | notes: remarks for the reader of the results                         |
+    """
+
+    recon: je.Reconstructor | je.imaging.IterativeReconstructor
+    masks: je.PadMasks
+    locator: AbstractLocator | None = None
+    notes: tuple[str, ...] = ()
+
+    def presses(self, dv: np.ndarray) -> PressImages:
+        """Images of presses (presses, readings) V, each of which holds one contact."""
+        recon = self.recon
+        image = recon(jnp.asarray(dv, recon.dtype))
+        estimated = {n: np.asarray(e(image, recon), float) for n, e in je.metrics.ESTIMATORS.items()}
+        places = None
+        if self.locator is not None:
+            places = locate(self.locator.single(), dv, recon, self.masks, image)
+            estimated["fitted"] = np.asarray(places.position[:, 0], float)
+        integral = np.asarray(je.metrics.image_sum(image, recon.areas), float)
+        return PressImages(np.asarray(image), integral, estimated, places)
+
+
+def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Imager:
+    """The imager of a recipe, prepared with channels, noise and untouched frames of the presses.
+
+    Raises:
+        InverseError, HyperparameterError: if no image can be made with these choices.
+    """
+    imaging = recipe.imaging
+    model = je.discretise(je.Scene(skin), recipe.fidelity)
+    recon = imaging.prepare(
+        model,
+        quiet=presses.quiet_frames(recipe.processing) if imaging.noise.needs_frames else None,
+        frames=presses.dv,
+        channels=presses.channels,
+    )
+    masks = je.pad_masks(skin, recon)
+    if not recipe.locates:
+        return Imager(recon, masks)
+    locator, note = _prepare_locator(recipe.locator, model, presses)
+    return Imager(recon, masks, locator, (note,) if note else ())
+
+
+def _prepare_locator(
+    choice: AbstractLocatorChoice, model: je.Model, presses: PooledPresses
+) -> tuple[AbstractLocator, str]:
+    """The locator, prepared with the sheet of the untouched frames, and a note if a uniform sheet was assumed."""
+    sigma, note = None, ""
+    if choice.looks_through_sheet:
+        sigma, note = fit_untouched_sheet(model, presses.untouched, presses.channels)
+    return choice.prepare(model, presses.noise, presses.channels, sigma), note
+
+
+def fit_untouched_sheet(model: je.Model, untouched: np.ndarray, channels: np.ndarray) -> tuple[Any, str]:
+    """Conductivity of the untouched sheet (elements,) S; or None, and a note that a uniform sheet is assumed."""
+    try:
+        return je.fit_background(model, np.where(channels, untouched, np.nan)), ""
+    except je.imaging.InverseError as error:
+        return None, f"contacts are placed on an even sheet, as the untouched frame shows none that fits: {error}"

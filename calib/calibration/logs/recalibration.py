@@ -1,0 +1,76 @@
+"""Recalibration of a log's calibration from a log with known force; see `shift`."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...check.acceptance import accept
+from ...fitting.gain_update import GainDrift
+from ...fitting.logs import series_of
+from ...session import Session, SessionError
+from .calibration import LogCalibration
+from .procedure import log_of, place_of, stream_of
+from .shift import LogShift, fit_shift, full_scale_of, shift_prior
+
+
+def assess_log(
+    calibration: LogCalibration, session: Session, drift: GainDrift | None = None, *, ignore_errors: bool = False
+) -> LogShift:
+    """How far a log with known force is off a calibration; arguments and errors as for `recalibrate_log`."""
+    signal = stream_of(calibration, session)
+    ignored = accept([session], None, ignore_errors=ignore_errors)
+    places = [place_of(session, session.stream("force").time)] if calibration.needs_place else None
+    series = series_of([log_of(session)], places=places)
+    found = replace(calibration, shift=None).predict(series.time, series.values, series.place)
+    used = series.complete & found.valid
+    scale = full_scale_of(calibration.model)
+    moved = shift_prior(calibration.shift, scale, drift or GainDrift())
+    try:
+        fit = fit_shift(
+            series.force[used], found.force[used], found.standard_error[used], series.blocks(used)[used], moved
+        )
+    except ValueError as error:
+        raise SessionError(f"{session.name}: /streams/{signal.name}: {error}") from None
+    outside = int((series.complete & ~found.valid).sum())
+    notes = [f"{outside} of {int(series.complete.sum())} samples left out: outside the calibrated range"]
+    before = np.array([1.0, 0.0]) if calibration.shift is None else moved[0]
+    return LogShift(
+        gain=float(fit.mean[0]),
+        offset=float(fit.mean[1]),
+        covariance=fit.covariance,
+        before=before,
+        full_scale=scale,
+        determined=fit.determined,
+        misfit=fit.misfit,
+        session=f"{session.hash}  {session.name}",
+        since=calibration.recorded,
+        until=session.epoch,
+        notes=(*ignored, *(notes if outside else [])),
+    )
+
+
+def recalibrate_log(
+    calibration: LogCalibration, session: Session, drift: GainDrift | None = None, *, ignore_errors: bool = False
+) -> LogCalibration:
+    """The same calibration, moved to what the sensor reads in a log with known force: its gain and its offset.
+
+    Args:
+        drift: how far the gain may have moved; the offset by the same part of the largest calibrated force.
+        ignore_errors: use also a session in which `check_session` finds an error, or that does not tell the gain.
+
+    Raises:
+        SessionError: if a stream is missing, the sensor is another, or the log does not determine the gain.
+        RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
+    """
+    found = assess_log(calibration, session, drift, ignore_errors=ignore_errors)
+    if not found.determined and not ignore_errors:
+        raise SessionError(f"{session.name}: {found.health}; or move it all the same (--force, ignore_errors=True)")
+    history = [calibration.provenance.get("recalibrations", ""), found.summary()]
+    return replace(
+        calibration,
+        shift=found,
+        provenance=calibration.provenance
+        | {"recalibrations": "\n".join(filter(None, history)), "recalibrated_utc": found.until},
+        simulated=calibration.simulated or session.simulated,
+        notes=(*calibration.notes, found.health, *found.notes),
+    )

@@ -1,0 +1,253 @@
+"""Check the EIT readings of a recording: dead, saturated, noisy or not reciprocal readings, and their order."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+import jaxeit as je
+
+from ...presses.streams import finite_mean, true_runs
+from ...presses.times import PressColumns
+from ...session import Session, Status
+from ...session.units import SECOND
+from ..report import ChannelTable, Finding, Severity, listed
+from ..streams.statistics import StreamStatistics
+from .reading_order import OrderCheck, check_order, transfer_matrix
+
+MIN_SNR = 40.0  # dB; healthy benches reach 50 to 60
+NOISE_RATIO = 5.0  # over the median noise of the readings
+MAX_RECIPROCITY_ERROR = 0.02
+SATURATED_FRACTION = 0.01  # of the samples at the converter's end
+MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the converter's end; fewer may be chance
+MAX_EMPTY_FRACTION = 0.25  # of the readings without a value, up to which the others make an image
+MAX_SATURATED_FRACTION = 0.05  # of the readings: those beside the drive may clip without much harm to an image
+MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
+AMPLITUDE_RATIO_RANGE = 0.2, 5.0  # of measured over modelled voltage: outside it, a unit or the sheet is wrong
+AMPLITUDE_RATIO_OF_OTHER_ORDERS = 0.03, 30.0  # the same for readings that do not look like the model
+MIN_CORRELATION = 0.9  # with the model: readings below it do not look like this skin
+MIN_SOUND_READINGS = 10  # for a comparison with the model
+
+
+def check_eit(
+    session: Session,
+    stats: StreamStatistics | None,
+    presses: PressColumns | None,
+    skin: je.Skin | None,
+    transfer: np.ndarray | None,
+    findings: list[Finding],
+) -> tuple[ChannelTable | None, OrderCheck | None]:
+    """Check the readings against each other and against a model of the skin; add what is wrong to ``findings``.
+
+    Returns None for what was not checked: without EIT voltages, without a pattern or without a skin.
+    """
+    pattern = session.pattern
+    if stats is None or pattern is None or stats.row.variable != "voltage":
+        return None, None
+    findings += _frame_rate_findings(session, stats, skin)
+    table = _channel_table(stats, pattern, presses)
+    findings += _channel_findings(stats, table)
+    if skin is None or pattern.max() >= len(skin.electrodes):
+        return table, None
+    order = _check_order(session, table, pattern, skin, transfer, findings)
+    if order is not None:
+        findings += _order_findings(order)
+    return table, order
+
+
+def _frame_rate_findings(session: Session, stats: StreamStatistics, skin: je.Skin | None) -> Iterator[Finding]:
+    """A scan cannot take longer than the time from one frame to the next."""
+    if session.offset is not None:
+        scan_time = float(np.ptp(session.offset))
+    elif skin is not None:
+        scan_time = skin.protocol.frame_time
+    else:
+        return
+    if stats.row.rate * scan_time > 1.02:
+        what = (
+            f"{stats.row.rate:.4g} frames a second, but one scan takes {1e3 * scan_time:.3g} ms "
+            f"({1 / scan_time:.4g} a second at most)"
+        )
+        yield Finding(Severity.WARNING, "/streams/eit", what, "correct reading_time, or the time stamps")
+
+
+def _rest_frames(time: np.ndarray, presses: PressColumns | None) -> slice:
+    """Longest run of frames without a press, or the first frames if there is no such run."""
+    loaded = np.zeros(len(time), bool)
+    if presses is not None:
+        starts = np.searchsorted(time, np.asarray(presses.t_press) - SECOND // 10)
+        stops = np.searchsorted(time, np.asarray(presses.t_release) + 3 * SECOND // 2)
+        for start, stop in zip(starts, stops, strict=True):
+            loaded[start:stop] = True
+    runs = true_runs(~loaded)
+    sizes = runs[:, 1] - runs[:, 0]
+    if not len(runs) or sizes.max() < MIN_REST_FRAMES:
+        return slice(0, min(len(time), MAX_REST_FRAMES))
+    start = int(runs[sizes.argmax(), 0])
+    return slice(start, start + min(int(sizes.max()), MAX_REST_FRAMES))
+
+
+def _channel_table(stats: StreamStatistics, pattern: np.ndarray, presses: PressColumns | None) -> ChannelTable:
+    rest = _rest_frames(stats.time, presses)
+    values = stats.stream.read(rest.start, rest.stop)
+    mean = finite_mean(values)
+    # First differences suppress drift, which is no noise.
+    noise = np.sqrt(finite_mean(np.diff(values, axis=0) ** 2) / 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        snr = 20 * np.log10(np.abs(mean) / noise)
+    partner, saturated = je.skin.reciprocal_rows(pattern), _saturated(stats)
+    typical = np.median(noise[np.isfinite(noise)]) if np.isfinite(noise).any() else np.inf
+    return ChannelTable(
+        frames=len(values),
+        pattern=pattern,
+        mean=mean,
+        noise=noise,
+        snr=snr,
+        partner=partner,
+        reciprocity=_reciprocity(mean, partner),
+        missing=stats.missing,
+        dead=stats.dead & ~saturated,
+        saturated=saturated,
+        noisy=(noise > NOISE_RATIO * typical) & (snr < MIN_SNR) & ~stats.dead,
+    )
+
+
+def _reciprocity(mean: np.ndarray, partner: np.ndarray) -> np.ndarray:
+    other = np.where(partner >= 0, mean[partner], np.nan)
+    rms = np.sqrt(finite_mean(mean[:, None] ** 2))[0]
+    size = np.fmax(np.fmax(np.abs(mean), np.abs(other)), 0.1 * rms)
+    return np.asarray(np.abs(mean - other) / np.where(size > 0, size, np.nan))
+
+
+def _saturated(stats: StreamStatistics) -> np.ndarray:
+    """Channels that reach an end of the converter: an extreme value of all channels that several of them share.
+
+    A single channel may rest at its own extreme; it counts only if the status flag says that some reading is
+    saturated. A channel that is always zero is dead.
+    """
+    some = (stats.finite > 0) & ~((stats.low == 0) & (stats.high == 0))
+    out = np.zeros(len(some), bool)
+    for value, count in ((stats.low, stats.at_low), (-stats.high, stats.at_high)):
+        if some.any():
+            at_end = some & (value == value[some].min()) & (count > SATURATED_FRACTION * len(stats.time))
+            if at_end.sum() >= MIN_SHARED_EXTREMES or stats.flagged(Status.saturated):
+                out |= at_end
+    return out
+
+
+def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[Finding]:
+    where = "/streams/eit"
+    remedy = "check the wires and terminals of these electrodes"
+    empty = stats.finite == 0
+    # A calibration leaves out readings without a value, and so loses little if they are few.
+    severity = Severity.WARNING if empty.mean() < MAX_EMPTY_FRACTION else Severity.ERROR
+    yield from _channel_list_finding(empty, table, severity, "hold no finite value (dead)", remedy)
+    dead = table.dead & ~empty
+    yield from _channel_list_finding(dead, table, Severity.ERROR, _dead_text(stats, dead), remedy)
+    what = "sit at the converter's end (saturated)"
+    gain = "lower the gain or the drive current"
+    severity = Severity.WARNING if table.saturated.mean() < MAX_SATURATED_FRACTION else Severity.ERROR
+    yield from _channel_list_finding(table.saturated, table, severity, what, gain)
+    what = f"are more than {NOISE_RATIO:g} times noisier than most and below {MIN_SNR:g} dB"
+    yield from _channel_list_finding(table.noisy, table, Severity.WARNING, what, remedy)
+    snr = table.snr[~table.bad & ~np.isnan(table.snr)]
+    if len(snr) and np.median(snr) < MIN_SNR:
+        what = f"low signal: the median SNR of a reading is {np.median(snr):.1f} dB, below {MIN_SNR:g} dB"
+        remedy = "raise the current or the averaging, improve the contacts, shield against mains hum"
+        yield Finding(Severity.WARNING, where, what, remedy)
+    error = table.reciprocity[~table.bad & np.isfinite(table.reciprocity)]
+    if len(error) and np.median(error) > MAX_RECIPROCITY_ERROR:
+        what = (
+            f"reciprocity error: readings differ by {100 * np.median(error):.1f} % (median) when drive "
+            "and sense are exchanged, where physics allows no difference"
+        )
+        remedy = "compare the wiring and the order of the readings with the recorded pattern"
+        yield Finding(Severity.WARNING, where, what, remedy)
+
+
+def _dead_text(stats: StreamStatistics, dead: np.ndarray) -> str:
+    if (stats.low[dead] == 0).all():
+        return "are always zero (dead)"
+    return "never change (dead)"
+
+
+def _channel_list_finding(
+    flag: np.ndarray, table: ChannelTable, severity: Severity, what: str, remedy: str
+) -> Iterator[Finding]:
+    rows = np.flatnonzero(flag)
+    if not len(rows):
+        return
+    text = f"{len(rows)} of {len(table)} readings {what}: {listed(rows)}"
+    common = _common_electrodes(flag, table.pattern)
+    if common:
+        text += f"; all of them use electrode {' or '.join(map(str, common))}"
+        remedy = f"check electrode {' and '.join(map(str, common))}: its terminal, wire and switch"
+    yield Finding(severity, "/streams/eit", text, remedy)
+
+
+def _common_electrodes(flag: np.ndarray, pattern: np.ndarray) -> list[int]:
+    """One or two electrodes that occur in all flagged readings and in few others; found greedily."""
+    left = flag.copy()
+    found: list[int] = []
+    while left.sum() >= 3 and len(found) < 2:
+        uses = np.array([(pattern == e).any(1) for e in range(pattern.max() + 1)])
+        share = (uses & flag).sum(1) / np.maximum(uses.sum(1), 1)
+        hits = np.where(share > 0.8, (uses & left).sum(1), 0)
+        if not hits.any():
+            return []
+        found.append(int(hits.argmax()))
+        left &= ~uses[found[-1]]
+    return [] if left.any() else found
+
+
+def _check_order(
+    session: Session,
+    table: ChannelTable,
+    pattern: np.ndarray,
+    skin: je.Skin,
+    transfer: np.ndarray | None,
+    findings: list[Finding],
+) -> OrderCheck | None:
+    """Compare the sound readings with a uniform sheet; None if there are too few, or if the skin has no model."""
+    good = np.isfinite(table.mean) & ~table.bad
+    if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
+        what = f"only {good.sum()} readings are sound: order and signs were not checked"
+        findings.append(Finding(Severity.WARNING, "/streams/eit", what, "correct the readings above first"))
+        return None
+    try:
+        transfer = transfer_matrix(skin) if transfer is None else transfer
+    except ValueError as error:
+        what = f"the skin {skin.name!r} cannot be modelled: {error}"
+        findings.append(Finding(Severity.ERROR, "/device", what, "correct the skin's TOML file"))
+        return None
+    return check_order(
+        table.mean,
+        good,
+        pattern,
+        transfer,
+        current=skin.protocol.current if session.current is None else session.current,
+        positions=skin.electrode_positions,
+        usual=skin.protocol.pattern,
+    )
+
+
+def _order_findings(order: OrderCheck) -> Iterator[Finding]:
+    where = "/streams/eit"
+    if order.claimed:
+        same = f" (or, with the same readings: {'; '.join(order.same)})" if order.same else ""
+        what = (
+            f"the order looks wrong: {order.what}{same}. Correlation with the model is "
+            f"{order.as_is:.3f} as recorded and {order.best:.3f} in this order"
+        )
+        yield Finding(Severity.ERROR, where, what, order.remedy)
+    elif order.as_is < MIN_CORRELATION:
+        what = (
+            f"the readings do not look like this skin: correlation with its model {order.as_is:.2f}, "
+            f"and no simple reordering explains it (best {order.best:.2f})"
+        )
+        remedy = "compare positions and numbering of the electrodes in the skin's file with the hardware"
+        yield Finding(Severity.WARNING, where, what, remedy)
+    low, high = AMPLITUDE_RATIO_RANGE if order.as_is >= MIN_CORRELATION else AMPLITUDE_RATIO_OF_OTHER_ORDERS
+    if order.as_is > 0 and not low < order.scale < high:
+        parts = "unit (V, mV), gain, current or sheet_resistance is wrong"
+        what = f"the amplitude is {order.scale:.3g} times the model's: {parts}"
+        yield Finding(Severity.WARNING, where, what, "correct the unit at import, current or sheet_resistance")

@@ -1,0 +1,1 @@
+"""Checks of single streams: their samples and clocks, and columns that have changed places."""

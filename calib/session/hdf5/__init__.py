@@ -1,0 +1,1 @@
+"""Guarded access to HDF5: nothing in a file is trusted before it has been checked."""

@@ -1,0 +1,160 @@
+"""Preparation of a tracker from a model of the skin."""
+
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+from scipy.spatial import cKDTree
+
+from ..contacts.bump_responses import points_of
+from ..contacts.preparation import prepare_contacts
+from ..contacts.settings import ContactSettings
+from ..fusion import pad_masks
+from ..imaging.noise import whitened_readings
+from ..model.bases import Pixels
+from ..model.discretisation import Model, discretise
+from ..model.forward_model import conductivity
+from ..model.scene import Scene
+from ..model.sensitivity import pair_jacobian
+from ..skin.description import Skin
+from .filter import SIZE, ContactFilter
+from .reanalysis import prepare_reanalysis
+from .response import LoadedSheet, Neighbours
+from .settings import TrackerSettings
+
+# Cells of the grid of neighbours, along the longer side.
+GRID = 25
+
+
+def prepare_filter(
+    model: Model,
+    skin: Skin,
+    settings: TrackerSettings,
+    noise: Float[ArrayLike, "..."],
+    sigma: Float[Array, " elements"] | None,
+    channels: Bool[ArrayLike, " readings"] | None,
+) -> ContactFilter:
+    """The filter of a skin; see `prepare_tracker`."""
+    loads = settings.loads
+    found = whitened_readings(model, noise, channels)
+    finder = prepare_contacts(model, ContactSettings(most=1), noise=noise, sigma=sigma, channels=channels)
+    # E C^T = 1, so that the directions which the finder kept are its rows times C^T.
+    kept = np.asarray(finder.compress, float) @ found.factor.T
+    put = partial(jnp.asarray, dtype=model.dtype)
+    whole = conductivity(model) if sigma is None else sigma
+    places, sheet = _loaded_sheet(model, skin, settings, whole, found.electrodes, kept @ found.factor)
+    unit = jnp.eye(len(finder.whitening.channels), dtype=model.dtype)
+    return ContactFilter(
+        finder=finder,
+        compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
+        sheet=sheet,
+        places=put(places),
+        model_error=put(loads.model_error),
+        persistence=put(settings.persistence),
+        rates=put(_rates(settings)),
+        active_modes=settings.modes,
+    )
+
+
+def _loaded_sheet(
+    model: Model,
+    skin: Skin,
+    settings: TrackerSettings,
+    sigma: Float[Array, " elements"],
+    pairs: np.ndarray,
+    mixing: np.ndarray,
+) -> tuple[np.ndarray, LoadedSheet]:
+    """Where the modes of the gain lie, (g, 2) m, and what contacts show."""
+    loads, light = settings.loads, partial(jnp.asarray, dtype=np.dtype(settings.dtype))
+    coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(settings.columns).on(model)
+    response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
+    background = np.asarray(fine.restrict(sigma)) / np.asarray(fine.restrict(jnp.ones_like(sigma)))
+    mean, masks, (points, weights) = (
+        _carried(model, sigma, coarse),
+        pad_masks(skin, fine),
+        points_of(coarse, loads.width),
+    )
+    centres = np.asarray(fine.centres, float)
+    places, of_elements, of_pixels = _gain_modes(coarse, centres, loads.gain_length)
+
+    def with_level(modes: np.ndarray) -> Array:
+        return light(np.concatenate([np.full((len(modes), 1), settings.level), loads.gain * modes], 1))
+
+    sheet = LoadedSheet(
+        sheet=prepare_reanalysis(coarse, jnp.asarray(mean, coarse.dtype), pairs, mixing, light(0).dtype),
+        neighbours=_neighbours(coarse, centres, settings),
+        sigma=light(mean),
+        points=light(points),
+        weights=light(weights),
+        modes=with_level(of_elements),
+        pixels=light(centres),
+        pixel_response=light(response * background[:, None]),
+        pixel_modes=with_level(of_pixels),
+        pad_area=light((masks.weights * masks.areas).T),
+        law=loads.law,
+    )
+    return np.concatenate([np.full((1, 2), np.inf), places]), sheet
+
+
+def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings) -> Neighbours:
+    chart = np.asarray(model.chart, float)
+    low, high = chart.min(0), chart.max(0)
+    pitch = float((high - low).max() / GRID)
+    shape = tuple(int(n) for n in np.ceil((high - low)[::-1] / pitch).astype(int))
+    y, x = np.meshgrid(*(pitch * (np.arange(n) + 0.5) for n in shape), indexing="ij")
+    cells = low + np.stack([x.ravel(), y.ravel()], 1)
+    middles, unknowns = chart[np.asarray(model.triangles)].mean(1), _places_of_unknowns(model)
+
+    def nearest(places: np.ndarray, count: int) -> Array:
+        found = cKDTree(places).query(cells, k=min(count, len(places)))[1]
+        return jnp.asarray(found.reshape(len(cells), -1), jnp.int32)
+
+    return Neighbours(
+        low=jnp.asarray(low, settings.dtype),
+        pitch=jnp.asarray(pitch, settings.dtype),
+        elements=nearest(middles, 2 * settings.unknowns),
+        unknowns=nearest(unknowns, settings.unknowns),
+        pixels=nearest(pixels, settings.pixels),
+        shape=(shape[0], shape[1]),
+    )
+
+
+def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:
+    """About where each unknown lies: the mean middle of its elements."""
+    dofs = np.asarray(model.system.dofs)
+    middles = np.asarray(model.chart, float)[np.asarray(model.triangles)].mean(1)
+    count = np.maximum(np.bincount(dofs.ravel(), minlength=model.system.unknowns), 1)
+    sums = [np.bincount(dofs.ravel(), np.repeat(axis, dofs.shape[1]), len(count)) for axis in middles.T]
+    return np.stack(sums, 1) / count[:, None]
+
+
+def _carried(model: Model, sigma: Float[Array, " elements"], other: Model) -> np.ndarray:
+    """A conductivity on the elements of another mesh of the same sheet: of the nearest element."""
+    near = cKDTree(np.asarray(model.centroids, float)).query(np.asarray(other.centroids, float))[1]
+    found: np.ndarray = np.asarray(sigma, float)[near]
+    return found
+
+
+def _rates(settings: TrackerSettings) -> list[float]:
+    """Random walk of each number of a contact, per root of a second; a place moves by its velocity alone."""
+    rates = [1e-4, 1e-4, settings.width_rate, settings.force_rate, 1e-4, 1e-4, *2 * [settings.acceleration]]
+    assert len(rates) == SIZE
+    return rates
+
+
+def _gain_modes(
+    model: Model, pixels: Float[np.ndarray, "p 2"], length: float
+) -> tuple[Float[np.ndarray, "g 2"], Float[np.ndarray, "elements g"], Float[np.ndarray, "p g"]]:
+    """Where the modes of a Gaussian field of variance one lie, and their values on elements and pixels: bumps whose sum
+    of products is exp(-d^2 / 2 length^2)."""
+    chart = np.asarray(model.chart, float)
+    corners = zip(chart.min(0), chart.max(0), strict=True)
+    axes = [np.arange(low - length, high + 1.5 * length, length) for low, high in corners]
+    nodes = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    values = [
+        np.exp(-((at[:, None] - nodes) ** 2).sum(-1) / length**2) for at in (np.asarray(model.centroids, float), pixels)
+    ]
+    norm = np.sqrt(np.mean((values[0] ** 2).sum(-1)))
+    return nodes, values[0] / norm, values[1] / norm

@@ -1,0 +1,202 @@
+"""What frames and pads show of contacts, with derivatives.
+
+Contacts are loads, which add as pressure; the law of the contact layer turns pressure times gain into conductivity. The
+first order of the readings is that of an image on a fine mesh, what is beyond it is solved anew on a coarse mesh under
+the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that an evaluation solves once.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import erf
+from jaxtyping import Array, Float, Int
+
+from ..effects.material import ContactPiezoresistance
+from .reanalysis import Reanalysis
+
+# Least half length, m: an edge of length zero has no direction.
+SHORTEST = 1e-3
+
+
+class Near(NamedTuple):
+    """What lies under and around contacts: elements (e,), their unknowns (m,), and pixels (n,).
+
+    ``own`` of elements and pixels is zero for one that also occurs before, near another contact, else one.
+    """
+
+    elements: Int[Array, " e"]
+    unknowns: Int[Array, " m"]
+    pixels: Int[Array, " n"]
+    own_elements: Float[Array, " e"]
+    own_pixels: Float[Array, " n"]
+
+
+class Neighbours(eqx.Module):
+    """Elements, unknowns and pixels nearest to the middle of each cell of a grid, (cells, ...).
+
+    ``low`` (2,) m is the corner of the grid, ``pitch`` m its cells' side, ``shape`` their number along y and x.
+    """
+
+    low: Float[Array, "2"]
+    pitch: Float[Array, ""]
+    elements: Int[Array, "cells e"]
+    unknowns: Int[Array, "cells m"]
+    pixels: Int[Array, "cells n"]
+    shape: tuple[int, int] = eqx.field(static=True)
+
+    def near(self, places: Float[Array, "K 2"], elements: int, pixels: int) -> Near:
+        """What is near places, of a mesh of so many elements and an image of so many pixels."""
+        rows, columns = self.shape
+        x, y = jnp.floor((places - self.low) / self.pitch).astype(jnp.int32).T
+        cell = jnp.clip(y, 0, rows - 1) * columns + jnp.clip(x, 0, columns - 1)
+        under, unknowns, around = (table[cell].ravel() for table in (self.elements, self.unknowns, self.pixels))
+        count = len(places)
+        return Near(under, unknowns, around, _once(under, count, elements), _once(around, count, pixels))
+
+
+def _once(indices: Int[Array, " e"], lists: int, size: int) -> Float[Array, " e"]:
+    """One for each index that no earlier list holds, else zero."""
+    rows, taken, out = indices.reshape(lists, -1), jnp.zeros(size, bool), []
+    for row in rows:
+        out.append(~taken[row])
+        taken = taken.at[row].set(True)
+    return jnp.concatenate(out).astype(jnp.float32)
+
+
+class Shown(NamedTuple):
+    """What contacts show, and its derivatives with respect to the numbers of contacts and the modes that are asked for.
+
+    | meaning                  | shape       | unit |
+    |--------------------------|-------------|------|
+    | readings, whitened       | (r,)        | 1    |
+    | pads: force on each      | (pads,)     | N    |
+    | reading_slopes           | (a, r)      |      |
+    | pad_slopes               | (a, pads)   |      |
+    """
+
+    readings: Float[Array, " r"]
+    pads: Float[Array, " pads"]
+    reading_slopes: Float[Array, "a r"]
+    pad_slopes: Float[Array, "a pads"]
+
+
+class LoadedSheet(eqx.Module):
+    """A sheet on which contacts press.
+
+    | meaning                                                                  | shape            | unit |
+    |--------------------------------------------------------------------------|------------------|------|
+    | sheet: readings of a changed sheet beyond the first order                |                  |      |
+    | neighbours: of places                                                    |                  |      |
+    | sigma: of the untouched sheet, on the coarse mesh                        | (elements,)      | S    |
+    | points, weights: of the elements                                         | (elements, q, 2), (q,) | m |
+    | modes: of the log gain of each element; the first is the level           | (elements, g)    | 1    |
+    | pixels: their middles                                                    | (p, 2)           | m    |
+    | pixel_response: readings per relative change of each, to first order     | (p, r)           | 1    |
+    | pixel_modes: of the log gain of each                                     | (p, g)           | 1    |
+    | pad_area: area of each pad in each pixel                                 | (p, pads)        | m^2  |
+    | law: factor of conductivity by pressure                                  |                  |      |
+    """
+
+    sheet: Reanalysis
+    neighbours: Neighbours
+    sigma: Float[Array, " elements"]
+    points: Float[Array, "elements q 2"]
+    weights: Float[Array, " q"]
+    modes: Float[Array, "elements g"]
+    pixels: Float[Array, "p 2"]
+    pixel_response: Float[Array, "p r"]
+    pixel_modes: Float[Array, "p g"]
+    pad_area: Float[Array, "p pads"]
+    law: ContactPiezoresistance
+
+    def near(self, contacts: Float[Array, "K 6"]) -> Near:
+        """What is near contacts."""
+        places = contacts[:, :2].astype(self.points.dtype)
+        return self.neighbours.near(places, len(self.sigma), len(self.pixels))
+
+    def shown(
+        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+    ) -> Shown:
+        """What frames and pads show of contacts, with slopes in their numbers and in some modes of the gain."""
+        loads = contacts.astype(self.points.dtype)
+        pads, pixels = self._first_order(loads, gain, modes, near)
+        change, slopes = self._changes(loads, gain, modes, near)
+        found = self.sheet.beyond(near.elements, near.unknowns, change)
+        beyond = self.sheet.beyond_slopes(near.elements, found, slopes.T)
+        readings, first = pixels
+        exact = contacts.dtype
+        force, pad_slopes = pads
+        still = jnp.zeros((len(modes), len(force)), exact)  # pads feel no gain
+        return Shown(
+            (readings + found.readings).astype(exact),
+            force.astype(exact),
+            (first + beyond).astype(exact),
+            jnp.concatenate([pad_slopes.T.astype(exact), still]),
+        )
+
+    def _first_order(
+        self, loads: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Forces on pads and their slopes (pads, a); readings of the image and their slopes (a, r)."""
+        pixels, table = near.pixels, self.pixel_modes[near.pixels]
+        pressure, slopes = _pressures(loads, self.pixels[pixels])
+        pressure, slopes = pressure * near.own_pixels, slopes * near.own_pixels[:, None]
+        area = self.pad_area[pixels].T
+        relative, along, by_gain = self._conducting(pressure, jnp.exp((table @ gain).astype(loads.dtype)))
+        moved = jnp.concatenate([along[:, None] * slopes, by_gain[:, None] * table[:, modes].astype(loads.dtype)], 1)
+        response = self.pixel_response[pixels]
+        return (area @ pressure, area @ slopes), (relative @ response, moved.T @ response)
+
+    def _changes(
+        self, loads: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+    ) -> tuple[Float[Array, " e"], Float[Array, "e a"]]:
+        """Change of conductivity of the elements, S, and its slopes."""
+        elements, table = near.elements, self.modes[near.elements]
+        points = self.points[elements]
+        pressure, slopes = _pressures(loads, points.reshape(-1, 2))
+        factor = jnp.exp((table @ gain).astype(loads.dtype))
+        relative, along, by_gain = self._conducting(pressure.reshape(points.shape[:2]), factor[:, None])
+        scale = self.sigma[elements] * near.own_elements
+        by_load = jnp.einsum("eq,eqk->ek", along * self.weights, slopes.reshape(*points.shape[:2], -1))
+        by_mode = (by_gain @ self.weights)[:, None] * table[:, modes].astype(loads.dtype)
+        return scale * (relative @ self.weights), scale[:, None] * jnp.concatenate([by_load, by_mode], 1)
+
+    def _conducting(
+        self, pressure: Float[Array, "..."], gain: Float[Array, "..."]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+        """Relative change of conductivity under pressure times gain, and its slopes in pressure and in log gain."""
+        law = jax.tree.map(lambda leaf: leaf.astype(pressure.dtype), self.law)
+        felt = pressure * gain
+        factor, slope = jax.jvp(law.factor, (felt,), (jnp.ones_like(felt),))
+        return factor - 1, slope * gain, slope * felt
+
+
+def _pressures(
+    loads: Float[Array, "K 6"], points: Float[Array, "n 2"]
+) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
+    """Pressure of all loads at points, Pa, and its slopes in their numbers."""
+    values, slopes = zip(*(_with_slopes(load, points) for load in loads), strict=True)
+    return jnp.sum(jnp.stack(values), 0), jnp.concatenate(slopes, 1)
+
+
+def _with_slopes(
+    load: Float[Array, "6"], points: Float[Array, "n 2"]
+) -> tuple[Float[Array, " n"], Float[Array, "n 6"]]:
+    value, push = jax.linearize(lambda load: load_pressure(load, points), load)
+    return value, jax.vmap(push, out_axes=1)(jnp.eye(len(load), dtype=load.dtype))
+
+
+def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    """Pressure at points, Pa, of a load (x, y, log width, log force, half length along x and y): even along a line,
+    blurred by a Gaussian; of a length near zero, a Gaussian."""
+    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + SHORTEST**2)
+    away = points - load[:2]
+    along = away @ load[4:] / half
+    across = jnp.sum(away**2, -1) - along**2
+    root = np.sqrt(2.0) * width
+    spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
+    found: Array = jnp.exp(load[3] - 0.5 * across / width**2) * spread / (np.sqrt(2 * np.pi) * width)
+    return found

@@ -1,0 +1,56 @@
+"""What is known of contacts over time before they are followed."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..contacts.loads import LoadSettings
+from ..imaging.noise import InverseError
+from ..model.fidelity import Fidelity
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How contacts move and press, and how closely they are followed.
+
+    | meaning                                                                        | default | unit      |
+    |--------------------------------------------------------------------------------|---------|-----------|
+    | loads: the law of pressure, the gain of the contact layer, usual sizes and forces |       |           |
+    | level: standard deviation of the log of the gain that all places share         | 0.3     | 1         |
+    | persistence: time over which errors of mesh and load shape stay as they are    | 0.5     | s         |
+    | acceleration: change of a contact's velocity                                   | 0.3     | m/s/sqrt(s) |
+    | width_rate, force_rate: change of the logs of width and force                  | 0.5, 5  | 1/sqrt(s) |
+    | birth_rate: of contacts anywhere on the skin                                   | 0.5     | 1/s       |
+    | most: contacts followed at once                                                | 3       |           |
+    | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
+    | modes: of the gain around a contact that a frame updates                       | 24      |           |
+    | columns: pixels along x of the first order; pixels: around a contact           | 50, 400 |           |
+    | fidelity: of the mesh that is solved anew; its first order is the model's      | draft   |           |
+    | dtype: of these solutions; errors of float32 are far below noise               | float32 |           |
+
+    Raises:
+        InverseError: for a value out of range.
+    """
+
+    loads: LoadSettings = field(default_factory=LoadSettings)
+    level: float = 0.3
+    persistence: float = 0.5
+    acceleration: float = 0.3
+    width_rate: float = 0.5
+    force_rate: float = 5.0
+    birth_rate: float = 0.5
+    most: int = 3
+    unknowns: int = 96
+    modes: int = 24
+    columns: int = 50
+    pixels: int = 400
+    fidelity: Fidelity = field(default_factory=Fidelity.draft)
+    dtype: str = "float32"
+
+    def __post_init__(self) -> None:
+        for name in ("level", "persistence", "acceleration", "width_rate", "force_rate", "birth_rate"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
+        for name in ("most", "unknowns", "modes", "columns", "pixels"):
+            if getattr(self, name) < 1:
+                raise InverseError(f"{name} is {getattr(self, name)}; give one or more")
