@@ -164,6 +164,11 @@ class _Search:
     def __init__(self, fitter: LoadFitter, y: np.ndarray, contacts: Contacts):
         self.fitter, self.y, self.contacts = fitter, y, jax.tree.map(np.asarray, contacts)
 
+    def put(self, *arrays: np.ndarray) -> tuple[Array, ...]:
+        """Arrays as JAX holds them; numbers in the precision of the model."""
+        dtype = self.fitter.low.dtype
+        return tuple(jnp.asarray(array, dtype if array.dtype.kind == "f" else None) for array in arrays)
+
     def loads(self) -> Loads:
         """Loads of all kinds with their probabilities."""
         fits = {LoadKind.ONE: self.one()}
@@ -200,18 +205,18 @@ class _Search:
 
     def fit(self, kind: LoadKind, rows: np.ndarray, fall: float) -> Fit:
         """The best loads near a start, with the errors there."""
-        start, forms = padded(rows, kind)
-        low, high = self.fitter.bounds(start, forms)
-        start = np.clip(start, low, high)
-        root = self.errors(_unknowns(self.fitter, *_put(start, forms)))
-        y, start, forms, low, high, given = _put(self.y, start, forms, low, high, root)
-        loads, square, normal = _fit(self.fitter, y, start, forms, given, (low, high), fall)
+        begin, forms = padded(rows, kind)
+        bounds = self.fitter.bounds(begin, forms)
+        start, form = self.put(np.clip(begin, *bounds), forms)
+        root = self.errors(_unknowns(self.fitter, start, form))
+        y, given, low, high, end = self.put(self.y, root, *bounds, np.array(fall))
+        loads, square, normal = _fit(self.fitter, y, start, form, given, (low, high), end)
         return Fit(np.asarray(loads), float(square), np.asarray(normal), root)
 
     def left(self, kind: LoadKind, fit: Fit) -> tuple[np.ndarray, Unknowns]:
         """What a fit leaves of the frame, in units of its errors, and the slopes there."""
         forms = padded(fit.loads[: len(FORMS[kind])], kind)[1]
-        known = _unknowns(self.fitter, *_put(fit.loads, forms))
+        known = _unknowns(self.fitter, *self.put(fit.loads, forms))
         return solve_triangular(fit.root, self.y - np.asarray(known.value), lower=True), known
 
     def errors(self, unknowns: Unknowns) -> np.ndarray:
@@ -245,7 +250,7 @@ class _Search:
         shapes = {
             kind.name.lower(): self.shape(kind if kind in evidence else LoadKind.TWO, fit) for kind, fit in fits.items()
         }
-        return Loads(probability=jnp.asarray(probability / probability.sum()), **shapes)
+        return Loads(probability=self.put(probability / probability.sum())[0], **shapes)
 
     def shape(self, kind: LoadKind, fit: Fit) -> LoadShape:
         """Loads as they are handed out."""
@@ -255,15 +260,10 @@ class _Search:
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
         covariance = scale[:, None] * np.linalg.pinv(scale[:, None] * normal * scale, hermitian=True) * scale
         parts = rows[:, :2], np.exp(rows[:, 2]), np.exp(rows[:, 3]), rows[:, 4:], covariance
-        problem = _Problem(self.fitter, jnp.asarray(self.y), jnp.asarray(padded(rows, kind)[1]), jnp.zeros((0, 0)))
-        surprise = np.asarray(_surprise(jnp.asarray(fit.loads.ravel()), problem))
-        misfit = (fit.square - surprise @ surprise) / len(self.y)
-        return LoadShape(*(jnp.asarray(part) for part in (*parts, misfit)))
-
-
-def _put(*arrays: np.ndarray) -> tuple[Array, ...]:
-    """Arrays as JAX holds them."""
-    return tuple(jnp.asarray(array) for array in arrays)
+        y, forms, root, flat = self.put(self.y, padded(rows, kind)[1], fit.root, fit.loads.ravel())
+        surprise = np.asarray(_surprise(flat, _Problem(self.fitter, y, forms, root)))
+        misfit = np.array((fit.square - surprise @ surprise) / len(self.y))
+        return LoadShape(*self.put(*parts, misfit))
 
 
 class _Problem(NamedTuple):
@@ -293,7 +293,7 @@ def _fit(
     forms: Forms,
     root: Float[Array, "r r"],
     bounds: tuple[Parameters, Parameters],
-    fall: Float[Array, ""] | float,
+    fall: Float[Array, ""],
 ) -> tuple[Parameters, Float[Array, ""], Float[Array, "m m"]]:
     """Loads, square and normal matrix; see `Fit`."""
     problem = _Problem(fitter, y, forms, root)
