@@ -162,7 +162,7 @@ class _Search:
     """The search of one frame, whose whitened readings are y."""
 
     def __init__(self, fitter: LoadFitter, y: np.ndarray, contacts: Contacts):
-        self.fitter, self.y, self.contacts = fitter, y, jax.tree.map(np.asarray, contacts)
+        self.fitter, self.y, self.contacts = fitter, y, contacts
 
     def put(self, *arrays: np.ndarray) -> tuple[Array, ...]:
         """Arrays as JAX holds them; numbers in the precision of the model."""

@@ -35,15 +35,16 @@ class Starts(eqx.Module):
 
     def single(self, y: np.ndarray, contacts: Contacts) -> np.ndarray:
         """One load in the place of all contacts, or the atom that explains most; (1, 4)."""
-        if not contacts.present.any():
+        present = np.asarray(contacts.present)
+        if not present.any():
             return self.atom(y, np.eye(len(y)))[1]
-        rows, weight = self.rows(contacts), np.where(contacts.present, contacts.strength, 0)
+        rows, weight = self.rows(contacts), np.where(present, np.asarray(contacts.strength), 0)
         middle = weight @ rows[:, :3] / weight.sum()
-        return np.append(middle, logsumexp(rows[contacts.present, 3]))[None]
+        return np.append(middle, logsumexp(rows[present, 3]))[None]
 
     def pair(self, contacts: Contacts) -> np.ndarray | None:
         """The two strongest contacts, (2, 4), if there are two."""
-        return self.rows(contacts)[:2] if contacts.present.sum() > 1 else None
+        return self.rows(contacts)[:2] if np.sum(contacts.present) > 1 else None
 
     def split(self, one: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A load as two narrower ones (2, 4), and as an edge (1, 6), with the second moments that a frame asks for.
@@ -83,8 +84,8 @@ class Starts(eqx.Module):
 
     def rows(self, contacts: Contacts) -> np.ndarray:
         """Contacts as loads (K, 4): the force whose pressure changes the middle of the bump as much."""
-        width, law = np.maximum(contacts.width, 1e-3), jax.tree.map(float, self.law)
-        change = np.clip(contacts.amplitude / float(self.background) / law.amplitude, 0.01, 0.95)
+        width, law = np.maximum(np.asarray(contacts.width), 1e-3), jax.tree.map(float, self.law)
+        change = np.clip(np.asarray(contacts.amplitude) / float(self.background) / law.amplitude, 0.01, 0.95)
         pressure = law.half_pressure * (change / (1 - change)) ** (1 / law.exponent)
         force = np.log(2 * np.pi * width**2 * pressure)
-        return np.concatenate([contacts.position, np.log(width)[:, None], force[:, None]], 1)
+        return np.concatenate([np.asarray(contacts.position), np.log(width)[:, None], force[:, None]], 1)
