@@ -210,23 +210,11 @@ TABLES: dict[str, Table] = {
         "{touch} | {frames} | {told:.0f %} | {by_bumps:.0f %} | {error_mm:.1f} | {covered:.0f %}",
         lambda loads: loads["rows"],
     ),
-    "loads-coverage": listed(
-        "loads",
-        "single tip, noise, sheet | frames | told one | error of place, mm | ellipse covers | interval of force covers",
-        "{case} | {frames} | {told:.0f %} | {error_mm:.1f} | {place:.0f %} | {force:.0f %}",
-        lambda loads: loads["coverage"],
-    ),
     "loads-reliability": listed(
         "loads",
         "probability stated, mean | kinds true | frames times kinds",
         "{stated:.0f %} | {true:.0f %} | {count}",
         lambda loads: loads["reliability"],
-    ),
-    "loads-chest": listed(
-        "loads",
-        "one frame of | frames | told by loads | told by bumps | error of place, mm | ellipse of 90 % covers",
-        "{touch} | {frames} | {told:.0f %} | {by_bumps:.0f %} | {error_mm:.1f} | {covered:.0f %}",
-        lambda loads: loads["chest"],
     ),
     "scenes": listed(
         "scene",
