@@ -44,7 +44,7 @@ FORMS = {
     LoadKind.EDGE: (Form.LONG,),
     LoadKind.MORE: (Form.ROUND, Form.ROUND, Form.ROUND),
 }
-STEPS = 8  # of a fit at most
+STEPS = 16  # of a fit at most
 # Half of the fall of chi-square at which a fit ends: one whose errors are those at its start, and the last one.
 TRIAL_FALL, LAST_FALL = 1.0, 0.02
 MIN_FALL = 12.0  # of chi-square by a third load, below which none is fitted
@@ -236,7 +236,10 @@ class _Search:
     def evidence(self, kind: LoadKind, fit: Fit) -> float:
         """Logarithm of the evidence of a kind of loads, up to a constant that all kinds share."""
         free = free_parameters(padded(fit.loads[: len(FORMS[kind])], kind)[1]).ravel()
-        sign, volume = np.linalg.slogdet(fit.normal[np.ix_(free, free)])
+        # A place that the frame does not tell is somewhere on the sheet: the variance of an even density bounds it.
+        sides = np.asarray(self.fitter.high - self.fitter.low, float)
+        on_sheet = np.tile(np.concatenate([12 / sides**2, np.zeros(SIZE - 2)]), MOST)
+        sign, volume = np.linalg.slogdet((fit.normal + np.diag(on_sheet))[np.ix_(free, free)])
         noise = np.sum(np.log(np.diag(fit.root)))
         found = self.fitter.log_prior(kind, fit.loads) - 0.5 * fit.square - noise
         found += 0.5 * (np.count_nonzero(free) * np.log(2 * np.pi) - volume)
