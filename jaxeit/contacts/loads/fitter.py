@@ -174,8 +174,8 @@ class _Search:
         fits = {LoadKind.ONE: self.one()}
         one = fits[LoadKind.ONE]
         halves, long = self.fitter.starts.split(one.loads[0], self.reach(one))
-        pair = self.fitter.starts.pair(self.contacts)
-        fits[LoadKind.TWO] = self.best(LoadKind.TWO, [halves] if pair is None else [halves, pair])
+        seen = self.fitter.starts.seen
+        fits[LoadKind.TWO] = self.best(LoadKind.TWO, [halves, *seen(self.contacts, 2)])
         two = fits[LoadKind.TWO]
         share, between = self.fitter.starts.between(two.loads[:2])
         fits[LoadKind.EDGE] = self.best(LoadKind.EDGE, [between if share > MIN_SHARE else long])
@@ -183,8 +183,9 @@ class _Search:
         left = self.left(LoadKind.TWO, two)[0]
         fall, three = self.fitter.starts.another(two, left)
         if fall > MIN_FALL:
-            fits[LoadKind.MORE] = self.best(LoadKind.MORE, [three])
-        evidence |= {kind: self.evidence(kind, fit) for kind, fit in fits.items()}
+            fits[LoadKind.MORE] = self.best(LoadKind.MORE, [three, *seen(self.contacts, 3)])
+        there = bool(np.any(self.contacts.present))  # what the finder cannot tell from noise is nothing
+        evidence |= {kind: self.evidence(kind, fit) if there else -np.inf for kind, fit in fits.items()}
         fits.setdefault(LoadKind.MORE, two)
         return self.summary(evidence, fits)
 

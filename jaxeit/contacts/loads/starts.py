@@ -42,9 +42,9 @@ class Starts(eqx.Module):
         middle = weight @ rows[:, :3] / weight.sum()
         return np.append(middle, logsumexp(rows[present, 3]))[None]
 
-    def pair(self, contacts: Contacts) -> np.ndarray | None:
-        """The two strongest contacts, (2, 4), if there are two."""
-        return self.rows(contacts)[:2] if np.sum(contacts.present) > 1 else None
+    def seen(self, contacts: Contacts, count: int) -> list[np.ndarray]:
+        """The strongest contacts (count, 4), if there are so many."""
+        return [self.rows(contacts)[:count]] if np.sum(contacts.present) >= count else []
 
     def split(self, one: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A load as two narrower ones (2, 4), and as an edge (1, 6), with the second moments that a frame asks for.
