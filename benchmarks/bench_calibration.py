@@ -2,17 +2,16 @@
 
 The pool is the bundled session testbed_grid.h5: 225 simulated presses to 20 N on a 15 x 15 grid.  Some of them are
 fitted and the others predicted, over their holds and all along their presses; of all 225 each fifth of the places is
-predicted from the rest.  They lie on a grid (nearest to the middles of equal cells), are scattered evenly without one
-(Roberts' R2 sequence), or drawn at random.  The second session, testbed_presses.h5, is predicted too: four presses of
-other forces, elsewhere.  With so many force levels, only the samples nearest to equal steps up to the hold are fitted,
+predicted from the rest.  They lie on a grid (nearest to the middles of equal cells) or are scattered evenly without one
+(Roberts' R2 sequence).  With so many force levels, only the samples nearest to equal steps up to the hold are fitted,
 as a bench that stops at these forces would record them.  Places are found with the noise of the whole session, and
 through the sheet that the mean of its untouched frames shows.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -23,71 +22,58 @@ from calib.fitting.fields import Geometry, Places, geometry_of
 from calib.fitting.held_out import folds_by_place
 from calib.fitting.pads import LocatedPresses, PadModel, fit_pads
 from calib.fitting.results import FitResult
+from calib.fitting.validation import rmse
 from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
 
 from .figures import curves, logarithmic, panels
 from .harness import ROOT, Question, Run
-from .rows import Row, averaged, grouped
+from .rows import Row
 
-SESSIONS = ROOT / "data" / "sessions"
+SESSION = ROOT / "data" / "sessions" / "testbed_grid.h5"
 SIDES = (3, 4, 5, 6, 8, 10, 15)  # of the grid of presses
+SIDE = SIDES[-1]  # of the pool's grid
 LEVELS = (1, 2, 3, 5, None)  # None: the whole press
-DRAWS, FOLDS = 3, 5
-SIDE = 15  # of the pool's grid
+FOLDS = 5
 CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib.PowerLaw()}
 RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))  # curve, and location field
 SMOKE = calib.Recipe(
-    location=calib.Bilinear(nodes=2, shared=True),
+    location=calib.fitting.Bilinear(nodes=2, shared=True),
     locator=calib.ImageCentroid("half"),
     fidelity=je.Fidelity.draft(),
     folds=2,
 )
-LINES = {"scattered": "-", "grid": "--", "random": ":"}
 
 
-@dataclass(frozen=True, eq=False)
-class Pool:
-    """Presses to fit from and to predict, with the places that their images tell.
-
-    | meaning                                                        | shape        | unit |
-    |----------------------------------------------------------------|--------------|------|
-    | data, geometry, places: what `fit_pads` takes                |              |      |
-    | position of each press                                         | (presses, 2) | m    |
-    | seconds a press takes, from one to the next                    | ()           | s    |
-    | other, elsewhere: pressures and forces of the second session, and its places | |     |
-    """
+class Pool(NamedTuple):
+    """Presses to fit from and to predict: what `fit_pads` takes, with the places that their images tell; the position
+    of each press (presses, 2) m; and the seconds that a press takes, from one to the next."""
 
     data: PressData
     geometry: Geometry
     places: Places
     position: np.ndarray
     seconds: float
-    other: PressData
-    elsewhere: Places
 
 
 @cache
 def pool(smoke: bool) -> Pool:
     """Places as `calibrate` tells them."""
-    with calib.open_session(SESSIONS / "testbed_grid.h5") as session:
+    with calib.open_session(SESSION) as session:
         calibration = calib.calibrate([session], recipe=SMOKE if smoke else calib.Recipe(location=calib.PadEdge()))
         found = pool_presses([session], calibration.skin)
-        seconds = float(np.median(np.diff(found.recordings[0].presses.t_press))) * 1e-9
-    with calib.open_session(SESSIONS / "testbed_presses.h5") as session:
-        other = pool_presses([session], calibration.skin)
-    places: Any
-    elsewhere: Any
-    places, elsewhere = (calibration.locate(frames, single=True) for frames in (found.dv, other.dv))  # it has a field
+    seconds = float(np.median(np.diff(found.recordings[0].presses.t_press))) * 1e-9
+    places: Any = calibration.locate(found.dv, single=True)  # it has a field
     geometry = geometry_of(calibration.skin, places.position.dtype)
-    return Pool(found.data, geometry, places, found.position, seconds, other.data, elsewhere)
+    return Pool(found.data, geometry, places, found.position, seconds)
 
 
 # --- what is fitted
 
 
-def on_grid(position: np.ndarray, side: int) -> np.ndarray:
-    """(presses,) true for those nearest to the middles of side x side cells of the box of presses."""
+def on_grid(position: np.ndarray, count: int) -> np.ndarray:
+    """(presses,) true for those nearest to the middles of ``count`` equal cells of the box of presses."""
+    side = round(count**0.5)
     low, high = position.min(0), position.max(0)
     pitch = (high - low) / (SIDE - 1)
     cell = (high - low + pitch) / side
@@ -111,10 +97,7 @@ def scattered(position: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-def drawn(presses: int, count: int, seed: int) -> np.ndarray:
-    chosen = np.zeros(presses, bool)
-    chosen[np.random.default_rng(seed).choice(presses, count, replace=False)] = True
-    return chosen
+SPREADS = {"grid": on_grid, "scattered": scattered}
 
 
 def at_levels(data: PressData, levels: int | None) -> PressData:
@@ -138,69 +121,49 @@ def fitted(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | N
     pressed = pool.position[use]
     data = replace(at_levels(pool.data, levels), reach=np.stack([pressed.min(0), pressed.max(0)]))
     presses = LocatedPresses(data, pool.geometry, places)
-    hybrid = fit_pads(CURVES[recipe[0]], field, presses, calib.fitting.SoftL1(), use=use)
-    results = [hybrid.curves.result, *([] if hybrid.field is None else [hybrid.field.result])]
-    return hybrid if all((np.asarray(found) == FitResult.SUCCESS).all() for found in results) else None
+    model = fit_pads(CURVES[recipe[0]], field, presses, calib.fitting.SoftL1(), use=use)
+    results = [model.curves.result, *([] if model.field is None else [model.field.result])]
+    return model if all((np.asarray(found) == FitResult.SUCCESS).all() for found in results) else None
 
 
 # --- how well it predicts
 
 
-def errors(hybrid: PadModel, data: PressData, places: Places) -> tuple[np.ndarray, np.ndarray]:
-    """Of the total force, N: over the holds, (presses,), and of samples along the presses, (n,); NaN: not told."""
-    held = hybrid.pad_forces(data.pressure, places)[0].sum(1) - data.force
-    along = places[data.sample_press]
-    return held, hybrid.pad_forces(data.sample_pressure.T, along)[0].sum(1) - data.sample_force
-
-
-def judged(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> dict[str, float] | None:
-    """Root mean squares over presses not fitted, N; all presses: over folds of places."""
+def judged(pool: Pool, recipe: tuple[str, str], use: np.ndarray, levels: int | None) -> Row:
+    """Root mean squares of the error of the total force over presses not fitted, N, over the holds and along the
+    presses; all presses: over folds of places.  Nothing where a fit is not determined."""
     folds = folds_by_place(pool.data.place, FOLDS)
     parts = [folds != k for k in range(FOLDS)] if use.all() else [use]
-    hybrids = [fitted(pool, recipe, part, levels) for part in (*parts, use)]
-    if not all(hybrids):
-        return None
-    held, along = [], []
-    for part, hybrid in zip(parts, hybrids, strict=False):
-        over_holds, over_samples = errors(hybrid, pool.data, pool.places)
-        held.append(over_holds[~part])
-        along.append(over_samples[~part[pool.data.sample_press]])
-    other = errors(hybrids[-1], pool.other, pool.elsewhere)[0]
-    return {"hold_n": _rms(held), "press_n": _rms(along), "other_session_n": _rms([other])}
+    models = [fitted(pool, recipe, part, levels) for part in parts]
+    if not all(models):
+        return {}
+    data, own = pool.data, pool.data.sample_press
+    errors = np.full(len(data.force), np.nan), np.full(len(own), np.nan)
+    for part, model in zip(parts, models, strict=True):
+        held = model.pad_forces(data.pressure, pool.places)[0].sum(1) - data.force
+        along = model.pad_forces(data.sample_pressure.T, pool.places[own])[0].sum(1) - data.sample_force
+        errors[0][~part], errors[1][~part[own]] = held[~part], along[~part[own]]
+    return {name: rmse(e, np.zeros_like(e)) for name, e in zip(("hold_n", "press_n"), errors, strict=True)}
 
 
-def _rms(parts: Sequence[np.ndarray]) -> float:
-    return float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2)))
-
-
-def row(pool: Pool, recipe: tuple[str, str], spread: str, uses: Sequence[np.ndarray], levels: int | None = None) -> Row:
-    """Means over the draws that determine the fit, and their standard deviations."""
-    good = [one for one in (judged(pool, recipe, use, levels) for use in uses) if one]
-    count = int(uses[0].sum())
+def row(pool: Pool, recipe: tuple[str, str], spread: str, count: int, levels: int | None = None) -> Row:
     out: Row = {"curve": recipe[0], "location": recipe[1], "spread": spread, "presses": count, "levels": levels}
-    out |= {"minutes": round(count * pool.seconds / 60, 1), "draws": len(uses), "failed": len(uses) - len(good)}
-    return out | (averaged(good) if good else {})
+    out["minutes"] = round(count * pool.seconds / 60, 1)
+    return out | judged(pool, recipe, SPREADS[spread](pool.position, count), levels)
 
 
 def by_presses(run: Run) -> Iterator[Row]:
-    found = pool(run.smoke)
-    presses = len(found.data.force)
     for recipe in run.sizes(RECIPES, RECIPES[1:2]):
-        for side in run.sizes(SIDES, (5, 15)):
-            uses, count = {"grid": [on_grid(found.position, side)]}, side**2
-            if count < presses:
-                uses["scattered"] = [scattered(found.position, count)]
-                uses["random"] = [drawn(presses, count, seed) for seed in range(1 if run.smoke else DRAWS)]
-            yield {"presses": [row(found, recipe, spread, some) for spread, some in uses.items()]}
+        for side in run.sizes(SIDES, (5, SIDE)):
+            spreads = SPREADS if side < SIDE else ("grid",)
+            yield {"presses": [row(pool(run.smoke), recipe, spread, side**2) for spread in spreads]}
 
 
 def by_levels(run: Run) -> Iterator[Row]:
     yield {"levels": []}
     for curve in run.sizes(list(CURVES), ()):
         for count in (36, 100):
-            uses = [scattered(pool(False).position, count)]
-            rows = [row(pool(False), (curve, "pad edge"), "scattered", uses, levels) for levels in LEVELS]
-            yield {"levels": rows}
+            yield {"levels": [row(pool(False), (curve, "pad edge"), "scattered", count, n) for n in LEVELS]}
 
 
 # --- the picture
@@ -209,17 +172,13 @@ def by_levels(run: Run) -> Iterator[Row]:
 def picture(data: Row) -> Figure:
     """Error against presses, and against force levels."""
     figure, (left, right) = panels(10.8, 4.6, 1, 2, sharey=True)
-    colours = dict(zip(RECIPES, ("C0", "C1", "C2"), strict=True))
-    for (curve, location, spread), rows in grouped(data["presses"], "curve", "location", "spread").items():
-        points = [(r["presses"], r["hold_n"], r.get("hold_n_sd", 0)) for r in rows if "hold_n" in r]
-        first = spread == "scattered"
-        look: Row = {"marker": "o", "label": f"{curve}, place: {location}"} if first else {"marker": "."}
-        look |= {"color": colours[curve, location], "linestyle": LINES[spread]}
-        left.errorbar(*zip(*points, strict=True), **look)
+    for spread in SPREADS:
+        rows = [row for row in data["presses"] if row["spread"] == spread]
+        curves(left, rows, "presses", "hold_n", ("curve", "location", "spread"), _by_recipe)
     rows = [r | {"step": LEVELS.index(r["levels"])} for r in data["levels"]]
-    curves(right, rows, "step", "press_n", ("curve", "presses"), _look)
+    curves(right, rows, "step", "press_n", ("curve", "presses"), _by_curve)
     labels: Any = {"xlabel": "presses fitted", "ylabel": "RMS error of held-out forces, N"}
-    logarithmic(left, "over the holds; scattered (lines), grid (dashed), random (dotted, ± sd)", **labels)
+    logarithmic(left, "over the holds; scattered (lines), grid (dashed)", **labels)
     left.set_xticks([s**2 for s in SIDES], labels=[str(s**2) for s in SIDES])
     left.set_xticks([], minor=True)
     right.set_xticks(range(len(LEVELS)), labels=["whole press" if n is None else str(n) for n in LEVELS])
@@ -231,7 +190,14 @@ def picture(data: Row) -> Figure:
     return figure
 
 
-def _look(curve: str, count: int) -> Row:
+def _by_recipe(curve: str, location: str, spread: str) -> Row:
+    look: Row = {"color": f"C{RECIPES.index((curve, location))}"}
+    if spread == "grid":
+        return look | {"marker": ".", "linestyle": "--"}
+    return look | {"label": f"{curve}, place: {location}"}
+
+
+def _by_curve(curve: str, count: int) -> Row:
     line, colour = "-" if count == 100 else "--", f"C{list(CURVES).index(curve)}"
     return {"color": colour, "linestyle": line, "label": f"{curve}, {count} presses"}
 

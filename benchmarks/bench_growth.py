@@ -1,8 +1,8 @@
 """How time and memory grow: with nodes, electrodes, readings, pixels, frames of a batch, and pads.
 
-One size varies at a time, on the square of the other benchmarks.  The exponents are the slopes of a line through the
-logarithms, over all sizes and from the last but one to the last; beside them what the theory expects for large sizes.
-Memory is what XLA states for the compiled program: arguments, results and temporaries.
+One size varies at a time, on the square of the other benchmarks.  The exponent is the slope of a line through the
+logarithms; beside it what the theory expects for large sizes.  Memory is what XLA states for the compiled program:
+arguments, results and temporaries.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -122,14 +122,12 @@ def megabytes(compiled: Any) -> float:
 
 
 def fits(one: Series, rows: Sequence[Row]) -> Row:
-    """Exponents over all sizes and at the end, beside the theory's."""
-    size = np.log([row["size"] for row in rows])
-    out: Row = {"series": one.name, "of": one.of, "sizes": [row["size"] for row in rows]}
+    """Exponents beside the theory's."""
+    sizes, out = [row["size"] for row in rows], {"series": one.name, "of": one.of}
     for name, key, theory in (("time", "median_ms", one.time), ("memory", "megabytes", one.memory)):
-        value = np.log([row[key] for row in rows])
-        overall, last = np.polyfit(size, value, 1)[0], (value[-1] - value[-2]) / (size[-1] - size[-2])
-        out[name] = {"exponent": round(float(overall), 2), "at_the_end": round(float(last), 2), "theory": theory}
-    return out
+        slope = np.polyfit(np.log(sizes), np.log([row[key] for row in rows]), 1)[0]
+        out[name] = {"exponent": round(float(slope), 2), "theory": theory}
+    return out | {"sizes": sizes}
 
 
 def measure(run: Run) -> Iterator[Row]:

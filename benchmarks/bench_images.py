@@ -14,7 +14,7 @@ uses the first two seeds.
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import cycle
+from itertools import cycle, product
 from typing import Any, NamedTuple
 
 import jax
@@ -24,19 +24,18 @@ import jaxeit as je
 
 from .clock import in_turns, seconds, spread
 from .harness import Question, Run, stored
-from .problems import pressed
+from .problems import matched, pressed, uneven
 from .rows import Row, averaged
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.02, 0.03, 0.04, 0.06), (1.0, 1 / 3)
 LEVELS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 MAX_FALSE_SECONDS = 0.05  # of the single presses may show a second contact
-BLANKS = 100  # untouched frames, of which the coat is fitted to the mean
 USUAL: Row = {"basis": je.Pixels(40), "hyperparameter": 0.1}
 ITERATIVE: Row = {"basis": je.Pixels(24)}
 FITS: dict[str, Row] = {"contacts, fitted": {}, "contacts, fitted, sheet known": {"sheet_known": True}}
 METHODS: dict[str, Row] = {
-    "back-projection": {"method": je.BackProjection()},
+    "back-projection": {"method": je.imaging.BackProjection()},
     "one step, Tikhonov": {"prior": je.Tikhonov()},
     "one step, NOSER": {},
     "one step, Laplace": {"prior": je.Laplace()},
@@ -57,62 +56,36 @@ Found = list[np.ndarray]  # contacts of each frame, (k, 2) m
 class Simulated:
     """The presses of one seed.
 
-    | meaning                                                          | shape                  | unit |
-    |------------------------------------------------------------------|------------------------|------|
-    | sites of single presses                                          | (sites, 2)             | m    |
-    | pairs pressed at once, once for each of SHARES                   | (distances, pairs, 2, 2) | m  |
-    | frames: singles, then pairs by distance and share; less untouched | (presses, readings)   | V    |
-    | noise of a reading; blank: mean of untouched frames              | (readings,)            | V    |
+    | meaning                                                           | shape               | unit |
+    |-------------------------------------------------------------------|---------------------|------|
+    | sites of single presses                                           | (sites, 2)          | m    |
+    | pairs pressed at once: name of distance and share, and places     | (pairs, 2, 2)       | m    |
+    | frames: singles, then the pairs by name; less untouched           | (presses, readings) | V    |
+    | noise of a reading; blank: mean of untouched frames               | (readings,)         | V    |
     """
 
     def __init__(self, seed: int, grid: int, pairs: int) -> None:
-        rng = np.random.default_rng(seed)
-        line = np.linspace(0.01, 0.19, grid)
+        rng, line = np.random.default_rng(seed), np.linspace(0.01, 0.19, grid)
         self.sites = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
         centre, angle = rng.uniform(0.05, 0.15, (pairs, 2)), rng.uniform(0, np.pi, pairs)
         along = np.stack([np.cos(angle), np.sin(angle)], -1) / 2
-        far = np.array(DISTANCES)[:, None, None]
-        self.pairs = np.stack([centre - far * along, centre + far * along], -2)
-        uneven = je.effects.CoatingNonUniformity(0.15, 0.03, seed=2 * seed)
-        found = pressed((uneven, je.effects.ContactGain(0.12, 0.015, seed=2 * seed + 1)), *self._presses())
+        self.pairs: dict[str, np.ndarray] = {}
+        places, loads = [np.repeat(self.sites[:, None], 2, 1)], [np.tile([LOAD, 0.0], (len(self.sites), 1))]
+        for far, share in product(DISTANCES, SHARES):  # the second of a single is not loaded
+            places.append(np.stack([centre - far * along, centre + far * along], -2))
+            loads.append(np.tile([LOAD, share * LOAD], (pairs, 1)))
+            self.pairs[f"pairs_{1e3 * far:.0f}mm_1:{1 / share:.0f}"] = places[-1]
+        found = pressed(uneven(seed), np.concatenate(places), np.concatenate(loads))
         self.noise = np.full(found.untouched.size, found.noise)
-        self.blank = found.untouched + self.noise / np.sqrt(BLANKS) * rng.normal(size=found.untouched.size)
-        self.frames = found.change + self.noise * rng.normal(size=found.change.shape)
-
-    def _presses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two places of each press, and the loads there; the second of a single is not loaded."""
-        places, shares = [np.repeat(self.sites[:, None], 2, 1)], [np.tile([1.0, 0.0], (len(self.sites), 1))]
-        for pairs in self.pairs:
-            places += [pairs] * len(SHARES)
-            shares += [np.tile([1.0, share], (len(pairs), 1)) for share in SHARES]
-        return np.concatenate(places), LOAD * np.concatenate(shares)
+        self.blank, self.frames = found.frames(rng)
 
     @property
     def singles(self) -> np.ndarray:
         return self.frames[: len(self.sites)]
 
-    def doubles(self, found: Found) -> Iterator[tuple[str, Found, np.ndarray]]:
-        """Name of a distance and share, what was found in those frames, and the pairs."""
-        count, start = self.pairs.shape[1], len(self.sites)
-        for distance, pairs in zip(DISTANCES, self.pairs, strict=True):
-            for share in SHARES:
-                yield f"pairs_{1e3 * distance:.0f}mm_1:{1 / share:.0f}", found[start : start + count], pairs
-                start += count
-
-
-def matched(found: Found, places: np.ndarray) -> np.ndarray:
-    """Flags of the frames in which both contacts and nothing else are found."""
-    reach = min(0.015, float(np.linalg.norm(places[0, 0] - places[0, 1])) / 2)
-    return np.array([len(f) == 2 and _both(f, pair, reach) for f, pair in zip(found, places, strict=True)])
-
-
-def _both(found: np.ndarray, pair: np.ndarray, reach: float) -> bool:
-    away = np.linalg.norm(found[:, None] - pair, axis=-1)
-    return bool(min(away[[0, 1], [0, 1]].max(), away[[0, 1], [1, 0]].max()) < reach)
-
 
 def in_regions(recon: Any, images: np.ndarray, level: float) -> Found:
-    return [je.find_regions(image, recon, level=level, least=(1 - level) / 2).centres for image in images]
+    return [je.contacts.find_regions(image, recon, level=level, least=(1 - level) / 2).centres for image in images]
 
 
 def chosen_level(recon: Any, images: np.ndarray) -> float:
@@ -173,8 +146,9 @@ def scores(one: Simulated, seen: Seen) -> Iterator[tuple[str, float]]:
     yield "inward_mm", 1e3 * float(np.nanmean(je.metrics.inward_bias(best, one.sites, np.array([0.1, 0.1]))))
     yield "cv", float(je.metrics.coefficient_of_variation(seen.sums, ddof=0))
     yield "false_seconds", float(np.mean([len(f) > 1 for f in seen.found[: len(one.sites)]]))
-    for name, found, pairs in one.doubles(seen.found):
-        yield name, float(matched(found, pairs).mean())
+    rest = iter(seen.found[len(one.sites) :])
+    for name, pairs in one.pairs.items():
+        yield name, float(np.mean([matched(next(rest), pair) for pair in pairs]))
 
 
 def frame_time(apply: Callable, frames: np.ndarray) -> float:

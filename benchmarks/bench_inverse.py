@@ -28,17 +28,12 @@ QUICKEST = "jaxeit, on_host(),"
 LACKING = "jaxeit, on_host(), one reading is NaN,"
 BY_HAND = "NumPy and SciPy, through pair sums,"
 ASKED = 100  # readings of a frame of the event-driven scan
+FEW = f"jaxeit, on_host(), {ASKED} readings are there,"
 STILL = "as much time in the first cache"
 ELSEWHERE = np.zeros(1 << 25, np.uint8)  # bytes that other work touches: sixteen times what a core keeps to itself
 TOGETHER, LOOP = 1000, 100
 LATE_MS = 0.1
-STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
-    "p50": np.median,
-    "p99": lambda times: np.quantile(times, 0.99),
-    "p99.9": lambda times: np.quantile(times, 0.999),
-    "min": np.min,
-    "max": np.max,
-}
+QUANTILES = {"min": 0.0, "p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +109,7 @@ def single_ways(recon: je.Reconstructor, frame: np.ndarray) -> Ways:
         return {
             QUICKEST: Way(lambda: given.on_host(whole), exact, given.compressed),
             LACKING: Way(lambda: given.on_host(broken), mended, given.compressed),
-            f"jaxeit, on_host(), {ASKED} readings are there,": Way(
-                lambda: given.on_host(few), little, given.compressed
-            ),
+            FEW: Way(lambda: given.on_host(few), little, given.compressed),
             "jaxeit, NumPy in and out,": Way(lambda: np.asarray(mine(whole)), exact, given.ours),
             "jaxeit, JAX array,": Way(lambda: wait(mine(on_device)), exact, given.ours),
             "jaxeit, compiled(), NumPy in and out,": Way(lambda: np.asarray(compiled(whole)), exact, given.ours),
@@ -177,17 +170,17 @@ def latencies(
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(calls // block):
         for name, way in ways.items():
-            times[name] += _block(way.call, block, budget - sum(times[name]), between)
+            left = budget - sum(times[name])
+            if between is None and left > 0:
+                way.call()
+            times[name] += _block(way.call, block, left, between or (lambda: None))
     return {name: np.array(taken) / ways[name].frames for name, taken in times.items()}
 
 
-def _block(call: Callable[[], Any], calls: int, left: float, between: Callable[[], Any] | None) -> list[float]:
+def _block(call: Callable[[], Any], calls: int, left: float, between: Callable[[], Any]) -> list[float]:
     taken: list[float] = []
-    if between is None and left > 0:
-        call()
     while len(taken) < calls and sum(taken) < left:
-        if between is not None:
-            between()
+        between()
         taken.append(seconds(call)[0])
     return taken
 
@@ -197,24 +190,14 @@ def other_work() -> None:
     np.add(ELSEWHERE, 1, out=ELSEWHERE)
 
 
-def copy_seconds(count: int) -> float:
-    """Least time in which so many bytes are touched by a copy, half read and half written; small ones stay in cache."""
-    source = np.ones(max(count // 2, 1), np.uint8)
-    into = np.empty_like(source)
-    return min(seconds(np.copyto, into, source)[0] for _ in range(50))
-
-
-def application_rows(ways: Ways, times: Mapping[str, np.ndarray], byte_per_s: float) -> list[Row]:
-    """ms per frame; the least times are those of a copy of as many bytes, from memory and as they lie in the caches."""
-    rows = []
+def application_rows(ways: Ways, times: Mapping[str, np.ndarray], byte_per_s: float) -> Iterator[Row]:
+    """ms per frame; the least time is that of a copy of as many bytes from memory."""
     for name, way in ways.items():
-        ms, per_frame = 1e3 * times[name], 1e3 * way.passes / way.frames
-        found = {f"{key}_ms": round(float(f(ms)), 5) for key, f in STATISTICS.items()}
-        row: Row = {"way": name, "frames": way.frames, "calls": len(ms)} | found
-        row |= {"above": int(np.sum(ms > LATE_MS)), "frames_per_s": round(1e3 / float(np.median(ms)), 1)}
-        row |= {"bytes": way.bytes, "least_ms": round(per_frame * way.bytes / byte_per_s, 5)}
-        rows.append(row | {"least_cached_ms": round(per_frame * copy_seconds(way.bytes), 5)})
-    return rows
+        ms, least = 1e3 * times[name], 1e3 * way.passes / way.frames * way.bytes / byte_per_s
+        found = zip(QUANTILES, np.quantile(ms, [*QUANTILES.values()]) if len(ms) else (), strict=False)
+        row: Row = {"way": name, "frames": way.frames, "calls": len(ms), "above": int(np.sum(ms > LATE_MS))}
+        row |= {f"{key}_ms": round(float(value), 5) for key, value in found}
+        yield row | {"bytes": way.bytes, "least_ms": round(least, 5)}
 
 
 def application(run: Run) -> Iterator[Row]:

@@ -5,37 +5,27 @@ challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, w
 evaluation frames are not used here; the levels are made by leaving those readings of the training frames out.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from scipy.io import loadmat
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from scipy.optimize import minimize_scalar
 
 import jaxeit as je
-from calib.report.figures import write_figure
 
 from .clock import seconds
-from .figures import panels
-from .harness import ROOT, Question, Run
-from .markdown import crossed
+from .harness import Question, Run
 from .rows import Row, grouped
 
-PICTURE = ROOT / "docs" / "ktc.png"
 RADIUS, ELECTRODES, GRID = 0.115, 32, 256
 LEVELS, SMOKE_LEVELS = tuple(range(1, 8)), (1, 7)
-OTHER_SECTORS, OTHER_LEVELS = (8, 16, 24), (4, 7)  # where else electrodes are taken away; not looked at while tuning
 WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
 PUBLISHED = {"linear baseline": 10.30, "winners (trained networks), about": 15.0}
 
@@ -73,14 +63,14 @@ class Data:
     | meaning                                               | shape         | unit |
     |-------------------------------------------------------|---------------|------|
     | pattern: drive+, drive-, sense+, sense-               | (2356, 4)     |      |
-    | current of each reading, as the file tells it         | (2356,)       | mA   |
+    | mean current, as the file tells it                    | ()            | mA   |
     | reference: water only                                 | (2356,)       | V    |
     | frames                                                | (4, 2356)     | V    |
     | truth: 0 water, 1 resistive, 2 conductive; row 0 = +y | (4, 256, 256) |      |
     """
 
     pattern: np.ndarray
-    current: np.ndarray
+    current: float
     reference: np.ndarray
     frames: np.ndarray
     truth: np.ndarray
@@ -100,8 +90,7 @@ def load(folder: Path) -> Data:
     frames = [loadmat(folder / "training" / f"data{k}.mat")["Uel"].ravel() for k in range(1, 5)]
     truth = [loadmat(folder / "groundtruth_training" / f"true{k}.mat")["truth"] for k in range(1, 5)]
     pattern = np.concatenate([np.repeat(drives, count, 0), np.tile(senses, (len(drives), 1))], 1)
-    current = np.repeat(drive.max(0), count)
-    return Data(pattern, current, reference["Uelref"].ravel(), np.array(frames), np.array(truth))
+    return Data(pattern, float(drive.max(0).mean()), reference["Uelref"].ravel(), np.array(frames), np.array(truth))
 
 
 def tank(data: Data, edge_length: float = 0.03) -> je.Model:
@@ -111,20 +100,13 @@ def tank(data: Data, edge_length: float = 0.03) -> je.Model:
     width = disc.perimeter / (2 * ELECTRODES)
     starts = (middles - width / 2) % disc.perimeter
     patches = tuple(je.BoundaryPatch(float(s), float(s + width), 1e-4) for s in starts)
-    protocol = je.Protocol(data.pattern, float(data.current.mean()))
+    protocol = je.Protocol(data.pattern, data.current)
     return je.discretise(je.Scene(je.Skin("ktc", disc, 1.0, patches, protocol)), je.Fidelity(edge_length=edge_length))
 
 
 class Water(NamedTuple):
-    """Water and contacts as `ref.mat` tells them.
-
-    | meaning                                                 | shape       | unit       |
-    |---------------------------------------------------------|-------------|------------|
-    | sigma                                                   | ()          | mS         |
-    | contact                                                 | ()          | kilohm m   |
-    | missed: reading less model (and offset)                 | (readings,) | V          |
-    | residual: norm of it, relative to that of the readings  | ()          |            |
-    """
+    """Water as `ref.mat` tells it: sigma in mS, contact in kilohm m, what model (and offsets) miss of the
+    readings (readings,) in V, and its norm relative to theirs."""
 
     sigma: float
     contact: float
@@ -138,7 +120,10 @@ LEAST_CONTACT, MOST_CONTACT = 1e-6, 1.0  # contact resistance times conductivity
 def homogeneous(model: je.Model, readings: np.ndarray, channel: np.ndarray | None = None) -> Water:
     """Fit of one conductivity and one contact resistance; with ``channel`` also of an offset of each sensing pair.
 
-    As ``voltages(sigma, contact) = voltages(1, contact sigma) / sigma``, all but the product of the two is linear.
+    All currents are taken alike: pairs that were driven in both directions then agree in size to 0.7 % on average, to
+    2.6 % with the currents of the file. Most of what is left (7.3 % to 4.1 %) is a fixed offset of each sensing pair,
+    which differences of frames do not see. As ``voltages(sigma, contact) = voltages(1, contact sigma) / sigma``, all
+    but the product of the two is linear.
     """
 
     def less_offsets(values):
@@ -164,25 +149,9 @@ def _even(model, ratio):
     return je.forward(eqx.tree_at(lambda m: m.contact, model, contact), jnp.ones_like(model.background))
 
 
-def fits(model: je.Model, data: Data) -> dict[str, Water]:
-    """Relative residuals of even water in `ref.mat`, the currents and offsets taken in three ways.
-
-    Pairs that were driven in both directions agree in size to 0.7 % on average if all currents are taken alike, to
-    2.6 % if they are those of the file. Most of what is then left (7.3 % to 4.1 %) is a fixed offset of each sensing
-    pair, which differences of frames do not see.
-    """
-    as_told = data.reference * data.current.mean() / data.current
-    return {
-        "currents of the file": homogeneous(model, as_told),
-        "equal currents": homogeneous(model, data.reference),
-        "equal currents, offsets": homogeneous(model, data.reference, data.channel),
-    }
-
-
-def with_level(data: Data, level: int, first: int = 0) -> Data:
-    """Frames with NaN where a reading uses one of the 2 (level - 1) electrodes from ``first`` on."""
-    gone = (first + np.arange(2 * (level - 1))) % ELECTRODES
-    lost = np.isin(data.pattern, gone).any(1)
+def with_level(data: Data, level: int) -> Data:
+    """Frames with NaN where a reading uses one of the first 2 (level - 1) electrodes."""
+    lost = (data.pattern < 2 * (level - 1)).any(1)
     frames = np.where(lost, np.nan, data.frames)
     return replace(data, reference=np.where(lost, np.nan, data.reference), frames=frames)
 
@@ -243,102 +212,33 @@ def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method
 # --- results
 
 
-def measure(
-    data: Data, ways: dict[str, Method], levels: Iterable[int], first: int = 0
-) -> tuple[list[Row], dict[tuple[int, str], list[np.ndarray]]]:
-    """Scores of every method at every level, and the labels behind them."""
-    rows, found = [], {}
-    for level, (name, way) in product(levels, ways.items()):
-        spent, found[level, name] = seconds(way, with_level(data, level, first))
-        scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(found[level, name], data.truth, strict=True)]
-        row = {"level": level, "first": first, "method": name, "seconds": round(spent, 2)}
-        rows.append(row | {"scores": [round(s, 3) for s in scores], "mean": round(float(np.mean(scores)), 3)})
-        print(rows[-1], flush=True)
-    return rows, found
-
-
-def _mean(rows: list[Row]) -> float:
-    return float(np.mean([row["mean"] for row in rows]))
+def scored(data: Data, ways: dict[str, Method], level: int) -> Iterator[Row]:
+    """Scores of every method at a level."""
+    for name, way in ways.items():
+        spent, found = seconds(way, with_level(data, level))
+        scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(found, data.truth, strict=True)]
+        row: Row = {"level": level, "method": name, "seconds": round(spent, 2)}
+        yield row | {"scores": np.round(scores, 3).tolist(), "mean": round(float(np.mean(scores)), 3)}
 
 
 def totals(rows: list[Row]) -> dict[str, float]:
     """Mean over levels, of the 21 points of the challenge (three frames at each of seven levels)."""
-    return {name: round(21 * _mean(mine), 2) for name, mine in grouped(rows, "method").items()}
-
-
-def means(rows: list[Row]) -> dict[str, dict[str, float]]:
-    """Mean score by level and method."""
-    by_method = {name: grouped(mine, "level") for name, mine in grouped(rows, "method").items()}
-    return {
-        name: {f"level {level}": round(_mean(mine), 3) for level, mine in by_level.items()}
-        for name, by_level in by_method.items()
-    }
-
-
-def table(rows: list[Row]) -> str:
-    """Scores by level, and the total."""
-    of_21 = [{"method": name, "head": "of 21", "score": f"{total:.2f}"} for name, total in totals(rows).items()]
-    by_level = [row | {"head": f"level {row['level']}", "score": f"{row['mean']:.3f}"} for row in rows]
-    return crossed("method", "{method}", "{head}", "{score}", by_level + of_21)
-
-
-RIM = "#333333"
-COLOURS = ListedColormap(["#dfeaf2", "#c2571a", "#1f4e79"])
-SHOWN = {"linear": "linear", "variation": "total variation"}
-
-
-def picture(data: Data, found: dict[tuple[int, str], list[np.ndarray]]) -> Figure:
-    """Truth beside what each method makes of it, at the first and the last level found."""
-    levels = sorted({level for level, _ in found})
-    columns = [(level, name) for level in (levels[0], levels[-1]) for name in SHOWN]
-    rows, width = len(data.truth), 1 + len(columns)
-    figure, axes = panels(2.1 * width, 2.3 * rows, rows, width, squeeze=False)
-    for number, truth in enumerate(data.truth):
-        first, *others = axes[number * width : (number + 1) * width]
-        _panel(first, truth, 1)
-        first.set_ylabel(f"frame {number + 1}", fontsize=10)
-        for panel, key in zip(others, columns, strict=True):
-            _panel(panel, found[key][number], key[0])
-            panel.set_xlabel(f"score {float(je.metrics.ktc_score(found[key][number], truth)):.2f}", fontsize=9)
-    axes[0].set_title("truth", fontsize=10)
-    for panel, (level, name) in zip(axes[1:width], columns, strict=True):
-        panel.set_title(f"{SHOWN[name]}\nlevel {level}", fontsize=10)
-    kinds = [Patch(color=COLOURS(kind), label=name) for kind, name in enumerate(("water", "resistive", "conductive"))]
-    rim = Line2D([], [], color=RIM, linewidth=2, label="electrodes in use")
-    figure.legend(handles=[*kinds, rim], loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
-    return figure
-
-
-def _panel(axes: Any, labels: np.ndarray, level: int) -> None:
-    """Labels in the tank, with the electrodes that are left."""
-    line = np.linspace(-RADIUS, RADIUS, GRID)
-    inside = np.hypot(*np.meshgrid(line, line)) <= RADIUS
-    extent = (-RADIUS, RADIUS, -RADIUS, RADIUS)
-    shown = np.ma.masked_where(~inside, labels)
-    axes.imshow(shown, cmap=COLOURS, vmin=0, vmax=2, extent=extent, interpolation="nearest")
-    for electrode in range(2 * (level - 1), ELECTRODES):
-        angle = np.pi / 2 + 2 * np.pi * electrode / ELECTRODES + np.linspace(-1, 1, 5) * np.pi / ELECTRODES / 2
-        axes.plot(1.03 * RADIUS * np.cos(angle), 1.03 * RADIUS * np.sin(angle), color=RIM, linewidth=2)
-    axes.set(xlim=(-1.1 * RADIUS, 1.1 * RADIUS), ylim=(-1.1 * RADIUS, 1.1 * RADIUS), xticks=[], yticks=[])
-    axes.set_frame_on(False)
+    by_method = grouped(rows, "method")
+    return {name: round(21 * float(np.mean([row["mean"] for row in mine])), 2) for name, mine in by_method.items()}
 
 
 def challenge(run: Run) -> Iterator[Row]:
-    """All levels, and some levels with electrodes taken away elsewhere."""
+    """All levels."""
     data = load(run.args.data)
     model = tank(data)
-    water = fits(model, data)
-    yield {"residuals": {name: round(fit.residual, 4) for name, fit in water.items()}}
-    ways = methods(model, water["equal currents, offsets"])
+    ways = methods(model, homogeneous(model, data.reference, data.channel))
     if run.smoke:
         data = replace(data, frames=data.frames[:1], truth=data.truth[:1])
-    rows, found = measure(data, ways, run.sizes(LEVELS, SMOKE_LEVELS))
-    print(table(rows), flush=True)
-    yield {"published_of_21": PUBLISHED, "of_21": totals(rows), "rows": rows}
-    if not run.smoke:
-        write_figure(picture(data, found), PICTURE)
-        others = [row for first in OTHER_SECTORS for row in measure(data, ways, OTHER_LEVELS, first)[0]]
-        yield {"means_other_sectors": means(others), "other_sectors": others}
+    yield {"published_of_21": PUBLISHED, "rows": []}
+    for level in run.sizes(LEVELS, SMOKE_LEVELS):
+        for row in scored(data, ways, level):
+            print(row, flush=True)
+            yield {"rows": [row], "of_21": totals([*run.data["rows"], row])}
 
 
 DATA: Row = {"type": Path, "required": True, "help": "folder with training/ and groundtruth_training/"}

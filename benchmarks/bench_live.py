@@ -11,12 +11,9 @@ that does nothing but sleep from one hundredth of a second to the next, at the s
 promise less, at the same priority.
 """
 
-import os
-import sys
 import tempfile
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import count
@@ -39,7 +36,7 @@ from calib.record.priority import real_time, refusal
 from calib.record.recorder import record_session, session_journal
 from calib.runtime import set_up_live
 
-from .harness import Question, Run
+from .harness import Question, Run, with_one_blas_thread
 from .memory import growth, resident
 from .rows import Row
 
@@ -77,8 +74,7 @@ def rates(run: Run) -> Iterator[Row]:
                 return True
         return False
 
-    most = 2 * RATE if run.smoke else FASTEST
-    yield {"highest_hz": highest(sustains, RATE, most), "rates": tried}
+    yield {"highest_hz": highest(sustains, RATE, 2 * RATE if run.smoke else FASTEST), "rates": tried}
 
 
 def highest(sustains: Callable[[int], bool], low: int, most: int) -> int:
@@ -88,9 +84,7 @@ def highest(sustains: Callable[[int], bool], low: int, most: int) -> int:
     high = 2 * low
     while high <= most and sustains(high):
         low, high = high, 2 * high
-    if high > most:
-        return low
-    while high > CLOSE * low:
+    while high <= most and high > CLOSE * low:
         middle = (low + high) // 2
         low, high = (middle, high) if sustains(middle) else (low, middle)
     return low
@@ -107,116 +101,7 @@ def made_up() -> calib.Calibration:
     return calib.Calibration(skin, recon, je.pad_masks(skin, recon), curves, none, {}, simulated=True)
 
 
-def skin_process(rates: tuple[int, int], channels: tuple[int, int], told: Any, stop: Event) -> None:
-    """The device, until told to stop."""
-    with SimulatedDevice(
-        [frames(number + 1, *what) for number, what in enumerate(zip(rates, channels, strict=True))]
-    ) as device:
-        told.put((device.begin, device.urls))
-        stop.wait()
-
-
-def frames(number: int, rate: int, channels: int) -> Packets:
-    """Noise; on the pads a press of 2 kPa, two seconds of every four: rest levels can be found in each pause."""
-    rng = np.random.default_rng(number)
-    pool = rng.normal(0, 1e-6, (64, channels)).astype("f4")
-    pressed = pool + np.float32(2e-4 * rng.normal() if number == 1 else 2000.0)
-    times = (n * 1_000_000_000 // rate for n in count())
-    choice = ((pressed if n // (2 * rate) % 2 else pool)[n % 64] for n in count())
-    return frame_packets(number, times, choice)
-
-
-class Received:
-    """What arrives, on its way to a log: how many frames of each stream, and when the latest were due."""
-
-    def __init__(self, log: RecordSink):
-        self._log = log
-        self.counts = [0, 0]
-        self._due: OrderedDict[int, int] = OrderedDict()
-
-    @property
-    def size(self) -> int:
-        """Bytes written."""
-        return self._log.size
-
-    def append(self, stream: int, flags: int, host: int, payload: bytes) -> None:
-        """One record."""
-        self._log.append(stream, flags, host, payload)
-        if stream > 1:
-            return
-        self.counts[stream] += 1
-        ticks = unpack_frames([payload]).ticks if stream == 0 else None
-        if ticks is not None:
-            self._due.setdefault(host, int(ticks[0]))  # of those read together the earliest
-            if len(self._due) > 64:
-                self._due.popitem(last=False)
-
-    def due(self, host: int) -> int | None:
-        """When the frame that came at `host` was due, device time in us modulo 2**32."""
-        return self._due.get(host)
-
-
-class Memory:
-    """Samples of the time, s, and the memory of this process, MB; all room is taken at the beginning."""
-
-    def __init__(self, most: int):
-        self._samples, self._used = np.full((most, 2), np.nan), 0
-
-    @property
-    def samples(self) -> np.ndarray:
-        """(n, 2)."""
-        return self._samples[: self._used]
-
-    def note(self, at_least: float = 0.0) -> None:
-        """Take a sample, unless the last is younger than that many seconds."""
-        now = time.monotonic()
-        if not self._used or now - self._samples[self._used - 1, 0] >= at_least:
-            self._samples[self._used] = now, resident()
-            self._used += 1
-
-
-def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
-    """By how much memory grows in an hour of frames at the rate of the paper, MB, and the standard error of that.
-
-    Nothing where a run was too short to tell.
-    """
-    found, share = growth(memory), RATE / rate
-    if not np.isfinite(found.error):
-        return {}
-    return {
-        f"memory_mb_per_hour{end}": round(mb * share, 2) for end, mb in (("", found.slope), ("_error", found.error))
-    }
-
-
-class Watch:
-    """Latencies, s, and the memory of this process once a second; all room is taken at the beginning."""
-
-    def __init__(self, rate: int, seconds: float, begin: int, received: Received):
-        most = int(1.5 * rate * seconds) + 1000
-        self._latency, self._since_due = np.full(most, np.nan), np.full(most, np.nan)
-        self._rate, self._begin, self._received, self._memory = rate, begin, received, Memory(int(seconds) + 60)
-        self.last: FrameResult | None = None
-
-    def __call__(self, result: FrameResult) -> None:
-        now, row = time.monotonic_ns(), result.number - 1
-        self.last = result
-        self._latency[row] = result.latency
-        due = self._received.due(result.host)
-        if due is not None:
-            self._since_due[row] = ((now - self._begin) // 1000 - due) % 2**32 / 1e6
-        self._memory.note(at_least=1.0)
-
-    def found(self) -> Row:
-        """In ms, and MB."""
-        times = percentiles("latency", self._latency) | percentiles("since_due", self._since_due)
-        memory = self._memory.samples
-        return times | {"memory_mb": round(memory[-1, 1])} | grown(memory, self._rate)
-
-
-def percentiles(name: str, seconds: np.ndarray) -> dict[str, float]:
-    """Median, 99th percentile and most, ms."""
-    values = 1e3 * np.nanpercentile(seconds, [50, 99, 100])
-    return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
+# --- processes beside the one that is measured
 
 
 @contextmanager
@@ -234,15 +119,32 @@ def beside(target: Callable[..., None], *args: Any) -> Iterator[tuple[Any, Event
 
 
 @contextmanager
-def device(calibration: calib.Calibration, rates: tuple[int, int]) -> Iterator[tuple[int, list[str]]]:
+def device(calibration: calib.Calibration, rates: tuple[int, int]) -> Iterator[tuple[int, dict[str, str]]]:
     """The simulated skin: when it began, ns, and where its streams are."""
-    channels = calibration.recon.readings, len(calibration.skin.pads)
-    with beside(skin_process, rates, channels) as (told, _):
-        yield told.get(timeout=120)
+    with beside(skin_process, rates, (calibration.recon.readings, len(calibration.skin.pads))) as (told, _):
+        begin, urls = told.get(timeout=120)
+        yield begin, dict(zip(("eit", "pressure"), urls, strict=True))
+
+
+def skin_process(rates: tuple[int, int], channels: tuple[int, int], told: Any, stop: Event) -> None:
+    """The device, until told to stop."""
+    streams = zip((1, 2), rates, channels, strict=True)
+    with SimulatedDevice([frames(*stream) for stream in streams]) as device:
+        told.put((device.begin, device.urls))
+        stop.wait()
+
+
+def frames(number: int, rate: int, channels: int) -> Packets:
+    """Noise; on the pads a press of 2 kPa, two seconds of every four: rest levels can be found in each pause."""
+    rng = np.random.default_rng(number)
+    pool = rng.normal(0, 1e-6, (64, channels)).astype("f4")
+    pressed = pool + np.float32(2e-4 * rng.normal() if number == 1 else 2000.0)
+    times = (n * 1_000_000_000 // rate for n in count())
+    return frame_packets(number, times, ((pressed if n // (2 * rate) % 2 else pool)[n % 64] for n in count()))
 
 
 @contextmanager
-def metronome(realtime: bool) -> Iterator[dict[str, float]]:
+def sleeper(realtime: bool) -> Iterator[dict[str, float]]:
     """Filled on leaving: how late a process that only sleeps was woken in between."""
     found: dict[str, float] = {}
     with beside(sleeping, realtime) as (told, stop):
@@ -266,21 +168,97 @@ def sleeping(realtime: bool, told: Any, stop: Event) -> None:
     told.put(np.array(late))
 
 
+# --- what is seen
+
+
+class Samples:
+    """Rows of two numbers; all room is taken at the beginning, so that what grows is the memory of others."""
+
+    def __init__(self, most: float) -> None:
+        self._rows, self._used = np.full((int(most), 2), np.nan), 0
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(n, 2)."""
+        return self._rows[: self._used]
+
+    def add(self, first: float, second: float) -> None:
+        self._rows[self._used] = first, second
+        self._used += 1
+
+
+def grown(memory: np.ndarray, rate: int) -> dict[str, float]:
+    """By how much memory, rows of s and MB, grows in an hour of frames at the rate of the paper, MB, and the standard
+    error of that; nothing where a run was too short to tell."""
+    found, share = growth(memory), RATE / rate
+    names = ("memory_mb_per_hour", "memory_mb_per_hour_error") if np.isfinite(found.error) else ()
+    return {name: round(mb * share, 2) for name, mb in zip(names, found, strict=False)}
+
+
+def percentiles(name: str, seconds: np.ndarray) -> dict[str, float]:
+    """Median, 99th percentile and most, ms."""
+    values = 1e3 * np.nanpercentile(seconds, [50, 99, 100])
+    return {f"{name}_ms_{what}": round(float(v), 3) for what, v in zip(("p50", "p99", "max"), values, strict=True)}
+
+
+class Watch:
+    """What arrives on its way to a log, and the results: frames of each stream, latencies, memory once a second."""
+
+    def __init__(self, log: RecordSink, rate: int, seconds: float, begin: int) -> None:
+        self._log, self._rate, self._begin = log, rate, begin
+        self.received, self._due = [0, 0], np.zeros((64, 2), np.int64)  # when the last frames came, and were due
+        self._latency, self._memory = Samples(1.5 * rate * seconds + 1000), Samples(seconds + 60)
+        self.last: FrameResult | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes written."""
+        return self._log.size
+
+    def append(self, stream: int, flags: int, host: int, payload: bytes) -> None:
+        """One record."""
+        self._log.append(stream, flags, host, payload)
+        if stream > 1:
+            return
+        ticks = unpack_frames([payload]).ticks if stream == 0 else None
+        if ticks is not None:
+            self._due[self.received[0] % len(self._due)] = host, ticks[0]
+        self.received[stream] += 1
+
+    def __call__(self, result: FrameResult) -> None:
+        now = time.monotonic_ns()
+        due = self._due[self._due[:, 0] == result.host, 1]  # of those read together the earliest counts
+        late = ((now - self._begin) // 1000 - int(due.min())) % 2**32 / 1e6 if len(due) else np.nan
+        self._latency.add(result.latency, late)
+        if not len(self._memory.rows) or now / 1e9 - self._memory.rows[-1, 0] >= 1:
+            self._memory.add(now / 1e9, resident())
+        self.last = result
+
+    def found(self) -> Row:
+        """In ms, and MB."""
+        latency, since_due = self._latency.rows.T
+        return (
+            percentiles("latency", latency) | percentiles("since_due", since_due) | grown(self._memory.rows, self._rate)
+        )
+
+
+# --- runs
+
+
 def tenfold(calibration: calib.Calibration, seconds: float) -> Row:
     """A recording at ten times the rate of the paper: frames, those lost, and what memory did."""
-    rates, memory = (10 * RATE, 10 * PRESSURE_RATE), Memory(int(10 * seconds) + 1000)
-    with device(calibration, rates) as (_, (eit, pressure)), tempfile.TemporaryDirectory() as folder:
-        plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
-        path = Path(folder) / "session.h5"
-        summary = record_session(plan, sources, path, seconds=seconds, progress=lambda line: memory.note())
-    return {
-        "rate_hz": rates[0],
-        "seconds": seconds,
-        "recorded": [stream.frames for stream in summary.streams],
-        "lost": [stream.lost for stream in summary.streams],
-        "complete": summary.complete,
-        **grown(memory.samples[:-1], rates[0]),  # the last is told when the session is written
-    }
+    rates, memory = (10 * RATE, 10 * PRESSURE_RATE), Samples(10 * seconds + 1000)
+    with device(calibration, rates) as (_, urls), tempfile.TemporaryDirectory() as folder:
+        plan, sources = plan_recording(urls, calibration.skin)
+
+        def note(line: str) -> None:
+            memory.add(time.monotonic(), resident())
+
+        summary = record_session(plan, sources, Path(folder) / "session.h5", seconds=seconds, progress=note)
+    streams = summary.streams
+    row: Row = {"rate_hz": rates[0], "seconds": seconds, "complete": summary.complete}
+    row |= {"recorded": [one.frames for one in streams], "lost": [one.lost for one in streams]}
+    return row | grown(memory.rows[:-1], rates[0])  # the last is told when the session is written
 
 
 def soaked(calibration: calib.Calibration, seconds: float, realtime: bool = False) -> Row:
@@ -301,32 +279,18 @@ def watched(
 ) -> Row:
     """One run: frames and what became of them, the latencies in ms, and what memory did."""
     show, settings = LiveControl(), LiveSettings(REST, realtime=realtime)
-    with device(calibration, (rate, PRESSURE_RATE)) as (begin, (eit, pressure)):
-        with session_journal(output) if output else nullcontext(NullSink()) as sink, metronome(realtime) as woken:
-            received = Received(sink)
-            watch, timer = Watch(rate, seconds, begin, received), threading.Timer(seconds, show.stop.set)
-            plan, sources = plan_recording({"eit": eit, "pressure": pressure}, calibration.skin)
-            run_live(calibration, plan, sources, [watch], show, settings, log=received, begun=timer.start)
-            timer.cancel()
-            ended = time.monotonic()
-        finishing = time.monotonic() - ended
+    journal = session_journal(output) if output else nullcontext(NullSink())
+    with device(calibration, (rate, PRESSURE_RATE)) as (begin, urls), journal as sink, sleeper(realtime) as woken:
+        watch, timer = Watch(sink, rate, seconds, begin), threading.Timer(seconds, show.stop.set)
+        plan, sources = plan_recording(urls, calibration.skin)
+        run_live(calibration, plan, sources, [watch], show, settings, log=watch, begun=timer.start)
+        timer.cancel()
     assert watch.last is not None, "no frame came"
-    frames, dropped = received.counts[0], watch.last.dropped
+    frames, dropped = watch.received[0], watch.last.dropped
     enough = frames > 0.98 * rate * seconds  # else the simulated skin, not the host, was too slow
-    return {
-        "rate_hz": rate,
-        "seconds": round(seconds, 1),
-        "received": received.counts,
-        "lost": show.lost,
-        "dropped": dropped,
-        "shown": watch.last.number,
-        "sustained": bool(show.lost + dropped <= max(1, LOST * frames) and enough),
-        "skin_kept_up": bool(enough),
-        "unsearched": watch.last.unsearched,
-        **watch.found(),
-        **woken,
-        **({} if output is None else {"finishing_s": round(finishing, 1)}),
-    }
+    row: Row = {"rate_hz": rate, "seconds": round(seconds, 1), "received": watch.received, "lost": show.lost}
+    row |= {"dropped": dropped, "shown": watch.last.number}
+    return row | {"sustained": show.lost + dropped <= max(1, LOST * frames) and enough} | watch.found() | woken
 
 
 OPTIONS: Row = {
@@ -336,7 +300,5 @@ OPTIONS: Row = {
 main = Question("live", __doc__, {"runs": long_runs, "rates": rates}, OPTIONS, prepare=set_up_live)
 
 if __name__ == "__main__":
-    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # read when NumPy is imported; jaxeit live sets it too
-        os.environ["OPENBLAS_NUM_THREADS"] = "1"
-        os.execv(sys.executable, [sys.executable, "-m", "benchmarks.bench_live", *sys.argv[1:]])
+    with_one_blas_thread()
     main()

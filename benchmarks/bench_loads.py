@@ -29,18 +29,16 @@ import jaxeit as je
 from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
 
-from .bench_images import matched
 from .clock import seconds
 from .harness import Question, Run
-from .problems import Pressed, pressed
-from .rows import Row
+from .problems import Pressed, matched, pressed, uneven
+from .rows import Row, grouped
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.015, 0.02, 0.025, 0.03, 0.04), (1.0, 1 / 3)
 LENGTHS = (0.02, 0.03, 0.04, 0.06)
 TRIANGLE = 0.025  # m, from its middle to each of three tips
 TIPS = 19  # of a touch at most
-BLANKS = 100
 INSIDE, WITHIN = float(chi2.ppf(0.9, 2)), float(norm.ppf(0.95))
 NOISES, SHAPES = (40, 60, 80), ("gaussian", "flat", "ring", "tilted")
 TIP, TIP_SPREAD, RING = 0.018, 0.006, 0.015  # m: radius and spread of a flat tip, radius of a ring
@@ -122,11 +120,7 @@ def _touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> 
 
 def simulated(seed: int, given: list[Touch], **how: Any) -> Pressed:
     """The frames of touches on the skin of a seed."""
-    effects = (
-        je.effects.CoatingNonUniformity(0.15, 0.03, seed=2 * seed),
-        je.effects.ContactGain(0.12, 0.015, seed=2 * seed + 1),
-    )
-    return pressed(effects, np.stack([t.places for t in given]), np.stack([t.loads for t in given]), **how)
+    return pressed(uneven(seed), np.stack([t.places for t in given]), np.stack([t.loads for t in given]), **how)
 
 
 class Seen(NamedTuple):
@@ -141,10 +135,10 @@ class Seen(NamedTuple):
 def seen(model: je.Model, found: Pressed, given: list[Touch], seed: int, decibels: int, known: bool) -> Iterator[Seen]:
     """What fitter and finder see of touches, with noise so many decibels below the readings."""
     rng = np.random.default_rng([seed, decibels, known])
-    noise = np.full(found.untouched.size, found.noise * 10 ** ((60 - decibels) / 20))
-    blank = found.untouched + noise / np.sqrt(BLANKS) * rng.normal(size=noise.size)
+    found = found._replace(noise=found.noise * 10 ** ((60 - decibels) / 20))
+    blank, frames = found.frames(rng)
+    noise = np.full(blank.size, found.noise)
     sheet = je.fit_background(model, blank) if known else None
-    frames = found.change + noise * rng.normal(size=found.change.shape)
     finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
     fitter: LoadFitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
     bumps = finder(frames)
@@ -163,7 +157,7 @@ def judged(one: Seen) -> Row:
     place, order = _ordered(np.asarray(shape.position), touch.truth)
     told = loads.kind is touch.kind
     if touch.kind is LoadKind.TWO:
-        told = told and bool(matched([place], touch.truth[None])[0])
+        told = told and matched(place, touch.truth)
     inside = [_square(shape, k, t) < INSIDE for k, t in zip(order, touch.truth, strict=True)]
     probability = np.asarray(loads.probability)
     return {
@@ -196,17 +190,16 @@ def _by_bumps(touch: Touch, found: Any) -> bool:
     """Whether the finder tells one from two; an edge is one."""
     there = np.asarray(found.position)[np.asarray(found.present)]
     if touch.kind is LoadKind.TWO:
-        return bool(matched([there], touch.truth[None])[0])
+        return matched(there, touch.truth)
     return len(there) == len(touch.truth)
 
 
 def means(every: list[Row], key: str) -> list[Row]:
     """Means of rows that share a name."""
     rows = []
-    for name in dict.fromkeys(row[key] for row in every):
-        mine = [row for row in every if row[key] == name]
-        found = {k: float(np.mean([row[k] for row in mine])) for k in mine[0] if k != key}
-        rows.append({key: name, "frames": len(mine)} | {k: round(value, 4) for k, value in found.items()})
+    for name, mine in grouped(every, key).items():
+        found = {k: round(float(np.mean([row[k] for row in mine])), 4) for k in mine[0] if k != key}
+        rows.append({key: name, "frames": len(mine)} | found)
     return rows
 
 

@@ -9,12 +9,10 @@ readings; "with switching" each change of the driven pair takes ten readings mor
 chooses with that cost in mind. "Lost": frames in which the fit finds no contact.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
@@ -53,6 +51,7 @@ class Bench:
     |------------------------------------|---------------------|------|
     | sites                              | (presses, 2)        | m    |
     | frames, less untouched, with noise | (presses, readings) | V    |
+    | masks: weights of pixels by pad    | (pads, pixels)      |      |
     """
 
     def __init__(self, smoke: bool) -> None:
@@ -68,40 +67,36 @@ class Bench:
         self.fit = je.prepare_contacts(self.model, settings, noise=std)
         self.image = je.prepare(self.model, noise=std)
         self.basis = je.Pixels(20).on(self.model)
+        self.masks = je.pad_masks(self.skin, self.basis).weights
 
     def pads_at(self, places: np.ndarray) -> np.ndarray:
         """The pad of the pixel that is nearest to each place."""
         pixel = np.linalg.norm(np.asarray(self.basis.centres) - places[:, None], axis=-1).argmin(1)
         return np.asarray(self.masks)[:, pixel].argmax(0)
 
-    @cached_property
-    def masks(self) -> jax.Array:
-        return je.pad_masks(self.skin, self.basis).weights
-
-    def signal(self, region: Any = None) -> jax.Array:
-        """Covariance of the readings by contacts anywhere, or in a region; of several regions several."""
-        return je.scan.signal_covariance(self.model, basis=self.basis, region=region)
-
-    def order(self, signal: jax.Array, selection: Any = None, switch: float = 0.0) -> np.ndarray:
-        """All readings, the best first."""
+    def order(
+        self, region: Any = None, selection: Any = None, most: int | None = None, switch: float = 0.0
+    ) -> np.ndarray:
+        """Readings, the best first, by the covariance that contacts anywhere, or in a region, give them."""
+        signal = je.scan.signal_covariance(self.model, basis=self.basis, region=region)
         pattern = self.skin.protocol.pattern
-        return np.asarray(je.choose_readings(signal, len(signal), selection, pattern=pattern, switch=switch).rows)
+        return np.asarray(
+            je.scan.choose_readings(signal, most or len(signal), selection, pattern=pattern, switch=switch).rows
+        )
 
     def ways(self) -> dict[str, Orders]:
         """Ways to choose readings, by name."""
         near = self.sites + KNOWN / np.sqrt(2) * np.random.default_rng(1).normal(size=self.sites.shape)
-        whole, by_pad = self.signal(), [self.order(one) for one in self.signal(self.masks)]
+        by_pad = [self.order(mask) for mask in self.masks]
         for_all = {
-            "D-optimal": self.order(whole),
-            "D-optimal, cost per drive": self.order(whole, switch=SWITCH),
-            "most sensitive": self.order(whole, je.scan.Sensitive()),
-            "largest volume": np.asarray(je.choose_readings(whole, INDEPENDENT, je.scan.Volume()).rows),
+            "D-optimal": self.order(),
+            "D-optimal, cost per drive": self.order(switch=SWITCH),
+            "most sensitive": self.order(selection=je.scan.Sensitive()),
+            "largest volume": self.order(selection=je.scan.Volume(), most=INDEPENDENT),
         }
         return {name: [order] * len(near) for name, order in for_all.items()} | {
             "around the pad": [by_pad[pad] for pad in self.pads_at(near)],
-            "around the place": [
-                self.order(self.signal(je.scan.around(self.basis.picture, place, 0.03))) for place in near
-            ],
+            "around the place": [self.order(je.scan.around(self.basis.picture, place, 0.03)) for place in near],
         }
 
     def at_random(self, seed: int) -> Orders:
@@ -109,20 +104,14 @@ class Bench:
 
     def row(self, name: str, count: int, orders: Orders) -> Row:
         rows = [np.sort(order[:count]) for order in orders]
-        frames = np.full(self.frames.shape, np.nan)
-        for number, kept in enumerate(rows):
-            frames[number, kept] = self.frames[number, kept]
+        readings = self.skin.protocol.readings
+        frames = jnp.stack(
+            [je.scan.in_frame(frame[kept], kept, readings) for frame, kept in zip(self.frames, rows, strict=True)]
+        )
         fitted = np.asarray(je.localisation_error(je.contacts.strongest(self.fit(frames)), self.sites))
         pictured = np.asarray(je.localisation_error(ESTIMATOR(self.image(frames), self.image), self.sites))
-        return {
-            "way": name,
-            "readings": count,
-            "fit_mm": _mm(fitted, np.nanmean),
-            "fit_p95_mm": _mm(fitted, lambda e: np.nanquantile(e, 0.95)),
-            "lost": float(np.mean(np.isnan(fitted))),
-            "image_mm": _mm(pictured, np.nanmean),
-            **self.rates(rows),
-        }
+        out: Row = {"way": name, "readings": count, "fit_mm": _mm(fitted), "lost": float(np.mean(np.isnan(fitted)))}
+        return out | {"image_mm": _mm(pictured), **self.rates(rows)}
 
     def rates(self, rows: Sequence[Any]) -> dict[str, float]:
         """Frames per second of scans that take these readings each, without and with the time to switch."""
@@ -131,8 +120,8 @@ class Bench:
         return {"frames_per_s": float(rates[0]), "frames_per_s_with_switching": float(rates[1])}
 
 
-def _mm(errors: np.ndarray, of: Callable) -> float | None:
-    return 1e3 * float(of(errors)) if np.isfinite(errors).any() else None
+def _mm(errors: np.ndarray) -> float | None:
+    return 1e3 * float(np.nanmean(errors)) if np.isfinite(errors).any() else None
 
 
 def measure(run: Run) -> Iterator[Row]:
@@ -150,7 +139,7 @@ def measure(run: Run) -> Iterator[Row]:
 def events(bench: Bench, idle: int, local: int) -> Row:
     """Readings and errors by frame: at rest, for the pad that is pressed, then around the contact found."""
     settings = je.scan.EventScanSettings(onset=500.0, idle=idle, local=local)
-    scan = je.prepare_event_scan(bench.model, bench.skin, settings)
+    scan = je.scan.prepare_event_scan(bench.model, bench.skin, settings)
     step = eqx.filter_jit(lambda state, pressure, places: scan.step(state, pressure, places))
     masks: dict[str, list] = {"rest": [], "first": [], "next": []}
     errors: dict[str, list[float]] = {"first": [], "next": []}
@@ -170,7 +159,7 @@ def events(bench: Bench, idle: int, local: int) -> Row:
     for name, mine in masks.items():
         out[name] = {"readings": float(np.mean([int(m.sum()) for m in mine]))} | bench.rates(mine)
     for name, apart in errors.items():
-        out[name] |= {"fit_mm": _mm(np.array(apart), np.nanmean), "lost": float(np.isnan(apart).mean())}
+        out[name] |= {"fit_mm": _mm(np.array(apart)), "lost": float(np.isnan(apart).mean())}
     return out
 
 

@@ -1,7 +1,7 @@
 """Start-up times of fresh processes: imports, help, and the README's first program.
 
 Times are from the start of a process to its end.  The program runs without a cache of compiled programs, with an empty
-cache, and with the cache that this run filled.  The times of imports, by package, are those of `python -X importtime`.
+cache, and with the cache that this run filled.
 """
 
 import re
@@ -24,7 +24,6 @@ COMMANDS = {
     "calib.open_session": "import calib; calib.open_session",
     "jaxeit --help": "import sys; sys.argv = ['jaxeit', '--help']; from calib.cli import main; main()",
 }
-IMPORTS = {"jaxeit": "import jaxeit; jaxeit.forward", "calib.calibration": "import calib.calibration"}
 
 
 def measure(run: Run) -> Iterator[Row]:
@@ -49,28 +48,14 @@ def programs(repeats: int) -> list[Row]:
     """The first program without a cache, with an empty one, and with a full one."""
     code, times = program(), defaultdict(list)
     for _ in range(repeats):
-        times["no cache"].append(fresh(code)[0])
+        times["no cache"].append(fresh(code))
         with tempfile.TemporaryDirectory() as folder:
             for name in ("empty cache", "full cache"):
-                times[name].append(fresh(code, cache=folder)[0])
+                times[name].append(fresh(code, cache=folder))
     return [{"start": f"the README's program, {name}", **spread(taken)} for name, taken in times.items()]
 
 
-def packages(code: str) -> list[Row]:
-    """What the imports of a program take, by package, most first."""
-    said = fresh(code, "-X", "importtime")[1].stderr
-    own: dict[str, float] = defaultdict(float)
-    for microseconds, name in re.findall(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)", said):
-        own[name.split(".")[0]] += int(microseconds) / 1e3
-    most = sorted(own.items(), key=lambda item: -item[1])[:12]
-    return [{"package": name, "ms": round(ms, 1)} for name, ms in most]
-
-
-def imports(run: Run) -> Iterator[Row]:
-    yield {"imports": {module: packages(code) for module, code in IMPORTS.items()}}
-
-
-main = Question("start", __doc__, {"rows": measure, "imports": imports})
+main = Question("start", __doc__, {"rows": measure})
 
 if __name__ == "__main__":
     main()

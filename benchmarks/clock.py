@@ -1,13 +1,10 @@
 """The clock that every question shares: seconds of calls, tools in turn, agreement before timing, memory, limits."""
 
 import os
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,37 +35,28 @@ def taken(tool: Tool, sigma: np.ndarray) -> tuple[float, np.ndarray]:
     return getattr(tool, "last_seconds", outside), out
 
 
-class Times(NamedTuple):
-    """Seconds of the last call in each turn of a tool, and of the first call, which follows all the other tools."""
+class Turn(NamedTuple):
+    """Seconds of the last call in a turn of a tool, and of the first call, which follows all the other tools."""
 
-    own: list[float]
-    after_others: list[float]
-
-
-class Call(NamedTuple):
-    """A tool, and the conductivity that it is called with."""
-
-    tool: Tool
-    sigma: np.ndarray
+    last: float
+    first: float
 
 
-def interleaved(calls: Sequence[Call], repeats: int, budget: float) -> list[Times]:
-    """Times of tools that take turns, each round in another order, so that no tool always follows the same one.
+def interleaved(calls: Sequence[tuple[Tool, np.ndarray]], repeats: int, budget: float) -> list[list[Turn]]:
+    """Turns of tools with their conductivities, each round in another order, so that none always follows the same one.
 
     A slow tool stops after ``budget`` seconds, though not before `MIN_TURNS` turns.
     """
-    times = [Times([], []) for _ in calls]
-    for turn in range(repeats):
-        for number in np.random.default_rng(turn).permutation(len(calls)):
-            (tool, sigma), (own, after_others) = calls[number], times[number]
-            if len(own) < MIN_TURNS or sum(own) < budget:
-                last, first = a_turn(tool, sigma * (1 + 1e-3 * turn))
-                own.append(last)
-                after_others.append(first)
-    return times
+    turns: list[list[Turn]] = [[] for _ in calls]
+    for number in range(repeats):
+        for k in np.random.default_rng(number).permutation(len(calls)):
+            if len(turns[k]) < MIN_TURNS or sum(turn.last for turn in turns[k]) < budget:
+                tool, sigma = calls[k]
+                turns[k].append(a_turn(tool, sigma * (1 + 1e-3 * number)))
+    return turns
 
 
-def a_turn(tool: Tool, sigma: np.ndarray) -> tuple[float, float]:
+def a_turn(tool: Tool, sigma: np.ndarray) -> Turn:
     """Seconds of the last and of the first call among those that `TURN_SECONDS` holds; no conductivity occurs twice.
 
     In the first calls the processor fetches again what other tools have driven from its caches, and the system learns
@@ -78,7 +66,7 @@ def a_turn(tool: Tool, sigma: np.ndarray) -> tuple[float, float]:
     while spent < TURN_SECONDS:
         last = taken(tool, sigma * (1 + 1e-3 * spent))[0]
         spent += last
-    return last, first
+    return Turn(last, first)
 
 
 def in_turns(calls: Mapping[Any, Callable], repeats: int, budget: float = np.inf) -> dict[Any, list[float]]:
@@ -138,29 +126,7 @@ def require_agreement(
     return found
 
 
-# --- memory and limits of the machine
-
-
-def peak_megabytes() -> float:
-    """Peak memory of this process so far. On Linux getrusage would start at the parent's peak."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        (line,) = (line for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM"))
-        return int(line.split()[1]) / 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
-
-
-def peaks(before: float, now: float | None = None) -> dict[str, int]:
-    """Peak memory of this process in MB, in all and beyond what it was before."""
-    now = peak_megabytes() if now is None else now
-    return {"peak_mb": round(now), "beyond_imports_mb": round(now - before)}
-
-
-def alone() -> ProcessPoolExecutor:
-    """A pool of one process that starts anew."""
-    return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
-
+# --- fresh processes, and limits of the machine
 
 CACHE = {  # as the command line sets it, calib/runtime.py
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -168,15 +134,13 @@ CACHE = {  # as the command line sets it, calib/runtime.py
 }
 
 
-def fresh(code: str, *options: str, cache: str = "") -> tuple[float, subprocess.CompletedProcess]:
-    """Seconds of a fresh Python that runs the code, and what it wrote; with a folder for compiled programs, or none."""
+def fresh(code: str, cache: str = "") -> float:
+    """Seconds of a fresh Python that runs the code, with a folder for compiled programs, or none."""
     ours = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", *CACHE)
     environment = {name: value for name, value in os.environ.items() if name not in ours}
     environment |= CACHE | {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
-    command, folder = [sys.executable, *options, "-c", code], Path(__file__).parents[1]
-    return seconds(
-        lambda: subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
-    )
+    how: Any = {"cwd": Path(__file__).parents[1], "env": environment, "capture_output": True, "check": True}
+    return seconds(lambda: subprocess.run([sys.executable, "-c", code], **how))[0]
 
 
 def limits() -> dict[str, float]:

@@ -8,8 +8,8 @@ import numpy as np
 
 import jaxeit as je
 
-from .clock import Call, alone, interleaved, limits, peak_megabytes, peaks, require_agreement, seconds, spread, taken
-from .harness import Run, set_up
+from .clock import interleaved, limits, require_agreement, seconds, spread, taken
+from .harness import Run
 from .problems import SIZES, SMOKE, Problem
 from .rows import Row
 from .tools import PIXELS, TOOLS, basis_of, present
@@ -21,7 +21,8 @@ class Comparison:
     they are called.
 
     ``images``: onto what, as the ends of the tools' names; ``work``: flops and bytes of a problem onto an image;
-    ``before``: numbers by tool, checked at each size before anything is timed, which go into the rows as ``checked``.
+    ``largest``: cells a side of the largest problem; ``voltages``: how far each tool's voltages are off with so many
+    cells a side, checked before anything is timed.
     """
 
     tools: str
@@ -30,24 +31,21 @@ class Comparison:
     work: Callable[[Problem, str], Row]
     repeats: int
     images: tuple[str, ...] = ("",)
-    checked: str = ""
-    before: Callable[[int], Mapping[str, float]] = lambda cells: {}
+    largest: int = SIZES[-1]
+    voltages: Callable[[int], Row] | None = None
 
     def __call__(self, run: Run) -> Iterator[Row]:
-        """Rows and work of all sizes, then the peak memory of each tool at the largest."""
+        """Rows and work of all sizes."""
         machine = limits()
         yield {"limits": machine, "rows": [], "work": []}
-        for cells in run.sizes(SIZES, (SMOKE,)):
-            before, problem = self.before(cells), Problem(cells)
+        for cells in run.sizes([cells for cells in SIZES if cells <= self.largest], (SMOKE,)):
+            problem, off = Problem(cells), self.voltages(cells) if self.voltages else None
             for image in self.images:
                 rows = self.rows(problem, image, 3 if run.smoke else self.repeats)
+                for row in rows if off else ():
+                    row["voltage_difference"] = off.get(row["tool"].split(",")[0])
                 if rows:
-                    for row in rows if self.checked else ():
-                        row[self.checked] = before.get(row["tool"].split(",")[0])
                     yield {"rows": rows, "work": [with_limits(rows, machine, self.work(problem, image))]}
-        if not run.smoke:
-            self._add_peaks(run.data["rows"], SIZES[-1])
-            yield {}
 
     def rows(self, problem: Problem, image: str, repeats: int, budget: float = 8.0) -> list[Row]:
         """A row for each tool: agreement with the reference first, then the clocks."""
@@ -63,7 +61,7 @@ class Comparison:
         found = require_agreement(outputs, reference, {e.name: e.loose for e in entries})
         first_call = {name: round(spent, 3) for name, (spent, _) in first.items()}
         del first, outputs  # Jacobians are large
-        times = interleaved([Call(tool, problem.sigma) for _, tool in ready.values()], repeats, budget)
+        turns = interleaved([(tool, problem.sigma) for _, tool in ready.values()], repeats, budget)
         return [
             {
                 "tool": name,
@@ -72,28 +70,11 @@ class Comparison:
                 "difference": found.get(name, 0.0),
                 "prepare_s": round(spent, 3),
                 "first_call_s": first_call[name],
-                **spread(own),
-                "after_others_ms": round(1e3 * float(np.median(after_others)), 4),
+                **spread([turn.last for turn in own]),
+                "after_others_ms": spread([turn.first for turn in own])["median_ms"],
             }
-            for (name, (spent, _)), (own, after_others) in zip(ready.items(), times, strict=True)
+            for (name, (spent, _)), own in zip(ready.items(), turns, strict=True)
         ]
-
-    def _add_peaks(self, rows: list[Row], cells: int) -> None:
-        """Peak memory of each tool at one size, alone in a process, into its row."""
-        for row in rows:
-            if row["nodes"] == (cells + 1) ** 2:
-                with alone() as process:
-                    row |= process.submit(peaks_of, self.tools, row["tool"], cells).result()
-
-
-def peaks_of(tools: str, name: str, cells: int) -> dict[str, int]:
-    """Peak memory of this process, MB, by one tool at one size: preparation, compilation and one call."""
-    set_up()
-    before, problem = peak_megabytes(), Problem(cells)
-    entry = next(e for e in TOOLS[tools] if e.name == name)
-    tool: Any = entry.prepare(problem)
-    tool(problem.sigma)
-    return tool.peaks() if hasattr(tool, "peaks") else peaks(before)
 
 
 # --- the least work, and the time that the machine needs for it

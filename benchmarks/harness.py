@@ -35,6 +35,13 @@ def set_up() -> None:
     je.reuse_memory()
 
 
+def with_one_blas_thread() -> None:
+    """Start this command anew where BLAS has more threads: it reads their number once, when NumPy is imported."""
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
+        os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        os.execv(sys.executable, [sys.executable, "-m", f"benchmarks.{Path(sys.argv[0]).stem}", *sys.argv[1:]])
+
+
 @dataclass(eq=False)
 class Run:
     """A question while it is measured: the options given, and its section of the results so far."""

@@ -7,8 +7,8 @@ and ``{x:.1f kilo}`` (in thousands). A cell is empty where the row lacks the num
 
 import re
 import string
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from .rows import Row
 
@@ -36,27 +36,6 @@ def cell(template: str, row: Row, missing: str = "") -> str:
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
-
-
-class Table(NamedTuple):
-    """The sections of the results that a table is made of, and how."""
-
-    sections: tuple[str, ...]
-    text: Callable[..., str]
-
-
-def listed(sections: str, heads: str, line: str, rows: Callable[..., Iterable[Row]]) -> Table:
-    """A line for each row; heads and cells with bars between."""
-
-    def text(*results: Row) -> str:
-        return markdown(heads.split(" | "), ([cell(c, row) for c in line.split(" | ")] for row in rows(*results)))
-
-    return Table(tuple(sections.split()), text)
-
-
-def crossing(sections: str, *formats: str, rows: Callable[..., Sequence[Row]], missing: str = "") -> Table:
-    """See `crossed`, whose head, line, column and content the formats are."""
-    return Table(tuple(sections.split()), lambda *results: crossed(*formats, rows(*results), missing))
 
 
 def crossed(head: str, line: str, column: str, content: str, rows: Sequence[Row], missing: str = "") -> str:

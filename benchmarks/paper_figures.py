@@ -5,190 +5,121 @@ sensitivity over the sheet.
 
 Figure 8 shows two contacts that come and go one by one: force over time, its error, and interference.  Its scenes
 (`two_contacts` and `chest_two_contacts`): press 1, press 2, release 1, release 2, some with both tips on one pad, the
-others on neighbouring ones.  The calibration is of single presses on a grid over the same sheet, as a bench
-makes them: it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump, and
-beside it that of the force map's pixels nearest to it.  A pad's true force is that of the tips above it, so that what
-spreads to its neighbours counts as interference; it means nothing for tips that stand on a border of pads.
+others on neighbouring ones.  The calibration is of single presses on a grid over the same sheet, as a bench makes them:
+it has seen no second contact.  A contact's force is its share of the pads' forces by its fitted bump.
 """
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
+from calib.calibration import Calibration
 from calib.report.curved_figure import curved_figure
 from calib.report.figures import localisation_figure, sensitivity_figure, write_figure
 from calib.report.force_series import ForceSeries, force_series_figure
 from calib.runtime import set_up
 
 from .harness import ROOT, Question, Run
-from .rows import Row, grouped
+from .rows import Row
 
 PICTURES = ROOT / "docs" / "figures"
 SCENES = {"testbed": ("paper_bench", "two_contacts"), "chest": ("chest_bench", "chest_two_contacts")}
-SIDE = 9  # of the grid of presses that are calibrated on
-MARGIN = 0.01  # m
-KINDS = ("one pad", "two pads", "a border of pads")
+SIDE, MARGIN = 9, 0.01  # of the grid of presses that figure 8 is calibrated on; m
 CASES = ("two contacts on one pad", "a contact on each of two pads")
 EVENTS = ("press 1", "press 2", "release 1", "release 2")
-
-
-def alone(bench: Bench, smoke: bool) -> Bench:
-    """Single presses on a grid over the same sheet, to forces as large as both tips have together."""
-    x, y = (
-        np.linspace(low + MARGIN, high - MARGIN, 4 if smoke else SIDE)
-        for low, high in np.transpose(bench.scene.skin.domain.bounds)
-    )
-    sites = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    changes: Row = {"companions": (), "forces": np.array([25.0]), "eit_rate": 10.0, "toml": "", "seed": bench.seed + 1}
-    return replace(bench, sites=sites, **changes)
-
-
-def force_map(bench: Bench, smoke: bool) -> dict[str, np.ndarray]:
-    """What `calib.apply` writes: time (n,) ns, force (n, pixels) N, pad_force (n, pads) N, centres (pixels, 2) m,
-    contact_position (n, K, 2) m, contact_force (n, K) N."""
-    fidelity = je.Fidelity.draft() if smoke else je.Fidelity.standard()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        grid = simulate(alone(bench, smoke), folder / "alone.h5", fidelity=fidelity)
-        pair = simulate(bench, folder / "pair.h5", fidelity=fidelity)
-        with calib.open_session(grid) as session:
-            calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge(), fidelity=fidelity))
-        with calib.open_session(pair) as session:
-            calib.apply(calibration, session, folder / "map.h5")
-        return dict(calib.session.read_archive(folder / "map.h5", "skin-forcemap").arrays)
-
-
-class Press:
-    """One press of both tips: what they did, and what the force map says of that time.
-
-    | meaning                                                          | shape         | unit |
-    |------------------------------------------------------------------|---------------|------|
-    | time; rows: of the force map                                     | (n,)          | s    |
-    | tips                                                             | (contacts, 2) | m    |
-    | contacts: true forces; by_fit: of the contacts that were fitted; | (n, contacts) | N    |
-    | by_map: of the pixels of the force map                           | (n, contacts) | N    |
-    | under: pad under each tip                                        | (contacts,)   |      |
-    | pads: true forces; found: those of the force map                 | (n, pads)     | N    |
-    """
-
-    def __init__(self, bench: Bench, forces: dict[str, np.ndarray], number: int) -> None:
-        self.bench, self.number, self.start = bench, number, bench.blank + number * bench.period
-        every, motion = forces["time"] / 1e9, planned_motion(bench)
-        rows = (every >= self.start + 0.5) & (every < self.start + bench.period - 0.2)
-        self.time, self.found, force = every[rows], forces["pad_force"][rows], forces["force"][rows]
-        self.tips, self.contacts = motion.places[number], loads_at(motion, every[rows]).load
-        self.outlines = [je.Polygon(pad.outline) for pad in bench.scene.skin.pads]
-        self.under = np.argmax([outline.contains(self.tips) for outline in self.outlines], 0)
-        self.pads = np.zeros(self.found.shape)
-        np.add.at(self.pads.T, self.under, self.contacts.T)
-        self.by_fit = self._to_tips(forces["contact_position"][rows], forces["contact_force"][rows])
-        self.by_map = self._to_tips(np.broadcast_to(forces["centres"], (*force.shape, 2)), force)
-
-    def _to_tips(self, place: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Forces (n, k) at places (n, k, 2), each given to the nearest tip, (n, contacts); NaN is nowhere."""
-        far = np.linalg.norm(place[:, :, None] - self.tips, axis=-1)
-        nearest = np.argmin(np.nan_to_num(far, nan=np.inf), -1)
-        force = np.where(np.isfinite(far).all(-1), force, 0)
-        return (force[..., None] * (nearest[..., None] == np.arange(len(self.tips)))).sum(1)
-
-    @property
-    def kind(self) -> str:
-        """One of `KINDS`; a tip on a border rests on pads beside the one that its centre is on."""
-        pressed = zip(self.under, self.tips, strict=True)
-        away = [self.outlines[pad].boundary_distance(tip[None])[0] for pad, tip in pressed]
-        return KINDS[2] if min(away) < 1e-6 else KINDS[len(set(self.under.tolist())) - 1]
-
-    def row(self) -> Row:
-        idle, both = ~self.pads.any(0), (self.contacts > 0.9 * self.contacts.max(0)).all(1)
-        off, hold = self.found.sum(1) - self.pads.sum(1), self.pads.sum(1)[both].mean()
-        return {
-            "press": self.number,
-            "tips_on": self.kind,
-            "pad_rmse_N": _rms((self.found - self.pads)[:, ~idle]),
-            "contact_rmse_N": _rms(self.by_fit - self.contacts),
-            "map_contact_rmse_N": _rms(self.by_map - self.contacts),
-            "total_rmse_N": _rms(off),
-            "total_error_of_hold_percent": float(100 * np.abs(off[both]).mean() / hold),
-            "interference_percent": float(100 * np.abs(self.found[both][:, idle]).max(0).max() / hold),
-        }
-
-    def series(self, title: str) -> ForceSeries:
-        others = np.delete(self.found, self.under, 1).sum(1)
-        timing, late = self.bench.timing, self.bench.companions[0].delay
-        down = timing.rest + timing.ramp + timing.hold
-        events = dict(zip(EVENTS, (timing.rest, timing.rest + late, down, down + late), strict=True))
-        names = ("contact 1", "contact 2", "pads not touched, together")
-        true, found = (np.column_stack(parts) for parts in ((self.contacts, 0 * others), (self.by_fit, others)))
-        return ForceSeries(title, names, self.time - self.start, true, found, events)
-
-
-def _rms(error: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(error**2)))
-
-
-def summary(rows: Sequence[Row]) -> dict[str, Row]:
-    """Means by kind."""
-    by_kind = grouped(rows, "tips_on")
-    return {
-        kind: {key: round(float(np.mean([row[key] for row in by_kind[kind]])), 3) for key in list(rows[0])[2:]}
-        for kind in KINDS
-        if kind in by_kind
-    }
+FOUND = ("localisation_quarter_mean", "localisation_fitted_mean", "cv_eit_ddof1", "cv_hybrid_ddof1", "force_rmse")
 
 
 def measure(run: Run) -> Iterator[Row]:
+    fidelity = je.Fidelity.draft() if run.smoke else je.Fidelity.standard()
     for skin, (bench, contacts) in run.sizes(list(SCENES.items()), list(SCENES.items())[:1]):
-        single = bench_figures(skin, bench, run.smoke)
-        rows = contact_figure(skin, contacts, run.smoke)
-        means = [{"skin": skin, "tips_on": kind} | row for kind, row in summary(rows).items()]
-        yield {"bench": [{"skin": skin} | single], "contacts": means, "rows": [{"skin": skin} | row for row in rows]}
+        with tempfile.TemporaryDirectory() as folder:
+            figures, row = bench_figures(load_bench(bench), Path(folder), fidelity, run.smoke)
+            forces = force_map(load_bench(contacts), Path(folder), fidelity, run.smoke)
+        figures["contacts"], errors = contact_figure(load_bench(contacts), forces)
+        for name, figure in {} if run.smoke else figures.items():
+            write_figure(figure, PICTURES / f"{skin}-{name}.png")
+        yield {"bench": [{"skin": skin} | row], "contacts": [{"skin": skin} | one for one in errors]}
 
 
-def bench_figures(skin: str, scene: str, smoke: bool) -> Row:
+def calibrated(path: Path, fidelity: je.Fidelity) -> Calibration:
+    with calib.open_session(path) as session:
+        return calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge(), fidelity=fidelity))
+
+
+def bench_figures(bench: Bench, folder: Path, fidelity: je.Fidelity, smoke: bool) -> tuple[Row, Row]:
     """Figures 5 and 6 from a calibration of the scene, and its errors."""
-    bench = load_bench(scene)
-    bench = replace(bench, sites=bench.sites[::4], eit_rate=10.0, pad_rate=20.0, blank=5.0) if smoke else bench
-    fidelity = je.Fidelity.draft() if smoke else je.Fidelity.standard()
-    with tempfile.TemporaryDirectory() as folder:
-        path = simulate(bench, Path(folder) / "bench.h5", fidelity=fidelity)
-        with calib.open_session(path) as session:
-            recipe = calib.Recipe(location=calib.PadEdge(), fidelity=fidelity)
-            calibration = calib.calibrate([session], recipe=recipe)
+    if smoke:
+        bench = replace(bench, sites=bench.sites[::4], eit_rate=10.0, pad_rate=20.0, blank=5.0)
+    calibration = calibrated(simulate(bench, folder / "bench.h5", fidelity=fidelity), fidelity)
     found, sheet = calibration.evaluation, calibration.skin
-    figures = {
+    figures: Row = {
         "places": localisation_figure(found, sheet, "quarter", "fitted", simulated=True),
         "sensitivity": sensitivity_figure(found, sheet, simulated=True),
     }
     if sheet.surface is not None:
         figures["curved"] = curved_figure(calibration, "fitted")
-    if not smoke:
-        for name, figure in figures.items():
-            write_figure(figure, PICTURES / f"{skin}-{name}.png")
-    names = ("localisation_quarter_mean", "localisation_fitted_mean", "cv_eit_ddof1", "cv_hybrid_ddof1", "force_rmse")
-    return {name: round(float(value), 4) for name, value in found.summary().items() if name in names}
+    return figures, {name: round(float(found.summary()[name]), 4) for name in FOUND}
 
 
-def contact_figure(skin: str, scene: str, smoke: bool) -> list[Row]:
-    """Figure 8, and a row for each press of both tips."""
-    bench = load_bench(scene)
-    bench = replace(bench, eit_rate=10.0, blank=2.0) if smoke else bench
-    forces = force_map(bench, smoke)
-    presses = [Press(bench, forces, number) for number in range(len(bench.sites))]
-    if not smoke:
-        firsts = [next(press for press in presses if press.kind == kind) for kind in KINDS[:2]]
-        cases = [press.series(title) for press, title in zip(firsts, CASES, strict=True)]
-        write_figure(force_series_figure(cases, simulated=True), PICTURES / f"{skin}-contacts.png")
-    return [press.row() for press in presses]
+def force_map(bench: Bench, folder: Path, fidelity: je.Fidelity, smoke: bool) -> dict[str, np.ndarray]:
+    """What `calib.apply` writes of the scene, by a calibration of single presses on a grid over the same sheet, to
+    forces as large as both tips have together."""
+    ends = np.transpose(bench.scene.skin.domain.bounds)
+    x, y = (np.linspace(low + MARGIN, high - MARGIN, 4 if smoke else SIDE) for low, high in ends)
+    changes: Row = {"companions": (), "forces": np.array([25.0]), "eit_rate": 10.0, "toml": "", "seed": bench.seed + 1}
+    alone = replace(bench, sites=np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), **changes)
+    calibration = calibrated(simulate(alone, folder / "alone.h5", fidelity=fidelity), fidelity)
+    bench = replace(bench, eit_rate=10.0) if smoke else bench
+    with calib.open_session(simulate(bench, folder / "pair.h5", fidelity=fidelity)) as session:
+        calib.apply(calibration, session, folder / "map.h5")
+    return dict(calib.session.read_archive(folder / "map.h5", "skin-forcemap").arrays)
 
 
-main = Question("paper_figures", __doc__, {"rows": measure}, prepare=set_up)
+def contact_figure(bench: Bench, forces: dict[str, np.ndarray]) -> tuple[Figure, list[Row]]:
+    """Figure 8: the first press with both tips on one pad, and the first with a tip on each of two; and the errors of
+    the contacts' forces, N."""
+    tips = planned_motion(bench).places[: len(bench.sites)]  # (presses, 2, 2)
+    outlines = [je.Polygon(pad.outline) for pad in bench.scene.skin.pads]
+    pairs = tips.reshape(-1, 2)
+    inside = np.reshape([outline.contains(pairs) for outline in outlines], (-1, len(tips), 2))
+    away = np.reshape([outline.boundary_distance(pairs) for outline in outlines], (-1, len(tips), 2))
+    under = inside.argmax(0)  # (presses, 2)
+    within = (away.min(0) > 1e-6).all(1)  # else a tip rests on pads beside the one that its centre is on
+    same = under[:, 0] == under[:, 1]
+    firsts = [int(np.flatnonzero(within & kind)[0]) for kind in (same, ~same)]
+    cases = [series(title, bench, forces, number, under[number]) for title, number in zip(CASES, firsts, strict=True)]
+    rmse = [float(np.sqrt(np.mean((one.estimated - one.true)[:, :2] ** 2))) for one in cases]
+    errors = [{"case": title, "rmse_n": round(error, 3)} for title, error in zip(CASES, rmse, strict=True)]
+    return force_series_figure(cases, simulated=True), errors
+
+
+def series(title: str, bench: Bench, forces: dict[str, np.ndarray], number: int, under: np.ndarray) -> ForceSeries:
+    """Forces of the two contacts of a press, and of the pads that are not touched, over its time."""
+    start, every, motion = bench.blank + number * bench.period, forces["time"] / 1e9, planned_motion(bench)
+    rows = (every >= start + 0.5) & (every < start + bench.period - 0.2)
+    place, share = forces["contact_position"][rows], forces["contact_force"][rows]  # (n, K, 2) m; (n, K) N
+    far = np.linalg.norm(place[:, :, None] - motion.places[number], axis=-1)
+    there, nearest = np.isfinite(far).all(-1), np.argmin(np.nan_to_num(far, nan=np.inf), -1)
+    by_fit = np.stack([np.where(there & (nearest == tip), share, 0).sum(1) for tip in (0, 1)], 1)
+    others = np.delete(forces["pad_force"][rows], under, 1).sum(1)
+    timing, late = bench.timing, bench.companions[0].delay
+    down = timing.rest + timing.ramp + timing.hold
+    events = dict(zip(EVENTS, (timing.rest, timing.rest + late, down, down + late), strict=True))
+    names = ("contact 1", "contact 2", "pads not touched, together")
+    true = np.column_stack([loads_at(motion, every[rows]).load, 0 * others])
+    return ForceSeries(title, names, every[rows] - start, true, np.column_stack([by_fit, others]), events)
+
+
+main = Question("paper_figures", __doc__, {"figures": measure}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

@@ -137,6 +137,8 @@ def exact_disc(pattern: np.ndarray) -> np.ndarray:
 
 # --- presses
 
+BLANKS = 100  # untouched frames, to whose mean the coat is fitted
+
 
 class Pressed(NamedTuple):
     """Readings (readings,) V of the untouched testbed, their change (presses, readings) V, and the noise of one,
@@ -145,6 +147,19 @@ class Pressed(NamedTuple):
     untouched: np.ndarray
     change: np.ndarray
     noise: float
+
+    def frames(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """The mean of the untouched frames, and the changes, with noise."""
+        blank = self.untouched + self.noise / np.sqrt(BLANKS) * rng.normal(size=self.untouched.size)
+        return blank, self.change + self.noise * rng.normal(size=self.change.shape)
+
+
+def uneven(seed: int) -> tuple[je.effects.AbstractEffect, ...]:
+    """A coating and a contact layer of one seed."""
+    return (
+        je.effects.CoatingNonUniformity(0.15, 0.03, seed=2 * seed),
+        je.effects.ContactGain(0.12, 0.015, seed=2 * seed + 1),
+    )
 
 
 def pressed(
@@ -177,3 +192,11 @@ def _forwards(model: je.Model, places: jax.Array, loads: jax.Array) -> jax.Array
 
 _jit: Any = eqx.filter_jit  # its type leaves out what it hands on to jax.jit
 _touched = _jit(_forwards, compiler_options=je.compiler_options())  # compiled once for all seeds
+
+
+def matched(found: np.ndarray, pair: np.ndarray) -> bool:
+    """Whether both contacts of a pair (2, 2) m and nothing else are found, (k, 2) m, within half their distance, at
+    most 15 mm."""
+    reach = min(0.015, float(np.linalg.norm(pair[0] - pair[1])) / 2)
+    away = np.linalg.norm(found[:, None] - pair, axis=-1)
+    return len(found) == 2 and bool(min(away[[0, 1], [0, 1]].max(), away[[0, 1], [1, 0]].max()) < reach)

@@ -12,7 +12,7 @@ from calib.runtime import set_up
 from calib.session import replacing
 
 from .markdown import replaced
-from .tables import evaluation, filled
+from .tables import filled, table
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -23,7 +23,7 @@ def main() -> None:
     set_up()
     with calib.open_session(ROOT / "data" / "sessions" / "testbed_grid.h5") as session:
         calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge()))
-    results = evaluation(calibration.evaluation.summary())
+    results = table("results", calibration.evaluation.summary())
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     for page in PAGES:
         text = filled(replaced(page.read_text(encoding="utf-8"), "results", results), measured)

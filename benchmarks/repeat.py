@@ -1,22 +1,21 @@
 """Do two runs agree?  Ratios of times between tools on the same work, each within what the other run's spread allows.
 
-python -m benchmarks.repeat FIRST.json SECOND.json [--sections forward jacobian inverse]
+python -m benchmarks.repeat FIRST.json SECOND.json [SECTION ...]
 
-Both files are results/<machine>.json of different runs; or one file and two names of a section, as `--section` of
-bench_forward and its kin writes them:  python -m benchmarks.repeat RESULTS.json --sections forward forward-again
+Both files are results/<machine>.json of different runs.  Exit status 1 where a ratio does not agree.
 """
 
-import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from .markdown import markdown
+from .rows import Row
 
 OURS = "jaxeit float64"
 SECTIONS = ("forward", "jacobian", "inverse", "pipeline")
-
-Row = Mapping[str, Any]
 
 
 class Ratio(NamedTuple):
@@ -33,7 +32,7 @@ class Ratio(NamedTuple):
         return self.low <= other.value <= self.high
 
 
-class Comparison(NamedTuple):
+class Agreement(NamedTuple):
     """One ratio, other tool over ours, in two runs."""
 
     what: str
@@ -61,45 +60,22 @@ def _image(row: Row) -> str:
     return row["tool"].rpartition(", ")[2] if "," in row["tool"] else ""
 
 
-def compared(first: Sequence[Row], second: Sequence[Row]) -> list[Comparison]:
+def compared(first: Sequence[Row], second: Sequence[Row]) -> list[Agreement]:
     """Ratios that both runs have."""
     again = dict(ratios(second))
-    return [Comparison(what, one, again[what]) for what, one in ratios(first) if what in again]
+    return [Agreement(what, one, again[what]) for what, one in ratios(first) if what in again]
 
 
-def table(found: Sequence[Comparison]) -> str:
-    lines = ["| times ours | first run | second run | agree |", "|---|---|---|---|"]
-    lines += [f"| {f.what} | {f.first} | {f.second} | {'yes' if f.agrees else 'NO'} |" for f in found]
-    agreeing = sum(f.agrees for f in found)
-    return "\n".join([*lines, "", f"{agreeing} of {len(found)} ratios agree within the spread of the runs."])
-
-
-def pairs(files: Sequence[Path], sections: Sequence[str]) -> Iterator[tuple[str, Sequence[Row], Sequence[Row]]]:
-    """What is compared: a section of two files, or two sections of one."""
-    results = [json.loads(path.read_text(encoding="utf-8")) for path in files]
-    if len(files) == 2:
-        for name in sections:
-            if all(name in one for one in results):
-                yield name, results[0][name]["rows"], results[1][name]["rows"]
-        return
-    if len(sections) != 2 or any(name not in results[0] for name in sections):
-        raise SystemExit(f"of one file two sections are compared; {files[0].name} has {', '.join(results[0])}")
-    yield " and ".join(sections), results[0][sections[0]]["rows"], results[0][sections[1]]["rows"]
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Status 1 where a ratio does not agree."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="one or two results")
-    parser.add_argument("--sections", nargs="+", default=SECTIONS, help="by default %(default)s")
-    args = parser.parse_args(argv)
-    if len(args.files) > 2:
-        parser.error("give one file or two")
-    found = {name: compared(first, second) for name, first, second in pairs(args.files, args.sections)}
-    for name, several in found.items():
-        print(f"{name}\n\n{table(several)}\n")
-    return 0 if all(one.agrees for several in found.values() for one in several) else 1
+def main(argv: Sequence[str]) -> int:
+    first, second = (json.loads(Path(name).read_text(encoding="utf-8")) for name in argv[:2])
+    names = [name for name in argv[2:] or SECTIONS if name in first and name in second]
+    found = [one for name in names for one in compared(first[name]["rows"], second[name]["rows"])]
+    lines = [[one.what, str(one.first), str(one.second), "yes" if one.agrees else "NO"] for one in found]
+    print(markdown(["times ours", "first run", "second run", "agree"], lines))
+    agreeing = sum(one.agrees for one in found)
+    print(f"{agreeing} of {len(found)} ratios agree within the spread of the runs.")
+    return 0 if agreeing == len(found) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -1,22 +1,27 @@
-"""The tables of the pages, by their marks, as data; and what a run prints of its section."""
+"""The tables of the pages, written from the results as tables.toml says; and what a run prints of its section."""
 
 import re
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import reduce
+from pathlib import Path
 
 import jaxeit as je
 
-from .markdown import Table, all_columns, cell, crossing, listed, markdown, plain, replaced
+from .markdown import all_columns, cell, crossed, markdown, plain, replaced
 from .repeat import compared
 from .rows import Row
+
+FORMATS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def report(section: str, data: Row) -> str:
     """All rows of a section, then the tables that are made of it alone and whose parts are measured."""
     parts = list(_every(data))
-    for table in TABLES.values():
+    for mark in FORMATS:
         with suppress(LookupError):
-            parts += [table.text(data)] if table.sections == (section,) else []
+            parts += [table(mark, data)] if sections(mark) == [section] else []
     return "\n".join(parts)
 
 
@@ -32,44 +37,39 @@ def _every(data: Row, path: str = "") -> Iterator[str]:
 
 def filled(page: str, measured: Row) -> str:
     """A page with the tables between its marks written anew; those whose benchmark has not run stay as they are."""
-    for mark, table in TABLES.items():
-        if f"<!-- {mark}:" in page and all(name in measured for name in table.sections):
-            page = replaced(page, mark, table.text(*(measured[name] for name in table.sections)))
+    for mark in FORMATS:
+        names = sections(mark)
+        if f"<!-- {mark}:" in page and names and all(name in measured for name in names):
+            page = replaced(page, mark, table(mark, *(measured[name] for name in names)))
     return page
 
 
-PAPER = {"quarter": "6.9 mm (estimator not stated)", "eit": "0.31", "hybrid": "0.14"}
-EVALUATED = (  # what is told, in which cell (@ is the name of a variant in the summary), and the variants
-    (
-        "localisation error, {}, mean",
-        "{localisation_@_mean:.1f milli} ± {localisation_@_mean_se:.1f milli} mm",
-        {name: f"{name} estimator" for name in je.metrics.ESTIMATORS} | {"fitted": "contacts fitted"},
-    ),
-    (
-        "coefficient of variation of sensitivity, {}",
-        "{cv_@_ddof1:.3f} ± {cv_@_se:.3f}",
-        {"eit": "EIT only", "hybrid": "hybrid, the paper's recipe",
-         "calibrated": "hybrid, corrected for the contact's place"},
-    ),
-    (
-        "force error on presses held out by place, RMSE, {}",
-        "{force_@rmse:.2f} N, {force_@rmse_percent_full_scale:.1f} % of 20 N",
-        {"hybrid_": "the paper's recipe", "": "corrected for the place"},
-    ),
-)  # fmt: skip
+def sections(mark: str) -> list[str]:
+    """Of the results, of which a table is made."""
+    return FORMATS[mark].get("sections", [])
 
 
-def evaluation(summary: Row) -> str:
-    """The evaluation of a calibration on the bundled session, beside the paper."""
-    heads = ["simulated, 225 presses", "this run, ± SE over places", "the paper, on hardware"]
-    return markdown(
-        heads,
-        [
-            [what.format(label), cell(template.replace("@", name), summary), PAPER.get(name, "")]
-            for what, template, variants in EVALUATED
-            for name, label in variants.items()
-        ],
-    )
+def table(mark: str, *results: Row) -> str:
+    """The table of a mark from its sections of the results."""
+    how = FORMATS[mark]
+    found = ROWS[how["rows"]](*results) if how["rows"] in ROWS else _at(results[0], how["rows"])
+    if isinstance(found, str):
+        return found
+    if "crossed" in how:
+        return crossed(*how["crossed"], list(found), how.get("missing", ""))
+    return markdown(how["heads"].split(" | "), ([cell(c, row) for c in how["cells"].split(" | ")] for row in found))
+
+
+def _at(results: Row, path: str) -> Sequence[Row]:
+    return reduce(lambda part, key: part[key], path.split("."), results)
+
+
+# --- rows that are not those of a section
+
+
+def _evaluation(summary: Row) -> Iterator[Row]:
+    for what, template, paper in FORMATS["results"]["found"]:
+        yield {"what": what, "found": cell(template, summary), "paper": paper}
 
 
 SPEED = {
@@ -90,13 +90,9 @@ def _speed(forward: Row, jacobian: Row) -> list[Row]:
     return [row | {"tool": label} for (kind, tool), label in SPEED.items() for row in runs[kind] if row["tool"] == tool]
 
 
-def _by_size(sections: str, head: str, rows: Callable[..., Sequence[Row]] | None = None) -> Table:
-    """Medians by tool and mesh; tools onto "pixels" and "elements" say so in full."""
-
-    def named(results: Row) -> list[Row]:
-        return [row | {"tool": re.sub(", (?=pixels|elements)", ", onto ", row["tool"])} for row in results["rows"]]
-
-    return crossing(sections, head, "{tool}", "{nodes:,} nodes", "{median_ms:ms}", rows=rows or named)
+def _onto(results: Row) -> list[Row]:
+    """Tools onto "pixels" and "elements", which say so in full."""
+    return [row | {"tool": re.sub(", (?=pixels|elements)", ", onto ", row["tool"])} for row in results["rows"]]
 
 
 def _repeat(*runs: Row) -> str:
@@ -118,31 +114,26 @@ def _images(results: Row) -> Iterator[Row]:
         yield {"seeds": results["seeds"]} | row | {"error": min(row[name] for name in names if name in row)}
 
 
-PAPER_BENCH = {  # head, and the format of a number
-    "localisation_quarter_mean": ("localisation, quarter, mm", ".1f milli"),
-    "localisation_half_mean": ("half, mm", ".1f milli"),
-    "localisation_peak_mean": ("peak, mm", ".1f milli"),
-    "localisation_quarter_inward_bias": ("inward, mm", ".1f milli"),
-    "cv_eit_ddof1": ("CV, EIT only", ".3f"),
-    "cv_hybrid_ddof1": ("CV, hybrid", ".3f"),
-    "localisation_fitted_mean": ("contacts fitted, mm", ".1f milli"),
-    "cv_calibrated_ddof1": ("CV, hybrid corrected for the place", ".3f"),
-}
+def _ktc(results: Row) -> list[Row]:
+    """Mean scores by method and level, and their total."""
+    by_level = [row | {"head": f"level {row['level']}", "score": f"{row['mean']:.3f}"} for row in results["rows"]]
+    totals = results["of_21"].items()
+    return by_level + [{"method": name, "head": "of 21", "score": f"{total:.2f}"} for name, total in totals]
 
 
-def _paper(results: Row) -> str:
-    """Mean ± standard deviation over the seeds, a line for each load spreading."""
-    lines = []
+def _paper(results: Row) -> Iterator[Row]:
+    """Mean ± standard deviation over the seeds, a row for each load spreading."""
     for row in results["rows"]:
-        lines.append([f"{row['spreading_mm']:g} mm ({row['seeds']})"])
-        for name, (_, how) in PAPER_BENCH.items():
-            shown = row[name] if row["seeds"] > 1 else row[name][:1]
-            lines[-1].append(" ± ".join(cell(f"{{value:{how}}}", {"value": value}) for value in shown))
-    lines.append(["the paper, on hardware", *(results["paper"].get(name, "") for name in PAPER_BENCH)])
-    return markdown(["load spreading (seeds)", *(head for head, _ in PAPER_BENCH.values())], lines)
+        shown = {"label": f"{row['spreading_mm']:g} mm ({row['seeds']})"}
+        for name in row.keys() - {"spreading_mm", "seeds"}:
+            how = "{number:.1f milli}" if name.startswith("localisation") else "{number:.3f}"
+            numbers = row[name][: 2 if row["seeds"] > 1 else 1]
+            shown[name] = " ± ".join(cell(how, {"number": number}) for number in numbers)
+        yield shown
+    yield {"label": "the paper, on hardware"} | results["paper"]
 
 
-def _ladder(skin: int) -> Table:
+def _ladder(skin: int) -> Callable[[Row], Iterator[Row]]:
     """The rungs of a skin that name a fidelity or lie on the front of error against time of a forward solve."""
 
     def rows(results: Row) -> Iterator[Row]:
@@ -150,13 +141,7 @@ def _ladder(skin: int) -> Table:
             if row["front"] or row["label"] in ("draft", "standard", "reference"):
                 yield row | {"name": f"**{row['label']}**" if row["front"] else row["label"]}
 
-    return listed(
-        "ladder",
-        "fidelity | nodes | voltages, error | a touch, error | forward, ms | Jacobian, ms | localised, mm | frame, ms",
-        "{name} | {nodes:,} | {voltage_error:.2g %} | {difference_error:.2g %} | {forward[median]:ms milli} | "
-        "{jacobian[median]:ms milli} | {image[localisation]:.2f milli} | {image[frame][median]:ms milli}",
-        rows,
-    )
+    return rows
 
 
 def _frame(results: Row) -> Iterator[Row]:
@@ -174,7 +159,13 @@ def _calibration(results: Row) -> list[Row]:
     return sorted(scattered, key=lambda row: row["presses"]) + every
 
 
-EVENTS = {"rest": "at rest", "first": "first frame of a contact", "next": "the frames after"}
+def _events(results: Row) -> Iterator[Row]:
+    labels = {"rest": "at rest", "first": "first frame of a contact", "next": "the frames after"}
+    return (results["events"][name] | {"label": label} for name, label in labels.items())
+
+
+def _growth(results: Row) -> Iterator[Row]:
+    return (fit | {"last": fit["sizes"][-1]} for fit in results["fits"])
 
 
 def _live(results: Row) -> Iterator[Row]:
@@ -191,111 +182,19 @@ def _live(results: Row) -> Iterator[Row]:
     yield recorded | shown
 
 
-# By the mark in a page; `forward` and `jacobian` are only printed.
-TABLES: dict[str, Table] = {
-    "forward": _by_size("forward", "forward solve, ms"),
-    "jacobian": _by_size("jacobian", "Jacobian, ms"),
-    "speed": _by_size("forward jacobian", "ms, median", _speed),
-    "repeat": Table(("forward", "jacobian", "forward-again", "jacobian-again"), _repeat),
-    "images": listed(
-        "images",
-        "method (seeds) | error, mm | inward, mm | false second | both, 30 mm | 40 mm | 40 mm, 1:3 | ms a frame",
-        "{method} ({seeds}) | {error:.1f} | {inward_mm:.1f} | {false_seconds:.0f %} | {0[pairs_30mm_1:1]:.0f %} | "
-        "{0[pairs_40mm_1:1]:.0f %} | {0[pairs_40mm_1:3]:.0f %} | {frame_ms:ms}",
-        _images,
-    ),
-    "loads": listed(
-        "loads",
-        "one frame of | frames | told by loads | told by bumps | error of place, mm | ellipse of 90 % covers",
-        "{touch} | {frames} | {told:.0f %} | {by_bumps:.0f %} | {error_mm:.1f} | {covered:.0f %}",
-        lambda loads: loads["rows"],
-    ),
-    "loads-reliability": listed(
-        "loads",
-        "probability stated, mean | kinds true | frames times kinds",
-        "{stated:.0f %} | {true:.0f %} | {count}",
-        lambda loads: loads["reliability"],
-    ),
-    "scenes": listed(
-        "scene",
-        "scene | recording | frames | simulated in | times real time",
-        "`{scene}` | {recording_s:,.0f} s | {frames:,} | {second_s:.1f} s | {times_real_time:.0f}",
-        lambda scene: scene["sessions"],
-    ),
-    "paper": Table(("paper",), _paper),
-    "ladder": _ladder(0),
-    "ladder-chest": _ladder(1),
-    "preparation": _by_size("inverse", "a reconstruction prepared, ms"),
-    "frame": listed(
-        "inverse",
-        "ms a frame | p50 | p99 | max | p50, after other work | p99, after other work | max, after other work | "
-        "batch of 1,000 | memory-copy bound",
-        "{way} | {p50_ms:.3f} | {p99_ms:.3f} | {max_ms:.3f} | {after[p50_ms]:.3f} | {after[p99_ms]:.3f} | "
-        "{after[max_ms]:.3f} | {batch[p50_ms]:.4f} | {least_ms:.3f}",
-        _frame,
-    ),
-    "stream": listed(
-        "inverse",
-        "ms a frame | frames | p50 | p99 | p99.9 | above 0.1 ms",
-        "{way} | {calls:,} | {p50_ms:.3f} | {p99_ms:.3f} | {0[p99.9_ms]:.3f} | {above:,}",
-        lambda inverse: inverse["application"]["stream"],
-    ),
-    "pipeline": _by_size("pipeline", "mesh to images of 100 frames, ms"),
-    "to-accuracy": crossing(
-        "pipeline",
-        "forward, ms (unknowns)",
-        "{kind}",
-        "voltages to {target:g %}",
-        "{best[median_ms]:ms} ({best[unknowns]:,})",
-        rows=lambda pipeline: pipeline["to_accuracy"],
-        missing="not reached",
-    ),
-    "calibration-cost": crossing(
-        "calibration_cost",
-        "error of held-out forces, N",
-        "{curve}, location {location}",
-        "{presses} presses, {minutes:.0f} min",
-        "{hold_n:.2f}",
-        rows=_calibration,
-        missing="not determined",
-    ),
-    "measurement-cost": crossing(
-        "protocol_cost",
-        "mean error of place, contacts fitted, mm",
-        "{way}",
-        "{readings} readings, {frames_per_s:,.0f} frames/s",
-        "{fit_mm:.2g}",
-        rows=lambda protocol: protocol["rows"],
-    ),
-    "event-scan": listed(
-        "protocol_cost",
-        "event-driven scan | readings | fit, mm | lost | frames/s | frames/s with switching",
-        "{label} | {readings:.0f} | {fit_mm:.2f} | {lost:.0f %} | {frames_per_s:,.0f} | "
-        "{frames_per_s_with_switching:,.0f}",
-        lambda protocol: (protocol["events"][name] | {"label": label} for name, label in EVENTS.items()),
-    ),
-    "effects": listed(
-        "scene",
-        "effects | a frame, ms | Mflop | operations | 1,024 frames' histories, ms | Mflop | operations",
-        "{effects} | {frame_ms:ms} | {frame_mflop:ms} | {frame_operations:ms} | {block_ms:ms} | {block_mflop:ms} | "
-        "{block_operations:ms}",
-        lambda scene: scene["rows"],
-    ),
-    "growth": listed(
-        "growth",
-        "work | sizes | time grows as size to the | theory | memory | theory",
-        "{series} by {of} | {sizes[0]:,} to {last:,} | {time[exponent]} | {time[theory]} | {memory[exponent]} | "
-        "{memory[theory]}",
-        lambda growth: (fit | {"last": fit["sizes"][-1]} for fit in growth["fits"]),
-    ),
-    "start": listed("start", "fresh process | s", "{start} | {median_ms:.2f kilo}", lambda start: start["rows"]),
-    "live": listed(
-        "live",
-        "run | frames | lost | dropped | latency p50, ms | latency p99, ms | latency max, ms | "
-        "after due time, p99, ms | wake-up delay of a sleeper, p99, ms | memory, MB an hour",
-        "{label} | {received[0]:,} | {lost:,} | {dropped:,} | {latency_ms_p50:ms} | {latency_ms_p99:ms} | "
-        "{latency_ms_max:ms} | {since_due_ms_p99:ms} | {woken_ms_p99:ms} | "
-        "{memory_mb_per_hour:.2f} ± {memory_mb_per_hour_error:.2f}",
-        _live,
-    ),
+ROWS: dict[str, Callable] = {
+    "evaluation": _evaluation,
+    "speed": _speed,
+    "onto": _onto,
+    "repeat": _repeat,
+    "images": _images,
+    "ktc": _ktc,
+    "paper": _paper,
+    "ladder_testbed": _ladder(0),
+    "ladder_chest": _ladder(1),
+    "frame": _frame,
+    "calibration": _calibration,
+    "events": _events,
+    "growth": _growth,
+    "live": _live,
 }

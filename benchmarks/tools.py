@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 import jaxeit as je
 
-from .clock import MAX_DIFFERENCE, Tool, peak_megabytes, peaks, seconds
+from .clock import MAX_DIFFERENCE, Tool, seconds
 from .peers import adjoint, cholmod, eidors, pyeit, superlu
 from .problems import Problem
 
@@ -25,6 +25,7 @@ PIXELS = 30
 HYPERPARAMETER = 0.1
 PRIOR = je.Noser(floor=1e-12)  # the others know no floor; ours would lift the pixels in the corners
 FRAMES = 100  # of the pipeline
+CONTACTS = 64  # of a call with many, a multiple of every batch
 MAX_FLOAT32_DIFFERENCE = 1e-2  # single precision: how far it is off is reported, not required to be nothing
 MAX_IMAGE_DIFFERENCE = 1e-7
 IN_DATA, IN_IMAGE = "by hand in data space", "by hand in image space"
@@ -163,20 +164,15 @@ class Reconstruction:
     """`prepare`, whose clock stops when the reconstructor is there; Q is written out for comparison only."""
 
     def __init__(self, problem: Problem, pixels: bool, dtype: str = "float64") -> None:
-        self.before, self.dtype = peak_megabytes(), dtype
-        self.model = problem.model(dtype)
+        self.dtype, self.model = dtype, problem.model(dtype)
         self.basis = basis_of(self.model, pixels)
 
     def __call__(self, sigma: np.ndarray) -> np.ndarray:
         self.last_seconds, recon = seconds(self.reconstructor, sigma)
-        self.peak = peak_megabytes()
         return np.asarray(recon.matrix)
 
     def reconstructor(self, sigma: np.ndarray) -> je.Reconstructor:
         return jax.block_until_ready(reconstructor(self.model, self.basis, jnp.asarray(sigma, self.dtype)))
-
-    def peaks(self) -> dict[str, int]:
-        return peaks(self.before, self.peak)
 
 
 def noser(j: np.ndarray) -> tuple[np.ndarray, float]:
@@ -265,4 +261,41 @@ PIPELINE = (
     Entry(f"{pyeit.NAME}, elements", pipeline_by_pyeit, pyeit, largest=30, **LOOSE),
 )
 
-TOOLS = {"forward": FORWARD, "jacobian": JACOBIAN, "inverse": INVERSE, "pipeline": PIPELINE}
+# --- many contacts in one call
+
+
+def contacts(problem: Problem) -> np.ndarray:
+    """(CONTACTS, elements): by how much Gaussian contacts (width 12 mm, half as much again) raise conductivity, each
+    alone on the sheet, at places all over the grid of 41 x 41 whose pitch is 5 mm."""
+    numbers = np.linspace(0, 41**2 - 1, CONTACTS).astype(int)
+    offset = problem.mesh.chart_centroids - 0.005 * np.stack([numbers % 41, numbers // 41], 1)[:, None]
+    return 1 + 0.5 * np.exp(-0.5 * np.sum(offset**2, -1) / 0.012**2)
+
+
+def batched(problem: Problem, batch: int, dtype: str = "float64") -> Tool:
+    """Voltages with each of the contacts, (CONTACTS, readings), so many at a time."""
+
+    def several(model: je.Model, sigma: jax.Array) -> jax.Array:
+        return jax.lax.map(lambda one: je.forward(model, one), sigma, batch_size=batch)
+
+    tool = as_tool(compiled(several, problem.model(dtype), options=je.compiler_options()), dtype)
+    shapes = contacts(problem)
+    return lambda sigma: tool(shapes * sigma)
+
+
+def one_by_one(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
+    def looped(problem: Problem) -> Tool:
+        tool, shapes = prepare(problem), contacts(problem)
+        return lambda sigma: np.stack([tool(one) for one in shapes * sigma])
+
+    return looped
+
+
+BATCH = (
+    *(Entry(f"jaxeit float64, batches of {n}", partial(batched, batch=n)) for n in (1, 8, 32)),
+    Entry("jaxeit float32, batches of 8", partial(batched, batch=8, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
+    Entry(superlu.NAME, one_by_one(superlu.prepare), superlu),
+    Entry(cholmod.NAME, one_by_one(cholmod.prepare), cholmod),
+)
+
+TOOLS = {"forward": FORWARD, "jacobian": JACOBIAN, "inverse": INVERSE, "pipeline": PIPELINE, "batch": BATCH}

@@ -17,7 +17,6 @@ from .bench import Bench as Bench, load_bench as load_bench, simulate as simulat
 from .calibration import (
     Calibration as Calibration,
     Evaluation as Evaluation,
-    FittedContact as FittedContact,
     ForceEstimate as ForceEstimate,
     ImageCentroid as ImageCentroid,
     LogCalibration as LogCalibration,
@@ -33,17 +32,11 @@ from .calibration import (
 from .check import check_session as check_session
 from .fitting import (
     Affine as Affine,
-    Bilinear as Bilinear,
-    GaussianProcess as GaussianProcess,
     Linear as Linear,
     MonotonePolynomial as MonotonePolynomial,
     MonotoneSpline as MonotoneSpline,
     PadEdge as PadEdge,
-    PadEdgeSize as PadEdgeSize,
     PowerLaw as PowerLaw,
-    RadialBasis as RadialBasis,
-    TensorSpline as TensorSpline,
-    fit_curve as fit_curve,
     fit_curves as fit_curves,
 )
 from .report.document import write_report as write_report
@@ -53,4 +46,3 @@ from .session import (
     SessionWriter as SessionWriter,
     open_session as open_session,
 )
-from .session.importers import import_csv as import_csv

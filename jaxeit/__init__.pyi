@@ -19,27 +19,21 @@ from . import (
     tracking as tracking,
 )
 from ._compile import bind as bind, compiler_options as compiler_options, reuse_memory as reuse_memory, verb as verb
-from .accuracy import fit_fidelity as fit_fidelity, ladder as ladder
+from .accuracy import ladder as ladder
 from .budget import Budget as Budget, BudgetError as BudgetError
 from .contacts import (
     ContactFinder as ContactFinder,
     Contacts as Contacts,
-    find_regions as find_regions,
     prepare_contacts as prepare_contacts,
-    refine_contacts as refine_contacts,
 )
 from .fusion import ForceMap as ForceMap, PadMasks as PadMasks, fuse as fuse, pad_masks as pad_masks
 from .geometry import Cylinder as Cylinder, Disc as Disc, Polygon as Polygon, Rectangle as Rectangle, Sphere as Sphere
 from .imaging import (
     AbstractPrior as AbstractPrior,
-    BackProjection as BackProjection,
-    Discrepancy as Discrepancy,
     GaussianSmooth as GaussianSmooth,
-    GeneralisedCrossValidation as GeneralisedCrossValidation,
     Greit as Greit,
     Imaging as Imaging,
     Laplace as Laplace,
-    LCurve as LCurve,
     NoiseFigure as NoiseFigure,
     NonNegative as NonNegative,
     Noser as Noser,
@@ -53,11 +47,10 @@ from .imaging import (
     fit_background as fit_background,
     gauss_newton as gauss_newton,
     load_reconstructor as load_reconstructor,
-    noise_covariance as noise_covariance,
     prepare as prepare,
     save_reconstructor as save_reconstructor,
 )
-from .metrics import LevelCentroid as LevelCentroid, Peak as Peak, localisation_error as localisation_error
+from .metrics import LevelCentroid as LevelCentroid, localisation_error as localisation_error
 from .model import (
     Bumps as Bumps,
     Elements as Elements,
@@ -71,7 +64,6 @@ from .model import (
     jacobian as jacobian,
     pad_response as pad_response,
 )
-from .scan import choose_readings as choose_readings, prepare_event_scan as prepare_event_scan
 from .skin import (
     AreaPatch as AreaPatch,
     BoundaryPatch as BoundaryPatch,

@@ -10,6 +10,8 @@ os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # There is a worker a core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# A mask times a number, or a count times a length, is an error, here and in the processes that tests start.
+os.environ.setdefault("JAX_NUMPY_DTYPE_PROMOTION", "strict")
 
 import tests.annotations
 

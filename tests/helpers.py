@@ -23,6 +23,11 @@ def compiled(function):
     return eqx.filter_jit(function, compiler_options=je.compiler_options())
 
 
+def stand_in(kind, **values):
+    """An object of a class that has these attributes, whatever the class requires or computes."""
+    return object.__new__(type(kind)(kind.__name__, (kind,), values))
+
+
 def skin_of(domain, electrodes, pattern, *, sheet_resistance=1.0, current=1.0, pads=()):
     """A bare skin; unit sheet resistance and current unless said otherwise."""
     protocol = je.Protocol(np.asarray(pattern), current)

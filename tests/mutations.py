@@ -132,11 +132,15 @@ def place(mutant: Mutant, root: Path) -> tuple[Path, ast.AST, str]:
 
 
 def _alike(pattern: ast.AST, there: list[tuple[Path, ast.AST]]) -> list[Place]:
-    """The places of a pattern and what its names are called there; if it stands once under its own names, that one."""
+    """The places of a pattern and what its names are called there; if it stands once under its own names, that one.
+
+    Of three names or more one must still be called the same: else it is another expression of that shape.
+    """
     found = []
     for path, node in {id(node): (path, node) for path, symbol in there for node in ast.walk(symbol)}.values():
         names: dict[str, str] = {}
-        if isinstance(node, ast.expr | ast.stmt) and unified(pattern, node, names):
+        fits = isinstance(node, ast.expr | ast.stmt) and unified(pattern, node, names)
+        if fits and (len(names) < 3 or any(name == own for name, own in names.items())):
             found.append((path, node, names))
     exact = _exact(found)
     return exact if len(exact) == 1 else found
@@ -157,12 +161,18 @@ def unified(pattern: Any, node: Any, names: dict[str, str]) -> bool:
     for field, value in ast.iter_fields(pattern):
         own = getattr(node, field)
         if (type(pattern), field) in IDENTIFIERS and isinstance(value, str):
-            fixed = METHODS if isinstance(pattern, ast.Attribute) else GLOBALS
-            if not (value == own if {value, own} & fixed else _renamed(value, own, names)):
+            if not (value == own if _is_fixed(pattern, {value, own}) else _renamed(value, own, names)):
                 return False
         elif field not in ("ctx", "kind") and not unified(value, own, names):
             return False
-    return not (isinstance(pattern, ast.Attribute) and _root(pattern) in MODULES and pattern.attr != node.attr)
+    return True
+
+
+def _is_fixed(pattern: ast.AST, names: set[str]) -> bool:
+    """Whether one of two names belongs to others: what is in a module, methods of arrays and strings, builtins."""
+    if isinstance(pattern, ast.Attribute):
+        return _root(pattern) in MODULES or bool(names & METHODS)
+    return bool(names & GLOBALS)
 
 
 IDENTIFIERS = {(ast.Name, "id"), (ast.Attribute, "attr"), (ast.keyword, "arg"), (ast.arg, "arg")}

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks import (
+    bench_accuracy,
     bench_calibration,
     bench_growth,
     bench_loads,
@@ -46,7 +47,7 @@ def positions():
 
 @pytest.mark.parametrize("side", bench_calibration.SIDES)
 def test_a_grid_of_presses_is_even(positions, side):
-    chosen = bench_calibration.on_grid(positions, side)
+    chosen = bench_calibration.on_grid(positions, side**2)
     assert chosen.sum() == side**2
     for column in positions[chosen].T:
         assert len(np.unique(column.round(9))) == side
@@ -58,9 +59,8 @@ def test_scattered_presses_fill_the_sheet_better_than_drawn_ones(positions):
         return np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1).max()
 
     scattered = bench_calibration.scattered(positions, 36)
-    drawn = [bench_calibration.drawn(225, 36, seed) for seed in range(10)]
+    drawn = [np.random.default_rng(seed).permutation(225) < 36 for seed in range(10)]
     assert scattered.sum() == 36
-    assert all(d.sum() == 36 for d in drawn)
     assert widest_gap(scattered) < min(map(widest_gap, drawn))
     np.testing.assert_array_equal(bench_calibration.scattered(positions, 225), np.ones(225, bool))
 
@@ -91,7 +91,7 @@ def test_force_levels_are_samples_on_the_way_up():
 
 def _reached(tool, order, mesh, error, ms):
     row = {"tool": tool, "order": order, "mesh": mesh, "relative_error": error, "unknowns": 9, "min_ms": ms}
-    return row | {"median_ms": ms, "max_ms": ms}
+    return row | {"dtype": "float64"} | {"median_ms": ms, "max_ms": ms}
 
 
 def test_the_quickest_mesh_that_reaches_the_accuracy():
@@ -101,10 +101,10 @@ def test_the_quickest_mesh_that_reaches_the_accuracy():
         _reached("jaxeit", 1, "regular", 5e-3, 1.0),
         _reached("EIDORS first order", 1, "regular", 9e-3, 20.0),
     ]
-    found = {(r["kind"], r["target"]): r["best"] for r in bench_pipeline.to_accuracy(rows)}
-    assert [found["jaxeit P2, graded", t]["median_ms"] for t in bench_pipeline.TARGETS] == [4.0, 4.0, 9.0]
+    found = {(r["kind"], r["target"]): r["best"] for r in bench_accuracy.to_accuracy(rows)}
+    assert [found["jaxeit P2, graded", t]["median_ms"] for t in bench_accuracy.TARGETS] == [4.0, 4.0, 9.0]
     assert found["EIDORS first order", 1e-3] is None
-    page = tables.TABLES["to-accuracy"].text({"to_accuracy": bench_pipeline.to_accuracy(rows)})
+    page = tables.table("to-accuracy", {"to_accuracy": bench_accuracy.to_accuracy(rows)})
     assert "| jaxeit P1, regular | 1 (9) | not reached | not reached |" in page
 
 
@@ -136,7 +136,6 @@ def test_ratios_that_moved_more_than_the_spread_are_named():
     found = repeat.compared(_run(1, 10, 100), _run(2, 21, 300))
     assert [(one.what, one.agrees) for one in found] == [("EIDORS, 961 nodes", True), ("pyEIT, 961 nodes", False)]
     assert found[0].first == pytest.approx((10, 10 * 0.9 / 1.1, 10 * 1.1 / 0.9))
-    assert "1 of 2 ratios agree" in repeat.table(found)
     assert not repeat.compared(_run(1, 10, 100), _run(1, 10.5, 100, low=0.99, high=1.01))[0].first.allows(
         repeat.Ratio(13, 12, 14)
     )
@@ -153,7 +152,7 @@ def test_the_page_says_how_far_the_ratios_it_quotes_moved():
         for times in ((1, 1, 9, 9), (1, 1, 10, 90))
     )
     runs = [{"rows": rows} for rows in (_run(1, 10, 100), jacobian, _run(2, 21, 300), again)]
-    said = tables.TABLES["repeat"].text(*runs)
+    said = tables.table("repeat", *runs)
     assert "2 of the 3 ratios" in said
     assert "50 %" in said
 
@@ -184,18 +183,15 @@ def test_curves_leave_out_rows_without_a_number():
     assert [(line.get_label(), line.get_xydata().tolist()) for line in axes.lines] == [("a", [[1, 2], [2, 3]])]
 
 
-def test_two_files_or_two_sections_are_compared(tmp_path, capsys):
+def test_two_files_are_compared(tmp_path, capsys):
     files = [tmp_path / "a.json", tmp_path / "b.json"]
     for file, again in zip(files, (100, 300), strict=True):
-        runs = {"forward": {"rows": _run(1, 10, 100)}, "again": {"rows": _run(1, 10, again)}}
-        file.write_text(json.dumps(runs))
+        file.write_text(json.dumps({"forward": {"rows": _run(1, 10, 100)}, "again": {"rows": _run(1, 10, again)}}))
     names = [str(file) for file in files]
-    assert repeat.main([*names, "--sections", "forward"]) == 0
-    assert repeat.main([*names, "--sections", "forward", "again"]) == 1
-    assert repeat.main([names[1], "--sections", "forward", "again"]) == 1
+    assert repeat.main(names) == 0
+    assert "2 of 2 ratios" in capsys.readouterr().out
+    assert repeat.main([*names, "forward", "again"]) == 1
     assert "NO" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="two sections are compared"):
-        repeat.main([names[0]])
 
 
 def test_nothing_stored(monkeypatch, tmp_path):
@@ -213,7 +209,7 @@ def test_exponents_of_a_power_law():
     one = bench_growth.Series("work", "size", (), "2", "1", lambda size: (print, (), size))
     rows = [{"size": n, "median_ms": 3e-3 * n**2, "megabytes": 5.0 * n} for n in (10, 30, 200)]
     found = bench_growth.fits(one, rows)
-    assert (found["time"]["exponent"], found["time"]["at_the_end"], found["memory"]["exponent"]) == (2.0, 2.0, 1.0)
+    assert (found["time"]["exponent"], found["memory"]["exponent"]) == (2.0, 1.0)
 
 
 def test_the_first_program_is_the_readmes():
@@ -328,16 +324,13 @@ def test_smoke_loads():
 def test_smoke_start():
     data = bench_start.main(["--smoke"])
     assert {row["start"] for row in data["rows"]} == set(bench_start.COMMANDS)
-    packages = {row["package"] for row in data["imports"]["jaxeit"]}
-    assert {"jax", "jaxeit", "numpy"} <= packages
 
 
 @pytest.mark.slow
 def test_smoke_pipeline():
     data = bench_pipeline.main(["--smoke"])
     assert {row["tool"] for row in data["rows"]} >= {"jaxeit float64, pixels", "jaxeit float64, elements"}
-    best = {(r["kind"], r["target"]): r["best"] for r in data["to_accuracy"]}
-    assert best["jaxeit P2, regular", 1e-2] is not None
+    assert all(row["median_ms"] > 0 for row in data["rows"])
 
 
 # --- tables of the README
@@ -353,7 +346,9 @@ def test_tables_of_the_pages(root):
     results = {
         "pipeline": {
             "rows": [{"tool": "EIDORS, pixels", "nodes": n, **spread} for n in (961, 3721)],
-            "to_accuracy": bench_pipeline.to_accuracy([_reached("EIDORS first order", 1, "regular", 5e-4, 20.0)]),
+        },
+        "accuracy": {
+            "to_accuracy": bench_accuracy.to_accuracy([_reached("EIDORS first order", 1, "regular", 5e-4, 20.0)]),
         },
         "inverse": {
             "rows": [{"tool": "jaxeit float64, pixels", "nodes": n, **spread} for n in (961, 3721)],
@@ -410,7 +405,7 @@ def test_tables_of_the_pages(root):
     }
     pages = [(root / "docs" / name).read_text() for name in ("costs.md", "live.md")]
     marks = re.findall(r"<!-- end of ([\w-]+) -->", "".join(pages))
-    assert set(marks) <= set(tables.TABLES)
+    assert set(marks) <= set(tables.FORMATS)
     page = "".join(f"<!-- {mark}: written -->\nold\n<!-- end of {mark} -->\n" for mark in (*marks, "speed"))
     page = tables.filled(page, results)
     assert page.count("old") == 1  # only the table of speed, whose benchmarks have not run

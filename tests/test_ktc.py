@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from benchmarks import bench_ktc as ktc
-from calib.report.figures import write_figure
+from benchmarks import bench_ktc as ktc, tables
 
 from .helpers import REAL_DATA, disc_model
 
@@ -68,20 +67,8 @@ def test_totals_are_of_21():
         {"level": level, "method": name, "mean": mean} for level in (1, 2) for name, mean in (("a", 1.0), ("b", 0.5))
     ]
     assert ktc.totals(rows) == {"a": 21.0, "b": 10.5}
-    assert ktc.means(rows)["b"] == {"level 1": 0.5, "level 2": 0.5}
-    assert ktc.table(rows).splitlines()[-1] == "| b | 0.500 | 0.500 | 10.50 |"
-
-
-def test_the_picture_shows_the_score_and_the_electrodes_in_use(tmp_path):
-    truth = np.zeros((2, ktc.GRID, ktc.GRID), int)
-    truth[0, 100:150, 100:150] = ktc.CONDUCTIVE
-    data = ktc.Data(np.zeros((1, 4)), np.ones(1), np.ones(1), np.ones((2, 1)), truth)
-    figure = ktc.picture(data, {(level, name): list(truth) for level in (1, 7) for name in ktc.SHOWN})
-    panels = np.array(figure.axes).reshape(2, 5)
-    assert [len(axes.lines) for axes in panels[0]] == [32, 32, 32, 20, 20]
-    assert {axes.get_xlabel() for axes in panels[:, 1:].ravel()} == {"score 1.00"}
-    write_figure(figure, tmp_path / "ktc.png")
-    assert (tmp_path / "ktc.png").read_bytes().startswith(b"\x89PNG")
+    table = tables.table("ktc", {"rows": rows, "of_21": ktc.totals(rows)})
+    assert table.splitlines()[-1] == "| b | 0.500 | 0.500 | 10.50 |"
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +100,8 @@ def test_even_water_explains_the_reference(tank):
 @pytest.mark.parametrize(("level", "least"), [(1, 0.65), (7, 0.46)])
 def test_the_linear_recipe(tank, level, least):
     data, model, water = tank
-    rows, _ = ktc.measure(data, {"linear": ktc.methods(model, water)["linear"]}, [level])
-    assert rows[0]["mean"] > least
+    (row,) = ktc.scored(data, {"linear": ktc.methods(model, water)["linear"]}, level)
+    assert row["mean"] > least
 
 
 @needs_data
@@ -122,5 +109,5 @@ def test_the_linear_recipe(tank, level, least):
 @pytest.mark.parametrize(("level", "least"), [(1, 0.88), (7, 0.6)])
 def test_total_variation(tank, level, least):
     data, model, water = tank
-    rows, _ = ktc.measure(data, {"variation": ktc.methods(model, water)["variation"]}, [level])
-    assert rows[0]["mean"] > least
+    (row,) = ktc.scored(data, {"variation": ktc.methods(model, water)["variation"]}, level)
+    assert row["mean"] > least

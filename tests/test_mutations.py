@@ -56,6 +56,7 @@ def test_a_place_is_found_under_other_names(applied, line, new):
         "guarded: rows.ndim != 3 => False",
         "guarded: np.where(rows, 1, 0) => rows",
         "Frame.without: np.where(a, b, c) => b",
+        "Frame.without: np.where(a, b.c, 0) => b.c",
         "Renamed.elsewhere: frames.ndim != 2 => False",
     ],
 )

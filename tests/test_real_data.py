@@ -47,7 +47,7 @@ METHODS = {
     "Laplace": (je.Laplace(), je.OneStep()),
     "Gaussian": (je.GaussianSmooth(0.006), je.OneStep()),
     "truncated": (je.Noser(), je.TruncatedSvd()),
-    "back projection": (je.Noser(), je.BackProjection()),
+    "back projection": (je.Noser(), je.imaging.BackProjection()),
     "GREIT": (je.Noser(), je.Greit(0.003, 0.006, 0.001)),
     "sparse": (je.Noser(), je.SparseBayes()),
     "total variation": (je.TotalVariation(), je.Reweighted()),

@@ -6,7 +6,6 @@ do not count.
 """
 
 import os
-import re
 import shutil
 import subprocess
 import tempfile
@@ -60,7 +59,6 @@ class Eidors:
         self.close = weakref.finalize(self, _stop, self.process, folder)
         self._say("")  # EIDORS asks whether to compile anew where its source is newer: its own choice
         self._wait("started")
-        self.peak_before = self._peak_megabytes()
         self._wait("ready")
 
     def __call__(self, sigma: np.ndarray) -> np.ndarray:
@@ -68,15 +66,6 @@ class Eidors:
         self._say("go")
         self.last_seconds = float(self._wait("seconds"))
         return np.fromfile(self.folder / "result").reshape(-1, self.rows).T.squeeze()
-
-    def peaks(self) -> dict[str, int]:
-        """Most memory Octave has used, in all and beyond its start; nothing where the system does not say."""
-        peak = self._peak_megabytes()
-        return {"peak_mb": round(peak), "beyond_imports_mb": round(peak - self.peak_before)} if peak else {}
-
-    def _peak_megabytes(self) -> float:
-        status = Path(f"/proc/{self.process.pid}/status")
-        return int(re.findall(r"VmHWM:\s+(\d+)", status.read_text())[0]) / 1024 if status.exists() else 0.0
 
     def _say(self, line: str) -> None:
         self.process.stdin.write(line + "\n")

@@ -40,7 +40,6 @@ from .losses import LOSSES, AbstractLoss, Cauchy, Huber, SoftL1, Squared
 from .pads import PadModel
 from .results import FitError, FitResult
 from .selection import Candidate
-from .validation import cross_validate
 
 __all__ = [
     "CURVES",
@@ -76,7 +75,6 @@ __all__ = [
     "SoftL1",
     "Squared",
     "TensorSpline",
-    "cross_validate",
     "fit_curve",
     "fit_curves",
     "fit_field",

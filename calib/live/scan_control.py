@@ -22,7 +22,7 @@ def prepare_director(calibration: Calibration, number: int, send: Callable[[byte
     """
     model = je.discretise(je.Scene(calibration.skin), je.Fidelity.draft())
     onset = ONSET_FRACTION * np.asarray(calibration.curves.pressure_range)[:, 1]
-    scan = je.prepare_event_scan(model, calibration.skin, je.scan.EventScanSettings(onset=onset))
+    scan = je.scan.prepare_event_scan(model, calibration.skin, je.scan.EventScanSettings(onset=onset))
     return ScanDirector(scan, number, send)
 
 

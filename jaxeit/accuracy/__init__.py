@@ -9,7 +9,7 @@ from .settings import (
     fidelity_choices,
     image_choices,
 )
-from .study import fit_fidelity, ladder
+from .study import ladder
 
 __all__ = [
     "Choice",
@@ -19,7 +19,6 @@ __all__ = [
     "Touch",
     "few_choices",
     "fidelity_choices",
-    "fit_fidelity",
     "image_choices",
     "ladder",
 ]

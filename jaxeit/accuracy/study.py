@@ -5,7 +5,7 @@ reference that is extrapolated from two meshes finer than that of any rung (`jax
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -16,7 +16,7 @@ from ..model.fidelity import Fidelity
 from ..model.scene import Scene
 from ..model.sensitivity import jacobian
 from .image_quality import JudgedImages, judged_images
-from .recommendation import Image, Ladder, Reference, Rung, Times, require_wishes
+from .recommendation import Image, Ladder, Reference, Rung, Times
 from .settings import Choice, LadderError, Touch, default_touches, fidelity_choices, image_choices, refined
 from .solutions import Solution, extrapolated, relative_error, solved
 from .timing import Program, Progress, compiled, in_turn, timed_in_rounds
@@ -72,31 +72,6 @@ def ladder(
             for choice, image in zip(choices, images, strict=True)
         ),
     )
-
-
-def fit_fidelity(
-    scene: Scene,
-    *,
-    budget_ms: float | None = None,
-    error: float | None = None,
-    rungs: Sequence[Choice] | None = None,
-    progress: Progress = iter,
-) -> Fidelity:
-    """Find the fidelity for this scene on this machine: `Ladder.recommend` of a `ladder` without images.
-
-    Args:
-        scene: the scene to study.
-        budget_ms, error: as for `Ladder.recommend`.
-        rungs: default `fidelity_choices`.
-        progress: wraps each pass over the rungs.
-
-    Raises:
-        LadderError: if neither limit is given, or no rung meets both.
-    """
-    require_wishes(budget_ms, error)
-    choices = fidelity_choices() if rungs is None else rungs
-    measured = ladder(scene, [replace(choice, imaging=None) for choice in choices], progress=progress)
-    return measured.recommend(budget_ms=budget_ms, error=error).choice.fidelity
 
 
 def _reference_of(choices: Sequence[Choice]) -> tuple[Fidelity, Fidelity]:

@@ -197,6 +197,7 @@ def _factors(p: sp.csr_array, current: Any, weight: Any, channels: np.ndarray) -
     traces the weights, the structure is that of equal weights.
     """
     if is_traced(current, weight):
+        current, weight = jnp.asarray(current, float), jnp.asarray(weight, float)  # as on the host, whatever the model
         library, gram = JAX, current**2 * gram_of(p.toarray(), weight)
         structure = structure_of(gram_of(p, channels.astype(float)))
     else:

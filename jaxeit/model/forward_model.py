@@ -270,7 +270,7 @@ def transfer(model: Model, theta: Coefficients) -> Float[Array, "electrodes elec
 
 
 def series_resistance(system: System, theta: Coefficients) -> Float[Array, " electrodes"]:
-    """Contact resistance of discs taken in closed form (`electrodes.disc_resistance`), ohm; else 0.
+    """Contact resistance of discs taken in closed form, ohm; else 0: ``laplace(u) = (u - U) g / sigma`` under the disc.
 
     With x = a sqrt(g / sigma), the radius over the transfer length:
     ``R = I0(x) / I1(x) / (2 pi a sqrt(sigma g))``.

@@ -10,7 +10,7 @@ from .description import (
     shipped_skins,
 )
 from .edges import BoundaryPatch
-from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces, disc_resistance
+from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
 from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
@@ -34,7 +34,6 @@ __all__ = [
     "RingPatch",
     "Skin",
     "adjacent",
-    "disc_resistance",
     "load_skin",
     "parse_skin",
     "reciprocal_rows",

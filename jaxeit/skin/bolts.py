@@ -25,7 +25,7 @@ class AreaPatch(AbstractAreaElectrode):
 
     The current passes within the transfer length ``sqrt(contact / sheet resistance)`` of the rim,
     0.08 mm for the default.  Where triangles under the bolt are larger, the bolt is a perfect
-    contact in series with the closed form `disc_resistance`; where they are smaller, the area
+    contact in series with the closed form of `series_resistance`; where they are smaller, the area
     integral over ``(u - U) / contact`` is resolved.  Four-terminal readings depend on neither.
 
     The mesh generator needs the bolt wholly inside the sheet.  On a mesh of your own the rim may cut off less

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from scipy.special import ive
 
 from ..geometry.shapes import Domain
 from ..meshing.elements import Space
@@ -159,16 +158,3 @@ def require_covered(space: Space, elements: np.ndarray, area: float, what: str) 
         raise ElectrodeError(
             f"the mesh covers {100 * covered:.0f} % of {what}; move it inside the sheet, or make the mesh finer there"
         )
-
-
-def disc_resistance(radius: float, contact: float, sheet_resistance: float) -> float:
-    """Resistance in ohm from a disc electrode into the sheet around it, in closed form.
-
-    ``R_s L_T / (2 pi a) * I0(a / L_T) / I1(a / L_T)`` with the transfer length
-    ``L_T = sqrt(contact / R_s)``: the modified Bessel solution of ``laplace(u) = (u - U) / L_T^2``
-    under the disc.  Radius in m, contact in ohm m^2, sheet resistance in ohm per square.
-    """
-    require_positive(radius=radius, contact=contact, sheet_resistance=sheet_resistance)
-    transfer = np.sqrt(contact / sheet_resistance)
-    ratio = radius / transfer
-    return float(sheet_resistance * transfer / (2 * np.pi * radius) * ive(0, ratio) / ive(1, ratio))

@@ -18,7 +18,7 @@ from ..effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
-SHORTEST = 1e-3
+SHORTEST = 1e-4
 
 
 class Near(NamedTuple):

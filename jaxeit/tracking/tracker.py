@@ -130,7 +130,7 @@ class Tracker:
     """
 
     def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float):
-        self._filter, self._settings, self._area = tracker, settings, area
+        self.filter, self._settings, self._area = tracker, settings, area
         self._usual = np.log([settings.loads.width, settings.loads.force])
         self._spread = np.array([settings.loads.width_spread, settings.loads.force_spread])
 
@@ -141,8 +141,8 @@ class Tracker:
 
     def start(self) -> Tracking:
         """No contact, and the gain as it is known before the first frame."""
-        size = len(self._filter.places)
-        dtype = self._filter.places.dtype
+        size = len(self.filter.places)
+        dtype = self.filter.places.dtype
         return Tracking(Belief(jnp.zeros((0, SIZE), dtype), jnp.zeros(size, dtype), jnp.eye(size, dtype=dtype)))
 
     def step(
@@ -166,7 +166,7 @@ class Tracker:
         frame, pads = self._frame(dv), self._pads(pad_forces, pad_errors)
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
-        moved = predicted(self._filter, now.belief, jnp.asarray(seconds, frame.dtype))
+        moved = predicted(self.filter, now.belief, jnp.asarray(seconds, frame.dtype))
         now = replace(now, belief=moved)
         update = self._update(moved, frame, pads, seconds)
         if self._is_unexpected(now, update):
@@ -179,13 +179,13 @@ class Tracker:
     # --- one frame
 
     def _frame(self, dv: Float[ArrayLike, " readings"]) -> Float[Array, " readings"]:
-        frame, readings = jnp.asarray(dv, self._filter.places.dtype), self._filter.finder.readings
+        frame, readings = jnp.asarray(dv, self.filter.places.dtype), self.filter.finder.readings
         if frame.shape != (readings,):
             raise InverseError(f"dv has shape {frame.shape}; give one frame of {readings} readings")
         return frame
 
     def _pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
-        count = self._filter.sheet.pad_area.shape[1]
+        count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
             return Pads(jnp.zeros(count), jnp.full(count, jnp.inf))
         force, error = np.asarray(forces, float), np.asarray(errors, float)
@@ -199,15 +199,15 @@ class Tracker:
         return Pads(jnp.asarray(np.where(known, force, 0)), jnp.asarray(np.where(known, error, np.inf)))
 
     def _update(self, belief: Belief, frame: Array, pads: Pads, seconds: float, many: bool = False) -> Update:
-        found: Update = updated(self._filter, belief, frame, pads, jnp.asarray(seconds), many=many)
+        found: Update = updated(self.filter, belief, frame, pads, jnp.asarray(seconds), many=many)
         return found
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
-        size, misfit, surprise = len(self._filter.compress), float(update.misfit), float(update.surprise)
+        size, misfit, surprise = len(self.filter.compress), float(update.misfit), float(update.surprise)
         if surprise >= SURPRISING:
             return True
         unexpected = misfit > size + UNEXPECTED * np.sqrt(2 * size)
-        return unexpected and (now.since >= PATIENCE or misfit > WORSE * now.misfit)
+        return bool(unexpected and (now.since >= PATIENCE or misfit > WORSE * now.misfit))
 
     # --- events
 
@@ -222,7 +222,7 @@ class Tracker:
         best = self._update(now.belief, frame, pads, alone, many=True)
         taken = ordinary
         for _ in range(EVENTS):
-            left = np.asarray(unexplained(self._filter, best.belief, frame, pads))
+            left = np.asarray(unexplained(self.filter, best.belief, frame, pads))
             events = self._events(now, left, seconds)
             tried = [(one, self._update(one.belief, frame, pads, alone, many=True)) for one in events]
             if not tried:
@@ -264,7 +264,7 @@ class Tracker:
 
     def _with_another(self, belief: Belief, left: np.ndarray) -> Belief:
         """With a contact where it explains most of what is left."""
-        finder = self._filter.finder
+        finder = self.filter.finder
         best = int(np.argmax(np.asarray(finder.atoms) @ left))
         place = np.asarray(finder.starts)[best, :2]
         row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])

@@ -14,7 +14,6 @@ import jaxeit as je
 from benchmarks import ladder as benchmark
 from calib.cli.commands.bench_command import bench_scene
 from calib.report.accuracy_figure import ladder_figure
-from jaxeit.accuracy import study
 from jaxeit.accuracy.image_quality import misplaced
 from jaxeit.accuracy.recommendation import Reference, Times
 from jaxeit.accuracy.settings import default_touches, refined
@@ -213,22 +212,6 @@ def test_a_fidelity_is_listed_once_in_the_order_asked_for():
     again = replace(ladder.rungs[0], choice=je.accuracy.Choice("images", ladder.rungs[0].choice.fidelity))
     ladder = replace(ladder, rungs=(*ladder.rungs, again))
     assert [r.choice.label for r in ladder.fidelities()] == ["rung 0", "rung 1", "rung 2"]
-
-
-def test_a_fidelity_is_fitted_from_measurements_without_images(monkeypatch, scene):
-    asked = []
-
-    def fake(scene, rungs, progress):
-        asked.extend(rungs)
-        return made((1e-2, 1), (1e-3, 4))
-
-    monkeypatch.setattr(study, "ladder", fake)
-    assert je.fit_fidelity(scene, error=2e-3).edge_length == pytest.approx(0.011)
-    assert all(choice.imaging is None for choice in asked)
-    asked.clear()
-    with pytest.raises(je.accuracy.LadderError, match="give budget_ms"):
-        je.fit_fidelity(scene)
-    assert not asked  # refused before anything is measured
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,9 @@ def located(grid):
     with calib.open_session(grid) as session:
         return calib.calibrate(
             [session],
-            recipe=replace(QUICK, location=calib.Bilinear(nodes=2, shared=True), locator=calib.ImageCentroid("half")),
+            recipe=replace(
+                QUICK, location=calib.fitting.Bilinear(nodes=2, shared=True), locator=calib.ImageCentroid("half")
+            ),
         )
 
 
@@ -180,7 +182,7 @@ def test_a_calibration_whose_pads_were_exchanged_is_refused(calibration, folder)
 
 @pytest.mark.slow
 def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, calibration, grid):
-    locator = calib.FittedContact(columns=21, widths=(0.008, 0.03))
+    locator = calib.calibration.FittedContact(columns=21, widths=(0.008, 0.03))
     made = locator.prepare(model, np.full(550, 1e-5), np.ones(550, bool))
     again = locator_from_numbers(locator_numbers(made), model.dtype)
     assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (made, again)), strict=True))

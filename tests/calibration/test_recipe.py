@@ -120,7 +120,7 @@ def test_a_wrong_recipe_is_one_clear_line(text, message):
 
 def test_a_way_to_choose_with_frames_of_its_own_is_refused():
     with pytest.raises(RecipeError, match=r"LCurve has frames of its own; give LCurve\(\)"):
-        calib.Recipe(imaging=je.Imaging(hyperparameter=je.LCurve(jnp.ones((1, 550)))))
+        calib.Recipe(imaging=je.Imaging(hyperparameter=je.imaging.LCurve(jnp.ones((1, 550)))))
 
 
 def options(*words):
@@ -141,7 +141,7 @@ def test_options_come_before_the_file_and_the_file_before_the_defaults(tmp_path)
     path = tmp_path / "r.toml"
     path.write_text('loss = "huber"\nfolds = 7\n[imaging]\nprior = "laplace"\nbasis = "bumps"\n')
     recipe = options("--recipe", str(path), "--prior", "tikhonov", "--low-pass", "9", "--hyperparameter", "l-curve")
-    assert recipe.imaging == je.Imaging(je.Bumps(), prior=je.Tikhonov(), hyperparameter=je.LCurve())
+    assert recipe.imaging == je.Imaging(je.Bumps(), prior=je.Tikhonov(), hyperparameter=je.imaging.LCurve())
     assert LOSSES.name_of(recipe.loss) == "huber"
     assert recipe.folds == 7
     assert recipe.processing.corrections == (calib.presses.LowPass(9.0),)
@@ -209,7 +209,9 @@ def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, 
 @pytest.mark.parametrize("noise", [je.imaging.MeasuredNoise(), je.imaging.CorrelatedNoise()], ids=["std", "cov"])
 def test_noise_is_measured_before_the_presses(noise, grid, folder):  # noqa: F811
     """Of 1 uV, white, and steps of 1 uV."""
-    imaging = je.Imaging(je.Pixels(14), noise=noise, hyperparameter=je.Discrepancy(factor=100.0))  # of a draft model
+    imaging = je.Imaging(
+        je.Pixels(14), noise=noise, hyperparameter=je.imaging.Discrepancy(factor=100.0)
+    )  # of a draft model
     recipe = replace(QUICK, imaging=imaging)
     with calib.open_session(grid) as session:
         made = calib.calibrate([session], recipe=recipe)

@@ -4,10 +4,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from scipy import io
 
 import jaxeit as je
-from benchmarks.bench_real import aligned
+from benchmarks.bench_real import insole_counts
 from calib.bench import simulate
 from calib.check import Severity, check_session, transfer_matrix
 from calib.cli import main
@@ -85,11 +84,7 @@ def test_a_magnetic_skin_is_not_accused(tmp_path, capsys):
 @pytest.mark.slow
 def test_an_insole_in_a_chamber_is_accused_of_its_faulty_taxels_only(tmp_path):
     """Its reference starts under load and is never negative."""
-    found = io.loadmat(real("insole_plenum/calibration_dataset.mat"), squeeze_me=True, struct_as_record=False)[
-        "experiment"
-    ]
-    counts = np.asarray(found.C)[:, 2:]
-    chamber, *_ = aligned(counts, found.P)  # the two were recorded by clocks of their own
+    counts, chamber = insole_counts(real("insole_plenum").parent)
     time = (np.arange(len(counts)) * (SECOND / 48.7)).astype(np.int64)
     streams = {
         "pressure": Samples(StreamFacts("counts", units="1", channels=280, rate_hz=48.7), time, counts),

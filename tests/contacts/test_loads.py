@@ -24,10 +24,8 @@ def frames_of(touches, effects=(COAT, GAIN), seed=0):
     places = np.array([np.concatenate([p, np.repeat(p[-1:], TIPS - len(p), 0)]) for p, _ in touches])
     loads = np.array([np.concatenate([f, np.zeros(TIPS - len(f))]) for _, f in touches])
     found = pressed(effects, places, loads)
-    rng = np.random.default_rng(seed)
-    blank = found.untouched + found.noise / 10 * rng.normal(size=found.untouched.size)
-    noise = np.full(found.untouched.size, found.noise)
-    return found.change + found.noise * rng.normal(size=found.change.shape), noise, blank
+    blank, frames = found.frames(np.random.default_rng(seed))
+    return frames, np.full(blank.size, found.noise), blank
 
 
 def single(x, y, force=20.0):

@@ -6,6 +6,7 @@ import pytest
 import jaxeit as je
 
 from ..hard_sheet import by_inverse, by_schur_and_pinv, exact, found, sheet_model, worst
+from ..oracles.disc import disc_resistance
 
 EVEN = [(10.0**k,) * 4 for k in (-12, -9, -6, -3, 0, 3, 6, 8)]
 MIXED = [(1e-12, 1e8, 1e-12, 1e8), (1e8, 1e-12, 1e-6, 1.0), (1e-12, 1e-12, 1e8, 1e8)]
@@ -47,8 +48,8 @@ def test_a_disc_of_any_contact_follows_its_limits():
     radius, sheet = 0.003, 100.0
     for contact in 10.0 ** np.arange(2, 9):
         weak = contact / (np.pi * radius**2) + sheet / (8 * np.pi) * (1 - sheet * radius**2 / contact / 24)
-        assert je.skin.disc_resistance(radius, contact, sheet) == pytest.approx(weak, rel=1e-14)
+        assert disc_resistance(radius, contact, sheet) == pytest.approx(weak, rel=1e-14)
     for contact in 10.0 ** np.arange(-18, -11):
         shorter = np.sqrt(contact / sheet) / radius
         strong = sheet / (2 * np.pi) * (shorter + shorter**2 / 2 + 3 * shorter**3 / 8)
-        assert je.skin.disc_resistance(radius, contact, sheet) == pytest.approx(strong, rel=1e-12)
+        assert disc_resistance(radius, contact, sheet) == pytest.approx(strong, rel=1e-12)

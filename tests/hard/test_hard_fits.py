@@ -74,7 +74,7 @@ def straightness(fits, pad, row):
     at = np.linspace(np.nanmin(row[0]), np.nanmax(row[0]), 50)
     true = at * np.nanmedian(row[1] / row[0])
     got = fits.pad(pad).curve(fits.parameters[pad], jnp.asarray(at, fits.scale.dtype))
-    return float(np.abs(got - true).max() / true.max())
+    return float(np.abs(np.asarray(got) - true).max() / true.max())
 
 
 SOME = [("linear", "f8"), ("power", "f8")]
@@ -317,7 +317,8 @@ def test_the_covariance_of_independent_samples_is_hubers():
     dpsi, valid = jnp.array([1.0, 1, 1, 1, 1, 1, 0, 0, 0]), jnp.arange(9) < 8
     mean, scatter = 0.75, 0.1875
     expected = ((1 + scatter / (8 * mean**2)) / mean) ** 2 * 8 / 7
-    found = independent_covariance(valid[:, None] * 8**-0.5, valid * 1.0, dpsi, valid)
+    weight = valid.astype(float)
+    found = independent_covariance(weight[:, None] * 8**-0.5, weight, dpsi, valid)
     np.testing.assert_allclose(found, [[expected]], rtol=1e-12)
 
 

@@ -32,7 +32,6 @@ HOST = {
     "bind": "what it is given has",
     "compiler_options": _DESCRIBES,
     "discretise": _GEOMETRY,
-    "disc_resistance": "one number, on the host; in the forward map it is `series_resistance`, case 'forward'",
     "drives": _DESCRIBES,
     "expected_mesh_nodes": _GEOMETRY,
     "few_choices": _PREPARES,
@@ -41,8 +40,8 @@ HOST = {
     "fidelity_choices": _PREPARES,
     "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
     "prepare_loads": _PREPARES,
+    "prepare_tracker": _PREPARES,
     "find_regions": "counts the regions of an image, on the host, and says so under jit",
-    "fit_fidelity": _PREPARES,
     "from_numbers": _DESCRIBES,
     "image_choices": _PREPARES,
     "ktc_score": "labels are integers; structural_similarity has the derivative",
@@ -95,17 +94,31 @@ SIDE = 4
 PIXELS = SIDE**2
 
 
-@pytest.fixture(scope="module")
-def tiny():
+def _tiny(dtype):
     """Six electrodes, 32 triangles, 16 pixels; and the same with a pad between the tip and the sheet."""
-    model = square_model(POINTS, je.skin.adjacent(6), SIDE)
     felt = (je.effects.LoadSpreading(), je.effects.ContactPiezoresistance())
-    pressed = square_model(POINTS, je.skin.adjacent(6), SIDE, effects=felt)
-    basis = je.Pixels(SIDE).on(model)
+    model, pressed = (
+        square_model(POINTS, je.skin.adjacent(6), SIDE, dtype=dtype, effects=effects) for effects in ((), felt)
+    )
     rng = np.random.default_rng(0)
     return SimpleNamespace(
-        model=model, pressed=pressed, basis=basis, rng=rng, draw=lambda n: jnp.asarray(rng.normal(size=n))
+        model=model,
+        pressed=pressed,
+        basis=je.Pixels(SIDE).on(model),
+        rng=rng,
+        dtype=dtype,
+        draw=lambda n: jnp.asarray(rng.normal(size=n), dtype),
     )
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return _tiny("float64")
+
+
+@pytest.fixture(scope="module")
+def single():
+    return _tiny("float32")
 
 
 def _forward(t):
@@ -135,7 +148,7 @@ def _jacobian(t):
 
 
 def _fuse(t):
-    half = (jnp.arange(PIXELS) < PIXELS // 2).astype(float)
+    half = (jnp.arange(PIXELS) < PIXELS // 2).astype(t.dtype)
     masks = je.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
     image = jnp.abs(t.draw(PIXELS))
 
@@ -143,7 +156,7 @@ def _fuse(t):
         return je.fuse(x[:PIXELS], masks, x[PIXELS:]).force
 
     def at(image, *forces):
-        return jnp.append(image, jnp.array(forces))
+        return jnp.append(image, jnp.array(forces, image.dtype))
 
     nothing = jnp.zeros(PIXELS)
     kinks = [at(nothing, 3, 2), at(nothing, 0, 0), at(image, 0, -1), at(-image, 3, 2), at(image, jnp.nan, 2)]
@@ -152,7 +165,7 @@ def _fuse(t):
 
 def _contact_shares(t):
     """Of two contacts on two pads; alike, on a corner of a pixel, absent, of no width."""
-    half = (jnp.arange(PIXELS) < PIXELS // 2).astype(float)
+    half = (jnp.arange(PIXELS) < PIXELS // 2).astype(t.dtype)
     masks = je.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
 
     def shares(x):
@@ -186,7 +199,7 @@ def _standard_deviations(t):
 def _covariance(t):
     """Of correlated noise, as one vector."""
     spread = t.draw(t.model.pattern.shape[0] ** 2).reshape(2 * [t.model.pattern.shape[0]])
-    return (spread @ spread.T / len(spread) + jnp.eye(len(spread))).ravel()
+    return (spread @ spread.T / len(spread) + jnp.eye(len(spread), dtype=t.dtype)).ravel()
 
 
 def _by_covariance(t):
@@ -221,7 +234,7 @@ LINEAR = {
     "one step, Laplace": (je.Laplace(), je.OneStep()),
     "one step, Gaussian": (je.GaussianSmooth(0.05, noser=True), je.OneStep()),
     "truncated": (je.Noser(), je.TruncatedSvd()),
-    "back projection": (je.Noser(), je.BackProjection()),
+    "back projection": (je.Noser(), je.imaging.BackProjection()),
     "GREIT": (je.Noser(), je.Greit(0.05, 0.06, 0.02)),
 }
 
@@ -239,7 +252,7 @@ def _gains(t):
     signal = je.scan.signal_covariance(t.model, basis=t.basis)
 
     def gains(x):
-        return je.choose_readings(x[0] * signal, 5).gain
+        return je.scan.choose_readings(x[0] * signal, 5).gain
 
     return Case(gains, [jnp.ones(1)], [])
 
@@ -258,7 +271,7 @@ def _length(t):
 
 
 def _bias(t):
-    centre = jnp.array([0.1, 0.1])
+    centre = jnp.array([0.1, 0.1], t.dtype)
     kinks = [jnp.tile(centre, 2)]
     return Case(lambda x: je.metrics.inward_bias(x[:2], x[2:], centre), [jnp.array([0.11, 0.12, 0.13, 0.16])], kinks)
 
@@ -303,7 +316,9 @@ def _otsu(t):
 
 def _contacts(t):
     def place(x):
-        fields = je.Contacts(x[:1] > 0, x[1:3][None], *[jnp.ones(1)] * 2, jnp.ones((1, 4, 4)), x[0], jnp.zeros(1, int))
+        fields = je.Contacts(
+            x[:1] > 0, x[1:3][None], *[jnp.ones(1, t.dtype)] * 2, jnp.ones((1, 4, 4)), x[0], jnp.zeros(1, int)
+        )
         return jnp.append(je.contacts.strongest(fields), fields.strength)
 
     return Case(place, [jnp.array([1.0, 0.1, 0.2])], [jnp.array([0.0, 0.1, 0.2])])
@@ -344,7 +359,7 @@ CASES = {
     **{f"prepare, hyperparameter, {name}": _by_hyperparameter(*how) for name, how in LINEAR.items()},
     "signal_covariance": _signal,
     "choose_readings": _gains,
-    "Peak": _estimator(je.Peak()),
+    "Peak": _estimator(je.metrics.Peak()),
     "LevelCentroid": _estimator(je.LevelCentroid()),
     "PositiveCentroid": _estimator(je.metrics.PositiveCentroid()),
     "localisation_error": _length,
@@ -401,7 +416,7 @@ def _program(case):
     def numbers(x, along):
         def total(x):
             out = jnp.ravel(case.function(x))
-            weight = jnp.cos(jnp.arange(1.0, out.size + 1))
+            weight = jnp.cos(jnp.arange(1, out.size + 1, dtype=out.dtype))
             return jnp.sum(jnp.where(jnp.isfinite(out), out * weight, 0))
 
         value, slope = jax.jvp(total, (x,), (along,))
@@ -424,7 +439,7 @@ def test_derivatives_are_right_and_finite(hard, tiny, name):
     program = jax.jit(_program(case))
     worst = 0.0
     for x in case.smooth:
-        along = jnp.abs(x) * jnp.asarray(np.random.default_rng(1).normal(size=x.size)) + (x == 0)
+        along = jnp.where(x == 0, 1, jnp.abs(x) * jnp.asarray(np.random.default_rng(1).normal(size=x.size)))
         value, slope, gradient = program(x, along)
         assert float(jnp.vdot(gradient, along)) == pytest.approx(float(slope), rel=1e-7, abs=1e-9 * abs(float(value)))
         steps = [(program(x + h * along, along)[0] - program(x - h * along, along)[0]) / (2 * h) for h in (1e-4, 2e-4)]
@@ -460,6 +475,15 @@ def test_jit_vmap_and_plain_python_agree(tiny, name):
             plain = program(points[0], along)
         for found, expected in zip(plain, compiled(points[0], along), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * float(jnp.max(jnp.abs(expected))))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_float32_stays_float32(single, name):
+    """Through every step, since a step in float64 would be refused where it meets float32: promotion is strict."""
+    case = CASES[name](single)
+    x = case.smooth[0].astype("float32")
+    for found in (jax.eval_shape(case.function, x), *jax.eval_shape(_program(case), x, x)):
+        assert found.dtype == "float32"
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -576,12 +600,12 @@ def test_what_decides_by_values_says_so_where_they_are_hidden(tiny):
         "the protocol": lambda x: je.prepare(eqx.tree_at(lambda m: m.pattern, model, x), basis=basis),
         "NoiseFigure chooses": lambda x: je.prepare(model, basis=basis, noise=x, hyperparameter=je.NoiseFigure()),
         "prepare_contacts decides": lambda x: je.prepare_contacts(model, noise=x),
-        "refine_contacts decides": lambda x: je.refine_contacts(model, x, None, noise=frame),
-        "prepare_event_scan decides": lambda x: je.prepare_event_scan(model, skin, je.scan.EventScanSettings(x)),
-        "noise_covariance decides": lambda x: je.noise_covariance(jnp.stack([x] * 5)),
+        "refine_contacts decides": lambda x: je.contacts.refine_contacts(model, x, None, noise=frame),
+        "prepare_event_scan decides": lambda x: je.scan.prepare_event_scan(model, skin, je.scan.EventScanSettings(x)),
+        "noise_covariance decides": lambda x: je.imaging.noise_covariance(jnp.stack([x] * 5)),
         "pad_masks decides": lambda x: je.pad_masks(skin, eqx.tree_at(lambda r: r.picture.areas, recon, x)),
-        "find_regions decides": lambda x: je.find_regions(x, recon),
-        "drives decides": lambda x: je.choose_readings(jnp.eye(18), 3, pattern=x, switch=1.0),
+        "find_regions decides": lambda x: je.contacts.find_regions(x, recon),
+        "drives decides": lambda x: je.scan.choose_readings(jnp.eye(18), 3, pattern=x, switch=1.0),
         "on_host decides": lambda x: eqx.tree_at(lambda r: r.factor, recon, x).on_host(),
         "to_numbers decides": lambda x: je.imaging.to_numbers(eqx.tree_at(lambda r: r.factor, recon, x)),
     }

@@ -53,7 +53,7 @@ def image_matrix(jac, h):
 
 
 def test_discrepancy_leaves_the_noise_and_no_more(model, coarse, jac, frames, held):
-    h = chosen(model, coarse, je.Discrepancy(frames))
+    h = chosen(model, coarse, je.imaging.Discrepancy(frames))
 
     def misfit(h):
         left = frames - frames @ image_matrix(jac, h)[0].T @ jac.T
@@ -64,14 +64,14 @@ def test_discrepancy_leaves_the_noise_and_no_more(model, coarse, jac, frames, he
 
 def test_discrepancy_says_when_the_noise_cannot_be_right(model, coarse, frames):
     with pytest.raises(je.imaging.HyperparameterError, match="standard deviations from any image"):
-        je.prepare(model, basis=coarse, noise=np.full(550, 1e-12), hyperparameter=je.Discrepancy(frames))
+        je.prepare(model, basis=coarse, noise=np.full(550, 1e-12), hyperparameter=je.imaging.Discrepancy(frames))
     with pytest.raises(je.imaging.InverseError, match=r"noise=\.\.\."):
-        je.prepare(model, basis=coarse, hyperparameter=je.Discrepancy(frames))
+        je.prepare(model, basis=coarse, hyperparameter=je.imaging.Discrepancy(frames))
 
 
 def test_cross_validation_predicts_best(model, coarse, jac, frames, held):
     """The generalised form stands for leaving one number out; its choice is within a factor of the best one."""
-    h = chosen(model, coarse, je.GeneralisedCrossValidation(frames))
+    h = chosen(model, coarse, je.imaging.GeneralisedCrossValidation(frames))
     y = frames @ held
 
     def score(h):
@@ -97,7 +97,7 @@ def test_the_noise_figure_is_what_simulated_noise_gives(model, coarse, jac):
 
 
 def test_the_corner_of_the_l_curve_bends_most(model, coarse, jac, frames, held):
-    h = chosen(model, coarse, je.LCurve(frames))
+    h = chosen(model, coarse, je.imaging.LCurve(frames))
 
     def point(h):
         q, r = image_matrix(jac, h)
@@ -118,10 +118,10 @@ def test_where_the_l_curve_stands_still_it_does_not_bend(coarse):
     jacobian = jnp.zeros((2, coarse.size), jnp.float32)
     problem = Problem(jacobian, jnp.array(2.0), jnp.array(1.0), je.Noser(), coarse.picture)
     spectrum = Spectrum(squares, jnp.eye(2, dtype=jnp.float32), jacobian.T, problem)
-    assert je.LCurve(y).choose(spectrum, lambda y: y) > 1e-3
+    assert je.imaging.LCurve(y).choose(spectrum, lambda y: y) > 1e-3
 
 
-@pytest.mark.parametrize("choice", [je.GeneralisedCrossValidation, je.LCurve, je.Discrepancy])
+@pytest.mark.parametrize("choice", [je.imaging.GeneralisedCrossValidation, je.imaging.LCurve, je.imaging.Discrepancy])
 def test_frames_that_say_nothing_choose_nothing(model, coarse, frames, choice):
     """No change at all; a reading that is not finite, unless its channel is left out."""
     with pytest.raises(
@@ -143,8 +143,8 @@ def test_numbers_that_cannot_be_are_refused(model, coarse, bad):
 
 def test_it_has_no_unit(model, coarse, frames):
     """The same skin in other units of conductance chooses the same."""
-    how = je.GeneralisedCrossValidation(frames)
-    other = je.GeneralisedCrossValidation(1e3 * jnp.asarray(frames))
+    how = je.imaging.GeneralisedCrossValidation(frames)
+    other = je.imaging.GeneralisedCrossValidation(1e3 * jnp.asarray(frames))
     one = je.prepare(model, basis=coarse, hyperparameter=how)
     two = je.prepare(model, basis=coarse, hyperparameter=other)
     assert one.provenance["hyperparameter"] == two.provenance["hyperparameter"]

@@ -17,7 +17,7 @@ METHODS = {
     "one step, Laplace": (je.Laplace(), je.OneStep()),
     "one step, Gaussian": (je.GaussianSmooth(0.015), je.OneStep()),
     "truncated": (je.Noser(), je.TruncatedSvd()),
-    "back projection": (je.Noser(), je.BackProjection()),
+    "back projection": (je.Noser(), je.imaging.BackProjection()),
     "GREIT": (je.Noser(), je.Greit()),
     "not negative": (je.Noser(), je.NonNegative()),
     "total variation": (je.TotalVariation(), je.Reweighted(4)),
@@ -90,7 +90,7 @@ def test_truncation_keeps_the_singular_values_above_the_line(model, pixels, jac)
 def test_back_projection_is_the_mean_of_the_readings_by_sensitivity(model, pixels, jac):
     power = (jac**2).sum(0)
     expected = jac.T / (power + 1e-3 * power.max())[:, None]
-    found = je.prepare(model, method=je.BackProjection(), basis=pixels).matrix
+    found = je.prepare(model, method=je.imaging.BackProjection(), basis=pixels).matrix
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 

@@ -158,12 +158,12 @@ def test_noise_covariance_is_usable_from_few_frames_and_right_from_many():
     rng = np.random.default_rng(2)
     true = covariance()[:40, :40]
     draw = rng.normal(size=(4000, 40)) @ np.linalg.cholesky(true).T
-    few, many = (je.noise_covariance(draw[:n]) for n in (20, 4000))
+    few, many = (je.imaging.noise_covariance(draw[:n]) for n in (20, 4000))
     assert np.linalg.eigvalsh(few).min() > 0
     far = [np.linalg.norm(found - true) / np.linalg.norm(true) for found in (few, np.cov(draw[:20].T), many)]
     assert far[0] < far[1]
     assert far[2] < 0.08
-    alone = je.noise_covariance(rng.normal(size=(50, 40)))  # nothing is shared: little is claimed
+    alone = je.imaging.noise_covariance(rng.normal(size=(50, 40)))  # nothing is shared: little is claimed
     assert np.abs(alone - np.diag(np.diag(alone))).max() < 0.15
 
 
@@ -177,4 +177,4 @@ def test_noise_covariance_is_usable_from_few_frames_and_right_from_many():
 )
 def test_blanks_that_tell_nothing_are_refused(blank, message):
     with pytest.raises(je.imaging.InverseError, match=message):
-        je.noise_covariance(blank)
+        je.imaging.noise_covariance(blank)

@@ -13,11 +13,8 @@ import threading
 import time
 from inspect import unwrap
 from pathlib import Path
-from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -27,8 +24,10 @@ from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.force_maps import ForceLaw, fused
 from calib.cli import main
+from calib.fitting.curves.fitted import FittedCurve
+from calib.fitting.fields.places import single_places
 from calib.fitting.pads import PadModel
-from calib.live import loop as live_module
+from calib.live import engine as live_engine, loop as live_module
 from calib.live.engine import Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
 from calib.live.page import MAX_CONNECTIONS, Page
@@ -44,16 +43,18 @@ from calib.record.recorder import StopRequest, record_session
 from calib.record.wire import encoding
 from calib.record.wire.messages import Frame
 from jaxeit import effects as fx
+from tests.helpers import stand_in
 
 S = 1_000_000_000
 READINGS, PADS = 6, 2
 CENTRES = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1], [0.1, 0.1]])
+NOWHERE, SOMEWHERE = single_places([[np.nan, np.nan]], PADS), single_places([[0.05, 0.05]], PADS)
 
 
-class FakePrograms:
+class FakePrograms(FramePrograms):
     """The change of pressure in newtons; on each pad spread over its two pixels as 1 to 3."""
 
-    nowhere, searches = "nowhere", False
+    nowhere, searches = NOWHERE, False
 
     def __init__(self, law):
         self.searched, self.places = [], []
@@ -70,7 +71,7 @@ class FakePrograms:
 
     def search(self, frame):
         self.searched.append(frame)
-        return "somewhere", TouchEstimates(np.full((1, 2), 0.05), 1e-6 * np.eye(2)[None], np.array([True]), 0)
+        return SOMEWHERE, TouchEstimates(np.full((1, 2), 0.05), 1e-6 * np.eye(2)[None], np.array([True]), 0)
 
 
 class SearchingPrograms(FakePrograms):
@@ -79,36 +80,38 @@ class SearchingPrograms(FakePrograms):
     searches = True
 
 
-@pytest.fixture(scope="module", autouse=True)
-def stand_ins():
-    """Annotations are not checked here: calibrations and reconstructors are stand-ins of no class of the packages."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-        yield
-
-
 @pytest.fixture
 def calibration(monkeypatch, skin):
     """What live needs of one, of two pads and four pixels, without a computation."""
     monkeypatch.setattr(unwrap(Engine.__init__), "__defaults__", (2.0, FakePrograms))
-    channels = np.arange(READINGS) > 0
-    recon = SimpleNamespace(
-        centres=CENTRES, areas=np.ones(4), readings=READINGS, channels=channels, shape=(2, 2), factor=None
+    recon = stand_in(
+        je.Reconstructor,
+        centres=CENTRES,
+        areas=np.ones(4),
+        readings=READINGS,
+        channels=np.arange(READINGS) > 0,
+        shape=(2, 2),
+        factor=None,
     )
-    pads = [SimpleNamespace(name="left"), SimpleNamespace(name='<b>"right"')]
+    protocol = stand_in(
+        je.Protocol,
+        readings=READINGS,
+        pattern=np.tile([0, 1, 2, 3], (READINGS, 1)),
+        current=1.0,
+        frequency=0.0,
+        reading_time=1e-5,
+    )
+    pads = [stand_in(je.Pad, name="left"), stand_in(je.Pad, name='<b>"right"')]
     positions = np.array([[0.0, 0.0], [0.1, 0.1]])
-    protocol = SimpleNamespace(
-        readings=READINGS, pattern=np.tile([0, 1, 2, 3], (READINGS, 1)), current=1.0, frequency=0.0, reading_time=1e-5
-    )
-    hardware = SimpleNamespace(name="small", toml="", pads=pads, electrode_positions=positions, protocol=protocol)
+    curves = stand_in(FittedCurve, curve=calib.PowerLaw())
     weights = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
-    curves = SimpleNamespace(curve=SimpleNamespace(path=False))
-    return SimpleNamespace(
-        skin=hardware,
+    return stand_in(
+        calib.Calibration,
+        skin=stand_in(je.Skin, name="small", toml="", pads=pads, electrode_positions=positions, protocol=protocol),
         recon=recon,
-        masks=SimpleNamespace(weights=weights),
+        masks=stand_in(je.PadMasks, weights=weights),
         simulated=True,
-        pads=SimpleNamespace(curves=curves, field=None, gains=None, multiple=1.6),
+        pads=stand_in(PadModel, curves=curves, field=None, gains=None, multiple=1.6),
         curves=curves,
         locator=None,
         evaluation=None,
@@ -256,7 +259,8 @@ def test_the_newest_frame_is_taken_and_the_others_are_counted():
 # --- contacts, and readings that are missing -----
 
 
-def test_contacts_are_fitted_when_there_is_time_and_serve_the_next_frames(calibration):
+def test_contacts_are_fitted_when_there_is_time_and_serve_the_next_frames(calibration, monkeypatch):
+    monkeypatch.setattr(live_engine, "MAX_PLACE_AGE", np.inf)  # however slow the machine
     engine = rested(calibration, SearchingPrograms)
     programs = engine._programs
     programs.places.clear()  # zero was measured with them too
@@ -268,7 +272,7 @@ def test_contacts_are_fitted_when_there_is_time_and_serve_the_next_frames(calibr
     engine.use_spare_time(1.0)
     result = engine.step(arrival([31.0, 20.0], voltage=4.0))
     assert (result.touches.age, result.touches.sure.tolist()) == (1, [True])
-    assert programs.places == ["nowhere", "nowhere", "somewhere"]
+    assert programs.places == [NOWHERE, NOWHERE, SOMEWHERE]
     np.testing.assert_array_equal(programs.searched[0], np.full(READINGS, 3.0))
     line = json.loads(result.to_json())
     assert line["contacts_age"] == 1
@@ -276,7 +280,7 @@ def test_contacts_are_fitted_when_there_is_time_and_serve_the_next_frames(calibr
     assert contact.items() <= line["contacts"][0].items()
     result = engine.step(arrival([11.0, 20.0]))  # let go
     assert (len(result.touches.position), result.touches.age) == (0, 0)
-    assert programs.places[-1] == "somewhere"  # it may not be known yet that it was let go
+    assert programs.places[-1] is SOMEWHERE  # it may not be known yet that it was let go
 
 
 def test_frames_without_time_for_their_contacts_are_counted(calibration, monkeypatch):
@@ -437,18 +441,17 @@ def test_a_live_show_that_sees_nothing_leaves_nothing(calibration, tmp_path):
 
 def small_scan():
     """Two readings at rest, two more for the pad that is pressed, every reading each 40 frames."""
-    flags = np.eye(READINGS, dtype=bool)
-    scan = je.scan.EventScan(
+    flags = jnp.eye(READINGS, dtype=bool)
+    return je.scan.EventScan(
         idle=flags[0] | flags[1],
-        by_pad=np.stack([flags[0] | flags[2], flags[4] | flags[5]]),
+        by_pad=jnp.stack([flags[0] | flags[2], flags[4] | flags[5]]),
         by_place=(flags[0] | flags[4] | flags[5])[None],
-        centres=np.zeros((1, 2)),
-        pad_of=np.array([[False, True]]),
-        onset=np.full(PADS, 2.0),
-        release=np.full(PADS, 1.0),
-        every=np.asarray(40),
+        centres=jnp.zeros((1, 2)),
+        pad_of=jnp.array([[False, True]]),
+        onset=jnp.full(PADS, 2.0),
+        release=jnp.full(PADS, 1.0),
+        every=jnp.asarray(40),
     )
-    return jax.tree.map(jnp.asarray, scan)
 
 
 def test_pressure_says_what_the_device_reads_next(calibration, monkeypatch):
@@ -599,8 +602,9 @@ def test_a_viewer_is_given_the_newest_result_only(page, calibration):
     engine = rested(calibration)
     page.control.state = "running"
     link, reply, _ = fetch(page, "/results")
-    for force in range(200):
-        page.show_result(engine.step(arrival([11.0 + force, 20.0])))
+    results = [engine.step(arrival([11.0 + force, 20.0])) for force in range(200)]
+    for result in results:
+        page.show_result(result)
     found = events(reply, 2)
     assert found[-1]["about"] == {"state": "running", "health": "", "simulated": False, "lost": 0}
     last = [event["result"] for event in found if event["result"]][-1]
@@ -742,8 +746,8 @@ def test_an_event_driven_scan_of_the_testbed_finds_the_contact_with_a_fraction_o
     """A press appears where the whole scan sees it, from the readings of the director's own choice."""
     recon = je.prepare(model, basis=pixels)
     masks, owner = je.pad_masks(skin, recon), np.asarray(je.pad_masks(skin, recon).weights)
-    curves = SimpleNamespace(pressure_range=np.tile([0.0, 4000.0], (len(skin.pads), 1)))
-    director = prepare_director(SimpleNamespace(skin=skin, curves=curves), 1, lambda data: None)
+    curves = stand_in(FittedCurve, pressure_range=np.tile([0.0, 4000.0], (len(skin.pads), 1)))
+    director = prepare_director(stand_in(calib.Calibration, skin=skin, curves=curves), 1, lambda data: None)
     place = np.array([0.06, 0.15])
     centres, v0 = np.asarray(model.centroids), np.asarray(je.forward(model))
     bump = 0.3 * np.exp(-0.5 * ((centres - place) ** 2).sum(1) / 0.012**2)

@@ -1,14 +1,16 @@
 """The optional view in rerun: what a file of it holds, read back."""
 
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import calib
+import jaxeit as je
 from calib.cli import main
 from calib.live.loop import LiveControl
 from calib.live.results import FrameResult, TouchEstimates
+from tests.helpers import stand_in
 
 ROWS, COLUMNS = 3, 4
 S = 1_000_000_000
@@ -34,10 +36,12 @@ def view():
 def calibration():
     """Of a sheet of 3 by 4 pixels of 10 mm, with two pads."""
     x, y = np.meshgrid(0.01 * np.arange(COLUMNS), 0.01 * np.arange(ROWS))
-    pads = [SimpleNamespace(name="left"), SimpleNamespace(name="the right")]
-    return SimpleNamespace(
-        skin=SimpleNamespace(name="small", pads=pads),
-        recon=SimpleNamespace(centres=np.stack([x.ravel(), y.ravel()], 1), shape=(ROWS, COLUMNS)),
+    pads = [stand_in(je.Pad, name="left"), stand_in(je.Pad, name="the right")]
+    centres = np.stack([x.ravel(), y.ravel()], 1)
+    return stand_in(
+        calib.Calibration,
+        skin=stand_in(je.Skin, name="small", pads=pads),
+        recon=stand_in(je.Reconstructor, centres=centres, shape=(ROWS, COLUMNS)),
         simulated=True,
     )
 

@@ -11,6 +11,7 @@ from jaxeit.linalg import Dense
 from jaxeit.model.forward_model import coefficients, transfer
 
 from ..helpers import skin_of, square_model
+from ..oracles.disc import disc_resistance
 from ..oracles.rectangle import four_point
 
 POINTS = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.13)]
@@ -50,7 +51,7 @@ def test_four_terminal_readings_do_not_feel_the_contact():
     """They tend to the perfect contact at one end and to a limit of even injection at the other."""
     perfect, tiny = (np.asarray(je.forward(_patched(c))) for c in (0.0, 1e-12))
     assert tiny[0] == pytest.approx(perfect[0], rel=1e-9)
-    assert tiny[1] - perfect[1] == pytest.approx(2 * je.skin.disc_resistance(0.006, 1e-12, 1.0), rel=1e-3)
+    assert tiny[1] - perfect[1] == pytest.approx(2 * disc_resistance(0.006, 1e-12, 1.0), rel=1e-3)
     large, larger = (np.asarray(je.forward(_patched(c)))[0] for c in (1e2, 1e8))
     assert large == pytest.approx(larger, rel=1e-6)
 
@@ -255,14 +256,14 @@ def test_a_resolved_bolt_has_the_resistance_of_the_closed_form():
     resolved, perfect = (_bolts_apart(c, 48, 2) for c in (contact, 0.0))
     assert not np.asarray(resolved.system.lumped).any()
     found = float(je.forward(resolved)[0] - je.forward(perfect)[0]) / 2
-    assert found == pytest.approx(je.skin.disc_resistance(0.003, contact, 100.0), rel=0.02)
+    assert found == pytest.approx(disc_resistance(0.003, contact, 100.0), rel=0.02)
 
 
 def test_a_bolt_that_the_mesh_does_not_resolve_takes_the_closed_form():
     lumped, perfect = (_bolts_apart(c, 12, 1) for c in (1e-6, 0.0))
     assert np.asarray(lumped.system.lumped).all()
     found = float(je.forward(lumped)[0] - je.forward(perfect)[0]) / 2
-    assert found == pytest.approx(je.skin.disc_resistance(0.003, 1e-6, 100.0), rel=1e-9)
+    assert found == pytest.approx(disc_resistance(0.003, 1e-6, 100.0), rel=1e-9)
     # its derivative, by three ways
     sigma = lumped.background * (1 + 0.3 * jnp.sin(jnp.arange(lumped.background.size)))
     adjoint = je.jacobian(lumped, sigma)[0]
@@ -273,4 +274,4 @@ def test_a_bolt_that_the_mesh_does_not_resolve_takes_the_closed_form():
 
 
 def test_disc_resistance_of_the_physics_note():
-    assert je.skin.disc_resistance(3e-3, 1e-6, 100.0) == pytest.approx(0.54, abs=0.005)
+    assert disc_resistance(3e-3, 1e-6, 100.0) == pytest.approx(0.54, abs=0.005)

@@ -14,7 +14,7 @@ electrode's centre.
 """
 
 import numpy as np
-from scipy.special import spherical_jn
+from scipy.special import ive, spherical_jn
 
 
 def disc_potentials(
@@ -56,3 +56,15 @@ def _neumann_to_dirichlet(electrodes, width, degree, modes, sigma1, rho) -> np.n
     phase = np.exp(2j * np.pi / electrodes * np.outer(np.arange(electrodes), n))
     modal = (phase[:, None, :] * moments).reshape(electrodes * degree, modes)
     return ((modal * q) @ modal.conj().T).real
+
+
+def disc_resistance(radius: float, contact: float, sheet_resistance: float) -> float:
+    """Resistance in ohm from a disc electrode into the sheet around it, in closed form.
+
+    ``R_s L_T / (2 pi a) * I0(a / L_T) / I1(a / L_T)`` with the transfer length
+    ``L_T = sqrt(contact / R_s)``: the modified Bessel solution of ``laplace(u) = (u - U) / L_T^2``
+    under the disc.  Radius in m, contact in ohm m^2, sheet resistance in ohm per square.
+    """
+    transfer = np.sqrt(contact / sheet_resistance)
+    ratio = radius / transfer
+    return float(sheet_resistance * transfer / (2 * np.pi * radius) * ive(0, ratio) / ive(1, ratio))

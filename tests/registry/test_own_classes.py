@@ -158,7 +158,7 @@ def test_a_curve_in_a_recipe_and_in_a_fit(own):
     assert [type(x).__name__ for x in (recipe.imaging.prior, recipe.imaging.method)] == ["Flat", "Adjoint"]
     assert CURVES.name_of(recipe.curve) == f"{own}:Root"
     pressure = np.linspace(10, 4000, 60)
-    fit = calib.fit_curve(recipe.curve, pressure, 0.3 * np.sqrt(pressure))
+    fit = calib.fitting.fit_curve(recipe.curve, pressure, 0.3 * np.sqrt(pressure))
     assert float(fit.parameters[0]) == pytest.approx(0.3, rel=1e-6)
     assert calib.Recipe.from_toml(recipe.to_toml()) == recipe  # the module is imported by now
     del sys.modules[own]

@@ -30,7 +30,7 @@ def expected(model, pixels):
 
 @pytest.fixture(scope="module")
 def scan(model, skin, pixels):
-    return je.prepare_event_scan(
+    return je.scan.prepare_event_scan(
         model, skin, je.scan.EventScanSettings(onset=200.0, idle=12, local=30, every=5, radius=0.1), basis=pixels
     )
 
@@ -65,7 +65,7 @@ def test_what_readings_tell_is_the_fall_of_the_images_uncertainty(rows):
 
 def test_each_reading_is_the_best_beside_those_taken(rows):
     signal = rows @ rows.T
-    chosen = je.choose_readings(jnp.asarray(signal), 12)
+    chosen = je.scan.choose_readings(jnp.asarray(signal), 12)
     taken: list[int] = []
     for row, gain in zip(chosen.rows.tolist(), chosen.gain, strict=True):
         worth = {r: told(signal, [*taken, r]) - told(signal, taken) for r in range(12) if r not in taken}
@@ -79,32 +79,32 @@ def test_each_reading_is_the_best_beside_those_taken(rows):
 def test_greedy_is_near_the_best_of_all_subsets(rows, count):
     signal = rows @ rows.T
     best = max(told(signal, s) for s in combinations(range(12), count))
-    found = told(signal, je.choose_readings(jnp.asarray(signal), count).rows)
+    found = told(signal, je.scan.choose_readings(jnp.asarray(signal), count).rows)
     assert (1 - np.exp(-1)) * best <= found <= best * (1 + 1e-12)
     assert found > 0.97 * best  # what it does here; the bound is for the worst case
 
 
 def test_volume_is_qr_with_pivots(rows):
     _, _, pivots = qr(rows.T, pivoting=True)
-    chosen = je.choose_readings(jnp.asarray(rows @ rows.T), 9, je.scan.Volume())
+    chosen = je.scan.choose_readings(jnp.asarray(rows @ rows.T), 9, je.scan.Volume())
     assert chosen.rows.tolist() == pivots[:9].tolist()
     assert np.prod(chosen.gain) == pytest.approx(np.linalg.det(rows[pivots[:9]]) ** 2)
     with pytest.raises(je.skin.ProtocolError, match="fewer than 10 dimensions"):
-        je.choose_readings(jnp.asarray(rows @ rows.T), 10, je.scan.Volume())
+        je.scan.choose_readings(jnp.asarray(rows @ rows.T), 10, je.scan.Volume())
 
 
 def test_sensitive_is_the_largest_sums_of_squares(model, pixels):
     region = np.asarray(je.scan.around(pixels, [0.06, 0.13], 0.02))
     j = np.asarray(je.jacobian(model, None, pixels))
     signal = je.scan.signal_covariance(model, je.Tikhonov(), pixels, region=region)
-    found = je.choose_readings(signal, 40, je.scan.Sensitive())
+    found = je.scan.choose_readings(signal, 40, je.scan.Sensitive())
     worth = j**2 @ (region / np.asarray(pixels.areas))
     np.testing.assert_allclose(worth[np.asarray(found.rows)], np.sort(worth)[::-1][:40], rtol=1e-9)
 
 
 def test_on_the_testbed_d_optimal_tells_more_than_the_others_and_than_chance(expected):
     rng = np.random.default_rng(0)
-    told_by = [told(expected, je.choose_readings(expected, 60, s).rows) for s in SELECTIONS]
+    told_by = [told(expected, je.scan.choose_readings(expected, 60, s).rows) for s in SELECTIONS]
     chance = [told(expected, rng.choice(550, 60, replace=False)) for _ in range(20)]
     assert told_by[0] >= max(told_by[1:])
     assert told_by[0] > 1.2 * max(chance)
@@ -112,8 +112,8 @@ def test_on_the_testbed_d_optimal_tells_more_than_the_others_and_than_chance(exp
 
 def test_readings_that_share_a_drive_cost_less(skin, expected):
     pattern, protocol = skin.protocol.pattern, skin.protocol
-    free = je.choose_readings(expected, 60)
-    dear = je.choose_readings(expected, 60, pattern=pattern, switch=50.0)
+    free = je.scan.choose_readings(expected, 60)
+    dear = je.scan.choose_readings(expected, 60, pattern=pattern, switch=50.0)
     changes = [len(np.unique(je.scan.drives(pattern[np.asarray(c.rows)]))) for c in (free, dear)]
     assert changes[1] < changes[0] / 2
     times = [je.scan.scan_time(je.scan.shortened(protocol, c.rows), 50.0) for c in (free, dear)]
@@ -122,7 +122,7 @@ def test_readings_that_share_a_drive_cost_less(skin, expected):
 
 
 def test_a_short_scan_is_the_whole_one_without_the_rest(model, pixels, skin, expected):
-    chosen = np.asarray(je.choose_readings(expected, 80).rows)
+    chosen = np.asarray(je.scan.choose_readings(expected, 80).rows)
     flags = np.isin(np.arange(550), chosen)
     short = je.scan.shortened(skin.protocol, chosen)
     np.testing.assert_array_equal(short.pattern, skin.protocol.pattern[np.sort(chosen)])
@@ -135,8 +135,8 @@ def test_a_short_scan_is_the_whole_one_without_the_rest(model, pixels, skin, exp
 @pytest.mark.parametrize("selection", SELECTIONS, ids=lambda s: type(s).__name__)
 def test_single_precision_and_jit(rows, selection):
     signal = jnp.asarray(rows @ rows.T, jnp.float32)
-    wanted = je.choose_readings(jnp.asarray(rows @ rows.T), 5, selection)
-    found = je.choose_readings(signal, 5, selection)
+    wanted = je.scan.choose_readings(jnp.asarray(rows @ rows.T), 5, selection)
+    found = je.scan.choose_readings(signal, 5, selection)
     assert found.gain.dtype == np.float32
     np.testing.assert_array_equal(found.rows, wanted.rows)
 
@@ -144,9 +144,9 @@ def test_single_precision_and_jit(rows, selection):
 def test_what_cannot_be_chosen(model, pixels, expected):
     for count in (0, 551):
         with pytest.raises(je.skin.ProtocolError, match="give 1 to 550"):
-            je.choose_readings(expected, count)
+            je.scan.choose_readings(expected, count)
     with pytest.raises(je.skin.ProtocolError, match="give pattern="):
-        je.choose_readings(expected, 3, switch=1.0)
+        je.scan.choose_readings(expected, 3, switch=1.0)
     with pytest.raises(je.imaging.InverseError, match="one standard deviation per reading"):
         je.scan.signal_covariance(model, basis=pixels, noise=np.eye(550))
     with pytest.raises(je.imaging.InverseError, match="noise of reading 2 is"):
@@ -222,10 +222,10 @@ def test_readings_around_a_contact_are_the_ones_it_changes_most(model, pixels, s
 )
 def test_an_event_scan_that_makes_no_sense(model, skin, settings, said):
     with pytest.raises(je.skin.ProtocolError, match=said):
-        je.prepare_event_scan(model, skin, je.scan.EventScanSettings(**settings))
+        je.scan.prepare_event_scan(model, skin, je.scan.EventScanSettings(**settings))
 
 
 def test_an_event_scan_needs_pads(model, skin):
     bare = je.Skin("bare", skin.domain, skin.sheet_resistance, skin.electrodes, skin.protocol)
     with pytest.raises(je.skin.ProtocolError, match="has no pads"):
-        je.prepare_event_scan(model, bare, je.scan.EventScanSettings(onset=1.0))
+        je.scan.prepare_event_scan(model, bare, je.scan.EventScanSettings(onset=1.0))

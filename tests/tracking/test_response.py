@@ -1,0 +1,144 @@
+"""What contacts show, against the full forward map and against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit.imaging.noise import whitened_readings
+from jaxeit.tracking.reanalysis import prepare_reanalysis
+from jaxeit.tracking.response import load_pressure
+
+LOADS = jnp.array([[0.07, 0.09, np.log(0.012), np.log(15.0), 0, 0], [0.1, 0.1, np.log(0.01), np.log(8.0), 6e-3, 3e-3]])
+
+
+@pytest.fixture(scope="module")
+def whitened(model, blank):
+    return whitened_readings(model, blank[1], None)
+
+
+@pytest.fixture(scope="module")
+def sheet(model, whitened):
+    return prepare_reanalysis(model, model.background, whitened.electrodes, whitened.factor, np.dtype(float))
+
+
+@pytest.fixture(scope="module")
+def touched(model):
+    """Change of conductivity, S, and the elements that change, the most first."""
+    pressure = sum(load_pressure(load, model.centroids) for load in LOADS)
+    change = model.background * pressure / (20e3 + pressure)
+    return change, jnp.argsort(-change)
+
+
+def _all_unknowns(sheet):
+    return jnp.arange(len(sheet.green))
+
+
+def _first_order(sheet, change):
+    return change @ sheet.linear
+
+
+def test_with_all_unknowns_reanalysis_is_the_forward_map(model, whitened, sheet, touched):
+    change, elements = touched
+    found = sheet.beyond(elements, _all_unknowns(sheet), change[elements])
+    moved = je.forward(model, model.background + change) - je.forward(model, model.background)
+    exact = whitened.compress @ whitened.whitening.sums(moved)
+    assert jnp.linalg.norm(exact) > 500
+    np.testing.assert_allclose(found.readings + _first_order(sheet, change), exact, atol=1e-6)
+
+
+def test_fewer_unknowns_err_less_than_noise(sheet, touched):
+    change, elements = touched
+    every = sheet.beyond(elements, _all_unknowns(sheet), change[elements]).readings
+    around = jnp.zeros(len(sheet.green)).at[sheet.dofs].max(change[:, None])
+    errors = []
+    for size in (48, 96, 192):
+        chosen = jax.lax.top_k(around, size)[1]
+        errors.append(float(jnp.linalg.norm(sheet.beyond(elements, chosen, change[elements]).readings - every)))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1 < jnp.linalg.norm(every)
+
+
+def test_what_occurs_twice_counts_once(sheet, touched):
+    change, elements = touched
+    few, unknowns = elements[:150], jnp.unique(sheet.dofs[elements[:150]])
+    once = sheet.beyond(few, unknowns, change[few]).readings
+    both, twice = jnp.concatenate([few, few[:40]]), jnp.concatenate([unknowns, unknowns[:30]])
+    again = sheet.beyond(both, twice, jnp.concatenate([change[few], jnp.zeros(40)])).readings
+    np.testing.assert_allclose(again, once, atol=1e-8)
+
+
+def test_slopes_of_reanalysis_are_differences(sheet, touched):
+    change, elements = touched
+    few = elements[:150]
+    unknowns, size = jnp.unique(sheet.dofs[few]), 1e-5
+    direction = jnp.sin(jnp.arange(150.0)) * change[few]
+    sides = [sheet.beyond(few, unknowns, change[few] + s * size * direction).readings for s in (1, -1)]
+    found = sheet.beyond(few, unknowns, change[few])
+    slope = sheet.beyond_slopes(few, found, direction[None])[0]
+    np.testing.assert_allclose(slope, (sides[0] - sides[1]) / (2 * size), atol=1e-6 * float(jnp.linalg.norm(slope)))
+
+
+@pytest.fixture(scope="module")
+def exact(tracker):
+    """The tracker's sheet in double precision."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tracker.filter.sheet
+    )
+
+
+def test_what_contacts_show_has_the_slopes_of_differences(exact):
+    """Place, width, force, length and gain; forces on pads too."""
+    modes = jnp.array([0, 40, 77])
+    gain = 0.3 * jnp.cos(jnp.arange(exact.modes.shape[1], dtype=float))
+    near = exact.near(LOADS)
+
+    @jax.jit
+    def shown(numbers):
+        found = exact.shown(numbers[:12].reshape(2, 6), gain.at[modes].add(numbers[12:]), modes, near)
+        return jnp.concatenate([found.readings, found.pads]), found
+
+    start = jnp.concatenate([LOADS.ravel(), jnp.zeros(3)])
+    found = shown(start)[1]
+    slopes = jnp.concatenate([found.reading_slopes, found.pad_slopes], 1)
+    for k in range(len(start)):
+        step = jnp.zeros(len(start)).at[k].set(1e-6 if k in (0, 1, 4, 5, 6, 7, 10, 11) else 1e-5)
+        difference = (shown(start + step)[0] - shown(start - step)[0]) / (2 * step[k])
+        np.testing.assert_allclose(slopes[k], difference, atol=2e-5 * float(jnp.linalg.norm(difference)) + 1e-6)
+
+
+def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, exact):
+    """The tails of the second order are left out, and an image stands for the first."""
+    pressure = sum(load_pressure(load, model.centroids) for load in LOADS)
+    v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
+    wanted = tracker.filter.compress @ (v - blank[0])
+    gain = jnp.zeros(exact.modes.shape[1])
+    found = exact.shown(LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
+
+
+def test_single_precision_errs_below_a_tenth_of_the_noise(tracker, exact):
+    gain = jnp.zeros(exact.modes.shape[1])
+    single = tracker.filter.sheet.shown(LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    double = exact.shown(LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    assert single.dtype == double.dtype
+    assert jnp.max(jnp.abs(single - double)) < 0.1
+
+
+def test_a_load_on_a_pad_is_felt_by_it(tracker):
+    """The pads of the testbed cover its quarters, but for gaps."""
+    sheet = tracker.filter.sheet
+    load = jnp.array([[0.05, 0.05, np.log(0.008), np.log(10.0), 0, 0]])
+    found = sheet.shown(load, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.near(load))
+    np.testing.assert_allclose(sorted(found.pads), [0, 0, 0, 10], atol=0.3)
+
+
+def test_an_edge_of_length_zero_is_a_round_load():
+    points = jnp.stack(jnp.meshgrid(jnp.linspace(0, 0.2, 41), jnp.linspace(0, 0.2, 41)), -1)
+    load = LOADS[0]
+    square = jnp.sum((points - load[:2]) ** 2, -1)
+    width, force = jnp.exp(load[2]), jnp.exp(load[3])
+    gaussian = force * jnp.exp(-0.5 * square / width**2) / (2 * jnp.pi * width**2)
+    np.testing.assert_allclose(load_pressure(load, points), gaussian, atol=1e-4 * float(gaussian.max()))
+    assert jnp.isclose(load_pressure(LOADS[1], points).sum() * 0.005**2, 8, rtol=1e-3)

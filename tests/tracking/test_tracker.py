@@ -1,0 +1,172 @@
+"""Contacts followed through simulated frames, and the filter against a joint normal distribution."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit.imaging import InverseError
+from jaxeit.tracking import TrackerSettings
+from jaxeit.tracking.filter import SEEN, SIZE, Pads, _active, predicted, updated
+from jaxeit.tracking.response import load_pressure
+
+SECONDS = 0.01
+
+
+@pytest.fixture(scope="module")
+def frame_of(model, blank):
+    """Frames (readings,) V of loads (K, 6), from the full forward map."""
+
+    @jax.jit
+    def change(loads):
+        pressure = sum(load_pressure(load, model.centroids) for load in loads)
+        return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
+
+    v0, noise = blank
+    rng = np.random.default_rng(5)
+    return lambda loads: np.asarray(change(jnp.asarray(loads))) - v0 + noise * rng.normal(size=noise.size)
+
+
+def load(x, y, force, width=0.012):
+    return [x, y, np.log(width), np.log(force), 0.0, 0.0]
+
+
+def silent(tracker):
+    pads = tracker.filter.sheet.pad_area.shape[1]
+    return Pads(jnp.zeros(pads), jnp.full(pads, jnp.inf))
+
+
+@pytest.fixture(scope="module")
+def followed(tracker, frame_of):
+    """A press that slides; from the eighth frame on a second one 30 mm from it; the first lifts, then both are gone."""
+    states, truths, now = [], [], tracker.start()
+    for k in range(28):
+        first = load(0.06 + 0.0005 * k, 0.08, 12.0)
+        second = load(0.06 + 0.0005 * k, 0.11, 9.0)
+        truth = [one for one, there in ((first, 2 <= k < 18), (second, 8 <= k < 24)) if there]
+        now = tracker.step(now, frame_of(truth or [load(0.1, 0.1, 1e-6)]), SECONDS)
+        states.append(now)
+        truths.append(np.array(truth).reshape(-1, 6))
+    return states, truths
+
+
+def test_contacts_are_born_and_die_and_keep_their_numbers(followed):
+    states, truths = followed
+    numbers = [state.numbers for state in states]
+    late = 2  # frames until a contact that has lifted is gone
+    assert numbers[:2] == [(), ()]
+    assert numbers[2:8] == [(1,)] * 6
+    assert numbers[8:18] == [(1, 2)] * 10
+    assert numbers[18 + late : 24] == [(2,)] * (6 - late)
+    assert numbers[24 + late :] == [()] * (4 - late)
+    assert len(truths) == len(states)
+
+
+def test_places_and_forces_are_those_that_were_simulated(followed):
+    for state, truth in zip(*followed, strict=True):
+        if len(truth) != len(state.tracks):
+            continue
+        for track, own in zip(state.tracks, truth, strict=True):
+            assert np.linalg.norm(track.position - own[:2]) < 1.5e-3
+            assert abs(np.log(track.force) - own[3]) < 0.35  # without pads the gain of the layer is not known
+            assert np.linalg.norm(track.half) == 0
+
+
+def test_velocity_is_that_of_the_slide(followed):
+    velocity = followed[0][17].tracks[0].velocity
+    assert abs(velocity[0] - 0.05) < 0.03
+    assert abs(velocity[1]) < 0.03
+
+
+def test_covariances_stay_symmetric_and_definite(followed):
+    for state in followed[0]:
+        covariance = np.asarray(state.belief.covariance)
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance / np.sqrt(np.outer(*2 * [np.diag(covariance)]))).min() > 0
+
+
+def test_the_gain_is_learned_where_contacts_were_and_stays_unknown_elsewhere(tracker, followed):
+    variance = np.diag(np.asarray(followed[0][-1].belief.covariance))[1:]
+    distance = np.linalg.norm(np.asarray(tracker.filter.places)[1:] - [0.065, 0.09], axis=1)
+    assert variance[distance.argmin()] < 0.95
+    assert variance[distance.argmax()] == pytest.approx(1, abs=1e-3)
+
+
+def test_pads_tell_the_force(tracker, frame_of):
+    """An image alone confuses force and gain; a pad with an error of 1 % does not."""
+    truth = np.array([load(0.05, 0.05, 12.0)])
+    sheet = tracker.filter.sheet
+    near = sheet.near(jnp.asarray(truth))
+    forces = np.asarray(
+        sheet.shown(jnp.asarray(truth), jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads
+    )
+    now = tracker.start()
+    for _ in range(3):
+        now = tracker.step(now, frame_of(truth), SECONDS, forces, np.full(4, 0.1))
+    (track,) = now.tracks
+    assert track.force == pytest.approx(12, rel=0.03)
+    assert track.log_force_error < 0.03
+
+
+def test_missing_readings_are_left_out(tracker, frame_of, followed):
+    """A frame that lacks a tenth of its readings moves a contact by no more than its error."""
+    before = followed[0][7]
+    frame = frame_of([load(0.064, 0.08, 12.0)])
+    lacking = frame.copy()
+    lacking[::10] = np.nan
+    whole, part = (tracker.step(before, f, SECONDS).tracks[0] for f in (frame, lacking))
+    assert np.isfinite(part.position).all()
+    assert np.linalg.norm(whole.position - part.position) < 3 * np.sqrt(np.trace(part.covariance))
+
+
+def test_an_update_is_the_conditional_normal_distribution(tracker, followed):
+    """At a frame as it is expected: the covariance given the frame, by dense algebra."""
+    filter_, belief = tracker.filter, predicted(tracker.filter, followed[0][6].belief, jnp.asarray(SECONDS))
+    active = np.asarray(_active(filter_, belief.contacts))
+    contacts = belief.contacts[:, :SEEN]
+    shown = filter_.sheet.shown(contacts, belief.gain, jnp.asarray(active[SEEN:] - SIZE), filter_.sheet.near(contacts))
+    y, compress = np.asarray(shown.readings), np.asarray(filter_.compress)
+    frame = np.linalg.lstsq(compress, y)[0]
+    np.testing.assert_allclose(compress @ frame, y, atol=1e-6)
+    found = updated(filter_, belief, frame, silent(tracker), jnp.asarray(1e3)).belief
+    np.testing.assert_allclose(found.contacts, belief.contacts, atol=1e-5)
+    slopes, prior = np.zeros((len(y), len(belief.covariance))), np.asarray(belief.covariance)
+    slopes[:, active] = np.asarray(shown.reading_slopes).T
+    variance = 1 + float(filter_.model_error) ** 2 * (y @ y) / len(y)
+    gain = np.linalg.solve(slopes @ prior @ slopes.T + variance * np.eye(len(y)), slopes @ prior).T
+    wanted = prior - gain @ slopes @ prior
+    scale = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose((np.asarray(found.covariance) - wanted) / np.outer(scale, scale), 0, atol=1e-3)
+
+
+def test_a_belief_moves_by_the_integrated_random_walk(tracker, followed):
+    belief, filter_ = followed[0][10].belief, tracker.filter
+    steps = belief
+    for _ in range(4):
+        steps = predicted(filter_, steps, jnp.asarray(SECONDS / 4))
+    once = predicted(filter_, belief, jnp.asarray(SECONDS))
+    np.testing.assert_allclose(steps.contacts, once.contacts, rtol=1e-12)
+    np.testing.assert_allclose(steps.covariance, once.covariance, rtol=1e-6, atol=1e-16)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"dv": np.zeros(3)}, "550 readings"),
+        ({"seconds": 0.0}, "above zero"),
+        ({"pad_forces": np.zeros(4), "pad_errors": np.zeros(4)}, "standard error zero"),
+        ({"pad_forces": np.zeros(3), "pad_errors": np.ones(3)}, r"give \(4,\)"),
+        ({"pad_forces": np.zeros(4)}, r"give \(4,\)"),
+    ],
+)
+def test_wrong_frames_are_refused(tracker, given, said):
+    arguments = {"dv": np.zeros(550), "seconds": SECONDS} | given
+    with pytest.raises(InverseError, match=said):
+        tracker.step(tracker.start(), **arguments)
+
+
+@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"most": 0}, {"persistence": np.inf}, {"birth_rate": -1.0}])
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(InverseError, match=next(iter(wrong))):
+        TrackerSettings(**wrong)
