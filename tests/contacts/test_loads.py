@@ -1,5 +1,6 @@
 """Loads fitted through the pressure law: what they are, how many, where, and how sure."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +20,11 @@ GAIN = je.effects.ContactGain(0.12, 0.015, seed=71)
 COAT = je.effects.CoatingNonUniformity(0.15, 0.03, seed=70)
 
 
-def frames_of(touches, effects=(COAT, GAIN), seed=0):
+def frames_of(touches, effects=(COAT, GAIN), seed=0, **how):
     """Frames (n, readings), noise and untouched frame of touches: lists of places and forces, on another mesh."""
     places = np.array([np.concatenate([p, np.repeat(p[-1:], TIPS - len(p), 0)]) for p, _ in touches])
     loads = np.array([np.concatenate([f, np.zeros(TIPS - len(f))]) for _, f in touches])
-    found = pressed(effects, places, loads)
+    found = pressed(effects, places, loads, **how)
     blank, frames = found.frames(np.random.default_rng(seed))
     return frames, np.full(blank.size, found.noise), blank
 
@@ -45,6 +46,18 @@ def edge(x, y, length, angle, force=20.0):
 def three(x, y, reach, force=20.0):
     angle = 0.4 + 2 * np.pi * np.arange(3) / 3
     return np.array([x, y]) + reach * np.stack([np.cos(angle), np.sin(angle)], 1), np.full(3, force)
+
+
+def ring(x, y, reach, force=20.0):
+    angle = 2 * np.pi * np.arange(TIPS) / TIPS
+    return np.array([x, y]) + reach * np.stack([np.cos(angle), np.sin(angle)], 1), np.full(TIPS, force / TIPS)
+
+
+def tilted(x, y, angle, tilt, force=20.0):
+    """A square tip of 36 mm that presses more on one side."""
+    away = 0.012 * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
+    loads = 1 + tilt * away @ np.array([np.cos(angle), np.sin(angle)]) / 0.018
+    return np.array([x, y]) + away, force * loads / loads.sum()
 
 
 TOUCHES = {
@@ -89,6 +102,18 @@ def test_what_touches_the_sheet_is_told(ready, number):
     away = np.linalg.norm(there[:, None] - places, axis=2)
     assert away.min(0).max() < (0.008 if kind is LoadKind.EDGE else 0.004)
     np.testing.assert_allclose(np.sort(best.force), np.sort(forces), rtol=0.35)
+
+
+@pytest.mark.parametrize("touch", [ring(0.08, 0.11, 0.015), tilted(0.11, 0.09, 0.5, 0.8)], ids=["ring", "tilted tip"])
+def test_a_tip_that_is_no_gaussian_is_one(ready, touch):
+    """Two loads near one another explain these frames better than a Gaussian does; they count as one."""
+    fitter, finder, _, _ = ready
+    frame = frames_of([touch] * len(TOUCHES), seed=3, spread=0.006)[0][0]
+    found = fitter(frame, finder(frame))
+    assert found.kind is LoadKind.ONE
+    assert np.linalg.norm(np.asarray(found.one.position[0]) - touch[1] @ touch[0] / touch[1].sum()) < 0.002
+    apart = eqx.tree_at(lambda f: f.least, fitter, jnp.full(2, 1e-4))
+    assert found.probability[LoadKind.ONE] > apart(frame, finder(frame)).probability[LoadKind.ONE]
 
 
 def test_a_blank_frame_holds_nothing(ready):

@@ -25,6 +25,7 @@ import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from scipy.linalg import solve_triangular
+from scipy.stats import norm
 
 from ..._compile import require_known, verb
 from ...imaging.noise import InverseError, Whitening
@@ -80,6 +81,7 @@ class LoadFitter(eqx.Module):
     | low, high: corners of the sheet                                     | (2,)             | m    |
     | usual, spread: mean and standard deviation of log width, log force  | (2,)             |      |
     | difference: standard deviation of their differences between loads   | (2,)             |      |
+    | least: distance of two loads, length of an edge, that is not one load | (2,)           | m    |
     | length, prior, model_error: see `LoadSettings`                      | (), (5,), ()     |      |
     """
 
@@ -92,6 +94,7 @@ class LoadFitter(eqx.Module):
     usual: Float[Array, "2"]
     spread: Float[Array, "2"]
     difference: Float[Array, "2"]
+    least: Float[Array, "2"]
     length: Float[Array, ""]
     prior: Float[Array, "5"]
     model_error: Float[Array, ""]
@@ -185,7 +188,7 @@ class _Search:
         if fall > MIN_FALL:
             fits[LoadKind.MORE] = self.best(LoadKind.MORE, [three, *seen(self.contacts, 3)])
         there = bool(np.any(self.contacts.present))  # what the finder cannot tell from noise is nothing
-        evidence |= {kind: self.evidence(kind, fit) if there else -np.inf for kind, fit in fits.items()}
+        evidence |= self.evidences(fits) if there else dict.fromkeys(fits, -np.inf)
         fits.setdefault(LoadKind.MORE, two)
         return self.summary(evidence, fits)
 
@@ -234,9 +237,46 @@ class _Search:
         found: np.ndarray = np.linalg.lstsq(slopes, left, rcond=None)[0][4:]
         return found
 
+    def evidences(self, fits: dict[LoadKind, Fit]) -> dict[LoadKind, float]:
+        """Evidence of each kind that is fitted.
+
+        Two loads near one another, and a short edge, describe a flat, ringlike or tilted tip better than the slopes in
+        the shape of a Gaussian do. The part of their evidence where they are so near or short is evidence of one load.
+        """
+        found = {kind: self.evidence(kind, fit) for kind, fit in fits.items()}
+        for kind, least in zip((LoadKind.TWO, LoadKind.EDGE), np.asarray(self.fitter.least), strict=True):
+            beyond = self.beyond(kind, fits[kind], float(least))
+            found[LoadKind.ONE] = np.logaddexp(found[LoadKind.ONE], found[kind] + norm.logcdf(-beyond))
+            found[kind] += norm.logcdf(beyond)
+        return found
+
+    def beyond(self, kind: LoadKind, fit: Fit, least: float) -> float:
+        """By how many standard deviations two loads are farther apart, or an edge is longer, than the least."""
+        covariance, free = self.covariance(kind, fit), self.free(kind, fit)
+        second = np.eye(2, len(covariance), k=4)  # the half length of an edge, or the second place
+        step = 2 * second if kind is LoadKind.EDGE else second - np.eye(2, len(covariance))
+        away = step @ fit.loads.ravel()[free]
+        distance = max(float(np.linalg.norm(away)), np.finfo(float).tiny)
+        along = away @ step / distance
+        return (distance - least) / float(np.sqrt(along @ covariance @ along))
+
+    @staticmethod
+    def free(kind: LoadKind, fit: Fit) -> np.ndarray:
+        """Which of all parameters a kind has, (18,)."""
+        return free_parameters(padded(fit.loads[: len(FORMS[kind])], kind)[1]).ravel()
+
+    def covariance(self, kind: LoadKind, fit: Fit) -> np.ndarray:
+        """Covariance of the parameters that are fitted."""
+        free = self.free(kind, fit)
+        normal = fit.normal[np.ix_(free, free)]
+        scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+        inverse = np.linalg.pinv(scale[:, None] * normal * scale, hermitian=True)
+        found: np.ndarray = scale[:, None] * inverse * scale
+        return found
+
     def evidence(self, kind: LoadKind, fit: Fit) -> float:
         """Logarithm of the evidence of a kind of loads, up to a constant that all kinds share."""
-        free = free_parameters(padded(fit.loads[: len(FORMS[kind])], kind)[1]).ravel()
+        free = self.free(kind, fit)
         # A place that the frame does not tell is somewhere on the sheet: the variance of an even density bounds it.
         sides = np.asarray(self.fitter.high - self.fitter.low, float)
         on_sheet = np.tile(np.concatenate([12 / sides**2, np.zeros(SIZE - 2)]), MOST)
@@ -259,11 +299,7 @@ class _Search:
     def shape(self, kind: LoadKind, fit: Fit) -> LoadShape:
         """Loads as they are handed out."""
         rows = fit.loads[: len(FORMS[kind])]
-        free = free_parameters(padded(rows, kind)[1]).ravel()
-        normal = fit.normal[np.ix_(free, free)]
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
-        covariance = scale[:, None] * np.linalg.pinv(scale[:, None] * normal * scale, hermitian=True) * scale
-        parts = rows[:, :2], np.exp(rows[:, 2]), np.exp(rows[:, 3]), rows[:, 4:], covariance
+        parts = rows[:, :2], np.exp(rows[:, 2]), np.exp(rows[:, 3]), rows[:, 4:], self.covariance(kind, fit)
         y, forms, root, flat = self.put(self.y, padded(rows, kind)[1], fit.root, fit.loads.ravel())
         surprise = np.asarray(_surprise(flat, _Problem(self.fitter, y, forms, root)))
         misfit = np.array((fit.square - surprise @ surprise) / len(self.y))

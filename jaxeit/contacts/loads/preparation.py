@@ -64,6 +64,7 @@ def prepare_loads(
         spread=put([settings.width_spread, settings.force_spread]),
         difference=put([settings.width_difference, settings.force_difference]),
         length=put(settings.length),
+        least=put([settings.nearest, settings.shortest]),
         prior=put(settings.prior),
         model_error=put(settings.model_error),
     )

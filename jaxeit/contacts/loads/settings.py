@@ -10,7 +10,7 @@ from ...imaging.noise import InverseError
 KNOWN_COAT, UNKNOWN_COAT = 0.0, 0.15
 POSITIVE = (
     *("gain_length", "coat_length", "width", "width_spread", "force", "force_spread"),
-    *("width_difference", "force_difference", "length"),
+    *("width_difference", "force_difference", "length", "nearest", "shortest"),
 )
 
 
@@ -26,7 +26,7 @@ class LoadSettings:
     | coat: standard deviation of the log conductivity that the sheet is not known | see below    | 1    |
     |   by; None: 0 for a sheet given or fitted to a frame, 0.15 for an even one    |              |      |
     | coat_length: over which it changes                                           | 0.03         | m    |
-    | shape: standard deviation of each moment by which a round load differs from a | 0.2          | 1    |
+    | shape: standard deviation of each moment by which a round load differs from a | 0.1          | 1    |
     |   Gaussian (`pressure.shape_directions`)                                     |              |      |
     | model_error: part of the signal by which all else errs                       | 0.005        | 1    |
     | width, width_spread: median of a load's width, standard deviation of its log | 0.012, 0.4   | m, 1 |
@@ -35,6 +35,8 @@ class LoadSettings:
     |   of these logs between loads that press at once                             |              |      |
     | length: standard deviation of half an edge, in each direction; of half the   | 0.02         | m    |
     |   distance of loads, of which half are near one another and half anywhere    |              |      |
+    | nearest: distance below which two loads count as one of another shape         | 0.018        | m    |
+    | shortest: length below which an edge counts as one load of another shape      | 0.024        | m    |
     | prior: probabilities of the kinds, in the order of `LoadKind`                | 1/5 each     | 1    |
 
     Raises:
@@ -46,7 +48,7 @@ class LoadSettings:
     gain_length: float = 0.015
     coat: float | None = None
     coat_length: float = 0.03
-    shape: float = 0.2
+    shape: float = 0.1
     model_error: float = 0.005
     width: float = 0.012
     width_spread: float = 0.4
@@ -55,6 +57,8 @@ class LoadSettings:
     width_difference: float = 0.2
     force_difference: float = 0.8
     length: float = 0.02
+    nearest: float = 0.018
+    shortest: float = 0.024
     prior: tuple[float, float, float, float, float] = (0.2, 0.2, 0.2, 0.2, 0.2)
 
     def __post_init__(self) -> None:
