@@ -1,34 +1,50 @@
 """What one frame tells of contacts: how many, where and how surely, by loads and by bumps.
 
-For each seed the testbed is coated anew (CoatingNonUniformity 0.15, ContactGain 0.12), on another mesh than that of the
-fits, with noise 60 dB below the readings; the sheet of the fits is that of the mean of 100 untouched frames. Touches of
-20 N: single tips anywhere, two tips at a distance (equal, and one of a third), and edges, which are rows of nine tips.
-"told": the most probable kind is the true one, and for two both places are nearer than half their distance, at most
-15 mm. "covered": the ellipse of 90 % holds the place of the single, of both of two, or the middle of the edge. The
-finder of bumps (`prepare_contacts`) sees the same frames; it tells one from two, and an edge is one.
+For each seed the skin is coated anew (CoatingNonUniformity 0.15, ContactGain 0.12), on another mesh than that of the
+fits. Touches of 20 N: single tips anywhere, two tips at a distance (equal, and one of a third), edges, which are rows
+of nine tips, and three tips in a triangle.
+
+kinds: noise 60 dB below the readings, the sheet of the fits is that of the mean of 100 untouched frames. "told": the
+most probable kind is the true one, and for two both places are nearer than half their distance, at most 15 mm.
+"covered": the ellipse of 90 % holds the place of the single, of both of two, or the middle of the edge. The finder of
+bumps (`prepare_contacts`) sees the same frames; it tells one from two, and an edge is one. "reliability": how often
+kinds of a stated probability are the true ones.
+
+coverage: single tips of several shapes (Gaussian; flat, ring and tilted of 40 mm, which the pad spreads by 6 mm), noise
+40, 60 and 80 dB below the readings, the sheet known or not: ellipses and intervals of 90 % of place and force.
+
+chest: the same singles, pairs and edges on a curved skin.
 """
 
 from collections.abc import Iterator
+from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.stats import chi2
+from matplotlib.figure import Figure
+from scipy.stats import chi2, norm
 
 import jaxeit as je
 from calib.calibration.localisation.load_windows import FIDELITY
-from jaxeit.contacts import LoadKind, Loads, LoadShape
+from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
 
 from .clock import seconds
 from .harness import Question, Run
-from .problems import matched, pressed, uneven
+from .problems import Pressed, matched, pressed, uneven
 from .rows import Row, grouped
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.015, 0.02, 0.025, 0.03, 0.04), (1.0, 1 / 3)
 LENGTHS = (0.02, 0.03, 0.04, 0.06)
-TIPS = 9  # of an edge
-INSIDE = float(chi2.ppf(0.9, 2))
+TRIANGLE = 0.025  # m, from its middle to each of three tips
+TIPS = 19  # of a touch at most
+INSIDE, WITHIN = float(chi2.ppf(0.9, 2)), float(norm.ppf(0.95))
+NOISES, SHAPES = (40, 60, 80), ("gaussian", "flat", "ring", "tilted")
+TIP, TIP_SPREAD, RING = 0.018, 0.006, 0.015  # m: radius and spread of a flat tip, radius of a ring
+TILT = 0.8  # relative change of pressure from the middle of a tilted tip to its rim
+BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)  # of stated probability
+FIRST_SEED = 300
 
 
 class Touch(NamedTuple):
@@ -41,31 +57,60 @@ class Touch(NamedTuple):
 
     @property
     def truth(self) -> np.ndarray:
-        """Places (n, 2) m that are looked for: of an edge, its middle."""
+        """Places (n, 2) m that are looked for: of a single and of an edge, the middle of all tips."""
         there = self.places[self.loads > 0]
-        return there.mean(0)[None] if self.kind is LoadKind.EDGE else there
+        if self.kind in (LoadKind.EDGE, LoadKind.ONE):
+            return np.average(there, axis=0, weights=self.loads[self.loads > 0])[None]
+        return there
 
 
-def touches(rng: np.random.Generator, singles: int, others: int) -> Iterator[Touch]:
-    """All touches of a seed."""
-    for place in rng.uniform(0.02, 0.18, (singles, 2)):
+def touches(rng: np.random.Generator, singles: int, others: int, low: np.ndarray, high: np.ndarray) -> Iterator[Touch]:
+    """All touches of a seed, on a sheet whose corners are at low and high."""
+    for place in rng.uniform(low + 0.02, high - 0.02, (singles, 2)):
         yield _touch("one", LoadKind.ONE, place[None], np.array([LOAD]))
     for share in SHARES:
         for distance in DISTANCES:
-            for middle, along in _lines(rng, others):
+            for middle, along in _lines(rng, others, low, high):
                 places = middle + np.array([[-0.5], [0.5]]) * distance * along
                 name = f"two, 1:{1 / share:.0f}, {1e3 * distance:.0f} mm"
                 yield _touch(name, LoadKind.TWO, places, LOAD * np.array([1.0, share]))
     for length in LENGTHS:
-        for middle, along in _lines(rng, others):
-            places = middle + np.linspace(-0.5, 0.5, TIPS)[:, None] * length * along
-            yield _touch(f"edge, {1e3 * length:.0f} mm", LoadKind.EDGE, places, np.full(TIPS, LOAD / TIPS))
+        for middle, along in _lines(rng, others, low, high):
+            places = middle + np.linspace(-0.5, 0.5, 9)[:, None] * length * along
+            yield _touch(f"edge, {1e3 * length:.0f} mm", LoadKind.EDGE, places, np.full(9, LOAD / 9))
+    for middle, along in _lines(rng, others, low, high):
+        turned = np.exp(2j * np.pi * np.arange(3) / 3) * complex(*along)
+        places = middle + TRIANGLE * np.stack([turned.real, turned.imag], 1)
+        yield _touch("three", LoadKind.MORE, places, np.full(3, LOAD))
 
 
-def _lines(rng: np.random.Generator, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _lines(
+    rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for _ in range(count):
         angle = rng.uniform(0, np.pi)
-        yield rng.uniform(0.05, 0.15, 2), np.array([np.cos(angle), np.sin(angle)])
+        yield rng.uniform(low + 0.05, high - 0.05), np.array([np.cos(angle), np.sin(angle)])
+
+
+def shaped(rng: np.random.Generator, shape: str, count: int) -> Iterator[Touch]:
+    """Single touches of a shape on the testbed."""
+    for place in rng.uniform(0.03, 0.17, (count, 2)):
+        places, loads = _tip(shape, rng.uniform(0, 2 * np.pi))
+        yield _touch(shape, LoadKind.ONE, place + places, LOAD * loads / loads.sum())
+
+
+def _tip(shape: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places and loads that make up a tip; the plane is turned by an angle."""
+    if shape == "gaussian":
+        return np.zeros((1, 2)), np.ones(1)
+    if shape == "ring":
+        turned = angle + np.pi * np.arange(12) / 6
+        return RING * np.stack([np.cos(turned), np.sin(turned)], 1), np.ones(12)
+    i, j = (index.ravel() for index in np.mgrid[-2:3, -2:3])
+    inside = np.abs(i + j) <= 2
+    places = TIP / 2 * np.stack([i + j / 2, j * np.sqrt(3) / 2], 1)[inside]
+    along = places @ [np.cos(angle), np.sin(angle)] / TIP
+    return places, 1 + (TILT * along if shape == "tilted" else 0 * along)
 
 
 def _touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> Touch:
@@ -73,74 +118,180 @@ def _touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> 
     return Touch(name, kind, np.concatenate([places, np.repeat(places[-1:], spare, 0)]), np.pad(loads, (0, spare)))
 
 
-def measured(model: je.Model, seed: int, given: list[Touch]) -> Iterator[Row]:
-    """What both see of each touch of a seed."""
-    rng = np.random.default_rng([seed, 1])
-    found = pressed(uneven(seed), np.stack([t.places for t in given]), np.stack([t.loads for t in given]))
+def simulated(seed: int, given: list[Touch], **how: Any) -> Pressed:
+    """The frames of touches on the skin of a seed."""
+    return pressed(uneven(seed), np.stack([t.places for t in given]), np.stack([t.loads for t in given]), **how)
+
+
+class Seen(NamedTuple):
+    """A touch, its loads as fitted, its contacts as the finder sees them, and the milliseconds of the fit."""
+
+    touch: Touch
+    loads: Loads
+    bumps: Any
+    ms: float
+
+
+def seen(model: je.Model, found: Pressed, given: list[Touch], seed: int, decibels: int, known: bool) -> Iterator[Seen]:
+    """What fitter and finder see of touches, with noise so many decibels below the readings."""
+    rng = np.random.default_rng([seed, decibels, known])
+    found = found._replace(noise=found.noise * 10 ** ((60 - decibels) / 20))
     blank, frames = found.frames(rng)
-    noise, sheet = np.full(blank.size, found.noise), je.fit_background(model, blank)
+    noise = np.full(blank.size, found.noise)
+    sheet = je.fit_background(model, blank) if known else None
     finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
-    fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
+    fitter: LoadFitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
     bumps = finder(frames)
     fitter(frames[0], jax.tree.map(lambda part: part[0], bumps))
     for number, (touch, frame) in enumerate(zip(given, frames, strict=True)):
         one = jax.tree.map(lambda part, k=number: part[k], bumps)
         spent, loads = seconds(lambda f=frame, c=one: jax.block_until_ready(fitter(f, c)))
-        yield {"name": touch.name, "ms": 1e3 * spent, **_judged(touch, loads), "by_bumps": _by_bumps(touch, one)}
+        yield Seen(touch, loads, one, 1e3 * spent)
 
 
-def _judged(touch: Touch, loads: Loads) -> Row:
-    shape = {LoadKind.ONE: loads.one, LoadKind.TWO: loads.two, LoadKind.EDGE: loads.edge}[touch.kind]
+def judged(one: Seen) -> Row:
+    """What is right about the loads of a touch."""
+    touch, loads = one.touch, one.loads
+    shape = loads.of(touch.kind)
+    assert shape is not None
     place, order = _ordered(np.asarray(shape.position), touch.truth)
     told = loads.kind is touch.kind
     if touch.kind is LoadKind.TWO:
         told = told and matched(place, touch.truth)
     inside = [_square(shape, k, t) < INSIDE for k, t in zip(order, touch.truth, strict=True)]
+    probability = np.asarray(loads.probability)
     return {
+        "name": touch.name,
         "told": told,
-        "as_two": loads.kind is LoadKind.TWO,
+        "as_several": float(probability[LoadKind.TWO] + probability[LoadKind.MORE]) > 0.5,
         "error_mm": 1e3 * float(np.linalg.norm(place - touch.truth, axis=1).mean()),
         "covered": float(np.mean(inside)),
-        "probability": float(loads.probability[touch.kind]),
+        "probability": float(probability[touch.kind]),
+        "by_bumps": _by_bumps(touch, one.bumps),
+        "ms": one.ms,
     }
 
 
-def _ordered(place: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places in the order of the true ones, and that order."""
-    order = np.arange(len(place))
-    best = min((order, order[::-1]), key=lambda k: float(np.linalg.norm(place[k] - truth, axis=1).sum()))
-    return place[best], best
+def _ordered(place: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Places in the order of the true ones, each of which takes the nearest that is left."""
+    left, order = list(range(len(place))), []
+    for true in truth[: len(place)]:
+        order.append(min(left, key=lambda k, t=true: float(np.linalg.norm(place[k] - t))))
+        left.remove(order[-1])
+    return place[order], order
 
 
 def _square(shape: LoadShape, number: int, truth: np.ndarray) -> float:
     away = np.asarray(shape.position[number]) - truth
-    own = np.asarray(shape.covariance)[4 * number :, 4 * number :][:2, :2]
-    return float(away @ np.linalg.solve(own, away))
+    return float(away @ np.linalg.solve(np.asarray(shape.position_covariance[number]), away))
 
 
-def _by_bumps(touch: Touch, seen: Any) -> bool:
+def _by_bumps(touch: Touch, found: Any) -> bool:
     """Whether the finder tells one from two; an edge is one."""
-    there = np.asarray(seen.position)[np.asarray(seen.present)]
+    there = np.asarray(found.position)[np.asarray(found.present)]
     if touch.kind is LoadKind.TWO:
         return matched(there, touch.truth)
-    return len(there) == 1
+    return len(there) == len(touch.truth)
 
 
-def measure(run: Run) -> Iterator[Row]:
-    seeds, singles, others = run.sizes((4, 40, 10), (1, 2, 1))
+def means(every: list[Row], key: str) -> list[Row]:
+    """Means of rows that share a name."""
+    rows = []
+    for name, mine in grouped(every, key).items():
+        found = {k: round(float(np.mean([row[k] for row in mine])), 4) for k in mine[0] if k != key}
+        rows.append({key: name, "frames": len(mine)} | found)
+    return rows
+
+
+def reliability(stated: np.ndarray, true: np.ndarray) -> list[Row]:
+    """How often kinds are the true ones, by the probability that was stated for them: (frames, kinds) each."""
+    rows = []
+    for low, high in pairwise(BINS):
+        here = (stated >= low) & ((stated < high) | (high == BINS[-1]))
+        if here.any():
+            mean, often = float(stated[here].mean()), float(true[here].mean())
+            rows.append({"stated": round(mean, 4), "true": round(often, 4), "count": int(here.sum())})
+    return rows
+
+
+def kinds(run: Run, skin: str = "testbed", seeds: int = 3) -> tuple[list[Row], list[Row]]:
+    """Rows of all touches of a skin, and the reliability of their probabilities."""
+    seeds, singles, others = run.sizes((seeds, 10, 3), (1, 1, 1))
+    model = je.discretise(je.Scene(je.load_skin(skin)), FIDELITY)
+    low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
+    every, stated, true = [], [], []
+    for seed in range(FIRST_SEED, FIRST_SEED + seeds):
+        given = list(touches(np.random.default_rng(seed), singles, others, low, high))
+        for one in seen(model, simulated(seed, given, skin=skin), given, seed, 60, True):
+            every.append(judged(one))
+            stated.append(np.asarray(one.loads.probability))
+            true.append(np.arange(len(LoadKind)) == one.touch.kind)
+        print(f"{skin}, seed {seed}", flush=True)
+    return means(every, "name"), reliability(np.stack(stated), np.stack(true))
+
+
+def measure_kinds(run: Run) -> Iterator[Row]:
+    rows, reliable = kinds(run)
+    yield {"rows": [{"touch": row.pop("name")} | row for row in rows], "reliability": reliable}
+
+
+def measure_chest(run: Run) -> Iterator[Row]:
+    rows, _ = kinds(run, "chest", 1)
+    yield {"chest": [{"touch": row.pop("name")} | row for row in rows]}
+
+
+def measure_coverage(run: Run) -> Iterator[Row]:
+    seeds, count = run.sizes((2, 4), (1, 1))
     model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
     every: list[Row] = []
-    for seed in range(100, 100 + seeds):
-        every += measured(model, seed, list(touches(np.random.default_rng(seed), singles, others)))
-        print(f"seed {seed}", flush=True)
-    rows = []
-    for name, mine in grouped(every, "name").items():
-        means = {key: round(float(np.mean([row[key] for row in mine])), 4) for key in mine[0] if key != "name"}
-        rows.append({"touch": name, "frames": len(mine)} | means)
-    yield {"seeds": seeds, "rows": rows}
+    for seed in range(FIRST_SEED + 50, FIRST_SEED + 50 + seeds):
+        rng = np.random.default_rng(seed)
+        given = [list(shaped(rng, shape, count)) for shape in SHAPES]
+        spreads = [0.012, *[TIP_SPREAD] * (len(SHAPES) - 1)]
+        parts = [simulated(seed, some, spread=spread) for some, spread in zip(given, spreads, strict=True)]
+        found = parts[0]._replace(change=np.concatenate([part.change for part in parts]))
+        touched = list(chain(*given))
+        for decibels in NOISES:
+            for known in (True, False):
+                every += [_covered(one, decibels, known) for one in seen(model, found, touched, seed, decibels, known)]
+        print(f"coverage, seed {seed}", flush=True)
+    yield {"coverage": means(every, "case")}
 
 
-main = Question("loads", __doc__, {"rows": measure})
+def _covered(one: Seen, decibels: int, known: bool) -> Row:
+    """Whether ellipse and interval of a single touch hold its place and its force."""
+    shape, row = one.loads.one, judged(one)
+    spread = float(np.sqrt(shape.covariance[3, 3]))
+    return {
+        "case": f"{one.touch.name}, {decibels} dB, sheet {'known' if known else 'unknown'}",
+        "told": row["told"],
+        "error_mm": row["error_mm"],
+        "place": row["covered"],
+        "force": abs(np.log(float(shape.force[0]) / LOAD)) < WITHIN * spread,
+        "ms": one.ms,
+    }
+
+
+def picture(data: Row) -> Figure:
+    """How often two contacts are told apart, by their distance."""
+    figure = Figure(figsize=(5.5, 3.5), layout="constrained")
+    axes = figure.add_subplot()
+    rows = {row["touch"]: row for row in data["rows"]}
+    for share in SHARES:
+        names = [f"two, 1:{1 / share:.0f}, {1e3 * distance:.0f} mm" for distance in DISTANCES]
+        for way, style in (("told", "-o"), ("by_bumps", "--s")):
+            label = f"1:{1 / share:.0f}, by {'loads' if way == 'told' else 'bumps'}"
+            axes.plot(1e3 * np.array(DISTANCES), [100 * rows[name][way] for name in names], style, label=label)
+    false = [rows[name] for name in rows if name == "one" or name.startswith("edge")]
+    rate = np.average([row["as_several"] for row in false], weights=[row["frames"] for row in false])
+    axes.set(xlabel="distance of two contacts, mm", ylabel="told apart, %", ylim=(-3, 103))
+    axes.set_title(f"one frame, 60 dB; {100 * rate:.1f} % of singles and edges are called several", fontsize=9)
+    axes.legend(fontsize=8)
+    return figure
+
+
+PARTS = {"kinds": measure_kinds, "coverage": measure_coverage, "chest": measure_chest}
+main = Question("loads", __doc__, PARTS, picture=picture, file="separation.png")
 
 if __name__ == "__main__":
     main()

@@ -162,10 +162,20 @@ def uneven(seed: int) -> tuple[je.effects.AbstractEffect, ...]:
     )
 
 
-def pressed(effects: tuple, places: np.ndarray, loads: np.ndarray, edge_length: float = 0.026) -> Pressed:
-    """The testbed pressed by tips of 20 mm at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own."""
-    effects = (je.effects.LoadSpreading(0.012), *effects, je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
-    scene = je.Scene(je.load_skin("testbed"), effects)
+def pressed(
+    effects: tuple,
+    places: np.ndarray,
+    loads: np.ndarray,
+    edge_length: float = 0.026,
+    spread: float = 0.012,
+    skin: str = "testbed",
+) -> Pressed:
+    """A skin pressed by tips of 20 mm at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own.
+
+    The pad spreads each tip to a Gaussian of standard deviation ``spread``, m.
+    """
+    effects = (je.effects.LoadSpreading(spread), *effects, je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
+    scene = je.Scene(je.load_skin(skin), effects)
     model = je.discretise(scene, je.Fidelity.standard(edge_length=edge_length))
     untouched = np.asarray(je.forward(model))
     touched = np.asarray(_touched(model, jnp.asarray(places), jnp.asarray(loads)))

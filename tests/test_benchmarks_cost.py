@@ -316,8 +316,12 @@ def test_smoke_growth():
 @pytest.mark.slow
 def test_smoke_loads():
     data = bench_loads.main(["--smoke"])
-    assert {row["touch"].split(",")[0] for row in data["rows"]} == {"one", "two", "edge"}
-    assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data["rows"])
+    for part in ("rows", "chest"):
+        assert {row["touch"].split(",")[0] for row in data[part]} == {"one", "two", "edge", "three"}
+        assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data[part])
+    frames = sum(row["frames"] for row in data["rows"])
+    assert sum(row["count"] for row in data["reliability"]) == 5 * frames  # kinds
+    assert {row["case"].split(",")[0] for row in data["coverage"]} == set(bench_loads.SHAPES)
 
 
 @pytest.mark.slow

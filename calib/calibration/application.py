@@ -45,7 +45,7 @@ def apply(
         processing: how the session is corrected; default: as the sessions of the calibration.
         ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
             file then names the errors.
-        loads: also tell what touches the skin, none, one, two or an edge, in windows of so many s; None: do not.
+        loads: also tell what touches the skin, none, one, two, an edge or more, in windows of so many s; None: do not.
         track: also follow contacts from frame to frame, each with a number; smoothed over time.
         tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
 

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known, verb
-from ..imaging.background import fit_background
+from ..imaging.background import sheet_of
 from ..imaging.noise import InverseError, Whitened, whitened_readings
 from ..model.bases import Elements
 from ..model.discretisation import Model
@@ -92,23 +92,6 @@ def prepare_contacts(
     )
     ready: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, settings.false_alarm)))
     return ready
-
-
-def sheet_of(
-    model: Model,
-    untouched: Float[ArrayLike, " readings"] | None,
-    sigma: Float[Array, " elements"] | None,
-    channels: Bool[ArrayLike, " readings"] | None,
-) -> Float[Array, " elements"] | None:
-    """The conductivity of the untouched sheet, (elements,) S, from what is known of it; None: it is even."""
-    if untouched is None:
-        return sigma
-    if sigma is not None:
-        raise InverseError("untouched and sigma both tell the sheet; give one of them")
-    frame = np.asarray(untouched, float)
-    if channels is not None and frame.shape == np.shape(channels):
-        frame = np.where(channels, frame, np.nan)
-    return fit_background(model, frame)
 
 
 def _slopes(model: Model, found: Whitened, sigma: Float[Array, " elements"] | None) -> tuple[np.ndarray, float]:

@@ -75,6 +75,27 @@ def fit_background(
     return physics.sigma(x)
 
 
+def sheet_of(
+    model: Model,
+    untouched: Float[ArrayLike, " readings"] | None,
+    sigma: Float[Array, " elements"] | None,
+    channels: Bool[ArrayLike, " readings"] | None,
+) -> Float[Array, " elements"] | None:
+    """The conductivity of the untouched sheet, (elements,) S, from what is known of it; None: it is even.
+
+    Raises:
+        InverseError: if both a frame and a conductivity are given, or no coating explains the frame.
+    """
+    if untouched is None:
+        return sigma
+    if sigma is not None:
+        raise InverseError("untouched and sigma both tell the sheet; give one of them")
+    frame = jnp.asarray(untouched, model.dtype)
+    if channels is not None and frame.shape == np.shape(channels):
+        frame = jnp.where(jnp.asarray(channels, bool), frame, jnp.nan)
+    return fit_background(model, frame)
+
+
 def _is_known(value: Any) -> bool:
     """Whether a value can be checked; under a transformation of JAX its numbers are hidden."""
     return not isinstance(value, Tracer)

@@ -16,6 +16,7 @@ from .._compile import is_traced
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
 from ..model.sensitivity import pair_jacobian
+from .background import sheet_of
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
 from .methods.one_step import one_step_image
@@ -33,6 +34,7 @@ class Settings(TypedDict, total=False):
 
     noise: Float[ArrayLike, "..."] | None
     hyperparameter: Float[ArrayLike, ""] | AbstractHyperparameter
+    untouched: Float[ArrayLike, " readings"] | None
     sigma: Float[Array, " elements"] | None
     channels: Bool[ArrayLike, " readings"] | None
     provenance: Mapping[str, str] | None
@@ -76,6 +78,7 @@ def prepare(
     noise: Float[ArrayLike, "..."] | None = None,
     hyperparameter: Float[ArrayLike, ""] | AbstractHyperparameter = 0.1,
     *,
+    untouched: Float[ArrayLike, " readings"] | None = None,
     sigma: Float[Array, " elements"] | None = None,
     channels: Bool[ArrayLike, " readings"] | None = None,
     provenance: Mapping[str, str] | None = None,
@@ -97,7 +100,9 @@ def prepare(
             measured without contact; default: the same for all, of unknown size.
         hyperparameter: weight of the prior, without unit (see `methods`); 0.1 suits a signal-to-noise ratio of
             60 dB and 0.3 to 1 one of 40 dB.  Or a way to choose it (see `hyperparameters`).
-        sigma: conductivity to linearise at, (elements,) S; default: the untouched sheet.
+        untouched: mean frame of the untouched sheet, (readings,) V, to which `fit_background` fits the conductivity to
+            linearise at.
+        sigma: conductivity to linearise at, (elements,) S, if it is known already; default: that of the model.
         channels: readings to use; a dead one is left out, never taken for zero.
         provenance: what to write down beside the numbers.
 
@@ -106,7 +111,8 @@ def prepare(
         those that the readings hold.
 
     Raises:
-        InverseError: if a value is out of range or no channel is left, or the result is not finite; if prior, method or
+        InverseError: if a value is out of range or no channel is left, or the result is not finite; if both
+            ``untouched`` and ``sigma`` are given, or no coating explains the untouched frame; if prior, method or
             basis is none, such as a method in the place of the prior; or if jit, grad or vmap hides the protocol or the
             channels.
         HyperparameterError: if the hyperparameter is to be chosen by values that jit, grad or vmap hides.
@@ -114,6 +120,7 @@ def prepare(
     method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()
     require_choices(prior, method, basis)
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
+    sigma = sheet_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
     problem = Problem(
         jacobian=pair_jacobian(model, sigma, image, found.electrodes, jnp.asarray(found.factor, model.dtype)),

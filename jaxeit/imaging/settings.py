@@ -64,6 +64,7 @@ class Imaging:
         quiet: Float[ArrayLike, "frames readings"] | None = None,
         frames: Float[ArrayLike, "... readings"] | None = None,
         channels: Bool[ArrayLike, " readings"] | None = None,
+        untouched: Float[ArrayLike, " readings"] | None = None,
         sigma: Float[Array, " elements"] | None = None,
     ) -> Reconstructor | IterativeReconstructor:
         """The reconstructor that these choices make of a model, by `prepare`.
@@ -73,7 +74,7 @@ class Imaging:
                 is `EqualNoise`.
             frames: differences of readings, at least one of a touch, V; needed by a ``hyperparameter`` that looks at
                 frames and has none of its own.
-            channels, sigma: as for `prepare`.
+            channels, untouched, sigma: as for `prepare`.
 
         Raises:
             InverseError: as for `prepare`, or if the choices need frames that are not given.
@@ -83,5 +84,6 @@ class Imaging:
         if isinstance(weight, AbstractHyperparameter) and frames is not None:
             weight = weight.on(frames)
         noise = self.noise.measured(quiet, channels)
-        settings: Settings = {"noise": noise, "hyperparameter": weight, "sigma": sigma, "channels": channels}
+        sheet: Settings = {"untouched": untouched, "sigma": sigma}
+        settings: Settings = {"noise": noise, "hyperparameter": weight, "channels": channels} | sheet
         return prepare(model, self.prior, self.method, self.basis, **settings)

@@ -89,6 +89,25 @@ def pair_jacobian(
     return slopes if mixed is None else mixed @ slopes
 
 
+def element_slopes(
+    model: Model,
+    theta: Coefficients,
+    potential: Float[Array, "n electrodes"],
+    element: Int[Array, " e"],
+    pairs: Integer[ArrayLike, "k 2"],
+) -> Float[Array, "e k"]:
+    """Derivative of the transfer matrix's entries for these pairs of electrodes with respect to the conductivity of a
+    few elements, ohm/S, from the fields at theta."""
+    first, second = jnp.asarray(pairs).T
+    system = model.system
+    slopes = jnp.einsum("ekr,eka->era", system.slopes[element], potential[system.dofs[element]])
+    products = jnp.sum(slopes[..., first] * slopes[..., second], 1)
+    if not system.near_element.size:
+        return -products
+    series = jax.jacrev(lambda sigma: series_resistance(system, theta._replace(sigma=sigma)))(theta.sigma)
+    return jnp.where(first == second, series[:, element].T[:, first], 0) - products
+
+
 def _pair_slopes(
     model: Model,
     sigma: Float[Array, " elements"] | None,

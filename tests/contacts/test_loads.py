@@ -1,5 +1,7 @@
 """Loads fitted through the pressure law: what they are, how many, where, and how sure."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,18 +10,21 @@ import jaxeit as je
 from benchmarks.problems import pressed
 from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
+from jaxeit.contacts.loads.preparation import field_modes
+from jaxeit.contacts.loads.pressure import MOST, SIZE, Form, elongations, line, pressure, shape_directions, spot
 from jaxeit.imaging import InverseError
+from jaxeit.model.forward_model import coefficients, transfer
 
 TIPS = 9  # that an edge is simulated by
 GAIN = je.effects.ContactGain(0.12, 0.015, seed=71)
 COAT = je.effects.CoatingNonUniformity(0.15, 0.03, seed=70)
 
 
-def frames_of(touches, effects=(COAT, GAIN), seed=0):
+def frames_of(touches, effects=(COAT, GAIN), seed=0, **how):
     """Frames (n, readings), noise and untouched frame of touches: lists of places and forces, on another mesh."""
     places = np.array([np.concatenate([p, np.repeat(p[-1:], TIPS - len(p), 0)]) for p, _ in touches])
     loads = np.array([np.concatenate([f, np.zeros(TIPS - len(f))]) for _, f in touches])
-    found = pressed(effects, places, loads)
+    found = pressed(effects, places, loads, **how)
     blank, frames = found.frames(np.random.default_rng(seed))
     return frames, np.full(blank.size, found.noise), blank
 
@@ -38,6 +43,23 @@ def edge(x, y, length, angle, force=20.0):
     return [x, y] + np.linspace(-1, 1, TIPS)[:, None] * step, np.full(TIPS, force / TIPS)
 
 
+def three(x, y, reach, force=20.0):
+    angle = 0.4 + 2 * np.pi * np.arange(3) / 3
+    return np.array([x, y]) + reach * np.stack([np.cos(angle), np.sin(angle)], 1), np.full(3, force)
+
+
+def ring(x, y, reach, force=20.0):
+    angle = 2 * np.pi * np.arange(TIPS) / TIPS
+    return np.array([x, y]) + reach * np.stack([np.cos(angle), np.sin(angle)], 1), np.full(TIPS, force / TIPS)
+
+
+def tilted(x, y, angle, tilt, force=20.0):
+    """A square tip of 36 mm that presses more on one side."""
+    away = 0.012 * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
+    loads = 1 + tilt * away @ np.array([np.cos(angle), np.sin(angle)]) / 0.018
+    return np.array([x, y]) + away, force * loads / loads.sum()
+
+
 TOUCHES = {
     "one": (LoadKind.ONE, single(0.09, 0.12)),
     "one in a corner": (LoadKind.ONE, single(0.025, 0.03)),
@@ -45,13 +67,14 @@ TOUCHES = {
     "two at 40 mm, one of a third": (LoadKind.TWO, pair(0.08, 0.1, 0.04, 2.0, 1 / 3)),
     "an edge of 30 mm": (LoadKind.EDGE, edge(0.1, 0.1, 0.03, 1.2)),
     "an edge of 60 mm": (LoadKind.EDGE, edge(0.11, 0.09, 0.06, 0.3)),
+    "three in a triangle": (LoadKind.MORE, three(0.1, 0.1, 0.03)),
 }
 
 
 @pytest.fixture(scope="module")
 def ready():
     """The fitter, the finder, and the frames of `TOUCHES`."""
-    model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
     frames, noise, blank = frames_of([touch for _, touch in TOUCHES.values()])
     finder = je.prepare_contacts(model, noise=noise, untouched=blank)
     return prepare_loads(model, noise=noise, untouched=blank), finder, frames, noise
@@ -73,13 +96,24 @@ def test_what_touches_the_sheet_is_told(ready, number):
     best = found.best
     assert best.misfit < 1.4
     if kind is LoadKind.EDGE:
-        ends = np.asarray(best.position + np.array([-1, 1])[:, None] * best.half)
-        places, forces = places[[0, -1]], forces.sum()[None]
+        there, places, forces = np.asarray(best.ends), places[[0, -1]], forces.sum()[None]
     else:
-        ends = np.asarray(best.position)
-    away = min(np.linalg.norm(ends - places, axis=1).max(), np.linalg.norm(ends[::-1] - places, axis=1).max())
-    assert away < (0.008 if kind is LoadKind.EDGE else 0.004)
+        there = np.asarray(best.position)
+    away = np.linalg.norm(there[:, None] - places, axis=2)
+    assert away.min(0).max() < (0.008 if kind is LoadKind.EDGE else 0.004)
     np.testing.assert_allclose(np.sort(best.force), np.sort(forces), rtol=0.35)
+
+
+@pytest.mark.parametrize("touch", [ring(0.08, 0.11, 0.015), tilted(0.11, 0.09, 0.5, 0.8)], ids=["ring", "tilted tip"])
+def test_a_tip_that_is_no_gaussian_is_one(ready, touch):
+    """Two loads near one another explain these frames better than a Gaussian does; they count as one."""
+    fitter, finder, _, _ = ready
+    frame = frames_of([touch] * len(TOUCHES), seed=3, spread=0.006)[0][0]
+    found = fitter(frame, finder(frame))
+    assert found.kind is LoadKind.ONE
+    assert np.linalg.norm(np.asarray(found.one.position[0]) - touch[1] @ touch[0] / touch[1].sum()) < 0.002
+    apart = eqx.tree_at(lambda f: f.least, fitter, jnp.full(2, 1e-4))
+    assert found.probability[LoadKind.ONE] > apart(frame, finder(frame)).probability[LoadKind.ONE]
 
 
 def test_a_blank_frame_holds_nothing(ready):
@@ -91,26 +125,89 @@ def test_a_blank_frame_holds_nothing(ready):
     assert found.probability[0] == 1
 
 
-def test_pressure_of_loads_sums_to_their_force(ready):
-    fitter = ready[0]
-    areas = np.asarray(fitter.model.areas)
-    total = lambda p: float(np.sum(areas * (np.asarray(p) @ np.asarray(fitter.weights))))  # noqa: E731
-    spot = jnp.array([0.1, 0.1, np.log(0.01), np.log(7.0)])
-    assert total(fitter._spot(spot)) == pytest.approx(7.0, rel=2e-3)
-    for half in ((0.02, 0.01), (0.0, 0.0)):
-        assert total(fitter._line(jnp.append(spot, jnp.array(half)))) == pytest.approx(7.0, rel=5e-3)
-    np.testing.assert_allclose(
-        fitter._line(jnp.append(spot, jnp.array([1e-6, 0.0]))), fitter._spot(spot), rtol=1e-4, atol=1.0
-    )
+SPOT = jnp.array([0.1, 0.1, np.log(0.01), np.log(7.0), 0.0, 0.0])
+LONG = SPOT.at[4:].set(jnp.array([0.02, 0.01]))
 
 
-def test_the_gain_of_the_contact_layer_has_its_size_and_length(ready):
-    modes = np.asarray(ready[0].modes)
-    middle = np.asarray(ready[0].points)[:, 0]
-    inner = np.flatnonzero((np.abs(middle - 0.1) < 0.05).all(1))[:60]
-    covariance = modes[inner, 0] @ modes[inner, 0].T
-    distance = np.linalg.norm(middle[inner, None] - middle[inner], axis=-1)
-    np.testing.assert_allclose(covariance, 0.12**2 * np.exp(-(distance**2) / (2 * 0.015**2)), atol=0.1 * 0.12**2)
+def rows(*loads):
+    """All rows of parameters, and their forms."""
+    forms = [Form.LONG if one[4:].any() else Form.ROUND for one in loads] + [Form.ABSENT] * (MOST - len(loads))
+    return jnp.stack([*loads, *[SPOT] * (MOST - len(loads))]), jnp.array(forms)
+
+
+def grid_of_sheet(step=5e-4):
+    axis = np.arange(0, 0.2, step) + step / 2
+    return jnp.stack(jnp.meshgrid(axis, axis), -1), step**2
+
+
+def test_pressure_of_loads_sums_to_their_force():
+    points, area = grid_of_sheet()
+    for one in (SPOT, LONG):
+        assert float(jnp.sum(line(one, points)) * area) == pytest.approx(7.0, rel=1e-6)
+    assert float(jnp.sum(pressure(*rows(SPOT, LONG), points)) * area) == pytest.approx(14.0, rel=1e-6)
+    short = SPOT.at[4].set(1e-6)
+    np.testing.assert_allclose(line(short, points), spot(SPOT, points), rtol=1e-4, atol=1.0)
+
+
+def test_unknown_shapes_change_neither_force_nor_place_nor_width():
+    """Moments by quadrature; and they are orthonormal with the Gaussian's inverse as weight."""
+    points, area = grid_of_sheet()
+    bent = np.asarray(shape_directions(*rows(SPOT), points))[..., : 2 + 4]
+    away = (np.asarray(points) - 0.1) / 0.01
+    for moment in (np.ones(points.shape[:2]), *np.moveaxis(away, -1, 0), (away**2).sum(-1)):
+        total = np.einsum("xyd,xy->d", bent, moment) * area / 7.0
+        np.testing.assert_allclose(total, 0, atol=1e-7)
+    product = np.einsum("xyd,xye,xy->de", bent, bent, 1 / np.asarray(spot(SPOT, points))) * area / 7.0
+    np.testing.assert_allclose(product[:4, :4], np.eye(4), atol=1e-6)
+    assert product[4, 5] == pytest.approx(0, abs=1e-9)
+
+
+def test_halves_of_a_split_load_have_the_moments_of_elongations():
+    """To second order, two halves at d from the middle are the load plus elongations, at the same mean moment."""
+    points, _ = grid_of_sheet()
+    step = 0.15 * 0.01 * jnp.array([np.cos(0.4), np.sin(0.4)])
+    width = 0.5 * jnp.log(jnp.exp(2 * SPOT[2]) - 0.5 * step @ step)
+    halves = [SPOT.at[:2].add(way * step).at[2].set(width).at[3].add(-np.log(2.0)) for way in (1, -1)]
+    change = np.asarray(pressure(*rows(*halves), points) - spot(SPOT, points))
+    u = np.asarray(step) / 0.01
+    expected = np.asarray(elongations(SPOT, points)) @ np.array([(u[0] ** 2 - u[1] ** 2) / 2, u[0] * u[1]])
+    assert np.abs(change - expected).max() < 0.05 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("loads", [(SPOT,), (LONG,), (SPOT, SPOT.at[:2].set(0.07))], ids=["one", "edge", "two"])
+def test_slopes_are_those_of_the_forward_map(ready, loads):
+    """Against derivatives of the readings by JAX, through another path: `transfer` and all elements."""
+    sheet = ready[0].sheet
+    theta, forms = rows(*loads)
+    by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MOST * SIZE)
+    known = sheet.unknowns(theta, forms)
+    np.testing.assert_allclose(known.value, sheet.response(theta, forms), atol=1e-6 * float(jnp.abs(known.value).max()))
+    used = np.flatnonzero(np.abs(by_jax).max(0) > 0)
+    error = np.linalg.norm(known.loads - by_jax, axis=0)[used] / np.linalg.norm(by_jax, axis=0)[used]
+    assert error.max() < 0.03  # elements away from the loads are left out
+
+
+def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
+    """Slopes in the coat against differences of frames with and without the load."""
+    fitter, _, _, noise = ready
+    model = fitter.sheet.model
+    sheet = prepare_loads(model, noise=noise).sheet
+    theta, forms = rows(SPOT)
+    white = lambda sigma: sheet.white(transfer(model, coefficients(model, sigma)))  # noqa: E731
+    factor = sheet._pressed(theta, forms, jnp.ones_like(sheet.sigma), sheet.points)
+    change = lambda mode: (lambda s: white(s * factor) - white(s))(sheet.sigma * jnp.exp(sheet.coat[:, mode]))  # noqa: E731
+    slopes = sheet.unknowns(theta, forms).nuisances[:, -sheet.coat.shape[1] :]
+    strongest = int(jnp.argmax(jnp.linalg.norm(slopes, axis=0)))
+    seen = change(strongest) - (white(sheet.sigma * factor) - white(sheet.sigma))
+    assert np.linalg.norm(seen - slopes[:, strongest]) < 0.25 * np.linalg.norm(seen)
+
+
+def test_fields_that_are_not_known_have_their_size_and_length():
+    points = np.random.default_rng(2).uniform(0.05, 0.15, (60, 2))
+    corners = np.array([[0.0, 0.0], [0.2, 0.2]])
+    modes = field_modes(np.concatenate([points, corners]), 0.015)[:60]
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    np.testing.assert_allclose(modes @ modes.T, np.exp(-(distance**2) / (2 * 0.015**2)), atol=0.12)
 
 
 def test_covariances_grow_with_the_gain_that_is_not_known(ready):
@@ -126,12 +223,12 @@ def test_what_cannot_be_fitted_is_refused(ready):
     with pytest.raises(InverseError, match="fit one frame of 550 readings at a time"):
         fitter(frames[:2], contacts)
     with pytest.raises(InverseError, match="both tell the sheet"):
-        prepare_loads(fitter.model, noise=noise, untouched=np.ones(550), sigma=fitter.sigma)
+        prepare_loads(fitter.sheet.model, noise=noise, untouched=np.ones(550), sigma=fitter.sheet.sigma)
     with pytest.raises(InverseError, match="give the 550 readings of one frame"):
-        je.prepare_contacts(fitter.model, noise=noise, untouched=np.ones(5))
+        je.prepare_contacts(fitter.sheet.model, noise=noise, untouched=np.ones(5))
     with pytest.raises(InverseError, match="reading 3 is not finite"):
         fitter(np.where(np.arange(550) == 3, np.nan, frames[0]), contacts)
-    for bad in ({"width": 0.0}, {"gain": -1.0}, {"prior": (1.0, 0.0, 0.0)}, {"prior": (0.5, 0.5, 0.5, 0.5)}):
+    for bad in ({"width": 0.0}, {"gain": -1.0}, {"coat": -1.0}, {"prior": (1.0, 0.0, 0.0)}, {"prior": (0.5,) * 5}):
         with pytest.raises(InverseError, match=next(iter(bad))):
             LoadSettings(**bad)
 

@@ -103,3 +103,14 @@ def test_works_under_jit_and_its_gradients_agree_with_differences():
         up, down = ([*given[:k], value + step * along, *given[k + 1 :]] for step in (1e-4, -1e-4))
         change = float(program(*up) - program(*down)) / 2e-4
         assert float(jnp.vdot(slope, along)) == pytest.approx(change, rel=1e-4)
+
+
+def test_an_image_is_prepared_from_the_frame_of_the_untouched_sheet(model, untouched):
+    fitted = je.prepare(model, basis=je.Pixels(10), sigma=je.fit_background(model, untouched))
+    by_frame = je.prepare(model, basis=je.Pixels(10), untouched=untouched)
+    np.testing.assert_array_equal(by_frame.matrix, fitted.matrix)
+    assert not np.allclose(by_frame.matrix, je.prepare(model, basis=je.Pixels(10)).matrix, rtol=0.01)
+    with pytest.raises(je.imaging.InverseError, match="give one of them"):
+        je.prepare(model, untouched=untouched, sigma=model.background)
+    with pytest.raises(je.imaging.InverseError, match="no coating explains"):
+        je.Imaging().prepare(model, untouched=np.random.default_rng(0).normal(size=len(untouched)))

@@ -20,9 +20,9 @@ from ..calibration import Calibration
 from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 
-# A draft moves a load by 0.15 mm, so that its ellipse of 90 % covers 81 %; finer meshes than this move it by 0.01 mm.
-FIDELITY = je.Fidelity(edge_length=0.04, electrode_segments=12, growth=1.4)
-MOST = 2  # loads of a window
+# The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
+FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
+MOST = 3  # loads of a window
 MAX_WINDOW_FRAMES = 4096  # of a window, so that memory stays bounded
 
 
@@ -112,33 +112,36 @@ def _arrays(windows: list[Window], found: list[Loads]) -> dict[str, tuple[Any, s
 
 ABOUT = {
     "time": ("ns", "begin and end of each window, since time_epoch_utc"),
-    "probability": ("1", "of none, one, two and an edge"),
+    "probability": ("1", "of none, one, two, an edge and more"),
     "position": ("m", "of each load of the most probable kind; of an edge, its middle; NaN: none"),
     "position_covariance": ("m2", "of each position"),
-    "half": ("m", "from the middle of an edge to its end"),
+    "ends": ("m", "both ends of an edge; NaN: no edge"),
+    "ends_covariance": ("m2", "of x and y of the first end and of the second"),
     "width": ("m", "standard deviation of each load, across an edge"),
     "force": ("N", "of each load: its share, by the fit, of what the pads tell"),
+}
+
+
+EMPTY = {
+    "position": (MOST, 2),
+    "position_covariance": (MOST, 2, 2),
+    "ends": (2, 2),
+    "ends_covariance": (4, 4),
+    "width": (MOST,),
+    "force": (MOST,),
 }
 
 
 def _row(window: Window, found: Loads) -> Iterator[tuple[str, np.ndarray]]:
     yield "time", np.array([window.begin, window.end])
     yield "probability", np.asarray(found.probability)
+    out = {name: np.full(shape, np.nan) for name, shape in EMPTY.items()}
     best = found.best
-    count = 0 if best is None else len(best.force)
-    empty = {
-        "position": (MOST, 2),
-        "position_covariance": (MOST, 2, 2),
-        "half": (MOST, 2),
-        "width": (MOST,),
-        "force": (MOST,),
-    }
-    out = {name: np.full(shape, np.nan) for name, shape in empty.items()}
     if best is not None:
-        out["position"][:count], out["half"][:count] = best.position, best.half
-        out["width"][:count] = best.width
+        count = len(best.force)
+        out["position"][:count], out["width"][:count] = best.position, best.width
         out["force"][:count] = window.force * np.asarray(best.force / best.force.sum())
-        covariance = np.asarray(best.covariance)
-        for k in range(count):
-            out["position_covariance"][k] = covariance[4 * k :, 4 * k :][:2, :2]
+        out["position_covariance"][:count] = best.position_covariance
+    if best is not None and found.kind is LoadKind.EDGE:
+        out["ends"][:], out["ends_covariance"][:] = best.ends, best.ends_covariance
     yield from out.items()

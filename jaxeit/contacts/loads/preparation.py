@@ -1,0 +1,144 @@
+"""Preparing the fit of loads: everything that does not depend on the frame."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from ..._compile import require_known, verb
+from ...imaging.background import sheet_of
+from ...imaging.noise import InverseError, whitened_readings
+from ...model.discretisation import Model
+from ...model.forward_model import coefficients, conductivity, transfer
+from ..bump_responses import mean_conductivity, points_of
+from .fitter import LoadFitter
+from .pressure import MOST, SIZE, Form
+from .settings import LoadSettings
+from .sheet import PressedSheet
+from .starts import Starts
+
+REACH = 2.5  # widths from the middle of a usual load within which elements count
+
+
+def prepare_loads(
+    model: Model,
+    settings: LoadSettings | None = None,
+    *,
+    noise: Float[ArrayLike, "..."],
+    untouched: Float[ArrayLike, " readings"] | None = None,
+    sigma: Float[Array, " elements"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
+) -> LoadFitter:
+    """Prepare the fit of loads to frames of a skin, for use offline.
+
+    Args:
+        model: of edges not above 0.05 of the sheet; a draft moves a load by 0.15 mm, which is in no covariance.
+        settings: default `LoadSettings()`.
+        noise, untouched, sigma, channels: as for `prepare_contacts`.
+
+    Raises:
+        InverseError: as for `prepare_contacts`.
+    """
+    require_known("prepare_loads", InverseError, model, noise, untouched, sigma, channels)
+    settings = settings or LoadSettings()
+    sigma = sheet_of(model, untouched, sigma, channels)
+    found = whitened_readings(model, noise, channels)
+    put = partial(jnp.asarray, dtype=model.dtype)
+    known = sigma is not None
+    sigma = conductivity(model) if sigma is None else put(sigma)
+    chart = np.asarray(model.chart, float)
+    low, high = chart.min(0), chart.max(0)
+    sheet = _sheet(model, settings, sigma, settings.coat_spread(known), put(found.factor), found.electrodes)
+    return LoadFitter(
+        sheet=sheet,
+        whitening=found.whitening,
+        compress=put(found.compress),
+        starts=_starts(sheet, settings, low, high, mean_conductivity(model, np.asarray(sigma, float))),
+        low=put(low),
+        high=put(high),
+        usual=put(np.log([settings.width, settings.force])),
+        spread=put([settings.width_spread, settings.force_spread]),
+        difference=put([settings.width_difference, settings.force_difference]),
+        length=put(settings.length),
+        least=put([settings.nearest, settings.shortest]),
+        prior=put(settings.prior),
+        model_error=put(settings.model_error),
+    )
+
+
+def _sheet(
+    model: Model,
+    settings: LoadSettings,
+    sigma: Float[Array, " elements"],
+    coat: float,
+    factor: Float[Array, "r k"],
+    electrodes: np.ndarray,
+) -> PressedSheet:
+    """The sheet under loads, with the modes of all that is not known of it."""
+    put = partial(jnp.asarray, dtype=model.dtype)
+    points, weights = points_of(model, settings.width)
+    centroids = np.einsum("q,eqd->ed", weights, points)
+    modes = coat * field_modes(centroids, settings.coat_length) if coat else np.zeros((len(centroids), 0))
+    sheet = PressedSheet(
+        model=model,
+        sigma=sigma,
+        factor=factor,
+        pairs=jnp.asarray(electrodes),
+        untouched=jnp.zeros(len(factor), model.dtype),
+        points=put(points),
+        weights=put(weights),
+        gain=put(settings.gain * field_modes(centroids, settings.gain_length)),
+        coat=put(modes),
+        by_coat=put(np.zeros((len(factor), modes.shape[1]))),
+        shape=put(settings.shape),
+        law=settings.law,
+        reach=min(len(centroids), 2 * _reach(centroids, REACH * settings.width)),
+    )
+    return _without_loads(sheet)
+
+
+@verb
+def _without_loads(sheet: PressedSheet) -> PressedSheet:
+    """The sheet, which knows its readings without loads."""
+    z = transfer(sheet.model, coefficients(sheet.model, sheet.sigma))
+    known = sheet.white(z), sheet.coat_slopes(sheet.sigma)
+    ready: PressedSheet = eqx.tree_at(lambda s: (s.untouched, s.by_coat), sheet, known)
+    return ready
+
+
+def _starts(
+    sheet: PressedSheet, settings: LoadSettings, low: np.ndarray, high: np.ndarray, background: float
+) -> Starts:
+    """Readings of usual loads a usual width and a half apart."""
+    counts = np.maximum(np.round((high - low) / (1.5 * settings.width)).astype(int), 1)
+    axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, counts, strict=True)]
+    places = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    usual = np.broadcast_to(np.log([settings.width, settings.force]), places.shape)
+    rows = jnp.asarray(np.concatenate([places, usual], 1), sheet.sigma.dtype)
+    return Starts(_atoms(sheet, rows), rows, jnp.asarray(background, sheet.sigma.dtype), settings.law)
+
+
+@verb
+def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"]:
+    forms = jnp.array([Form.ROUND] + [Form.ABSENT] * (MOST - 1))
+    respond = lambda one: sheet.response(jnp.tile(jnp.pad(one, (0, SIZE - 4)), (MOST, 1)), forms)  # noqa: E731
+    found: Array = jax.lax.map(respond, rows)
+    return found
+
+
+def _reach(centroids: Float[np.ndarray, "elements 2"], radius: float) -> int:
+    """Largest number of elements within a circle around one of them."""
+    return max(int((((centroids - one) ** 2).sum(1) < radius**2).sum()) for one in centroids)
+
+
+def field_modes(points: Float[np.ndarray, "n 2"], length: float) -> Float[np.ndarray, "n g"]:
+    """Modes of a Gaussian field of variance one at points: bumps whose sum of products is exp(-d^2 / 2 length^2)."""
+    low, high = points.min(0), points.max(0)
+    axes = [np.arange(a - length, b + 1.5 * length, length) for a, b in zip(low, high, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    modes = np.exp(-((points[:, None] - nodes) ** 2).sum(-1) / length**2)
+    return np.asarray(modes / np.sqrt(np.mean((modes**2).sum(-1))))

@@ -1,0 +1,90 @@
+"""Pressure of up to `MOST` loads.
+
+Each load has six parameters: x, y, log width s, log force, and half its length along x and along y. A round load has no
+length. One table of parameters for all kinds of loads means one compiled program for all of them; which rows count,
+and how, is an array of `Form`.
+"""
+
+from enum import IntEnum
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import erf
+from jaxtyping import Array, Float, Int
+
+MOST, SIZE = 3, 6  # loads, and parameters of each
+ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
+LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
+SQRT_2 = np.sqrt(2.0)
+ELONGATION = 0.3  # standard deviation of second moments over that of the others
+
+
+class Form(IntEnum):
+    """What a row of parameters stands for."""
+
+    ABSENT = 0
+    ROUND = 1
+    LONG = 2
+
+
+Parameters = Float[Array, "n 6"]
+Forms = Int[Array, " n"]
+
+
+def pressure(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    """Pressure of all loads at points, Pa."""
+    kinds = (_nothing, spot, line)
+    return jnp.stack([jax.lax.switch(form, kinds, one, points) for one, form in zip(loads, forms, strict=True)]).sum(0)
+
+
+def _nothing(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    return jnp.zeros(points.shape[:-1], points.dtype)
+
+
+def spot(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    """Pressure of a round load: Gaussian."""
+    variance = jnp.exp(2 * one[2])
+    square = jnp.sum((points - one[:2]) ** 2, -1)
+    return jnp.exp(one[3] - 0.5 * square / variance) / (2 * jnp.pi * variance)
+
+
+def line(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    """Pressure of an edge: even along a line, blurred by a Gaussian."""
+    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + 1e-10)  # m; a length of zero has no direction
+    away = points - one[:2]
+    along = away @ one[4:] / half
+    across = jnp.sum(away**2, -1) - along**2
+    root = jnp.sqrt(2.0) * width
+    spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
+    return jnp.exp(one[3] - 0.5 * across / width**2) * spread / (jnp.sqrt(2 * jnp.pi) * width)
+
+
+def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "... d"]:
+    """Change of pressure by each moment by which a round load may differ from a Gaussian; an edge is a row of such.
+
+    With ``u = (x - x0) / s`` and ``r = |u|^2 / 2`` they are the Gaussian times the orthonormal polynomials of lowest
+    order that change neither force, place nor width: ``L2(r)`` and ``L3(r)`` (flat punch, ring, long tails), which are
+    those of all loads; ``u (r - 2) / sqrt(2)`` (tilted tip) and, times `ELONGATION`, ``(u_x^2 - u_y^2) / 2`` and
+    ``u_x u_y`` (tilted or elliptic tip), which each load has of its own. A flat disc has moments of -1/3 in L2 and L3,
+    a ring -1/2 and -2/3; what the pad spreads has less.
+    """
+    row = [(form, one.at[:2].add(t * one[4:]) - LOG_ROW) for form, one in zip(forms, loads, strict=True) for t in ROW]
+    found = [jnp.where(form > Form.ABSENT, _bent(one, points), 0) for form, one in row]
+    by_load = jnp.stack(found).reshape(len(loads), len(ROW), *found[0].shape).sum(1)
+    return jnp.concatenate([by_load[..., :2].sum(0), *by_load[..., 2:]], -1)
+
+
+def _bent(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
+    u = (points - one[:2]) * jnp.exp(-one[2])
+    r = 0.5 * jnp.sum(u**2, -1, keepdims=True)
+    radial = [1 - 2 * r + r**2 / 2, 1 - 3 * r + 1.5 * r**2 - r**3 / 6]
+    polynomials = jnp.concatenate([*radial, u * (r - 2) / SQRT_2], -1)
+    return jnp.concatenate([spot(one, points)[..., None] * polynomials, ELONGATION * elongations(one, points)], -1)
+
+
+def elongations(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    """Change of pressure of a round load by second moments: half of those along x minus along y, and of x and y."""
+    u = (points - one[:2]) * jnp.exp(-one[2])
+    both = jnp.stack([0.5 * (u[..., 0] ** 2 - u[..., 1] ** 2), u[..., 0] * u[..., 1]], -1)
+    return spot(one, points)[..., None] * both

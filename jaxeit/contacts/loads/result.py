@@ -1,0 +1,88 @@
+"""Loads as they are handed out."""
+
+from enum import IntEnum
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class LoadKind(IntEnum):
+    """What touches the sheet."""
+
+    NONE = 0
+    ONE = 1
+    TWO = 2
+    EDGE = 3
+    MORE = 4  # three loads explain the frame better than all else
+
+
+class LoadShape(eqx.Module):
+    """Loads of one kind, as they explain a frame best.
+
+    | meaning                                                                         | shape  | unit  |
+    |---------------------------------------------------------------------------------|--------|-------|
+    | position in the sheet's flat coordinates; of an edge, its middle                | (n, 2) | m     |
+    | width: standard deviation of the load, across an edge                           | (n,)   | m     |
+    | force                                                                           | (n,)   | N     |
+    | half: from the middle of an edge to its end; zero for others                    | (n, 2) | m     |
+    | covariance of all parameters: x, y, log width, log force of each load, half of an edge | (m, m) | mixed |
+    | misfit: chi-square over the number of readings, with the covariance of the model's error | ()     | 1     |
+    """
+
+    position: Float[Array, "n 2"]
+    width: Float[Array, " n"]
+    force: Float[Array, " n"]
+    half: Float[Array, "n 2"]
+    covariance: Float[Array, "m m"]
+    misfit: Float[Array, ""]
+
+    @property
+    def position_covariance(self) -> Float[Array, "n 2 2"]:
+        """Covariance of each position, m^2."""
+        size = len(self.covariance) // len(self.force)
+        return jnp.stack([self.covariance[k : k + 2, k : k + 2] for k in range(0, len(self.covariance), size)])
+
+    @property
+    def ends(self) -> Float[Array, "2 2"]:
+        """Both ends of an edge, (2, 2) m; of another shape, the first place twice."""
+        return self.position[0] + jnp.stack([-self.half[0], self.half[0]])
+
+    @property
+    def ends_covariance(self) -> Float[Array, "4 4"]:
+        """Covariance of x, y of the first end and of the second end of an edge, m^2."""
+        place = jnp.eye(2, len(self.covariance))
+        half = jnp.eye(2, len(self.covariance), k=4) if len(self.covariance) == 6 else jnp.zeros_like(place)
+        both = jnp.concatenate([place - half, place + half])
+        return both @ self.covariance @ both.T
+
+
+class Loads(eqx.Module):
+    """What a `LoadFitter` finds in a frame.
+
+    | meaning                                                    | shape |
+    |------------------------------------------------------------|-------|
+    | probability of each kind, in the order of `LoadKind`       | (5,)  |
+    | one, two, edge, more: the best loads of each kind; more: three |   |
+    """
+
+    probability: Float[Array, "5"]
+    one: LoadShape
+    two: LoadShape
+    edge: LoadShape
+    more: LoadShape
+
+    @property
+    def kind(self) -> LoadKind:
+        """The most probable kind."""
+        return LoadKind(int(np.argmax(np.asarray(self.probability))))
+
+    @property
+    def best(self) -> LoadShape | None:
+        """The loads of the most probable kind; None: nothing touches the sheet."""
+        return self.of(self.kind)
+
+    def of(self, kind: LoadKind) -> LoadShape | None:
+        """The best loads of a kind."""
+        return None if kind is LoadKind.NONE else getattr(self, kind.name.lower())

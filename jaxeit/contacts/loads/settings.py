@@ -1,0 +1,77 @@
+"""What is known of loads before a frame."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...effects.material import ContactPiezoresistance
+from ...imaging.noise import InverseError
+
+KNOWN_COAT, UNKNOWN_COAT = 0.0, 0.15
+POSITIVE = (
+    *("gain_length", "coat_length", "width", "width_spread", "force", "force_spread"),
+    *("width_difference", "force_difference", "length", "nearest", "shortest"),
+)
+
+
+@dataclass(frozen=True)
+class LoadSettings:
+    """What is known of loads before a frame, and of how the sheet answers to pressure.
+
+    | meaning                                                                      | default      | unit |
+    |------------------------------------------------------------------------------|--------------|------|
+    | law: factor of conductivity by pressure                                      | Hill, 20 kPa |      |
+    | gain: standard deviation of the log gain of the contact layer                | 0.12         | 1    |
+    | gain_length: over which it changes                                           | 0.015        | m    |
+    | coat: standard deviation of the log conductivity that the sheet is not known | see below    | 1    |
+    |   by; None: 0 for a sheet given or fitted to a frame, 0.15 for an even one    |              |      |
+    | coat_length: over which it changes                                           | 0.03         | m    |
+    | shape: standard deviation of each moment by which a round load differs from a | 0.1          | 1    |
+    |   Gaussian (`pressure.shape_directions`)                                     |              |      |
+    | model_error: part of the signal by which all else errs                       | 0.005        | 1    |
+    | width, width_spread: median of a load's width, standard deviation of its log | 0.012, 0.4   | m, 1 |
+    | force, force_spread: median of a force, standard deviation of its log        | 8, 1.2       | N, 1 |
+    | width_difference, force_difference: standard deviations of the differences   | 0.2, 0.8     | 1    |
+    |   of these logs between loads that press at once                             |              |      |
+    | length: standard deviation of half an edge, in each direction; of half the   | 0.02         | m    |
+    |   distance of loads, of which half are near one another and half anywhere    |              |      |
+    | nearest: distance below which two loads count as one of another shape         | 0.018        | m    |
+    | shortest: length below which an edge counts as one load of another shape      | 0.024        | m    |
+    | prior: probabilities of the kinds, in the order of `LoadKind`                | 1/5 each     | 1    |
+
+    Raises:
+        InverseError: for a value out of range.
+    """
+
+    law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
+    gain: float = 0.12
+    gain_length: float = 0.015
+    coat: float | None = None
+    coat_length: float = 0.03
+    shape: float = 0.1
+    model_error: float = 0.005
+    width: float = 0.012
+    width_spread: float = 0.4
+    force: float = 8.0
+    force_spread: float = 1.2
+    width_difference: float = 0.2
+    force_difference: float = 0.8
+    length: float = 0.02
+    nearest: float = 0.018
+    shortest: float = 0.024
+    prior: tuple[float, float, float, float, float] = (0.2, 0.2, 0.2, 0.2, 0.2)
+
+    def __post_init__(self) -> None:
+        for name in POSITIVE:
+            if not 0 < getattr(self, name) < np.inf:
+                raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
+        for name in ("gain", "coat", "shape", "model_error"):
+            if getattr(self, name) is not None and not 0 <= getattr(self, name) < np.inf:
+                raise InverseError(f"{name} is {getattr(self, name)}; give 0 or more")
+        if len(self.prior) != 5 or min(self.prior) < 0 or not np.isclose(sum(self.prior), 1):
+            raise InverseError(f"prior is {self.prior}; give five probabilities whose sum is 1")
+
+    def coat_spread(self, known: bool) -> float:
+        """Standard deviation of the log conductivity that the sheet is not known by."""
+        default = KNOWN_COAT if known else UNKNOWN_COAT
+        return default if self.coat is None else self.coat

@@ -1,0 +1,138 @@
+"""From loads to whitened readings, with slopes in the loads and in all that is not known about the sheet.
+
+All slopes are those of the readings in the conductivity, which the fields of the electrodes hold (`model.sensitivity`),
+times changes of the conductivity. These vanish away from the loads, so that the elements with the largest changes
+suffice: a slope that is off by a thousandth slows a fit down and does not move its end.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...effects.material import ContactPiezoresistance
+from ...model.discretisation import Model
+from ...model.forward_model import coefficients, fields, series_resistance, transfer
+from ...model.sensitivity import element_slopes
+from .pressure import Forms, Parameters, elongations, pressure, shape_directions
+
+MODES = 72  # of the gain that loads reach, of those on the whole sheet
+
+
+class Linearised(NamedTuple):
+    """Readings of loads near some.
+
+    | meaning                                                                  | shape  |
+    |--------------------------------------------------------------------------|--------|
+    | value: whitened readings                                                 | (r,)   |
+    | near: elements whose conductivity changes most                           | (e,)   |
+    | by_element: slopes of the pair sums in the conductivity of these         | (e, k) |
+    """
+
+    value: Float[Array, " r"]
+    near: Int[Array, " e"]
+    by_element: Float[Array, "e k"]
+
+
+class Unknowns(NamedTuple):
+    """Whitened readings (r,), and their slopes in what is not known: unknowns of standard deviation one (r, n), the
+    parameters of all loads (r, 6 n), and second moments of the first load (r, 2)."""
+
+    value: Float[Array, " r"]
+    nuisances: Float[Array, "r n"]
+    loads: Float[Array, "r m"]
+    elongation: Float[Array, "r 2"]
+
+
+class PressedSheet(eqx.Module):
+    """The sheet under loads.
+
+    | meaning                                                               | shape            | unit  |
+    |-----------------------------------------------------------------------|------------------|-------|
+    | sigma: conductivity of the untouched sheet                            | (elements,)      | S     |
+    | factor: from pair sums to whitened readings; pairs: of electrodes     | (r, k), (k, 2)   | 1/ohm |
+    | untouched: whitened readings without loads                            | (r,)             |       |
+    | points of the elements, their weights                                 | (elements, q, 2), (q,) | m |
+    | gain: modes of the log gain of the contact layer, at centroids        | (elements, g)    | 1     |
+    | coat: modes of the log conductivity that is not known                 | (elements, c)    | 1     |
+    | by_coat: slopes of the whitened readings in these without loads       | (r, c)           |       |
+    | shape: standard deviation of the moments of a load's shape            | ()               | 1     |
+    | reach: number of elements that loads change                           |                  |       |
+    """
+
+    model: Model
+    sigma: Float[Array, " elements"]
+    factor: Float[Array, "r k"]
+    pairs: Int[Array, "k 2"]
+    untouched: Float[Array, " r"]
+    points: Float[Array, "elements q 2"]
+    weights: Float[Array, " q"]
+    gain: Float[Array, "elements g"]
+    coat: Float[Array, "elements c"]
+    by_coat: Float[Array, "r c"]
+    shape: Float[Array, ""]
+    law: ContactPiezoresistance
+    reach: int = eqx.field(static=True)
+
+    def response(self, loads: Parameters, forms: Forms) -> Float[Array, " r"]:
+        """Whitened readings of loads."""
+        z = transfer(self.model, coefficients(self.model, self._pressed(loads, forms, self.sigma, self.points)))
+        return self.white(z) - self.untouched
+
+    def linearised(self, loads: Parameters, forms: Forms) -> Linearised:
+        """Readings, and their slopes in the conductivity of the elements that the loads change most."""
+        sigma = self._pressed(loads, forms, self.sigma, self.points)
+        near = jax.lax.top_k(sigma / self.sigma, self.reach)[1]
+        theta = coefficients(self.model, sigma)
+        x = fields(self.model, theta)
+        z = x.terminal + jnp.diag(series_resistance(self.model.system, theta))
+        slopes = element_slopes(self.model, theta, x.potential, near, self.pairs)
+        return Linearised(self.white(z) - self.untouched, near, slopes)
+
+    def slopes(self, at: Linearised, loads: Parameters, forms: Forms) -> Float[Array, "r m"]:
+        """Slopes of the readings in all parameters of the loads."""
+        sigma, points = self.sigma[at.near], self.points[at.near]
+        by_loads = jax.jacfwd(lambda loads: self._pressed(loads, forms, sigma, points))(loads)
+        return self._mixed(at, by_loads.reshape(len(sigma), -1))
+
+    def unknowns(self, loads: Parameters, forms: Forms) -> Unknowns:
+        """Slopes of the readings in gain, coat and shapes of loads, and in the loads themselves."""
+        at = self.linearised(loads, forms)
+        points = self.points[at.near]
+        here = pressure(loads, forms, points)
+        slope = jax.jvp(self.law.factor, (here,), (jnp.ones_like(here),))[1]
+        by_pressure = self.sigma[at.near, None] * slope * self.weights
+        by_gain = jnp.sum(by_pressure * here, 1)
+        there = jax.lax.top_k(by_gain @ self.gain[at.near], min(MODES, self.gain.shape[1]))[1]
+        gain = by_gain[:, None] * self.gain[at.near[:, None], there]
+        bent = jnp.concatenate([self.shape * shape_directions(loads, forms, points), elongations(loads[0], points)], -1)
+        mixed = self._mixed(at, jnp.concatenate([gain, jnp.einsum("eq,eqd->ed", by_pressure, bent)], 1))
+        nuisances = mixed[:, :-2]
+        if self.coat.shape[1]:
+            by_coat = self.coat_slopes(self._pressed(loads, forms, self.sigma, self.points)) - self.by_coat
+            nuisances = jnp.concatenate([nuisances, by_coat], 1)
+        return Unknowns(at.value, nuisances, self.slopes(at, loads, forms), mixed[:, -2:])
+
+    def coat_slopes(self, sigma: Float[Array, " elements"]) -> Float[Array, "r c"]:
+        """Slopes of the readings of a sheet in its log conductivity."""
+        theta = coefficients(self.model, sigma)
+        every = jnp.arange(len(sigma))
+        slopes = element_slopes(self.model, theta, fields(self.model, theta).potential, every, self.pairs)
+        found: Array = self.factor @ (slopes.T @ (sigma[:, None] * self.coat))
+        return found
+
+    def white(self, z: Float[Array, "a a"]) -> Float[Array, " r"]:
+        """Whitened readings of a transfer matrix."""
+        return self.factor @ z[self.pairs[:, 0], self.pairs[:, 1]]
+
+    def _pressed(
+        self, loads: Parameters, forms: Forms, sigma: Float[Array, " e"], points: Float[Array, "e q 2"]
+    ) -> Float[Array, " e"]:
+        """Conductivity of elements under loads."""
+        return sigma * (self.law.factor(pressure(loads, forms, points)) @ self.weights)
+
+    def _mixed(self, at: Linearised, change: Float[Array, "e d"]) -> Float[Array, "r d"]:
+        """What a change of the conductivity near the loads does to the readings."""
+        return self.factor @ (at.by_element.T @ change)
