@@ -18,6 +18,7 @@ from benchmarks import (
     bench_pipeline,
     bench_protocol,
     bench_start,
+    bench_tracking,
     figures,
     harness,
     problems,
@@ -322,6 +323,14 @@ def test_smoke_loads():
     frames = sum(row["frames"] for row in data["rows"])
     assert sum(row["count"] for row in data["reliability"]) == 5 * frames  # kinds
     assert {row["case"].split(",")[0] for row in data["coverage"]} == set(bench_loads.SHAPES)
+
+
+@pytest.mark.slow
+def test_smoke_tracking():
+    data = bench_tracking.main(["--smoke"])
+    assert {row["scene"].split(",")[0] for row in data["scenes"]} == {"crossing at 40 mm", "two in sequence", "edge"}
+    assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data["scenes"])
+    assert {row["learned"] for row in data["presses"]} == {"yes", "no"}
 
 
 @pytest.mark.slow
