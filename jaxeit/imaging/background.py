@@ -1,7 +1,8 @@
 """The conductivity of an untouched sheet, from a frame of it."""
 
-from typing import Any, cast
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -65,8 +66,9 @@ def fit_background(
         raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
     image = Pixels(columns).on(model) if basis is None else basis
     physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
-    spread = float(np.asarray(length)) if _is_known(length) else cast(float, length)
-    prior = GaussianSmooth(spread).precision(jnp.zeros((1, image.size), model.dtype), image.picture)
+    # The setting of a prior is a number; a length that JAX traces takes its place.
+    smooth = eqx.tree_at(lambda prior: prior.length, GaussianSmooth(), jnp.asarray(length, model.dtype))
+    prior = smooth.precision(jnp.zeros((1, image.size), model.dtype), image.picture)
     floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
     error = jnp.hypot(model_error * known, floor)
     penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)

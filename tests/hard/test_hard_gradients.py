@@ -30,6 +30,7 @@ _INNER = "a part of the verbs above, in their cases, or in the tests of its own 
 HOST = {
     "adjacent": _DESCRIBES,
     "bind": "what it is given has",
+    "compile_tracker": _PREPARES,
     "compiler_options": _DESCRIBES,
     "discretise": _GEOMETRY,
     "drives": _DESCRIBES,

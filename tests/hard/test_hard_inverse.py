@@ -373,7 +373,7 @@ def test_a_sheet_around_a_hole_has_a_noise_figure():
 def test_pixels_beside_the_sheet_have_a_prior_too(prior):
     rng, inside = np.random.default_rng(6), np.arange(SIDE**2) < 30
     problem = _problem(rng.normal(size=(20, SIDE**2)) * inside, 0.1, prior)
-    problem = replace(problem, picture=replace(problem.picture, areas=problem.picture.areas * inside))
+    problem = replace(problem, picture=replace(problem.picture, areas=jnp.where(inside, problem.picture.areas, 0)))
     assert np.isfinite(_imaged(je.OneStep(), problem, jnp.asarray(rng.normal(size=20)))).all()
 
 
@@ -389,7 +389,7 @@ def test_pixels_beside_the_sheet_teach_greit_nothing(greit):
     """The image of the others is as if they were not; a disc that does not reach the sheet is no image."""
     rng, inside = np.random.default_rng(6), np.arange(SIDE**2) < 30
     whole = _problem(rng.normal(size=(20, SIDE**2)) * inside, 0.1)
-    whole = replace(whole, picture=replace(whole.picture, areas=whole.picture.areas * inside))
+    whole = replace(whole, picture=replace(whole.picture, areas=jnp.where(inside, whole.picture.areas, 0)))
     part = replace(whole.picture, centres=whole.picture.centres[inside], areas=whole.picture.areas[inside])
     part, y = replace(whole, jacobian=whole.jacobian[:, inside], picture=part), jnp.asarray(rng.normal(size=20))
     image = np.asarray(_imaged(greit, whole, y))
