@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer, eval_context
 from jax.custom_batching import custom_vmap
+from jax.extend.backend import backends
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 from threadpoolctl import threadpool_limits
@@ -185,6 +186,17 @@ def _is_known(options: dict[str, Any]) -> bool:
     return True
 
 
+def by_platform(*args: Any, cpu: Callable[..., T], default: Callable[..., T]) -> T:
+    """`jax.lax.platform_dependent`. If JAX has no other device than CPUs, it traces the function for CPUs only.
+
+    Nested choices would otherwise trace every combination of their functions.
+    """
+    if set(backends()) == {"cpu"}:
+        return cpu(*args)
+    chosen: T = jax.lax.platform_dependent(*args, cpu=cpu, default=default)
+    return chosen
+
+
 def sequential_on_cpu(function: Callable[..., T]) -> Callable[..., T]:
     """``function``, whose `jax.vmap` on a CPU is a loop over the batch, as `jax.custom_batching.sequential_vmap` makes.
 
@@ -197,7 +209,7 @@ def sequential_on_cpu(function: Callable[..., T]) -> Callable[..., T]:
     @single.def_vmap
     def _(size: int, batched: Sequence[Any], *args: Any) -> tuple[T, Any]:
         mapped, shared = eqx.partition(args, tuple(batched))
-        out = jax.lax.platform_dependent(
+        out = by_platform(
             mapped,
             cpu=lambda mapped: jax.lax.map(lambda sample: single(*eqx.combine(sample, shared)), mapped),
             default=jax.vmap(lambda sample: function(*eqx.combine(sample, shared))),

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "budget", "files", "_compile", "toml",
     "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
-    "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy",
+    "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "__main__",
 ]  # fmt: skip
 BENCH = [
     "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "bench", "live", "report",

@@ -113,4 +113,5 @@ class _Version(argparse.Action):
     ) -> None:
         from importlib import metadata
 
-        parser.exit(message=f"jaxeit {metadata.version('jaxeit')}\n")
+        print(f"jaxeit {metadata.version('jaxeit')}")
+        parser.exit()

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import compiler_options, require_known
+from .._compile import compiler_options, is_traced, require_known
 from ..linalg.array_libraries import JAX
 from ..model.bases import AbstractPictured, Picture
 from .methods import AbstractIterativeMethod, Problem
@@ -63,11 +63,15 @@ class AbstractReconstructor(AbstractPictured):
         unchanged. The replacement loses digits as one over the square of the hyperparameter: three digits are left at
         1e-5, in float32 at 1e-2. Leave out a channel that is dead for good by ``channels`` of `prepare`.
 
+        The first frame with such a reading compiles a program of its own, which takes about a second; `compiled` makes
+        one program for all frames at once.
+
         Raises:
             InverseError: if the last axis does not hold the readings of a frame.
         """
         require_frames(dv, self.readings)
-        images: Array = _imaged(self, dv)
+        program = _imaged if is_traced(self, dv) or not np.isfinite(np.asarray(dv)).all() else _imaged_whole
+        images: Array = program(self, dv)
         return images
 
     def compiled(self) -> Callable[[Float[ArrayLike, "... readings"]], Float[Array, "... basis"]]:
@@ -118,6 +122,11 @@ class AbstractReconstructor(AbstractPictured):
 @jax.jit
 def _imaged(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
     return recon._image(recon._sums(jnp.asarray(dv, recon.predict.dtype)))
+
+
+@jax.jit
+def _imaged_whole(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
+    return recon._image(recon.whitening.sums(jnp.asarray(dv, recon.predict.dtype)))
 
 
 class Reconstructor(AbstractReconstructor):

@@ -28,6 +28,8 @@ from jax.custom_batching import custom_vmap
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._compile import by_platform
+
 Stacks = tuple[Array, ...]
 Linear = Callable[[Array], Array]
 
@@ -77,7 +79,7 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
         count = stacks[0].shape[0]
         rows, columns = (max(stack.shape[axis] for stack in stacks) for axis in (1, 2))
         portion = portion_of(count, rows, columns, operations)
-        done: Stacks = lax.platform_dependent(
+        done: Stacks = by_platform(
             stacks,
             cpu=partial(in_portions, portion=portion),
             default=lambda stacks: in_portions(stacks, count),

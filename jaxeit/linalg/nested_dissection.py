@@ -26,6 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Integer
 
+from .._compile import by_platform
 from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, on_device
 from .dissection import dissect
 from .lapack import portion_of, portioned
@@ -164,7 +165,7 @@ def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: 
     """The factors of all fronts, from the root down; of the root only, unless ``keep``."""
     padded = jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
     top = max(plan.subtrees, 1)
-    update, low = lax.platform_dependent(
+    update, low = by_platform(
         plan.levels[top:],
         padded,
         cpu=partial(_in_subtrees, count=1 if keep else 1 << plan.subtrees, keep=keep),
@@ -198,7 +199,7 @@ def _swept(
     fronts: list[Front] = []
     for level in reversed(levels):
         parts = _parts(level)
-        w, front = lax.platform_dependent(
+        w, front = by_platform(
             level, values, update, cpu=partial(_panels, parts=parts), default=partial(_panels, parts=1)
         )
         fronts.append(front)

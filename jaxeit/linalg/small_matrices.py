@@ -12,6 +12,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
+from .._compile import by_platform
+
 # Terms that one loop sums. XLA unrolls a sum of so many terms; a longer sum is cut into several.
 MAX_UNROLLED_TERMS = 16
 # Multiplications of a whole stack from which on loops are faster than the library. For fewer, the threads that share
@@ -71,7 +73,7 @@ def stacked_product(left: Float[Array, "m k i"], right: Float[Array, "m k j"]) -
     unfused = jax.config.read("jax_disable_most_optimizations")  # without fusion XLA would store each product of a loop
     if unfused or left.size * right.shape[2] < MIN_LOOPED_MULTIPLICATIONS:
         return by_library(left, right)
-    product: Array = jax.lax.platform_dependent(left, right, cpu=product_by_loops, default=by_library)
+    product: Array = by_platform(left, right, cpu=product_by_loops, default=by_library)
     return product
 
 

@@ -31,6 +31,7 @@ from ..effects import (
     Circuit,
     Indenter,
     Sheet,
+    chosen,
     fold,
 )
 from ..linalg import AbstractPlan, inverse_columns
@@ -98,11 +99,12 @@ def forward(
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model, or has a coat and the model none.
     """
-    return _forward(model, sigma if sigma is None or isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
+    sigma = conductivity(model) if sigma is None else sigma  # one program, with or without a conductivity given
+    return _forward(model, sigma if isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
 
 
 @verb
-def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | None) -> Float[Array, " readings"]:
+def _forward(model: Model, sigma: Float[Array, " elements"] | CoatedSheet) -> Float[Array, " readings"]:
     return voltages(model, transfer(model, coefficients(model, sigma)))
 
 
@@ -141,7 +143,6 @@ def conductivity(
 ) -> Float[Array, " elements"] | CoatedSheet: ...
 
 
-@verb
 def conductivity(
     model: Model, pressure: Float[Array, " elements"] | None = None, temperature: Float[ArrayLike, ""] = 0.0
 ) -> Float[Array, " elements"] | CoatedSheet:
@@ -154,9 +155,16 @@ def conductivity(
         pressure: on the sheet, (elements,) Pa; default: none.
         temperature: above that at which the skin's sheet resistance was measured, K.
     """
-    touched = pressure is not None
-    if not any(isinstance(effect, AbstractSheetEffect) for effect in model.effects):
+    if not chosen(model.effects, AbstractSheetEffect):
         return model.background  # no effect changes it: the program is that of the ideal sensor
+    return _conductivity(model, pressure, temperature)
+
+
+@verb
+def _conductivity(
+    model: Model, pressure: Float[Array, " elements"] | None, temperature: Float[ArrayLike, ""]
+) -> Float[Array, " elements"] | CoatedSheet:
+    touched = pressure is not None
     pressure = jnp.zeros_like(model.background) if pressure is None else pressure
     warmer = jnp.asarray(temperature, model.dtype)
     sheet = Sheet(model.background, pressure, model.centroids, jnp.sqrt(model.areas), warmer)

@@ -19,6 +19,11 @@ def grid_file(bundled):
     return next(path for path in bundled if path.stem == "testbed_grid")
 
 
+def test_the_command_is_also_a_module():
+    done = subprocess.run([sys.executable, "-m", "jaxeit", "--version"], capture_output=True, text=True, check=True)
+    assert re.fullmatch(r"jaxeit \d+\.\d+\.\d+\n", done.stdout)
+
+
 @pytest.fixture(scope="module")
 def presses_file(bundled):
     return next(path for path in bundled if path.stem == "testbed_presses")
