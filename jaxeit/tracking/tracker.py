@@ -7,7 +7,7 @@ MacKay 1992, Neural Comput. 4). An ordinary frame is one update.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -89,7 +89,7 @@ class Tracking:
     faint: tuple[int, ...] = ()
     begun: int = 0
     misfit: float = 0.0
-    since: int = field(default=0)
+    since: int = 0
 
     @property
     def tracks(self) -> tuple[Track, ...]:

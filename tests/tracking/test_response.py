@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.contacts.loads.pressure import line
 from jaxeit.imaging.noise import whitened_readings
 from jaxeit.tracking.reanalysis import prepare_reanalysis
-from jaxeit.tracking.response import load_pressure
 
 LOADS = jnp.array([[0.07, 0.09, np.log(0.012), np.log(15.0), 0, 0], [0.1, 0.1, np.log(0.01), np.log(8.0), 6e-3, 3e-3]])
 
@@ -26,7 +26,7 @@ def sheet(model, whitened):
 @pytest.fixture(scope="module")
 def touched(model):
     """Change of conductivity, S, and the elements that change, the most first."""
-    pressure = sum(load_pressure(load, model.centroids) for load in LOADS)
+    pressure = sum(line(load, model.centroids) for load in LOADS)
     change = model.background * pressure / (20e3 + pressure)
     return change, jnp.argsort(-change)
 
@@ -110,7 +110,7 @@ def test_what_contacts_show_has_the_slopes_of_differences(exact):
 
 def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, exact):
     """The tails of the second order are left out, and an image stands for the first."""
-    pressure = sum(load_pressure(load, model.centroids) for load in LOADS)
+    pressure = sum(line(load, model.centroids) for load in LOADS)
     v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
     wanted = tracker.filter.compress @ (v - blank[0])
     gain = jnp.zeros(exact.modes.shape[1])
@@ -140,5 +140,5 @@ def test_an_edge_of_length_zero_is_a_round_load():
     square = jnp.sum((points - load[:2]) ** 2, -1)
     width, force = jnp.exp(load[2]), jnp.exp(load[3])
     gaussian = force * jnp.exp(-0.5 * square / width**2) / (2 * jnp.pi * width**2)
-    np.testing.assert_allclose(load_pressure(load, points), gaussian, atol=1e-4 * float(gaussian.max()))
-    assert jnp.isclose(load_pressure(LOADS[1], points).sum() * 0.005**2, 8, rtol=1e-3)
+    np.testing.assert_allclose(line(load, points), gaussian, atol=1e-4 * float(gaussian.max()))
+    assert jnp.isclose(line(LOADS[1], points).sum() * 0.005**2, 8, rtol=1e-3)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.contacts.loads.pressure import line
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings
 from jaxeit.tracking.filter import SEEN, SIZE, Pads, _active, predicted, updated
-from jaxeit.tracking.response import load_pressure
 
 SECONDS = 0.01
 
@@ -20,7 +20,7 @@ def frame_of(model, blank):
 
     @jax.jit
     def change(loads):
-        pressure = sum(load_pressure(load, model.centroids) for load in loads)
+        pressure = sum(line(load, model.centroids) for load in loads)
         return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
 
     v0, noise = blank

@@ -17,6 +17,8 @@ MOST, SIZE = 3, 6  # loads, and parameters of each
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
 SQRT_2 = np.sqrt(2.0)
+# Half length of an edge at least, m: one of length zero has no direction, and its ends are lost in single precision.
+SHORTEST = 1e-4
 ELONGATION = 0.3  # standard deviation of second moments over that of the others
 
 
@@ -51,7 +53,7 @@ def spot(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, 
 
 def line(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
     """Pressure of an edge: even along a line, blurred by a Gaussian."""
-    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + 1e-10)  # m; a length of zero has no direction
+    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + SHORTEST**2)
     away = points - one[:2]
     along = away @ one[4:] / half
     across = jnp.sum(away**2, -1) - along**2
