@@ -3,16 +3,16 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .filter import SIZE, Belief
+from .filter import EDGE, SHAPE, SIZE, VELOCITY, Belief
 
 # Half length of an edge that is tried, m.
 HALF = 0.012
-# How far contacts may jump: x, y, log width, log force, half length, velocity.
-JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, 0.1, 0.1])
+# How far contacts may jump: x, y, log width, log force, half length, shape, velocity.
+JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, *6 * [0.1], 0.1, 0.1])
 # How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
+LENGTHEN, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, *6 * [0.1], 0.0, 0.0]), 0.3
 # Half length of an edge over the distance of the two contacts that were taken for it.
 BETWEEN = 0.8
-EDGE, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, 0.0, 0.0]), 0.3
 
 
 def without(belief: Belief, k: int) -> Belief:
@@ -45,9 +45,10 @@ def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     """With contact k as an edge in about this direction."""
     contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
     own = np.arange(SIZE * k, SIZE * (k + 1))
-    contacts[k, 4:6] = HALF * np.cos(angle), HALF * np.sin(angle)
+    contacts[k, EDGE] = HALF * np.cos(angle), HALF * np.sin(angle)
     contacts[k, 2] -= NARROWER
-    covariance[own, own] += EDGE**2
+    contacts[k, SHAPE] = 0.0
+    covariance[own, own] += LENGTHEN**2
     return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
 
 
@@ -57,8 +58,8 @@ def joined(belief: Belief, first: int, second: int) -> Belief:
     pair = contacts[[first, second]]
     force = np.exp(pair[:, 3])
     contacts[first, :3] = force @ pair[:, :3] / force.sum()
-    contacts[first, 3], contacts[first, 4:6] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
-    contacts[first, 6:] = pair[:, 6:].mean(0)
+    contacts[first, 3], contacts[first, EDGE] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
+    contacts[first, SHAPE], contacts[first, VELOCITY] = 0.0, pair[:, VELOCITY].mean(0)
     own = np.arange(SIZE * first, SIZE * (first + 1))
-    covariance[own, own] += EDGE**2
+    covariance[own, own] += LENGTHEN**2
     return without(Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance)), second)

@@ -151,6 +151,7 @@ def _carried(model: Model, sigma: Float[Array, " elements"], other: Model) -> np
 
 def _rates(settings: TrackerSettings) -> list[float]:
     """Random walk of each number of a contact, per root of a second; a place moves by its velocity alone."""
-    rates = [1e-4, 1e-4, settings.width_rate, settings.force_rate, 1e-4, 1e-4, *2 * [settings.acceleration]]
+    width, force, shape = settings.width_rate, settings.force_rate, settings.shape_rate
+    rates = [1e-4, 1e-4, width, force, 1e-4, 1e-4, *6 * [shape], *2 * [settings.acceleration]]
     assert len(rates) == SIZE
     return rates

@@ -22,7 +22,7 @@ from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import inserted, joined, jumped, lengthened, without
-from .filter import SIZE, Belief, ContactFilter, Pads, Update, predicted, unexplained, updated
+from .filter import EDGE, SHAPE, SIZE, VELOCITY, Belief, ContactFilter, Pads, Update, predicted, unexplained, updated
 from .preparation import prepare_filter
 from .settings import TrackerSettings
 
@@ -40,7 +40,7 @@ MIN_LOUDNESS, RIPPLE = 12.0, 0.05
 # Directions of an edge that are tried.
 DIRECTIONS = np.pi * np.arange(4) / 4
 # Prior deviations of the place and the velocity of a contact that begins, m and m/s.
-PLACE, VELOCITY = 0.012, 0.05
+PLACE, SPEED = 0.012, 0.05
 # Half an edge that is none: what keeps its covariance definite, m.
 ROUND = 1e-4
 
@@ -109,8 +109,8 @@ def _track(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -> 
         width=float(np.exp(row[2])),
         force=float(np.exp(row[3])),
         log_force_error=float(np.sqrt(covariance[3, 3])),
-        half=row[4:6] if edge else np.zeros(2),
-        velocity=row[6:],
+        half=row[EDGE] if edge else np.zeros(2),
+        velocity=row[VELOCITY],
     )
 
 
@@ -273,8 +273,9 @@ class Tracker:
 
     def with_contact(self, belief: Belief, place: np.ndarray) -> Belief:
         """The belief with a contact more, that begins about a place, (2,) m."""
-        row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])
-        spread = np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
+        row, spread = np.zeros((2, SIZE))
+        row[:4], spread[:4] = [*place, *self._usual], [PLACE, PLACE, *self._spread]
+        spread[EDGE], spread[SHAPE], spread[VELOCITY] = ROUND, self._settings.shape, SPEED
         return inserted(belief, row, spread)
 
     # --- deaths
