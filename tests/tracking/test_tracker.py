@@ -96,11 +96,10 @@ def test_the_gain_is_learned_where_contacts_were_and_stays_unknown_elsewhere(tra
 def test_pads_tell_the_force(tracker, frame_of):
     """An image alone confuses force and gain; a pad with an error of 1 % does not."""
     truth = np.array([load(0.05, 0.05, 12.0)])
+    shaped = jnp.pad(jnp.asarray(truth), ((0, 0), (0, SEEN - truth.shape[1])))
     sheet = tracker.filter.sheet
-    near = sheet.near(jnp.asarray(truth))
-    forces = np.asarray(
-        sheet.shown(jnp.asarray(truth), jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads
-    )
+    near = sheet.near(shaped)
+    forces = np.asarray(sheet.shown(shaped, jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads)
     now = tracker.start()
     for _ in range(3):
         now = tracker.step(now, frame_of(truth), SECONDS, forces, np.full(4, 0.1))
