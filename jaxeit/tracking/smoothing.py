@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .filter import SIZE, Belief, predicted
-from .tracker import Track, Tracker, Tracking, _track
+from .tracker import Tracker
+from .tracks import Track, Tracking, track_of
 
 # Frames after a frame that tell of it; a contact's velocity forgets them sooner.
 LAG = 256
@@ -100,7 +101,7 @@ class _Frame:
     seconds: float
 
     def timed(self, states: dict[int, State]) -> TimedTracks:
-        return TimedTracks(self.time, tuple(_track(n, *states[n], edge) for n, edge in self.edges.items()))
+        return TimedTracks(self.time, tuple(track_of(n, *states[n], edge) for n, edge in self.edges.items()))
 
 
 class Smoother:
