@@ -1,35 +1,14 @@
 """Contacts followed through simulated frames, and the filter against a joint normal distribution."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxeit as je
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings
 from jaxeit.tracking.filter import SEEN, SIZE, Pads, _active, predicted, updated
-from jaxeit.tracking.response import load_pressure
 
-SECONDS = 0.01
-
-
-@pytest.fixture(scope="module")
-def frame_of(model, blank):
-    """Frames (readings,) V of loads (K, 6), from the full forward map."""
-
-    @jax.jit
-    def change(loads):
-        pressure = sum(load_pressure(load, model.centroids) for load in loads)
-        return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
-
-    v0, noise = blank
-    rng = np.random.default_rng(5)
-    return lambda loads: np.asarray(change(jnp.asarray(loads))) - v0 + noise * rng.normal(size=noise.size)
-
-
-def load(x, y, force, width=0.012):
-    return [x, y, np.log(width), np.log(force), 0.0, 0.0]
+from .conftest import SECONDS, load
 
 
 def silent(tracker):
