@@ -28,12 +28,18 @@ from .response import LoadedSheet, Near, Shown
 
 # Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
 SIZE, SEEN = 8, 6
-# An update is linear enough where a further step would lower half of chi-square by less than this.
-FALL = 1.0
+# Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
+# of an ordinary frame, whose next step would lower it by 0.001 then, and of one that begins far from its end.
+FALL, CAREFUL_FALL = 10.0, 1.0
 # Evaluations of an update; of one that begins far from its end, and of a piece of such a one.
 STEPS, MANY_STEPS, PIECE = 6, 12, 2
 
-SOLVER = LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=FALL)
+
+def _solver(fall: float) -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=fall)
+
+
+ORDINARY, CAREFUL = _solver(FALL), _solver(CAREFUL_FALL)
 
 
 class Pads(NamedTuple):
@@ -235,13 +241,15 @@ def _scales(
     return jnp.sqrt(1 + repeats * share), jnp.sqrt(1 + share)
 
 
-def _fitted(problem: _Problem, steps: int, attempt: Attempt | None = None) -> optx.Solution[Array, Any]:
+def _fitted(
+    problem: _Problem, solver: LevenbergMarquardt, steps: int, attempt: Attempt | None = None
+) -> optx.Solution[Array, Any]:
     """The change z under which the frame is most probable, after so many evaluations more."""
     begun = {} if attempt is None else {"state": attempt.state}
     start = jnp.zeros(len(problem.active), problem.factor.dtype) if attempt is None else attempt.z
     options: dict[str, Any] = {"quadratic": _quadratic} | begun
     found: optx.Solution[Array, Any] = optx.least_squares(
-        _residual, SOLVER, start, problem, options, max_steps=steps, adjoint=ImplicitStep(), throw=False
+        _residual, solver, start, problem, options, max_steps=steps, adjoint=ImplicitStep(), throw=False
     )
     return found
 
@@ -263,7 +271,7 @@ def updated(
     if not len(belief.contacts):
         return _nothing(tracker, belief, dv, pads, seconds)
     problem = _problem(tracker, belief, dv, pads, seconds)
-    found = _fitted(problem, STEPS)
+    found = _fitted(problem, ORDINARY, STEPS)
     return _update(problem, found.value, found.state)
 
 
@@ -283,7 +291,7 @@ def attempted(
         update = _nothing(tracker, belief, dv, pads, tracker.persistence)
         return Attempt(jnp.zeros(0, update.evidence.dtype), None, update.evidence, update.loudness, jnp.asarray(True))
     problem = _problem(tracker, belief, dv, pads, tracker.persistence)
-    found = _fitted(problem, PIECE, attempt)
+    found = _fitted(problem, CAREFUL, PIECE, attempt)
     update = _update(problem, found.value, found.state)
     ended = found.state.converged | (found.state.steps >= MANY_STEPS)
     return Attempt(found.value, found.state, update.evidence, update.loudness, ended)
