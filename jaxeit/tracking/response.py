@@ -141,7 +141,7 @@ class LoadedSheet(eqx.Module):
         pads, pixels = self._first_order(loads, gain, modes, near)
         change, slopes = self._changes(loads, gain, modes, near)
         found = self.sheet.beyond(near.elements, near.unknowns, change)
-        beyond = self.sheet.beyond_slopes(near.elements, found, slopes.T)
+        beyond = self.sheet.beyond_slopes(found, slopes.T)
         readings, first = pixels
         exact = contacts.dtype
         force, pad_slopes = pads

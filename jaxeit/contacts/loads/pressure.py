@@ -5,6 +5,7 @@ length. One table of parameters for all kinds of loads means one compiled progra
 and how, is an array of `Form`.
 """
 
+import math
 from enum import IntEnum
 
 import jax
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float, Int
 MOST, SIZE = 3, 6  # loads, and parameters of each
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
-SQRT_2 = np.sqrt(2.0)
+SQRT_2 = math.sqrt(2)
 # Half length of an edge at least, m: one of length zero has no direction, and its ends are lost in single precision.
 SHORTEST = 1e-4
 ELONGATION = 0.3  # standard deviation of second moments over that of the others
@@ -67,7 +68,10 @@ def shaped(one: Float[Array, "6"], shape: Float[Array, "6"], points: Float[Array
 
     The polynomials are those of `shape_directions`, in units of the standard deviation along the edge and across it.
     """
-    return line(one, points) * (1 + sum(a * p for a, p in zip(shape, line_polynomials(one, points), strict=True)))
+    factor = sum(
+        (a * p for a, p in zip(shape, line_polynomials(one, points), strict=True)), start=jnp.ones_like(shape[0])
+    )
+    return line(one, points) * factor
 
 
 def line_polynomials(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> list[Float[Array, "..."]]:
