@@ -3,11 +3,11 @@
 import ctypes
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial, wraps
+from functools import cache, lru_cache, partial, wraps
 from importlib import import_module
 from itertools import chain
 from math import prod
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -55,7 +55,7 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
 
     For calls from a loop in Python: a model is many arrays, and checking all of them at each call takes longer than the
     forward solution of a small model. Small arrays are packed into one array of each type. Parts of ``first`` that are
-    no arrays are static, as for `verb`. ::
+    no arrays are static, as for `verb`. Where ``first`` differs in its numbers only, nothing is compiled anew. ::
 
         voltages = je.bind(je.forward, model)
         voltages(sigma)
@@ -65,29 +65,55 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     """
     leaves, static = eqx.partition(first, eqx.is_array)
     flat, structure = jax.tree.flatten(leaves)
-    packs, unpack = _pack_by_type(flat)
-
-    @partial(jax.jit, compiler_options=compiler_options() if options is None else dict(options))
-    def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
-        return function(*eqx.combine(jax.tree.unflatten(structure, unpack(packs)), static), *rest)
-
+    packs, layout = _pack_by_type(flat)
+    flags = tuple(sorted((compiler_options() if options is None else options).items()))
+    kept, form = jax.tree.flatten(static)
+    typed = tuple((type(leaf), leaf) for leaf in kept)  # 1 is no 1.0
+    program = _bound(function, structure, layout, typed, form, flags)
     return lambda *rest: program(packs, rest)
 
 
-def _pack_by_type(arrays: list[Array]) -> tuple[list[Array], Callable[[list[Array]], list[Array]]]:
-    """Small arrays packed into one array of each type, large ones as they are; and the function that unpacks them."""
+@lru_cache(maxsize=256)
+def _bound(
+    function: Callable[..., T], structure: Any, layout: "_Layout", typed: tuple[Any, ...], form: Any, flags: Any
+) -> Callable[..., T]:
+    """The program of `bind`, which models that differ in their numbers only share."""
+
+    @partial(jax.jit, compiler_options=dict(flags))
+    def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
+        leaves, static = (
+            jax.tree.unflatten(structure, layout.unpack(packs)),
+            jax.tree.unflatten(form, [leaf for _, leaf in typed]),
+        )
+        return function(*eqx.combine(leaves, static), *rest)
+
+    found: Callable[..., T] = program
+    return found
+
+
+class _Layout(NamedTuple):
+    """Where arrays lie in packs: the shapes of those in each pack, and the place of each array among all pieces."""
+
+    shapes: tuple[tuple[tuple[int, ...], ...], ...]
+    order: tuple[int, ...]
+
+    def unpack(self, packs: list[Array]) -> list[Array]:
+        """The arrays."""
+        pieces = list(chain(*map(_split_pack, packs, self.shapes)))
+        return [pieces[place] for place in self.order]
+
+
+def _pack_by_type(arrays: list[Array]) -> tuple[list[Array], _Layout]:
+    """Small arrays packed into one array of each type, large ones as they are."""
     groups: dict[Any, list[int]] = {}
     for place, array in enumerate(arrays):
         small = array.size <= MAX_PACKED_SIZE and isinstance(array.dtype, np.dtype)  # and no random key
         groups.setdefault(array.dtype if small else place, []).append(place)
     order = np.argsort(list(chain(*groups.values())))
-    shapes = [[arrays[place].shape for place in group] for group in groups.values()]
-
-    def unpack(packs: list[Array]) -> list[Array]:
-        pieces = list(chain(*map(_split_pack, packs, shapes)))
-        return [pieces[place] for place in order]
-
-    return [_concatenated([arrays[place] for place in group]) for group in groups.values()], unpack
+    shapes = tuple(tuple(arrays[place].shape for place in group) for group in groups.values())
+    return [_concatenated([arrays[place] for place in group]) for group in groups.values()], _Layout(
+        shapes, tuple(order.tolist())
+    )
 
 
 def _concatenated(arrays: list[Array]) -> Array:
@@ -98,7 +124,7 @@ def _concatenated(arrays: list[Array]) -> Array:
     return flat
 
 
-def _split_pack(pack: Array, shapes: list[tuple[int, ...]]) -> list[Array]:
+def _split_pack(pack: Array, shapes: tuple[tuple[int, ...], ...]) -> list[Array]:
     """The reverse of `_concatenated`."""
     if len(shapes) == 1:
         return [pack]

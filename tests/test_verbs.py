@@ -61,6 +61,21 @@ def test_a_bound_function_is_that_of_what_is_left(model):
     np.testing.assert_allclose(voltages(np.asarray(halved)), 2 * voltages(), rtol=1e-9)
 
 
+def test_functions_bound_to_other_numbers_share_a_program(compilations):
+    def power(base, exponent, factor):
+        return factor * base**exponent
+
+    x, other = jnp.arange(3.0), jnp.arange(1.0, 4.0)
+    je.bind(power, x, 2)(x)
+    seen = len(compilations)
+    assert seen
+    found = je.bind(power, other, 2)(x)
+    assert len(compilations) == seen
+    np.testing.assert_array_equal(found, [0, 4, 18])
+    je.bind(power, x, 2.0)(x)  # 2.0 is no 2
+    assert len(compilations) > seen
+
+
 def test_bound_arrays_keep_their_values_types_and_shapes():
     key = jax.random.key(3)
     large = np.arange(verbs.MAX_PACKED_SIZE + 1)

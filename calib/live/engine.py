@@ -2,7 +2,8 @@
 
 The force map of a frame waits for nothing else. Contacts take several times as long to fit. They are fitted to the
 newest frame if there is time before the next one is due (`Engine.use_spare_time`), and are used until the next fit.
-Where contacts are followed instead (`follower`), each frame has contacts of its own, and its result waits for them.
+Where contacts are followed instead (`follower`), each frame has contacts of its own, and its result waits for them;
+what may have happened to them is looked into in the time that is left.
 """
 
 import time
@@ -378,7 +379,12 @@ class Engine:
             self._places, self._touches = self._programs.nowhere, replace(NO_TOUCHES, age=0)
 
     def use_spare_time(self, seconds: float) -> None:
-        """Fit contacts of the newest frame if `seconds`, the time until the next frame, allow it; then recalibrate."""
+        """Fit contacts of the newest frame if `seconds`, the time until the next frame, allow it; then recalibrate.
+
+        Where contacts are followed: look further into a frame that was not expected.
+        """
+        if self._follower is not None:
+            self._follower.use_spare_time(seconds)
         if self._recalibrator is not None and self._waiting_frame is None:
             self._recalibrator.use_spare_time()
         if self._waiting_frame is not None and (

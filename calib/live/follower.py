@@ -1,5 +1,6 @@
 """Contacts followed through the frames of a live view, by `jaxeit.tracking`."""
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -12,6 +13,9 @@ from ..calibration.localisation.quiet_frames import QuietFrames
 from .results import TouchEstimates
 
 FIRST_SECONDS = 0.01  # before the first frame that is followed
+# Pieces of a look into an unexpected frame that follow one frame, at most; and the time, s, after which a piece is done
+# even if the next frame waits for it.
+PIECES, MAX_PAUSE = 6, 0.03
 
 Prepare = Callable[[Calibration, np.ndarray, np.ndarray | None], Tracker]
 
@@ -28,6 +32,7 @@ class LiveFollower:
         self._tracker: Tracker | None = None
         self._now: Tracking | None = None
         self._last: int | None = None
+        self._looked, self._piece = 0.0, 0.0  # s: end of the last piece of a look, and how long pieces take
 
     @property
     def ready(self) -> bool:
@@ -69,9 +74,25 @@ class LiveFollower:
         assert self._tracker is not None
         seconds = FIRST_SECONDS if self._last is None else max((host - self._last) / 1e9, MIN_SECONDS)
         before = self._tracker.start() if self._now is None else self._now
-        self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error))
+        self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error), whole=False)
         self._last = host
         return self._now.tracks
+
+    def use_spare_time(self, seconds: float) -> None:
+        """Look further into an unexpected frame, as far as the time until the next frame allows, or `MAX_PAUSE` asks.
+
+        Contacts that are found, or found to be others, are those of the next frame.
+        """
+        end = time.monotonic() + seconds
+        for _ in range(PIECES):
+            begin = time.monotonic()
+            if self._tracker is None or self._now is None or self._now.look is None:
+                return
+            if begin + self._piece > end and begin - self._looked < MAX_PAUSE:
+                return
+            self._now = self._tracker.look(self._now)
+            self._looked = time.monotonic()
+            self._piece = max(self._looked - begin, 0.95 * self._piece)
 
 
 def followed_touches(tracks: tuple[Track, ...]) -> TouchEstimates:

@@ -3,7 +3,8 @@
 from .compilation import compile_tracker
 from .settings import TrackerSettings
 from .smoothing import Smoother, TimedTracks
-from .tracker import Track, Tracker, Tracking, prepare_tracker
+from .tracker import Tracker, prepare_tracker
+from .tracks import Track, Tracking
 
 __all__ = [
     "Smoother",

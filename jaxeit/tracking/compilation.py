@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .tracker import Tracker, Tracking
+from .tracker import Tracker
+from .tracks import Tracking
 
 # A frame this many times as loud as noise is unexpected, whatever the contacts.
 LOUD = 30.0
@@ -25,4 +26,4 @@ def compile_tracker(tracker: Tracker) -> None:
     for count in range(most + 1):
         now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count)
         tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
-        belief = tracker.with_contact(belief, places[count * len(places) // (most + 1)])
+        belief = tracker.events.with_contact(belief, places[count * len(places) // (most + 1)])

@@ -1,18 +1,99 @@
 """What may happen to contacts between two frames, as beliefs before the next one."""
 
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from .filter import SIZE, Belief
+from .filter import EDGE, SHAPE, SIZE, VELOCITY, Belief
+from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.
 HALF = 0.012
-# How far contacts may jump: x, y, log width, log force, half length, velocity.
-JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, 0.1, 0.1])
-# How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
+# How far contacts may jump: x, y, log width, log force, half length, shape, velocity.
+JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, *6 * [0.1], 0.1, 0.1])
 # Half length of an edge over the distance of the two contacts that were taken for it.
 BETWEEN = 0.8
-EDGE, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, 0.0, 0.0]), 0.3
+# Directions of an edge that are tried.
+DIRECTIONS = np.pi * np.arange(4) / 4
+# Prior deviations of the place and the velocity of a contact that begins, m and m/s.
+PLACE, SPEED = 0.012, 0.05
+# Half an edge that is none: what keeps its covariance definite, m.
+ROUND = 1e-4
+# How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
+LENGTHEN, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, *6 * [0.1], 0.0, 0.0]), 0.3
+
+
+class Hypothesis(NamedTuple):
+    """A belief before a frame, with the contacts that it holds, and the log of its prior probability."""
+
+    belief: Belief
+    numbers: tuple[int, ...]
+    edges: tuple[bool, ...]
+    prior: float = 0.0
+
+    def without(self, k: int, prior: float) -> "Hypothesis":
+        """Contact k was none, or has lifted."""
+        numbers, edges = self.numbers, self.edges
+        return Hypothesis(without(self.belief, k), numbers[:k] + numbers[k + 1 :], edges[:k] + edges[k + 1 :], prior)
+
+    def as_edge(self, k: int, prior: float) -> Iterator["Hypothesis"]:
+        """Contact k as an edge in each of some directions, unless it is one."""
+        if not self.edges[k]:
+            edges = (*self.edges[:k], True, *self.edges[k + 1 :])
+            for angle in DIRECTIONS:
+                belief = lengthened(self.belief, k, angle)
+                yield Hypothesis(belief, self.numbers, edges, prior - float(np.log(len(DIRECTIONS))))
+
+    def joined(self, j: int, k: int, prior: float) -> "Hypothesis":
+        """Contacts j and k, the later one, are one edge."""
+        left, edges = self.without(k, prior), (*self.edges[:j], True, *self.edges[j + 1 :])
+        return left._replace(belief=joined(self.belief, j, k), edges=edges[:k] + edges[k + 1 :])
+
+
+class Events:
+    """The events that are tried where a frame is not expected."""
+
+    def __init__(self, settings: TrackerSettings, area: float):
+        """`area`: of the skin, m^2."""
+        self._settings, self._area = settings, area
+        loads = settings.loads
+        self._usual = np.log([loads.width, loads.force])
+        self._spread = np.array([loads.width_spread, loads.force_spread])
+
+    def possible(
+        self, now: Hypothesis, begun: int, place: Float[np.ndarray, "2"], seconds: float
+    ) -> Iterator[Hypothesis]:
+        """What may have happened to contacts within some seconds.
+
+        Args:
+            begun: number of contacts so far.
+            place: where a contact would explain most of what the contacts leave of the frame, m.
+        """
+        rare, count = float(np.log(self._settings.birth_rate * seconds)), len(now.numbers)
+        if count:
+            yield now._replace(belief=jumped(now.belief), prior=rare)
+            away = np.asarray(now.belief.contacts)[:, :2] - place
+            yield from now.as_edge(int(np.argmin(np.linalg.norm(away, axis=1))), rare)
+        for k in range(count):
+            yield now.without(k, rare)
+        for j, k in combinations(range(count), 2):
+            yield now.joined(j, k, rare)
+        if count < self._settings.most:
+            # The prior of a place is even over the skin, that of the fit is normal about where it begins.
+            even = float(np.log(2 * np.pi * PLACE**2 / self._area))
+            belief = self.with_contact(now.belief, place)
+            yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), rare + even)
+
+    def with_contact(self, belief: Belief, place: Float[np.ndarray, "2"]) -> Belief:
+        """The belief with a contact more, that begins about a place, m."""
+        row, spread = np.zeros((2, SIZE))
+        row[:4], spread[:4] = [*place, *self._usual], [PLACE, PLACE, *self._spread]
+        spread[EDGE], spread[SHAPE], spread[VELOCITY] = ROUND, self._settings.shape, SPEED
+        return inserted(belief, row, spread)
 
 
 def without(belief: Belief, k: int) -> Belief:
@@ -45,9 +126,10 @@ def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     """With contact k as an edge in about this direction."""
     contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
     own = np.arange(SIZE * k, SIZE * (k + 1))
-    contacts[k, 4:6] = HALF * np.cos(angle), HALF * np.sin(angle)
+    contacts[k, EDGE] = HALF * np.cos(angle), HALF * np.sin(angle)
     contacts[k, 2] -= NARROWER
-    covariance[own, own] += EDGE**2
+    contacts[k, SHAPE] = 0.0
+    covariance[own, own] += LENGTHEN**2
     return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
 
 
@@ -57,8 +139,8 @@ def joined(belief: Belief, first: int, second: int) -> Belief:
     pair = contacts[[first, second]]
     force = np.exp(pair[:, 3])
     contacts[first, :3] = force @ pair[:, :3] / force.sum()
-    contacts[first, 3], contacts[first, 4:6] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
-    contacts[first, 6:] = pair[:, 6:].mean(0)
+    contacts[first, 3], contacts[first, EDGE] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
+    contacts[first, SHAPE], contacts[first, VELOCITY] = 0.0, pair[:, VELOCITY].mean(0)
     own = np.arange(SIZE * first, SIZE * (first + 1))
-    covariance[own, own] += EDGE**2
+    covariance[own, own] += LENGTHEN**2
     return without(Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance)), second)

@@ -1,10 +1,11 @@
 """The belief of contacts and of the contact layer's gain, and how one frame changes it.
 
 An extended Kalman filter (Jazwinski 1970, ch. 8), whose update is iterated until it is linear enough. A contact is a
-load (place, width, force, half length of an edge) with a velocity; loads add as pressure, and the law of the contact
-layer turns pressure times gain into conductivity, of which `Reanalysis` knows the readings. The gain ``exp(level +
-field)`` is the same in all frames, so its modes are part of the belief: the uncertainty of a place that the gain causes
-does not shrink while a contact rests, and the gain is learned where contacts move.
+load (place, width, force, half length of an edge, shape) with a velocity; loads add as pressure, and the law of the
+contact layer turns pressure times gain into conductivity, of which `Reanalysis` knows the readings. The gain
+``exp(level + field)`` is the same in all frames, so its modes are part of the belief: the uncertainty of a place that
+the gain causes does not shrink while a contact rests, and the gain is learned where contacts move. Nor does that which
+an unknown shape causes, which hardly changes while a contact lasts.
 
 Only the parameters that a frame tells of are active in an update: places, widths, forces, half lengths, the level and
 the modes around contacts. With their covariance ``P = C C^T`` the update minimises ``|y - h|^2 / s^2 + |z|^2`` over z,
@@ -22,18 +23,26 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import verb
 from ..contacts.search import ContactFinder, Frame
-from ..least_squares import ImplicitStep, LevenbergMarquardt, normal_equations
+from ..least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations
 from ..linalg import lapack
 from .response import LoadedSheet, Near, Shown
 
-# Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
-SIZE, SEEN = 8, 6
-# An update is linear enough where a further step would lower half of chi-square by less than this.
-FALL = 1.0
-# Evaluations of an update, and of one that begins far from its end.
-STEPS, MANY_STEPS = 6, 12
+# Numbers of a contact: x, y, log width, log force, half an edge along x and y, six of its shape (`pressure.shaped`),
+# velocity along x and y; of these all but the velocity are seen in a frame.
+SIZE, SEEN = 14, 12
+EDGE, SHAPE, VELOCITY = slice(4, 6), slice(6, SEEN), slice(SEEN, SIZE)
+# Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
+# of an ordinary frame, whose next step would lower it by 0.001 then, and of one that begins far from its end.
+FALL, CAREFUL_FALL = 10.0, 1.0
+# Evaluations of an update; of one that begins far from its end, and of a piece of such a one.
+STEPS, MANY_STEPS, PIECE = 6, 12, 2
 
-SOLVER = LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=FALL)
+
+def _solver(fall: float) -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=0.0, atol=0.0, fall_rtol=1e-6, fall_atol=fall)
+
+
+ORDINARY, CAREFUL = _solver(FALL), _solver(CAREFUL_FALL)
 
 
 class Pads(NamedTuple):
@@ -48,12 +57,12 @@ class Belief(NamedTuple):
 
     | meaning                                                                  | shape    | unit  |
     |--------------------------------------------------------------------------|----------|-------|
-    | contacts: x, y, log width, log force, half an edge (2), velocity (2)     | (K, 8)   | mixed |
+    | contacts: x, y, log width, log force, half an edge (2), shape (6), velocity (2) | (K, 14) | mixed |
     | gain: level, then modes of the field, in units of their prior deviations | (g,)     | 1     |
     | covariance of contacts and gain                                          | (n, n)   | mixed |
     """
 
-    contacts: Float[Array, "K 8"]
+    contacts: Float[Array, "K 14"]
     gain: Float[Array, " g"]
     covariance: Float[Array, "n n"]
 
@@ -68,6 +77,7 @@ class Update(NamedTuple):
     | misfit: chi-square of the frame and the pads                              | ()    |
     | surprise: square of the change of the belief, in its standard deviations  | ()    |
     | loudness: of each contact's signal, in standard deviations                | (K,)  |
+    | solves: evaluations of what the contacts show                             | ()    |
     """
 
     belief: Belief
@@ -75,6 +85,24 @@ class Update(NamedTuple):
     misfit: Float[Array, ""]
     surprise: Float[Array, ""]
     loudness: Float[Array, " K"]
+    solves: Int[Array, ""]
+
+
+class Attempt(NamedTuple):
+    """An update that begins far from its end, as far as it has come; `attempted` goes on with it.
+
+    | meaning                                                                   | shape |
+    |---------------------------------------------------------------------------|-------|
+    | z: change of the active numbers; state: of the solver                     | (a,)  |
+    | evidence, loudness: as of an `Update`                                     |       |
+    | ended: further evaluations would not change it, or there were enough      | ()    |
+    """
+
+    z: Float[Array, " a"]
+    state: LeastSquaresState | None
+    evidence: Float[Array, ""]
+    loudness: Float[Array, " K"]
+    ended: Bool[Array, ""]
 
 
 class ContactFilter(eqx.Module):
@@ -88,7 +116,7 @@ class ContactFilter(eqx.Module):
     | places: where the modes of the gain lie; the first is the level          | (g, 2)           | m    |
     | model_error: part of the signal by which mesh, sheet and load shape err  | ()               | 1    |
     | persistence of that error                                                | ()               | s    |
-    | rates: random walk of each number of a contact                           | (8,)             | per sqrt(s) |
+    | rates: random walk of each number of a contact                           | (14,)            | per sqrt(s) |
     """
 
     finder: ContactFinder
@@ -97,7 +125,7 @@ class ContactFilter(eqx.Module):
     places: Float[Array, "g 2"]
     model_error: Float[Array, ""]
     persistence: Float[Array, ""]
-    rates: Float[Array, "8"]
+    rates: Float[Array, "14"]
     active_modes: int = eqx.field(static=True)
 
 
@@ -105,12 +133,17 @@ class ContactFilter(eqx.Module):
 def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""]) -> Belief:
     """The belief so many seconds later: contacts move on, and may change."""
     count, size = len(belief.contacts), belief.contacts.size
-    step = jnp.eye(SIZE).at[:2, 6:].set(seconds * jnp.eye(2))
+    step = jnp.eye(SIZE).at[:2, VELOCITY].set(seconds * jnp.eye(2))
     # A velocity that walks at random: the integrated Wiener process, exactly.
     walk = jnp.diag(tracker.rates**2 * seconds)
-    drift = tracker.rates[6:] ** 2
+    drift = tracker.rates[VELOCITY] ** 2
     walk = walk.at[:2, :2].add(jnp.diag(drift * seconds**3 / 3))
-    walk = walk.at[:2, 6:].add(jnp.diag(drift * seconds**2 / 2)).at[6:, :2].add(jnp.diag(drift * seconds**2 / 2))
+    walk = (
+        walk.at[:2, VELOCITY]
+        .add(jnp.diag(drift * seconds**2 / 2))
+        .at[VELOCITY, :2]
+        .add(jnp.diag(drift * seconds**2 / 2))
+    )
     whole = jnp.kron(jnp.eye(count), step)
     rows = belief.covariance.at[:size].set(whole @ belief.covariance[:size])
     both = rows.at[:, :size].set(rows[:, :size] @ whole.T)
@@ -127,7 +160,7 @@ class _Problem(NamedTuple):
     | belief before the frame                                          |
     | active: numbers of the belief that the frame tells of            |
     | factor C of their covariance                                     |
-    | scale: standard deviation of a whitened reading                  |
+    | scale: standard deviation of a whitened reading; alone: in a frame by itself |
     | near: what is near the contacts before the frame                 |
     """
 
@@ -139,6 +172,7 @@ class _Problem(NamedTuple):
     active: Int[Array, " a"]
     factor: Float[Array, "a a"]
     scale: Float[Array, ""]
+    alone: Float[Array, ""]
     near: Near
 
     def shown(self, z: Float[Array, " a"]) -> Shown:
@@ -171,7 +205,7 @@ def _residual(z: Float[Array, " a"], problem: _Problem) -> Float[Array, " n"]:
     return problem.residual(z, problem.shown(z))
 
 
-def _active(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
+def _active(tracker: ContactFilter, contacts: Float[Array, "K 14"]) -> Int[Array, " a"]:
     """Numbers of the belief that a frame tells of: of the contacts, the level, and the modes around contacts."""
     count = len(contacts)
     own = (SIZE * np.arange(count)[:, None] + np.arange(SEEN)).ravel()
@@ -194,54 +228,91 @@ def _seen(tracker: ContactFilter, dv: Float[Array, " readings"]) -> tuple[Frame,
 
 
 def _problem(
-    tracker: ContactFilter, belief: Belief, frame: Frame, whole: Bool[Array, ""], pads: Pads, scale: Float[Array, ""]
+    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
 ) -> _Problem:
+    frame, whole, share = _seen(tracker, dv)
+    scale, alone = _scales(tracker, share, seconds)
     active = _active(tracker, belief.contacts)
     factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
     near = tracker.sheet.near(belief.contacts[:, :SEEN])
-    return _Problem(tracker, frame, whole, pads, belief, active, factor, scale, near)
+    return _Problem(tracker, frame, whole, pads, belief, active, factor, scale, alone, near)
+
+
+def _scales(
+    tracker: ContactFilter, share: Float[Array, ""], seconds: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Standard deviations of a whitened reading in a frame so long after the last one, and in a frame by itself.
+
+    Errors of the model that stay for n frames are told n times, and count once.
+    """
+    repeats = jnp.maximum(tracker.persistence / seconds, 1)
+    return jnp.sqrt(1 + repeats * share), jnp.sqrt(1 + share)
+
+
+def _fitted(
+    problem: _Problem, solver: LevenbergMarquardt, steps: int, attempt: Attempt | None = None
+) -> optx.Solution[Array, Any]:
+    """The change z under which the frame is most probable, after so many evaluations more."""
+    begun = {} if attempt is None else {"state": attempt.state}
+    start = jnp.zeros(len(problem.active), problem.factor.dtype) if attempt is None else attempt.z
+    options: dict[str, Any] = {"quadratic": _quadratic} | begun
+    found: optx.Solution[Array, Any] = optx.least_squares(
+        _residual, solver, start, problem, options, max_steps=steps, adjoint=ImplicitStep(), throw=False
+    )
+    return found
+
+
+@verb
+def followed(
+    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
+) -> tuple[Belief, Update]:
+    """The belief as it is predicted so many seconds after the last frame, and what a frame makes of it."""
+    moved = predicted(tracker, belief, seconds)
+    return moved, updated(tracker, moved, dv, pads, seconds)
 
 
 @verb
 def updated(
+    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
+) -> Update:
+    """The belief after a difference frame (readings,) V and the forces on the pads, seconds after the last frame."""
+    if not len(belief.contacts):
+        return _nothing(tracker, belief, dv, pads, seconds)
+    problem = _problem(tracker, belief, dv, pads, seconds)
+    found = _fitted(problem, ORDINARY, STEPS)
+    return _update(problem, found.value, found.state)
+
+
+@verb
+def attempted(
     tracker: ContactFilter,
     belief: Belief,
     dv: Float[Array, " readings"],
     pads: Pads,
-    seconds: Float[Array, ""],
-    many: bool = False,
-) -> Update:
-    """The belief after a difference frame (readings,) V and the forces on the pads.
+    attempt: Attempt | None = None,
+) -> Attempt:
+    """An update that may begin far from its end, one piece further.
 
-    Args:
-        seconds: since the last frame. Errors of the model that stay for n frames are told n times, and count once.
-        many: a step of full length may be too long, as for a contact that has just been put somewhere.
+    Its evidence is that of one frame by itself: what the model errs by in this frame it has not told before.
     """
-    frame, whole, share = _seen(tracker, dv)
-    repeats = jnp.maximum(tracker.persistence / seconds, 1)
-    scale, alone = jnp.sqrt(1 + repeats * share), jnp.sqrt(1 + share)
     if not len(belief.contacts):
-        return _nothing(belief, frame.y, pads, alone, scale)
-    problem = _problem(tracker, belief, frame, whole, pads, scale)
-    found: optx.Solution[Array, Any] = optx.least_squares(
-        _residual,
-        SOLVER,
-        jnp.zeros(len(problem.active), problem.factor.dtype),
-        problem,
-        {"quadratic": _quadratic},
-        max_steps=MANY_STEPS if many else STEPS,
-        adjoint=ImplicitStep(),
-        throw=False,
-    )
-    z, normal, square = found.value, found.state.quadratic.hessian.matrix, found.state.square
-    root = lapack.cholesky(normal, lower=True)
-    return Update(
-        belief=_followed(belief, problem, z, root),
-        evidence=-0.5 * square - jnp.sum(jnp.log(jnp.diag(root))),
-        misfit=(square - z @ z) * (scale / alone) ** 2,
-        surprise=z @ z,
-        loudness=_loudness(normal, problem.factor, len(belief.contacts)) * scale / alone,
-    )
+        update = _nothing(tracker, belief, dv, pads, tracker.persistence)
+        return Attempt(jnp.zeros(0, update.evidence.dtype), None, update.evidence, update.loudness, jnp.asarray(True))
+    problem = _problem(tracker, belief, dv, pads, tracker.persistence)
+    found = _fitted(problem, CAREFUL, PIECE, attempt)
+    update = _update(problem, found.value, found.state)
+    ended = found.state.converged | (found.state.steps >= MANY_STEPS)
+    return Attempt(found.value, found.state, update.evidence, update.loudness, ended)
+
+
+@verb
+def concluded(
+    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, attempt: Attempt
+) -> Update:
+    """The update to which an attempt has come."""
+    if attempt.state is None:
+        return _nothing(tracker, belief, dv, pads, tracker.persistence)
+    return _update(_problem(tracker, belief, dv, pads, tracker.persistence), attempt.z, attempt.state)
 
 
 @verb
@@ -249,28 +320,51 @@ def unexplained(
     tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads
 ) -> Float[Array, " r"]:
     """What the contacts leave of a frame, (r,), in standard deviations of one frame."""
-    frame, whole, share = _seen(tracker, dv)
-    alone = jnp.sqrt(1 + share)
     if not len(belief.contacts):
-        return frame.y / alone
-    problem = _problem(tracker, belief, frame, whole, pads, alone)
-    left = (frame.y - problem.shown(jnp.zeros(len(problem.active))).readings) / alone
-    found: Array = jax.lax.cond(whole, lambda left: left, lambda left: frame.root @ left, left)
+        frame, _, share = _seen(tracker, dv)
+        return frame.y / jnp.sqrt(1 + share)
+    problem = _problem(tracker, belief, dv, pads, tracker.persistence)
+    left = (problem.frame.y - problem.shown(jnp.zeros(len(problem.active))).readings) / problem.alone
+    root = problem.frame.root
+    found: Array = jax.lax.cond(problem.whole, lambda left: left, lambda left: root @ left, left)
     return found
 
 
 def _nothing(
-    belief: Belief, y: Float[Array, " r"], pads: Pads, alone: Float[Array, ""], scale: Float[Array, ""]
+    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
 ) -> Update:
     """The update of a belief without contacts: nothing is learned."""
+    frame, _, share = _seen(tracker, dv)
+    scale, alone = _scales(tracker, share, seconds)
     on_pads = jnp.sum((pads.force / pads.error) ** 2)
-    none = jnp.zeros((), y.dtype)
-    evidence = -0.5 * (jnp.sum((y / scale) ** 2) + on_pads)
-    return Update(belief, evidence, jnp.sum((y / alone) ** 2) + on_pads, none, jnp.zeros(0, y.dtype))
+    none = jnp.zeros((), frame.y.dtype)
+    return Update(
+        belief=belief,
+        evidence=-0.5 * (jnp.sum((frame.y / scale) ** 2) + on_pads),
+        misfit=jnp.sum((frame.y / alone) ** 2) + on_pads,
+        surprise=none,
+        loudness=jnp.zeros(0, frame.y.dtype),
+        solves=jnp.asarray(0),
+    )
 
 
-def _followed(belief: Belief, problem: _Problem, z: Float[Array, " a"], root: Float[Array, "a a"]) -> Belief:
+def _update(problem: _Problem, z: Float[Array, " a"], state: LeastSquaresState) -> Update:
+    """What the change z of the active numbers makes of the belief."""
+    normal, square = state.quadratic.hessian.matrix, state.square
+    root, ratio = lapack.cholesky(normal, lower=True), problem.scale / problem.alone
+    return Update(
+        belief=_followed(problem, z, root),
+        evidence=-0.5 * square - jnp.sum(jnp.log(jnp.diag(root))),
+        misfit=(square - z @ z) * ratio**2,
+        surprise=z @ z,
+        loudness=_loudness(normal, problem.factor, len(problem.belief.contacts)) * ratio,
+        solves=state.steps,
+    )
+
+
+def _followed(problem: _Problem, z: Float[Array, " a"], root: Float[Array, "a a"]) -> Belief:
     """The belief whose active numbers have changed by C z and have the covariance C N^-1 C^T, with N = R R^T."""
+    belief = problem.belief
     across = lapack.solve_triangular(problem.factor, belief.covariance[problem.active], lower=True)
     unit = jnp.eye(len(z), dtype=z.dtype)
     learned = unit - lapack.cho_solve((root, True), unit)

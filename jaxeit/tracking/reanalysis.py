@@ -26,10 +26,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse.linalg import splu
 
 from ..linalg import lapack
-from ..model.bases import Elements
 from ..model.discretisation import Model
 from ..model.forward_model import Coefficients, assemble, coefficients, fields
-from ..model.sensitivity import pair_jacobian
 
 
 class Reanalysis(eqx.Module):
@@ -43,7 +41,6 @@ class Reanalysis(eqx.Module):
     | slopes of each element, weighted (`System`)                                          | (elements, k, s) |     |
     | pairs: of electrodes                                                                 | (p, 2)         |       |
     | mixing: from the pairs' entries of the transfer matrix to readings                   | (p, r)         | 1/ohm |
-    | linear: readings per change of each element, to first order                          | (elements, r)  | 1/S   |
     """
 
     green: Float[Array, "n n"]
@@ -52,7 +49,6 @@ class Reanalysis(eqx.Module):
     slopes: Float[Array, "elements k s"]
     pairs: Int[Array, "p 2"]
     mixing: Float[Array, "p r"]
-    linear: Float[Array, "elements r"]
 
     def beyond(
         self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
@@ -75,19 +71,23 @@ class Reanalysis(eqx.Module):
         green, before = self.green[unknowns[:, None], unknowns], self.potential[unknowns]
         y = lapack.solve(jnp.eye(size, dtype=change.dtype) + matrix @ green, matrix @ before)
         after = jnp.concatenate([before - green @ y, jnp.zeros_like(before[:1])])
-        fields = jnp.einsum("eks,eka->esa", slopes, after[place])
+        untouched = self._products(slopes, self.potential[dofs])
         first, second = self.pairs.T
-        products = jnp.sum(fields[..., first] * fields[..., second], 1)
-        moved = -(before.T @ y)[first, second]
-        readings = moved @ self.mixing - own @ self.linear[elements]
-        return BeyondFirstOrder(readings, inside, products)
+        moved = -(before.T @ y)[first, second] + own @ untouched
+        return BeyondFirstOrder(moved @ self.mixing, inside, self._products(slopes, after[place]) - untouched)
 
-    def beyond_slopes(
-        self, elements: Int[Array, " e"], found: "BeyondFirstOrder", directions: Float[Array, "d e"]
-    ) -> Float[Array, "d r"]:
+    def _products(
+        self, slopes: Float[Array, "e k s"], potential: Float[Array, "e k electrodes"]
+    ) -> Float[Array, "e p"]:
+        """Products of the fields of each pair of electrodes in elements."""
+        fields = jnp.einsum("eks,eka->sae", slopes, potential)
+        first, second = self.pairs.T
+        return jnp.sum(fields[:, first] * fields[:, second], 0).T
+
+    def beyond_slopes(self, found: "BeyondFirstOrder", directions: Float[Array, "d e"]) -> Float[Array, "d r"]:
         """Derivatives of the readings of `beyond` with respect to changes of the elements, by the adjoint identity."""
         own = jnp.where(found.inside, directions, 0)
-        return -(own @ found.products) @ self.mixing - own @ self.linear[elements]
+        return -(own @ found.products) @ self.mixing
 
 
 class BeyondFirstOrder(NamedTuple):
@@ -97,7 +97,7 @@ class BeyondFirstOrder(NamedTuple):
     |--------------------------------------------------------------------------|-----------|
     | readings                                                                 | (r,)      |
     | inside: whether an element has all its unknowns among those solved anew  | (e,)      |
-    | products: of the fields after the change, for each pair of electrodes    | (e, p)    |
+    | products: of the fields after the change, for each pair of electrodes, less those before | (e, p) |
     """
 
     readings: Float[Array, " r"]
@@ -120,7 +120,6 @@ def prepare_reanalysis(
     """
     theta = coefficients(model, sigma)
     put = partial(jnp.asarray, dtype=dtype)
-    image, wanted = Elements().on(model), jnp.asarray(mixing, model.dtype)
     return Reanalysis(
         green=put(_green(model, theta)),
         potential=put(fields(model, theta).potential),
@@ -128,7 +127,6 @@ def prepare_reanalysis(
         slopes=put(model.system.slopes),
         pairs=jnp.asarray(pairs, jnp.int32),
         mixing=put(mixing.T),
-        linear=put(pair_jacobian(model, sigma, image, jnp.asarray(pairs), wanted).T),
     )
 
 

@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .filter import SIZE, Belief, predicted
-from .tracker import Track, Tracker, Tracking, _track
+from .tracker import Tracker
+from .tracks import Track, Tracking, track_of
 
 # Frames after a frame that tell of it; a contact's velocity forgets them sooner.
 LAG = 256
@@ -33,17 +34,17 @@ JUMPED = 1 + 1e-6
 
 
 class Transition(NamedTuple):
-    """From the numbers of a contact in one frame to those in the next: matrix (8, 8) and covariance of the walk."""
+    """From the numbers of a contact in one frame to those in the next: matrix (14, 14) and covariance of the walk."""
 
-    matrix: Float[np.ndarray, "8 8"]
-    walk: Float[np.ndarray, "8 8"]
+    matrix: Float[np.ndarray, "14 14"]
+    walk: Float[np.ndarray, "14 14"]
 
 
 class State(NamedTuple):
-    """Numbers of one contact in a frame: mean (8,) and covariance (8, 8), in the order of `Belief`."""
+    """Numbers of one contact in a frame: mean (14,) and covariance (14, 14), in the order of `Belief`."""
 
-    mean: Float[np.ndarray, "8"]
-    covariance: Float[np.ndarray, "8 8"]
+    mean: Float[np.ndarray, "14"]
+    covariance: Float[np.ndarray, "14 14"]
 
 
 def transition(tracker: Tracker, seconds: float) -> Transition:
@@ -100,7 +101,7 @@ class _Frame:
     seconds: float
 
     def timed(self, states: dict[int, State]) -> TimedTracks:
-        return TimedTracks(self.time, tuple(_track(n, *states[n], edge) for n, edge in self.edges.items()))
+        return TimedTracks(self.time, tuple(track_of(n, *states[n], edge) for n, edge in self.edges.items()))
 
 
 class Smoother:

@@ -30,7 +30,7 @@ from calib.fitting.fields.places import single_places
 from calib.fitting.pads import PadModel
 from calib.live import engine as live_engine, loop as live_module
 from calib.live.engine import PREPARING, Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
-from calib.live.follower import LiveFollower
+from calib.live.follower import PIECES, LiveFollower
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
 from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
@@ -322,19 +322,24 @@ class FakeTracker(Tracker):
     """One contact while the first pad is pressed; a new one each time."""
 
     def __init__(self, untouched, noise):
-        self.untouched, self.noise, self.steps = untouched, noise, []
+        self.untouched, self.noise, self.steps, self.looks = untouched, noise, [], []
 
     def start(self):
         return stand_in(Tracking, tracks=(), begun=0)
 
-    def step(self, now, change, seconds, force, error):
+    def look(self, now):
+        self.looks.append(now.look)
+        return stand_in(Tracking, tracks=now.tracks, begun=now.begun, look=now.look - 1 or None)
+
+    def step(self, now, change, seconds, force, error, *, whole):
+        assert not whole
         self.steps.append((change, seconds, force, error))
         if not force[0] > 2:
             return stand_in(Tracking, tracks=(), begun=now.begun)
         begun = now.begun + (not now.tracks)
         place, half = np.array([0.02, 0.03]), np.array([0.01, 0.0])
         track = Track(begun, place, 4e-6 * np.eye(2), 0.01, float(force[0]), 0.1, half, np.zeros(2))
-        return stand_in(Tracking, tracks=(track,), begun=begun)
+        return stand_in(Tracking, tracks=(track,), begun=begun, look=10)
 
 
 @pytest.fixture
@@ -379,6 +384,22 @@ def test_each_frame_has_contacts_that_keep_their_numbers(following):
     np.testing.assert_allclose(engine._programs.places[-1].position, [[[0.02, 0.03]]])  # of the frame before
     engine.step(arrival([10.0, 20.0], 4 * S))
     assert engine.step(arrival([31.0, 20.0], 5 * S)).touches.number.tolist() == [2]
+
+
+def test_an_unexpected_frame_is_looked_into_in_spare_time_and_by_a_bounded_number_of_pieces(following):
+    engine, tracker = following
+    engine.use_spare_time(9.0)
+    engine.step(arrival([10.0, 20.0], 2 * S))
+    engine.use_spare_time(9.0)
+    assert not tracker.looks  # nothing is unexpected
+    engine.step(arrival([31.0, 20.0], 3 * S))
+    engine.use_spare_time(0.0)
+    engine.use_spare_time(0.0)
+    assert tracker.looks == [10]  # without spare time one piece, so that the look ends some time
+    engine.use_spare_time(9.0)
+    assert tracker.looks == [10 - n for n in range(1 + PIECES)]
+    engine.use_spare_time(9.0)
+    assert tracker.looks == [10 - n for n in range(10)]
 
 
 def test_a_pad_without_pressure_tells_a_tracker_nothing(following):

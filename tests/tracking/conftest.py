@@ -1,9 +1,13 @@
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.contacts.loads.pressure import line
 from jaxeit.tracking import TrackerSettings, prepare_tracker
 
+SECONDS = 0.01
 SETTINGS = TrackerSettings(most=2, unknowns=64, modes=8, pixels=250, columns=40)
 
 
@@ -18,3 +22,21 @@ def blank(model):
 def tracker(model, skin, blank):
     """Of the testbed at draft fidelity, for two contacts at most."""
     return prepare_tracker(model, skin, SETTINGS, noise=blank[1])
+
+
+@pytest.fixture(scope="module")
+def frame_of(model, blank):
+    """Frames (readings,) V of loads (K, 6), from the full forward map."""
+
+    @jax.jit
+    def change(loads):
+        pressure = sum(line(load, model.centroids) for load in loads)
+        return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
+
+    v0, noise = blank
+    rng = np.random.default_rng(5)
+    return lambda loads: np.asarray(change(jnp.asarray(loads))) - v0 + noise * rng.normal(size=noise.size)
+
+
+def load(x, y, force, width=0.012):
+    return [x, y, np.log(width), np.log(force), 0.0, 0.0]

@@ -1,35 +1,14 @@
 """Contacts followed through simulated frames, and the filter against a joint normal distribution."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxeit as je
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings
 from jaxeit.tracking.filter import SEEN, SIZE, Pads, _active, predicted, updated
-from jaxeit.tracking.response import load_pressure
 
-SECONDS = 0.01
-
-
-@pytest.fixture(scope="module")
-def frame_of(model, blank):
-    """Frames (readings,) V of loads (K, 6), from the full forward map."""
-
-    @jax.jit
-    def change(loads):
-        pressure = sum(load_pressure(load, model.centroids) for load in loads)
-        return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
-
-    v0, noise = blank
-    rng = np.random.default_rng(5)
-    return lambda loads: np.asarray(change(jnp.asarray(loads))) - v0 + noise * rng.normal(size=noise.size)
-
-
-def load(x, y, force, width=0.012):
-    return [x, y, np.log(width), np.log(force), 0.0, 0.0]
+from .conftest import SECONDS, load
 
 
 def silent(tracker):
@@ -96,11 +75,10 @@ def test_the_gain_is_learned_where_contacts_were_and_stays_unknown_elsewhere(tra
 def test_pads_tell_the_force(tracker, frame_of):
     """An image alone confuses force and gain; a pad with an error of 1 % does not."""
     truth = np.array([load(0.05, 0.05, 12.0)])
+    round_ = jnp.pad(jnp.asarray(truth), ((0, 0), (0, SEEN - truth.shape[1])))
     sheet = tracker.filter.sheet
-    near = sheet.near(jnp.asarray(truth))
-    forces = np.asarray(
-        sheet.shown(jnp.asarray(truth), jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads
-    )
+    near = sheet.near(round_)
+    forces = np.asarray(sheet.shown(round_, jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads)
     now = tracker.start()
     for _ in range(3):
         now = tracker.step(now, frame_of(truth), SECONDS, forces, np.full(4, 0.1))

@@ -1,0 +1,45 @@
+"""The compiled programs of a tracker, for calls from a loop in Python."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._compile import bind
+from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, unexplained
+
+
+class Programs:
+    """What a `ContactFilter` computes, with its arrays packed; each number of contacts is compiled once."""
+
+    def __init__(self, tracker: ContactFilter):
+        self._followed: Callable[..., tuple[Belief, Update]] = bind(followed, tracker)
+        self._attempted: Callable[..., Attempt] = bind(attempted, tracker)
+        self._concluded: Callable[..., Update] = bind(concluded, tracker)
+        self._unexplained: Callable[..., Array] = bind(unexplained, tracker)
+        self._atoms, self._starts = np.asarray(tracker.finder.atoms), np.asarray(tracker.finder.starts)[:, :2]
+        self._dtype = tracker.places.dtype
+
+    def followed(
+        self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, seconds: float
+    ) -> tuple[Belief, Update]:
+        """See `filter.followed`."""
+        return self._followed(belief, dv, pads, np.asarray(seconds, self._dtype))
+
+    def attempted(
+        self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt | None
+    ) -> Attempt:
+        """See `filter.attempted`."""
+        return self._attempted(belief, dv, pads, attempt)
+
+    def concluded(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt) -> Update:
+        """See `filter.concluded`."""
+        return self._concluded(belief, dv, pads, attempt)
+
+    def unexplained_place(
+        self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads
+    ) -> Float[np.ndarray, "2"]:
+        """Where a contact would explain most of what the contacts leave of a frame, m."""
+        left = np.asarray(self._unexplained(belief, dv, pads))
+        place: np.ndarray = self._starts[int(np.argmax(self._atoms @ left))]
+        return place

@@ -1,0 +1,145 @@
+"""What is known of contacts after a frame."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from .events import Hypothesis
+from .filter import EDGE, SIZE, VELOCITY, Attempt, Belief, Pads
+
+
+class Track(NamedTuple):
+    """A contact as it is now.
+
+    | meaning                                                             | shape  | unit  |
+    |---------------------------------------------------------------------|--------|-------|
+    | number: of the contact, which it keeps while it lives               |        |       |
+    | position in the sheet's flat coordinates; of an edge, its middle    | (2,)   | m     |
+    | covariance of the position                                          | (2, 2) | m^2   |
+    | width: standard deviation of the load, across an edge               |        | m     |
+    | force, and the standard deviation of its logarithm                  |        | N, 1  |
+    | half: from the middle of an edge to its end; zero for other contacts | (2,)  | m     |
+    | velocity                                                            | (2,)   | m/s   |
+    """
+
+    number: int
+    position: np.ndarray
+    covariance: np.ndarray
+    width: float
+    force: float
+    log_force_error: float
+    half: np.ndarray
+    velocity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """What a `Tracker` knows after a frame.
+
+    | meaning                                                               |
+    |-----------------------------------------------------------------------|
+    | belief: of contacts and gain                                          |
+    | numbers: of the contacts                                              |
+    | edges: which of them are edges                                        |
+    | faint: for how many frames each has hardly been seen                  |
+    | begun: number of contacts so far                                      |
+    | misfit: chi-square of the last frame that was looked into, and frames since then |
+    | look: into a frame that was not expected, as far as it has come       |
+    """
+
+    belief: Belief
+    numbers: tuple[int, ...] = ()
+    edges: tuple[bool, ...] = ()
+    faint: tuple[int, ...] = ()
+    begun: int = 0
+    misfit: float = 0.0
+    since: int = 0
+    look: "Look | None" = None
+
+    @property
+    def tracks(self) -> tuple[Track, ...]:
+        """The contacts, in the order in which they began."""
+        contacts, covariance = np.asarray(self.belief.contacts), np.asarray(self.belief.covariance)
+        return tuple(
+            track_of(number, contacts[k], covariance[SIZE * k : SIZE * (k + 1), SIZE * k : SIZE * (k + 1)], edge)
+            for k, (number, edge) in enumerate(zip(self.numbers, self.edges, strict=True))
+        )
+
+    def under(self, event: Hypothesis, belief: Belief) -> "Tracking":
+        """After an event, with what is believed then."""
+        faint = dict(zip(self.numbers, self.faint, strict=True))
+        return replace(
+            self,
+            belief=belief,
+            numbers=event.numbers,
+            edges=event.edges,
+            faint=tuple(faint.get(number, 0) for number in event.numbers),
+            begun=max([self.begun, *event.numbers]),
+        )
+
+
+class Seen(NamedTuple):
+    """A frame (readings,) V, the forces on the pads, and the seconds since the frame before."""
+
+    dv: np.ndarray
+    pads: Pads
+    seconds: float
+
+
+class Trial(NamedTuple):
+    """Contacts before a frame as an event leaves them, and how far the update by this frame has come."""
+
+    event: Hypothesis
+    attempt: Attempt | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether the update has come to its end."""
+        return self.attempt is not None and bool(self.attempt.ended)
+
+    @property
+    def probability(self) -> float:
+        """Log of the probability of event and frame, up to a constant."""
+        assert self.attempt is not None
+        return float(self.attempt.evidence) + self.event.prior
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A frame that is looked into, piece by piece.
+
+    | meaning                                                                             |
+    |-------------------------------------------------------------------------------------|
+    | seen: the frame                                                                     |
+    | before: contacts before it, after the events that have been found                   |
+    | best: these contacts                                                                |
+    | trials: what else may have happened; None: not asked yet                            |
+    | events: number of events that are still looked for                                  |
+    | happened: whether one has been found                                                |
+    | since: frames since                                                                 |
+    | after: contacts after the frame, followed to the first of these; None: not yet known |
+    """
+
+    seen: Seen
+    before: Tracking
+    best: Trial
+    events: int
+    trials: tuple[Trial, ...] | None = None
+    happened: bool = False
+    since: tuple[Seen, ...] = ()
+    after: Tracking | None = None
+
+
+def track_of(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -> Track:
+    """A contact from its numbers (14,) and their covariance (14, 14)."""
+    return Track(
+        number=number,
+        position=row[:2],
+        covariance=covariance[:2, :2],
+        width=float(np.exp(row[2])),
+        force=float(np.exp(row[3])),
+        log_force_error=float(np.sqrt(covariance[3, 3])),
+        half=row[EDGE] if edge else np.zeros(2),
+        velocity=row[VELOCITY],
+    )

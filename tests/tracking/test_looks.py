@@ -1,0 +1,105 @@
+"""Looks into unexpected frames, piece by piece: a bounded number of solves in each frame, and the same contacts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxeit.tracking.filter import PIECE, STEPS, Pads
+from jaxeit.tracking.looks import KEPT, meanwhile
+from jaxeit.tracking.programs import Programs
+from jaxeit.tracking.tracks import Seen
+
+from .conftest import SECONDS, load
+
+PIECES = 3  # of a look, in each frame
+
+
+class CountingPrograms(Programs):
+    """Counts the evaluations of what contacts show."""
+
+    solves = 0
+
+    def followed(self, *args):
+        found = super().followed(*args)
+        self.solves += int(found[1].solves)
+        return found
+
+    def attempted(self, belief, dv, pads, attempt):
+        found = super().attempted(belief, dv, pads, attempt)
+        steps = [0 if one is None or one.state is None else int(one.state.steps) for one in (attempt, found)]
+        self.solves += steps[1] - steps[0]
+        return found
+
+    def unexplained_place(self, *args):
+        self.solves += 1
+        return super().unexplained_place(*args)
+
+
+def truth(k):
+    """A press that slides; from the eighth frame on a second one 30 mm from it; the first lifts, then both are gone."""
+    first, second = load(0.06 + 0.0005 * k, 0.08, 12.0), load(0.06 + 0.0005 * k, 0.11, 9.0)
+    return [one for one, there in ((first, 2 <= k < 48), (second, 8 <= k < 60)) if there]
+
+
+@pytest.fixture(scope="module")
+def followed(tracker, frame_of):
+    """What is known after each frame and its pieces; evaluations in each frame, and in each piece."""
+    counting, states, frames, pieces = CountingPrograms(tracker.filter), [], [], []
+    kept, tracker._programs, now = tracker._programs, counting, tracker.start()
+    for k in range(70):
+        before = counting.solves
+        now = tracker.step(now, frame_of(truth(k) or [load(0.1, 0.1, 1e-6)]), SECONDS, whole=False)
+        frames.append(counting.solves - before)
+        for _ in range(PIECES):
+            before = counting.solves
+            now = tracker.look(now)
+            pieces.append(counting.solves - before)
+        states.append(now)
+    tracker._programs = kept
+    return states, frames, pieces
+
+
+def test_no_frame_does_more_than_a_bounded_number_of_solves(followed):
+    _, frames, pieces = followed
+    assert 0 < max(frames) <= STEPS
+    assert PIECE <= max(pieces) <= STEPS
+    assert sum(pieces) > 60  # more than one frame may do: they were spread
+
+
+def test_contacts_are_told_a_few_frames_later_and_keep_their_numbers(followed):
+    """As many as were simulated, once a look has had time to end; each within 2 mm."""
+    states, numbers = followed[0], [state.numbers for state in followed[0]]
+    late = next(k for k in range(70) if len(numbers[k]) == 2)
+    assert numbers[2:4].count((1,)) > 0
+    assert 8 <= late < 8 + 35
+    assert numbers[late:48] == [(1, 2)] * (48 - late)
+    assert numbers[54:60] == [(2,)] * 6  # of the other, some force is believed in for a while
+    assert numbers[-1] == ()
+    for k in range(late + 2, 48):
+        for track, own in zip(states[k].tracks, truth(k), strict=True):
+            assert np.linalg.norm(track.position - own[:2]) < 2e-3
+
+
+def test_a_look_ends_and_a_frame_is_looked_into_again_only_if_it_is_unexpected(followed):
+    looking = [state.look is not None for state in followed[0]]
+    assert looking[8]
+    assert not all(looking[12:47])
+
+
+def seen(number):
+    return Seen(np.full(1, number), Pads(np.zeros(1), np.ones(1)), 1.0)
+
+
+def test_frames_during_a_look_are_thinned_and_no_second_is_lost(followed):
+    look = next(state.look for state in followed[0] if state.look is not None)
+    look = replace(look, since=(), after=None)
+    for k in range(1, 50):
+        look = meanwhile(look, seen(k))
+        assert len(look.since) <= KEPT
+        assert sum(frame.seconds for frame in look.since) == k
+        assert look.since[-1].dv == k  # the newest frame is kept as it is
+    waiting = len(look.since)
+    look = meanwhile(replace(look, after=look.before), seen(50))
+    assert len(look.since) == waiting  # the frames to be followed do not become more
+    assert sum(frame.seconds for frame in look.since) == 50
