@@ -226,7 +226,7 @@ def delayed(bench: Bench, scene: Scene, frames: list[Shown], pieces: int | None)
 
 def schedules(run: Run) -> Iterator[Row]:
     """The same frames with looks into unexpected ones at once, and piece by piece."""
-    seeds, trials = run.sizes((2, 4), (1, 1))
+    seeds, trials = run.sizes((2, 3), (1, 1))
     model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
     rows: list[Row] = []
     for seed in range(600, 600 + seeds):

@@ -88,7 +88,7 @@ class Seen(NamedTuple):
 
 
 # An update is given up after so many evaluations if as many more steps like the next one would not make it the best.
-PROMISING, OUTLOOK = 4, 6
+PROMISING, OUTLOOK = 2, 3
 
 
 class Trial(NamedTuple):
