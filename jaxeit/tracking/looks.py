@@ -115,7 +115,13 @@ def _is_ripple(before: Tracking, trial: Trial) -> bool:
 
 
 def settled(now: Tracking, update: Update) -> Tracking:
-    """The contacts after an update, without those that are no longer seen."""
+    """The contacts after an update, without those that are no longer seen.
+
+    Without any if the update is not finite, as where rounding has left a covariance indefinite: the gain stays known,
+    and contacts begin anew.
+    """
+    if not _is_finite(update):
+        return _without_contacts(now)
     loudness = np.asarray(update.loudness)
     faint = tuple(count + 1 if own < FAINT else 0 for count, own in zip(now.faint, loudness, strict=True))
     now = replace(now, belief=update.belief, faint=faint)
@@ -124,3 +130,16 @@ def settled(now: Tracking, update: Update) -> Tracking:
             left = _as_is(now).without(k, 0.0)
             now = now.under(left, left.belief)
     return now
+
+
+def _is_finite(update: Update) -> bool:
+    belief = update.belief
+    numbers = (update.evidence, belief.contacts, belief.gain, np.diag(np.asarray(belief.covariance)))
+    return all(bool(np.isfinite(np.asarray(one)).all()) for one in numbers)
+
+
+def _without_contacts(now: Tracking) -> Tracking:
+    left = _as_is(now)
+    while left.numbers:
+        left = left.without(0, 0.0)
+    return now.under(left, left.belief)

@@ -1,5 +1,6 @@
 """What is known of contacts after a frame."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -104,9 +105,10 @@ class Trial(NamedTuple):
 
     @property
     def probability(self) -> float:
-        """Log of the probability of event and frame, up to a constant."""
+        """Log of the probability of event and frame, up to a constant; of an update that is not finite, none."""
         assert self.attempt is not None
-        return float(self.attempt.evidence) + self.event.prior
+        evidence = float(self.attempt.evidence)
+        return evidence + self.event.prior if math.isfinite(evidence) else -math.inf
 
     def is_hopeless(self, best: float) -> bool:
         """Whether the update would be less probable than another also after steps that do as much as the next one."""

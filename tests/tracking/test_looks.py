@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.tracking.filter import PIECE, STEPS, Pads
+from jaxeit.tracking.filter import PIECE, SIZE, STEPS, Pads
 from jaxeit.tracking.looks import KEPT, meanwhile
 from jaxeit.tracking.programs import Programs
 from jaxeit.tracking.tracks import Seen
@@ -104,3 +105,20 @@ def test_frames_that_wait_are_thinned_and_no_second_is_lost(followed):
     backlog = meanwhile(replace(backlog, look=None), seen(50))
     assert len(backlog.waiting) == count  # while frames are followed, they do not become more
     assert sum(frame.seconds for frame in backlog.waiting) == 50
+
+
+def test_contacts_begin_anew_after_an_update_that_is_not_finite(tracker, frame_of, followed):
+    """The gain stays as it was learned."""
+    now = followed[0][45]
+    assert len(now.numbers) == 2
+    broken = np.array(now.belief.covariance)
+    broken[2, 2] = -1.0
+    now = replace(now, belief=now.belief._replace(covariance=jnp.asarray(broken)), backlog=None)
+    lost = tracker.step(now, frame_of(truth(46)), SECONDS, whole=False)
+    assert lost.numbers == ()
+    np.testing.assert_array_equal(lost.belief.gain, now.belief.gain)
+    np.testing.assert_array_equal(lost.belief.covariance, broken[2 * SIZE :, 2 * SIZE :])
+    found = tracker.step(lost, frame_of(truth(47)), SECONDS)
+    places = np.sort([track.position[1] for track in found.tracks])
+    np.testing.assert_allclose(places, [0.08, 0.11], atol=2e-3)
+    assert found.numbers == (3, 4)
