@@ -13,9 +13,10 @@ import jaxeit as je
 
 
 def set_up() -> None:
-    """64-bit numbers, memory that is used again, and compiled programs kept between runs."""
+    """64-bit numbers, memory that is used again, one thread of BLAS, and compiled programs kept between runs."""
     jax.config.update("jax_enable_x64", True)
     je.reuse_memory()
+    je.limit_blas_threads()
     folder = cache_folder()
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))

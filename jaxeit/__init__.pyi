@@ -18,7 +18,13 @@ from . import (
     toml as toml,
     tracking as tracking,
 )
-from ._compile import bind as bind, compiler_options as compiler_options, reuse_memory as reuse_memory, verb as verb
+from ._compile import (
+    bind as bind,
+    compiler_options as compiler_options,
+    limit_blas_threads as limit_blas_threads,
+    reuse_memory as reuse_memory,
+    verb as verb,
+)
 from .accuracy import ladder as ladder
 from .budget import Budget as Budget, BudgetError as BudgetError
 from .contacts import (

@@ -1,5 +1,6 @@
 """Verbs compile themselves at the top, and become part of whatever program calls them."""
 
+import os
 import subprocess
 import sys
 
@@ -111,6 +112,23 @@ def test_memory_is_used_again():
     if can == "False":
         pytest.skip("not with this C library")
     assert int(given_back) > 20 * int(kept) + 100
+
+
+_THREADS = """
+import scipy.linalg
+from threadpoolctl import threadpool_info
+import jaxeit as je
+
+je.limit_blas_threads()
+print(sorted({library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}))
+"""
+
+
+def test_every_blas_of_a_process_is_limited_to_one_thread():
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    command = [sys.executable, "-c", _THREADS]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    assert done.stdout.strip() == "[1]"
 
 
 def _halved(seen):

@@ -86,14 +86,21 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
         description="Force maps in newtons from EIT-pneumatic robot skins.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=CommandParser)
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == chosen:
             module = import_module(f".commands.{name}_command", __name__)
             command.set_defaults(command=module.run)
+            command.words = argv
             module.add_arguments(command)
     return parser
+
+
+class CommandParser(argparse.ArgumentParser):
+    """The parser of one command. ``words`` is the command line, for a command whose arguments depend on it."""
+
+    words: Sequence[str] = ()
 
 
 class _Version(argparse.Action):

@@ -101,9 +101,6 @@ def _device() -> Iterator[Line]:
 def _threads() -> Iterator[Line]:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     yield Line("processors", str(count), "" if count > 1 else "recording and live need two", note=True)
-    pinned = any(os.environ.get(name) == "1" for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"))
-    remedy = "" if pinned else "for jaxeit live on a busy machine: export OPENBLAS_NUM_THREADS=1"
-    yield Line("BLAS threads", "one" if pinned else "as many as processors", remedy, note=True)
 
 
 def _priority() -> Iterator[Line]:

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Integer
 from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, on_device
 from .dissection import dissect
 from .lapack import portion_of, portioned
-from .small_matrices import stacked_product
+from .small_matrices import stacked_product, summed
 from .symbolic import Level, lay_out
 
 # Largest number of pivots eliminated at once.  For more, the threads of LAPACK and of XLA compete (a factor of
@@ -203,7 +203,7 @@ def _swept(
         )
         fronts.append(front)
         boundary = slice(level.pivots, None)
-        update = jnp.sum(_spread(level, update, boundary, boundary), 1) - stacked_product(w, w)
+        update = summed(_spread(level, update, boundary, boundary), 1) - stacked_product(w, w)
     return update, tuple(fronts[::-1]) if keep else ()
 
 
@@ -224,8 +224,8 @@ def _panels(
         found: tuple[Float[Array, "m p b"], Front] = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *done)
         return found
     pivots, boundary = slice(0, level.pivots), slice(level.pivots, None)
-    among = _values_at(values, level.among) + jnp.sum(_spread(level, update, pivots, pivots), 1)
-    beside = _values_at(values, level.beside) + jnp.sum(_spread(level, update, pivots, boundary), 1)
+    among = _values_at(values, level.among) + summed(_spread(level, update, pivots, pivots), 1)
+    beside = _values_at(values, level.beside) + summed(_spread(level, update, pivots, boundary), 1)
     return _eliminate(among, beside)
 
 
@@ -245,7 +245,7 @@ def _spread(
 ) -> Float[Array, "m c i j"]:
     """The children's updates, each at its places, in these rows and columns of the fronts.
 
-    The caller sums over the children by `jnp.sum`, which XLA computes once. XLA would recompute a sum written as two
+    The caller sums over the children by `summed`, which XLA computes once. XLA would recompute a sum written as two
     terms for every use of its result.
     """
     places, size = level.down, updates.shape[1]
@@ -349,7 +349,7 @@ def _forward(factor: NestedDissectionFactor, loads: list[Float[Array, "_ _ k"]])
 def _from_children(level: LevelPlan, handed: Float[Array, "mc b k"]) -> Float[Array, "m q k"]:
     """The sum of the children's boundary updates, at the places of their parent's front."""
     by_child = handed.reshape(*level.down.shape[:2], *handed.shape[1:])
-    return _gather(by_child, level.down[..., None], 2).sum(1)
+    return summed(_gather(by_child, level.down[..., None], 2), 1)
 
 
 def _backward(

@@ -34,6 +34,7 @@ from ..effects import (
     fold,
 )
 from ..linalg import AbstractPlan, inverse_columns
+from ..linalg.small_matrices import summed
 from .discretisation import Model
 from .metal_sheet import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
 from .system import System
@@ -382,7 +383,7 @@ def assemble(system: System, theta: Coefficients) -> Matrix:
         share**2 * sheet + rest**2 * touch,
         jnp.prod(share[system.bridge_electrodes], 1) * sigma[system.bridge_element] * system.bridge_flux,
     ]
-    values = jnp.concatenate([jnp.sum(e.weight * sigma[e.element], 1) for e in system.sheet])
+    values = jnp.concatenate([summed(e.weight * sigma[e.element], 1) for e in system.sheet])
     added = jnp.concatenate([c.ravel() for c in contributions])
     values, lift = _grounded(system, values.at[system.slots].add(added, mode="drop"))
     return Matrix(values, share, rest, lift)

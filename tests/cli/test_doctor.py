@@ -4,8 +4,6 @@ import warnings
 from contextlib import nullcontext
 from types import SimpleNamespace
 
-import pytest
-
 from calib.cli import diagnosis as doctor, main
 from calib.cli.diagnosis import Line, examine
 from calib.record import priority
@@ -87,13 +85,6 @@ def test_a_cache_open_to_others(monkeypatch):
 def test_a_full_disk(monkeypatch):
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
     assert not found("disk").ok
-
-
-@pytest.mark.parametrize(("value", "remedy"), [("1", False), ("", True)])
-def test_threads(monkeypatch, value, remedy):
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
-        monkeypatch.setenv(name, value)
-    assert bool(found("BLAS threads").remedy) == remedy
 
 
 def test_a_line_reads_well():

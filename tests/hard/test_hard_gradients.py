@@ -61,6 +61,7 @@ HOST = {
     "read_text": _DESCRIBES,
     "reciprocal_rows": _DESCRIBES,
     "refine_contacts": _PREPARES,
+    "limit_blas_threads": _DESCRIBES,
     "reuse_memory": _DESCRIBES,
     "rounding": "what it estimates has no direction",
     "save_reconstructor": _DESCRIBES,

@@ -374,6 +374,33 @@ def test_a_format_of_another_package_is_known_by_its_entry_point(tmp_path, monke
     assert "one number a line" in said
 
 
+def test_a_format_of_the_user_is_named_by_its_import_path(tmp_path, capsys):
+    path = table(tmp_path, "1.5\n2.5\n3.5\n", "log.txt")
+    form = f"{__name__}:LinesImporter"
+    assert main(["import", form, str(path), "--rate", "10", "-o", str(tmp_path / "s.h5")]) == 0
+    np.testing.assert_array_equal(stream(tmp_path, "force")[:, 0], [1.5, 2.5, 3.5])
+    with pytest.raises(SystemExit):
+        main(["import", form, "--help"])
+    assert "--rate" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("no_such_module:Format", "cannot be imported (No module named 'no_such_module')"),
+        (f"{__name__}:NoSuchFormat", "has no attribute 'NoSuchFormat'"),
+        (f"{__name__}:About", "is not a concrete class derived from AbstractImporter"),
+        ("calib.session.importers:AbstractTableImporter", "is not a concrete class derived from AbstractImporter"),
+    ],
+)
+def test_import_paths_that_lead_to_no_format_are_named(path, message, capsys):
+    assert main(["import", path, "log.txt", "-o", "s.h5"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"jaxeit: import format {path!r}")
+    assert message in said
+    assert said.count("\n") == 1
+
+
 def test_no_other_format_is_taken(capsys):
     with pytest.raises(SystemExit):
         main(["import", "xlsx", "log.xlsx", "-o", "s.h5"])

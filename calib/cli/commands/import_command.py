@@ -2,14 +2,16 @@
 
 import argparse
 
+from .. import CommandParser
 from ..arguments import skin_of
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The formats, each with its own arguments."""
+def add_arguments(parser: CommandParser) -> None:
+    """The formats, each with its own arguments; a user's own format where the command line names one."""
     from ...session.importers import add_arguments as add_formats
 
-    add_formats(parser)
+    own = [word for word in parser.words[1:2] if ":" in word]
+    add_formats(parser, own)
 
 
 def run(args: argparse.Namespace) -> int:

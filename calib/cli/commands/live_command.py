@@ -1,7 +1,6 @@
 """`jaxeit live`."""
 
 import argparse
-import os
 import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
@@ -46,9 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
     text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
     parser.add_argument("--realtime", action="store_true", help=text)
-
-
-_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -123,8 +119,6 @@ def _set_up_process(args: argparse.Namespace) -> None:
 
     with real_time(args.realtime):
         pass
-    for name in _BLAS_THREADS:  # a small product waits for its slowest thread, on a busy machine for long
-        os.environ.setdefault(name, "1")
     if args.rerun is not None:
         _require_rerun()
     from ...runtime import set_up_live

@@ -1,21 +1,24 @@
 """Convert recordings in other formats to session files: one class per format.
 
 A new format is one class derived from `AbstractImporter` in a module of `formats`, and its import in the ``__init__``
-there; another package adds one by an entry point of the group ``calib.importers``. A format of tables derives from
+there; another package adds one by an entry point of the group ``calib.importers``, and users name a class of their own
+by its import path, ``my_package.my_module:MyImporter``. A format of tables derives from
 `AbstractTableImporter`, or from `AbstractArrayImporter` where a file holds named arrays: it then has the options of all
 tables.
 """
 
 import argparse
+import pkgutil
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from importlib.metadata import entry_points
-from inspect import isabstract
+from inspect import isabstract, isclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from ..errors import SessionError, printable
 from .arrays import AbstractArrayImporter
 from .base import About, AbstractImporter, add_common_arguments, parse_epoch
 from .columns import FileSpec, StreamSpec
@@ -47,6 +50,7 @@ __all__ = [
     "StreamSpec",
     "Table",
     "add_arguments",
+    "find_importer",
     "import_csv",
     "import_tables",
     "importers",
@@ -74,10 +78,32 @@ def _formats(kind: type) -> Iterator[type[AbstractImporter]]:
         yield from _formats(one)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``jaxeit import``: the format, then the arguments of that format."""
+def find_importer(name: str) -> type[AbstractImporter]:
+    """The format of a name, or of an import path as in ``my_package.my_module:MyImporter``.
+
+    Raises:
+        SessionError: for an import path that leads to no concrete format.
+    """
+    if name in importers():
+        return importers()[name]
+    try:
+        kind = pkgutil.resolve_name(name)
+    except Exception as error:  # a user's module may raise anything
+        why = printable(error, 200)
+        raise SessionError(f"import format {name!r} cannot be imported ({why}); check path and PYTHONPATH") from None
+    if not (isclass(kind) and issubclass(kind, AbstractImporter)) or isabstract(kind):
+        raise SessionError(f"import format {name!r} is not a concrete class derived from {AbstractImporter.__name__}")
+    return kind
+
+
+def add_arguments(parser: argparse.ArgumentParser, own: Sequence[str] = ()) -> None:
+    """Add the arguments of ``jaxeit import``: the format, then the arguments of that format.
+
+    Args:
+        own: import paths of formats beside the known ones.
+    """
     formats = parser.add_subparsers(title="formats", dest="format", required=True, metavar="FORMAT")
-    for name, kind in importers().items():
+    for name, kind in {**importers(), **{path: find_importer(path) for path in own}}.items():
         one = formats.add_parser(name, help=kind.summary, description=kind.summary[0].upper() + kind.summary[1:] + ".")
         kind.add_arguments(one)
         add_common_arguments(one)
@@ -87,5 +113,5 @@ def run(args: argparse.Namespace, skin: "je.Skin | None" = None) -> int:
     """Import as parsed by `add_arguments`, ``skin`` being the one named; prints the report. Raises `SessionError`."""
     progress = partial(tqdm, desc="lines", unit="", disable=None, leave=False)
     about = About(args.title, args.license, parse_epoch(args.epoch), skin, progress)
-    print(importers()[args.format].convert(args, Path(args.output), about).summary())
+    print(find_importer(args.format).convert(args, Path(args.output), about).summary())
     return 0
