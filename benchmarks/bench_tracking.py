@@ -9,9 +9,13 @@ each contact is the same in all frames at full force. "covered": the ellipse of 
 coverage: single tips of several shapes (those of `bench_loads`), noise 40, 60 and 80 dB below the readings, the sheet
 known or not: how often ellipses and intervals of 90 % hold place and force;
 at 60 dB without forces on pads too.
+
+What may have happened is asked at once, as in a recording, or by a bounded number of pieces after each frame, as live
+does. "delay": from the first force of the last tip until as many contacts are told; "kept": from then on.
 """
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +23,12 @@ from scipy.stats import chi2, norm
 
 import jaxeit as je
 from calib.calibration.localisation.load_windows import FIDELITY
+from calib.live.follower import PIECES
 from jaxeit.tracking import Tracker, Tracking, prepare_tracker
 
 from .bench_loads import NOISES, SHAPES, TIP_SPREAD, WITHIN, Touch, shaped
 from .clock import seconds
-from .harness import Question, Run
+from .harness import Question, Run, with_one_blas_thread
 from .problems import matched, pressed, uneven
 from .rows import Row, averaged, grouped
 
@@ -52,6 +57,15 @@ class Scene(NamedTuple):
         """Places (n, 2) m of the contacts of a frame: of an edge, its middle."""
         there = self.places[frame][self.loads[frame] > 0]
         return there.mean(0)[None] if self.edge and len(there) else there
+
+
+class Shown(NamedTuple):
+    """A difference frame V, seconds since the last one, and forces on pads with their standard errors N."""
+
+    frame: np.ndarray
+    seconds: float
+    forces: np.ndarray
+    errors: np.ndarray
 
 
 def _force(frames: int, begin: int, end: int | None = None) -> np.ndarray:
@@ -129,18 +143,31 @@ class Bench:
         """How the readings change in the frames of a scene, without noise, (frames, readings) V."""
         return pressed(self._effects, scene.places, scene.loads, spread=scene.spread).change
 
-    def followed(
-        self, scene: Scene, now: Tracking | None = None, changes: np.ndarray | None = None, pads: bool = True
-    ) -> Iterator[tuple[int, Tracking, float]]:
-        """The number of each frame, what is known after it, and the seconds of the update."""
-        exact = pad_loads(self.skin, scene)
-        now = self.tracker.start() if now is None else now
-        for number, change in enumerate(self.changes(scene) if changes is None else changes):
+    def frames(self, scene: Scene, changes: np.ndarray | None = None, pads: bool = True) -> list[Shown]:
+        """What the tracker is shown of a scene, whose `changes` may be given; without pads it is told no forces."""
+        shown = []
+        for change, exact in zip(
+            self.changes(scene) if changes is None else changes, pad_loads(self.skin, scene), strict=True
+        ):
             frame = change + self.noise * self.rng.normal(size=change.size)
-            errors = np.hypot(PAD_ERROR[0] * exact[number], PAD_ERROR[1]) if pads else np.full(len(exact[0]), np.inf)
-            forces = exact[number] + errors * self.rng.normal(size=errors.size)
-            spent, now = seconds(lambda f=frame, n=now, p=forces, e=errors: self.tracker.step(n, f, 1 / RATE, p, e))
+            errors = np.hypot(PAD_ERROR[0] * exact, PAD_ERROR[1]) if pads else np.full(len(exact), np.inf)
+            heard = np.where(np.isfinite(errors), errors, 0) * self.rng.normal(size=errors.size)
+            shown.append(Shown(frame, 1 / RATE, exact + heard, errors))
+        return shown
+
+    def followed(
+        self, frames: Sequence[Shown], now: Tracking | None = None, pieces: int | None = None
+    ) -> Iterator[tuple[int, Tracking, float]]:
+        """The number of each frame, what is known after it, and the seconds of the update.
+
+        `pieces`: of a look into an unexpected frame, after each frame; None: it is looked into at once.
+        """
+        now = self.tracker.start() if now is None else now
+        for number, shown in enumerate(frames):
+            spent, now = seconds(lambda n=now, f=shown: self.tracker.step(n, *f, whole=pieces is None))
             yield number, now, spent
+            for _ in range(pieces or 0):
+                now = self.tracker.look(now)
 
 
 def _nearest(now: Tracking, truth: np.ndarray) -> list[tuple[float, bool]]:
@@ -158,7 +185,7 @@ def judged(bench: Bench, scene: Scene) -> Row:
     numbers: list[tuple[int, ...]] = []
     away: list[tuple[float, bool]] = []
     spent: list[float] = []
-    for frame, now, took in bench.followed(scene):
+    for frame, now, took in bench.followed(bench.frames(scene)):
         full = scene.loads[frame] > 0.99 * scene.loads.max()
         if full.all() and now.tracks:
             away += _nearest(now, scene.truth(frame))
@@ -193,6 +220,62 @@ def scenes(run: Run) -> Iterator[Row]:
     }
 
 
+def delayed(bench: Bench, scene: Scene, frames: list[Shown], pieces: int | None) -> Row:
+    """What was told of a scene by one of the schedules."""
+    begin = int(np.argmax((scene.loads > 0).all(1)))
+    states = [now for _, now, _ in bench.followed(frames, pieces=pieces)]
+    counts = np.array([len(now.numbers) for now in states])
+    told = np.flatnonzero((counts == len(scene.places[0])) & (np.arange(len(counts)) >= begin))
+    full = states[told[0] :] if len(told) else []
+    final = np.array([t.position for t in states[-1].tracks]).reshape(-1, 2)
+    return {
+        "scene": scene.name,
+        "schedule": "at once" if pieces is None else f"{pieces} pieces a frame",
+        "told": float(matched(final, scene.truth(len(states) - 1))),
+        "kept": float(len({now.numbers for now in full}) == 1),
+        "error_mm": 1e3 * float(np.mean([e for e, _ in _nearest(states[-1], scene.truth(-1))])) if len(final) else None,
+        "delay_ms": 1e3 / RATE * float(told[0] - begin) if len(told) else None,
+    }
+
+
+def schedules(run: Run) -> Iterator[Row]:
+    """The same frames with looks into unexpected ones at once, and piece by piece."""
+    seeds, trials = run.sizes((2, 3), (1, 1))
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    rows: list[Row] = []
+    for seed in range(600, 600 + seeds):
+        bench, rng = Bench(model, seed), np.random.default_rng(seed)
+        for _ in range(trials):
+            for scene in [crossing(rng), *(sequence(rng, d) for d in run.sizes((0.02, 0.03, 0.04), (0.03,)))]:
+                frames = bench.frames(scene)
+                rows += [delayed(bench, scene, frames, pieces) for pieces in (None, PIECES)]
+        print(f"seed {seed}", flush=True)
+    every = grouped(rows, "scene", "schedule").values()
+    yield {"schedules": [averaged(same) | {"trials": len(same)} for same in every]}
+
+
+def times(run: Run) -> Iterator[Row]:
+    """Wall and processor time of ordinary frames with one and two contacts, in turn, and of pieces of looks."""
+    bench = Bench(je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY), 700)
+    (repeats,) = run.sizes((300,), (3,))
+    scene = sequence(np.random.default_rng(700), 0.04)
+    frames = bench.frames(scene)
+    known = {len(now.numbers): (now, frames[number]) for number, now, _ in bench.followed(frames)}
+    spent: dict[int, list[tuple[float, float]]] = {count: [] for count in (1, 2)}
+    for _ in range(repeats):
+        for count, found in spent.items():
+            now, shown = known[count]
+            begin = time.process_time()
+            wall, _ = seconds(lambda n=now, f=shown: bench.tracker.step(n, *f, whole=False))
+            found.append((wall, time.process_time() - begin))
+    rows = []
+    for count, found in spent.items():
+        wall, used = 1e3 * np.transpose(found)
+        row = {"contacts": count, "p50_ms": np.median(wall), "p99_ms": np.quantile(wall, 0.99)}
+        rows.append(row | {"processor_p50_ms": np.median(used), "processor_p10_ms": np.quantile(used, 0.1)})
+    yield {"times": [{name: round(float(value), 3) for name, value in row.items()} for row in rows]}
+
+
 def learning(run: Run) -> Iterator[Row]:
     """Presses at unknown places, one after the other: place and force, as the gain of the contact layer is learned."""
     seeds, count = run.sizes((4, PRESSES), (1, 2))
@@ -207,7 +290,7 @@ def learning(run: Run) -> Iterator[Row]:
                 part = Scene(scene.name, *(a[press * per_press : (press + 1) * per_press] for a in scene[1:3]))
                 errors, inside, extra = [], [], 0
                 begin = now if learns else bench.tracker.start()
-                for frame, now, _ in bench.followed(part, begin):
+                for frame, now, _ in bench.followed(bench.frames(part), begin):
                     extra = max(extra, len(now.tracks) - 1)
                     if part.loads[frame, 0] > 0.99 * LOAD and now.tracks:
                         ((error, held),) = _nearest(now, part.truth(frame))
@@ -265,7 +348,7 @@ def _covered(bench: Bench, scene: Scene, touch: Touch, changes: np.ndarray, pads
     """Whether ellipse and interval of 90 % hold place and force of a tip, in the frames at full force."""
     place: list[tuple[float, bool]] = []
     force, several = [], 0
-    for frame, now, _ in bench.followed(scene, changes=changes, pads=pads):
+    for frame, now, _ in bench.followed(bench.frames(scene, changes, pads)):
         several = max(several, len(now.tracks) - 1)
         if scene.loads[frame].sum() > 0.99 * LOAD and now.tracks:
             place += _nearest(now, touch.truth)
@@ -286,7 +369,12 @@ def _stage(press: int) -> str:
     return f"{edges[place - 1]} to {edges[place] - 1}"
 
 
-main = Question("tracking", __doc__, {"scenes": scenes, "learning": learning, "coverage": coverage})
+main = Question(
+    "tracking",
+    __doc__,
+    {"scenes": scenes, "schedules": schedules, "times": times, "learning": learning, "coverage": coverage},
+)
 
 if __name__ == "__main__":
+    with_one_blas_thread()  # small matrices: threads that wait for one another cost ten times as much
     main()

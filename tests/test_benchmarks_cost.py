@@ -331,6 +331,8 @@ def test_smoke_tracking():
     assert {row["scene"].split(",")[0] for row in data["scenes"]} == {"crossing at 40 mm", "two in sequence", "edge"}
     assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data["scenes"])
     assert {row["learned"] for row in data["presses"]} == {"yes", "no"}
+    assert {row["schedule"] for row in data["schedules"]} == {"at once", f"{bench_tracking.PIECES} pieces a frame"}
+    assert [row["contacts"] for row in data["times"]] == [1, 2]
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ from .results import TouchEstimates
 FIRST_SECONDS = 0.01  # before the first frame that is followed
 # Pieces of a look into an unexpected frame that follow one frame, at most; and the time, s, after which a piece is done
 # even if the next frame waits for it.
-PIECES, MAX_PAUSE = 6, 0.03
+PIECES, MAX_PAUSE = 8, 0.03
+SMOOTHING = 0.2  # weight of a piece in the mean time that one takes
 
 Prepare = Callable[[Calibration, np.ndarray, np.ndarray | None], Tracker]
 
@@ -86,13 +87,13 @@ class LiveFollower:
         end = time.monotonic() + seconds
         for _ in range(PIECES):
             begin = time.monotonic()
-            if self._tracker is None or self._now is None or self._now.look is None:
+            if self._tracker is None or self._now is None or self._now.backlog is None:
                 return
             if begin + self._piece > end and begin - self._looked < MAX_PAUSE:
                 return
             self._now = self._tracker.look(self._now)
             self._looked = time.monotonic()
-            self._piece = max(self._looked - begin, 0.95 * self._piece)
+            self._piece += SMOOTHING * (self._looked - begin - self._piece)
 
 
 def followed_touches(tracks: tuple[Track, ...]) -> TouchEstimates:

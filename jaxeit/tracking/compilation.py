@@ -26,4 +26,5 @@ def compile_tracker(tracker: Tracker) -> None:
     for count in range(most + 1):
         now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count)
         tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
+        tracker.programs.predicted(belief, SECONDS)
         belief = tracker.events.with_contact(belief, places[count * len(places) // (most + 1)])

@@ -74,6 +74,11 @@ class Events:
             place: where a contact would explain most of what the contacts leave of the frame, m.
         """
         rare, count = float(np.log(self._settings.birth_rate * seconds)), len(now.numbers)
+        if count < self._settings.most:
+            # The prior of a place is even over the skin, that of the fit is normal about where it begins.
+            even = float(np.log(2 * np.pi * PLACE**2 / self._area))
+            belief = self.with_contact(now.belief, place)
+            yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), rare + even)
         if count:
             yield now._replace(belief=jumped(now.belief), prior=rare)
             away = np.asarray(now.belief.contacts)[:, :2] - place
@@ -82,11 +87,6 @@ class Events:
             yield now.without(k, rare)
         for j, k in combinations(range(count), 2):
             yield now.joined(j, k, rare)
-        if count < self._settings.most:
-            # The prior of a place is even over the skin, that of the fit is normal about where it begins.
-            even = float(np.log(2 * np.pi * PLACE**2 / self._area))
-            belief = self.with_contact(now.belief, place)
-            yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), rare + even)
 
     def with_contact(self, belief: Belief, place: Float[np.ndarray, "2"]) -> Belief:
         """The belief with a contact more, that begins about a place, m."""

@@ -4,9 +4,9 @@ The belief before the frame is updated in several ways: as it is; with contacts 
 with one, or two, that are an edge; with one more. The way under which the frame was most probable is taken, with the
 rates of such events as prior (evidence by Laplace's approximation, MacKay 1992, Neural Comput. 4).
 
-This is many updates. They are done in pieces of a few evaluations, so that a live view does some of them in each frame
-and goes on following the contacts meanwhile, as if nothing had happened. Where something has, the contacts after the
-event are followed through the frames since then, and take the place of the others.
+This is many updates. They are done in pieces of a few evaluations, so that a live view does some of them in each frame.
+Meanwhile it goes on as if nothing had happened, and keeps the frames, some standing for several. When it is known what
+has happened, these frames are followed, and looked into, one after the other, until none is left.
 """
 
 from dataclasses import replace
@@ -16,31 +16,31 @@ import numpy as np
 from .events import Events, Hypothesis
 from .filter import Update
 from .programs import Programs
-from .tracks import Look, Seen, Tracking, Trial
+from .tracks import Backlog, Look, Seen, Tracking, Trial
 
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
 FAINT, FAINT_FRAMES = 4.0, 2
 # Signal of a contact that begins beside others, at least: in standard deviations of the noise, and over that of all.
 MIN_LOUDNESS, RIPPLE = 12.0, 0.05
-# Frames since the one that is looked into that are kept; where there are more, each stands for two. An even number.
+# Frames that wait while another is looked into; where there are more, each stands for two. An even number.
 KEPT = 8
-# A frame that no event explains is asked about again after so many frames.
-PATIENCE = 10
+# Events that one frame may show.
+EVENTS = 4
 
 
-def begun(before: Tracking, seen: Seen, events: int) -> Look:
-    """Begin to look into a frame, for so many events; `before`: the contacts as they were predicted."""
-    return Look(seen, before, Trial(_as_is(before)), events)
+def begun(before: Tracking, otherwise: Tracking, seen: Seen) -> Look:
+    """Begin to look into a frame: contacts as they were predicted, and as the frame leaves them if nothing happened."""
+    return Look(seen, before, otherwise, Trial(_as_is(before)), EVENTS)
 
 
-def meanwhile(look: Look, seen: Seen) -> Look:
-    """A frame has come before the look has ended."""
-    since = look.since
-    if look.after is not None:
-        since = _merged(since[:2]) + since[2:]  # else a frame more would come for each that is followed
-    elif len(since) >= KEPT:
-        since = _merged(since)
-    return replace(look, since=(*since, seen))
+def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
+    """A frame has come while others wait."""
+    waiting = backlog.waiting
+    if backlog.look is None:
+        waiting = _merged(waiting[:2]) + waiting[2:]  # else a frame more would come for each that is followed
+    elif len(waiting) >= KEPT:
+        waiting = _merged(waiting)
+    return replace(backlog, waiting=(*waiting, seen))
 
 
 def _merged(frames: tuple[Seen, ...]) -> tuple[Seen, ...]:
@@ -56,26 +56,17 @@ def _as_is(now: Tracking) -> Hypothesis:
 
 
 def looked(look: Look, programs: Programs, events: Events) -> Look:
-    """A piece more of a look that has not ended (`is_over`)."""
-    if look.after is not None:
-        first, *rest = look.since
-        _, update = programs.followed(look.after.belief, *first)
-        return replace(look, after=settled(look.after, update), since=tuple(rest))
+    """A piece more of a look, until it knows the contacts after its frame."""
     if not look.best.ended:
         return replace(look, best=_further(look.best, look.seen, programs))
     if look.trials is None:
         return replace(look, trials=_trials(look, programs, events))
-    open_ = [k for k, trial in enumerate(look.trials) if not trial.ended]
-    if open_:
-        trials = list(look.trials)
-        trials[open_[0]] = _further(trials[open_[0]], look.seen, programs)
-        return replace(look, trials=tuple(trials))
-    return _judged(look, look.trials, programs)
-
-
-def is_over(look: Look) -> bool:
-    """Whether nothing is left to be done."""
-    return look.after is not None and not look.since
+    best = max(trial.probability for trial in [look.best, *_possible(look)])
+    for k, trial in enumerate(look.trials):
+        if not (trial.ended or trial.is_hopeless(best)):
+            trials = (*look.trials[:k], _further(trial, look.seen, programs), *look.trials[k + 1 :])
+            return replace(look, trials=trials)
+    return _judged(look, programs)
 
 
 def _further(trial: Trial, seen: Seen, programs: Programs) -> Trial:
@@ -92,10 +83,14 @@ def _trials(look: Look, programs: Programs, events: Events) -> tuple[Trial, ...]
     return tuple(map(Trial, possible))
 
 
-def _judged(look: Look, trials: tuple[Trial, ...], programs: Programs) -> Look:
+def _possible(look: Look) -> list[Trial]:
+    """Trials that have ended and may be what has happened."""
+    return [trial for trial in look.trials or () if trial.ended and not _is_ripple(look.before, trial)]
+
+
+def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing has happened."""
-    tried = [trial for trial in trials if not _is_ripple(look.before, trial)]
-    best = max([look.best, *tried], key=lambda trial: trial.probability)
+    best = max([look.best, *_possible(look)], key=lambda trial: trial.probability)
     happened = best is not look.best
     if happened:
         event = best.event
@@ -104,12 +99,11 @@ def _judged(look: Look, trials: tuple[Trial, ...], programs: Programs) -> Look:
         if look.events:
             return look
     if not look.happened:
-        return replace(look, trials=None, events=0, since=(), after=look.before)
+        return replace(look, after=look.otherwise)
     attempt = look.best.attempt
     assert attempt is not None
     update = programs.concluded(look.before.belief, look.seen.dv, look.seen.pads, attempt)
-    since = 0 if look.events else PATIENCE  # there may have been more events
-    return replace(look, after=settled(replace(look.before, since=since, misfit=float(update.misfit)), update))
+    return replace(look, after=settled(replace(look.before, since=0, misfit=float(update.misfit)), update))
 
 
 def _is_ripple(before: Tracking, trial: Trial) -> bool:
@@ -121,7 +115,13 @@ def _is_ripple(before: Tracking, trial: Trial) -> bool:
 
 
 def settled(now: Tracking, update: Update) -> Tracking:
-    """The contacts after an update, without those that are no longer seen."""
+    """The contacts after an update, without those that are no longer seen.
+
+    Without any if the update is not finite, as where rounding has left a covariance indefinite: the gain stays known,
+    and contacts begin anew.
+    """
+    if not _is_finite(update):
+        return _without_contacts(now)
     loudness = np.asarray(update.loudness)
     faint = tuple(count + 1 if own < FAINT else 0 for count, own in zip(now.faint, loudness, strict=True))
     now = replace(now, belief=update.belief, faint=faint)
@@ -130,3 +130,16 @@ def settled(now: Tracking, update: Update) -> Tracking:
             left = _as_is(now).without(k, 0.0)
             now = now.under(left, left.belief)
     return now
+
+
+def _is_finite(update: Update) -> bool:
+    belief = update.belief
+    numbers = (update.evidence, belief.contacts, belief.gain, np.diag(np.asarray(belief.covariance)))
+    return all(bool(np.isfinite(np.asarray(one)).all()) for one in numbers)
+
+
+def _without_contacts(now: Tracking) -> Tracking:
+    left = _as_is(now)
+    while left.numbers:
+        left = left.without(0, 0.0)
+    return now.under(left, left.belief)

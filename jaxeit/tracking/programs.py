@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compile import bind
-from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, unexplained
+from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, predicted, unexplained
 
 
 class Programs:
@@ -14,6 +14,7 @@ class Programs:
 
     def __init__(self, tracker: ContactFilter):
         self._followed: Callable[..., tuple[Belief, Update]] = bind(followed, tracker)
+        self._predicted: Callable[..., Belief] = bind(predicted, tracker)
         self._attempted: Callable[..., Attempt] = bind(attempted, tracker)
         self._concluded: Callable[..., Update] = bind(concluded, tracker)
         self._unexplained: Callable[..., Array] = bind(unexplained, tracker)
@@ -25,6 +26,10 @@ class Programs:
     ) -> tuple[Belief, Update]:
         """See `filter.followed`."""
         return self._followed(belief, dv, pads, np.asarray(seconds, self._dtype))
+
+    def predicted(self, belief: Belief, seconds: float) -> Belief:
+        """See `filter.predicted`."""
+        return self._predicted(belief, np.asarray(seconds, self._dtype))
 
     def attempted(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt | None

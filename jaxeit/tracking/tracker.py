@@ -18,19 +18,17 @@ from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import Events
 from .filter import SIZE, Belief, ContactFilter, Pads, Update
-from .looks import PATIENCE, begun, is_over, looked, meanwhile, settled
+from .looks import begun, looked, meanwhile, settled
 from .preparation import prepare_filter
 from .programs import Programs
 from .settings import TrackerSettings
-from .tracks import Seen, Tracking
+from .tracks import Backlog, Look, Seen, Tracking
 
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
 # of the belief changes by much more than it may.
 UNEXPECTED, SURPRISING = 4.0, 25.0
-# A frame that no event explains is asked about again where it has become so much worse, or after some frames.
-WORSE = 1.3
-# Events that one frame may show, and those that are found before the contacts are shown again.
-EVENTS, NEXT = 4, 1
+# A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
+PATIENCE, WORSE = 10, 1.3
 
 
 class Tracker:
@@ -44,7 +42,7 @@ class Tracker:
 
     def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float):
         self.filter, self.events = tracker, Events(settings, area)
-        self._settings, self._programs = settings, Programs(tracker)
+        self._settings, self.programs = settings, Programs(tracker)
 
     @property
     def settings(self) -> TrackerSettings:
@@ -74,7 +72,7 @@ class Tracker:
             pad_forces: on the pads, (pads,) N; default, or NaN: not known.
             pad_errors: their standard errors, (pads,) N.
             whole: an unexpected frame is looked into at once, which may take as long as a hundred ordinary frames.
-                Otherwise `look` does so, piece by piece, for one event at a time.
+                Otherwise `look` does so, piece by piece; the contacts are those without an event until then.
 
         Raises:
             InverseError: if an array has another shape, or `seconds` is not above zero.
@@ -82,29 +80,50 @@ class Tracker:
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         seen = Seen(self._frame(dv), self._pads(pad_forces, pad_errors), seconds)
-        moved, update = self._programs.followed(now.belief, *seen)
-        after = settled(now, update)
-        if now.look is not None:
-            return replace(after, since=now.since + 1, look=meanwhile(now.look, seen))
-        if not self._is_unexpected(now, update):
-            return replace(after, since=now.since + 1)
-        look = begun(replace(now, belief=moved), seen, EVENTS if whole else NEXT)
-        after = replace(after, since=0, misfit=float(update.misfit), look=look)
-        while whole and after.look is not None:
-            after = self.look(after)
-        return after
+        if now.backlog is not None:
+            moved, update = self.programs.followed(now.belief, *seen)
+            # What the contacts do not explain would bend them: until it is explained they move on as they did.
+            after = replace(now, belief=moved) if self._is_far(update) else settled(now, update)
+            return replace(after, backlog=meanwhile(now.backlog, seen))
+        after, look = self._followed(now, seen)
+        if look is None:
+            return after
+        now = replace(look.before, backlog=Backlog(after, look))
+        while whole and now.backlog is not None:
+            now = self.look(now)
+        return now
 
     def look(self, now: Tracking) -> Tracking:
-        """A piece more of a look into an unexpected frame, if there is one: `Tracking.look`.
+        """A piece more of what is left to be explained, if anything is: `Tracking.backlog`.
 
         A piece is at most `filter.STEPS` evaluations of what contacts show, as an ordinary frame, and mostly two.
         """
-        if now.look is None:
+        if now.backlog is None:
             return now
-        look = looked(now.look, self._programs, self.events)
-        if not is_over(look):
-            return replace(now, look=look)
-        return look.after if look.happened and look.after is not None else replace(now, look=None)
+        before, look, waiting = now.backlog.before, now.backlog.look, now.backlog.waiting
+        if look is not None:
+            look = looked(look, self.programs, self.events)
+            if look.after is not None:
+                now, before, look = self._until_now(now, look, waiting), look.after, None
+        else:
+            (before, look), waiting = self._followed(before, waiting[0]), waiting[1:]
+        return before if look is None and not waiting else replace(now, backlog=Backlog(before, look, waiting))
+
+    def _followed(self, now: Tracking, seen: Seen) -> tuple[Tracking, Look | None]:
+        """The contacts after a frame in which nothing happens, and the look into it if it is not expected."""
+        moved, update = self.programs.followed(now.belief, *seen)
+        after = settled(now, update)
+        if not self._is_unexpected(now, update):
+            return replace(after, since=now.since + 1), None
+        after = replace(after, since=0, misfit=float(update.misfit))
+        return after, begun(replace(now, belief=moved), after, seen)
+
+    def _until_now(self, now: Tracking, look: Look, waiting: tuple[Seen, ...]) -> Tracking:
+        """What is believed while the frames after an event wait: the contacts after it have moved on."""
+        seconds = sum(seen.seconds for seen in waiting)
+        if look.after is None or not (look.happened and seconds):
+            return now
+        return replace(look.after, belief=self.programs.predicted(look.after.belief, seconds))
 
     def _frame(self, dv: Float[ArrayLike, " readings"]) -> Float[np.ndarray, " readings"]:
         frame, readings = np.asarray(dv, self.filter.places.dtype), self.filter.finder.readings
@@ -127,11 +146,13 @@ class Tracker:
         return Pads(jnp.asarray(np.where(known, force, 0)), jnp.asarray(np.where(known, error, np.inf)))
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
-        size, misfit, surprise = len(self.filter.compress), float(update.misfit), float(update.surprise)
-        if surprise >= SURPRISING:
+        if float(update.surprise) >= SURPRISING:
             return True
-        unexpected = misfit > size + UNEXPECTED * np.sqrt(2 * size)
-        return bool(unexpected and (now.since >= PATIENCE or misfit > WORSE * now.misfit))
+        return self._is_far(update) and (now.since >= PATIENCE or float(update.misfit) > WORSE * now.misfit)
+
+    def _is_far(self, update: Update) -> bool:
+        size = len(self.filter.compress)
+        return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
 
 
 def prepare_tracker(

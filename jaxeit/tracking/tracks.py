@@ -1,5 +1,6 @@
 """What is known of contacts after a frame."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -45,7 +46,7 @@ class Tracking:
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
     | misfit: chi-square of the last frame that was looked into, and frames since then |
-    | look: into a frame that was not expected, as far as it has come       |
+    | backlog: frames that are not explained yet; the belief is that without events since then |
     """
 
     belief: Belief
@@ -55,7 +56,7 @@ class Tracking:
     begun: int = 0
     misfit: float = 0.0
     since: int = 0
-    look: "Look | None" = None
+    backlog: "Backlog | None" = None
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -87,6 +88,10 @@ class Seen(NamedTuple):
     seconds: float
 
 
+# An update is given up after so many evaluations if as many more steps like the next one would not make it the best.
+PROMISING, OUTLOOK = 2, 3
+
+
 class Trial(NamedTuple):
     """Contacts before a frame as an event leaves them, and how far the update by this frame has come."""
 
@@ -100,9 +105,16 @@ class Trial(NamedTuple):
 
     @property
     def probability(self) -> float:
-        """Log of the probability of event and frame, up to a constant."""
+        """Log of the probability of event and frame, up to a constant; of an update that is not finite, none."""
         assert self.attempt is not None
-        return float(self.attempt.evidence) + self.event.prior
+        evidence = float(self.attempt.evidence)
+        return evidence + self.event.prior if math.isfinite(evidence) else -math.inf
+
+    def is_hopeless(self, best: float) -> bool:
+        """Whether the update would be less probable than another also after steps that do as much as the next one."""
+        if self.attempt is None or self.attempt.state is None or int(self.attempt.state.steps) < PROMISING:
+            return False
+        return self.probability + OUTLOOK * float(self.attempt.state.promised) < best
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,22 +125,38 @@ class Look:
     |-------------------------------------------------------------------------------------|
     | seen: the frame                                                                     |
     | before: contacts before it, after the events that have been found                   |
-    | best: these contacts                                                                |
-    | trials: what else may have happened; None: not asked yet                            |
+    | otherwise: contacts after it if nothing has happened                                |
+    | best: the contacts before it                                                        |
     | events: number of events that are still looked for                                  |
-    | happened: whether one has been found                                                |
-    | since: frames since                                                                 |
-    | after: contacts after the frame, followed to the first of these; None: not yet known |
+    | trials: what else may have happened; None: not asked yet                            |
+    | happened: whether an event has been found                                           |
+    | after: contacts after the frame; None: not yet known                                |
     """
 
     seen: Seen
     before: Tracking
+    otherwise: Tracking
     best: Trial
     events: int
     trials: tuple[Trial, ...] | None = None
     happened: bool = False
-    since: tuple[Seen, ...] = ()
     after: Tracking | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Backlog:
+    """Frames that are still to be followed, while one before them is looked into.
+
+    | meaning                                                                            |
+    |------------------------------------------------------------------------------------|
+    | before: contacts before the frames that wait; of no meaning while there is a look  |
+    | look: into the frame before them                                                   |
+    | waiting: the frames; where there are many, each stands for several                 |
+    """
+
+    before: Tracking
+    look: Look | None
+    waiting: tuple[Seen, ...] = ()
 
 
 def track_of(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -> Track:

@@ -328,8 +328,8 @@ class FakeTracker(Tracker):
         return stand_in(Tracking, tracks=(), begun=0)
 
     def look(self, now):
-        self.looks.append(now.look)
-        return stand_in(Tracking, tracks=now.tracks, begun=now.begun, look=now.look - 1 or None)
+        self.looks.append(now.backlog)
+        return stand_in(Tracking, tracks=now.tracks, begun=now.begun, backlog=now.backlog - 1 or None)
 
     def step(self, now, change, seconds, force, error, *, whole):
         assert not whole
@@ -339,7 +339,7 @@ class FakeTracker(Tracker):
         begun = now.begun + (not now.tracks)
         place, half = np.array([0.02, 0.03]), np.array([0.01, 0.0])
         track = Track(begun, place, 4e-6 * np.eye(2), 0.01, float(force[0]), 0.1, half, np.zeros(2))
-        return stand_in(Tracking, tracks=(track,), begun=begun, look=10)
+        return stand_in(Tracking, tracks=(track,), begun=begun, backlog=10)
 
 
 @pytest.fixture

@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.tracking.filter import PIECE, STEPS, Pads
+from jaxeit.tracking.filter import PIECE, SIZE, STEPS, Pads
 from jaxeit.tracking.looks import KEPT, meanwhile
 from jaxeit.tracking.programs import Programs
 from jaxeit.tracking.tracks import Seen
@@ -46,7 +47,7 @@ def truth(k):
 def followed(tracker, frame_of):
     """What is known after each frame and its pieces; evaluations in each frame, and in each piece."""
     counting, states, frames, pieces = CountingPrograms(tracker.filter), [], [], []
-    kept, tracker._programs, now = tracker._programs, counting, tracker.start()
+    kept, tracker.programs, now = tracker.programs, counting, tracker.start()
     for k in range(70):
         before = counting.solves
         now = tracker.step(now, frame_of(truth(k) or [load(0.1, 0.1, 1e-6)]), SECONDS, whole=False)
@@ -56,7 +57,7 @@ def followed(tracker, frame_of):
             now = tracker.look(now)
             pieces.append(counting.solves - before)
         states.append(now)
-    tracker._programs = kept
+    tracker.programs = kept
     return states, frames, pieces
 
 
@@ -71,8 +72,9 @@ def test_contacts_are_told_a_few_frames_later_and_keep_their_numbers(followed):
     """As many as were simulated, once a look has had time to end; each within 2 mm."""
     states, numbers = followed[0], [state.numbers for state in followed[0]]
     late = next(k for k in range(70) if len(numbers[k]) == 2)
-    assert numbers[2:4].count((1,)) > 0
-    assert 8 <= late < 8 + 35
+    assert numbers[:2] == [()] * 2
+    assert numbers[6:8] == [(1,)] * 2
+    assert 8 < late < 8 + 35
     assert numbers[late:48] == [(1, 2)] * (48 - late)
     assert numbers[54:60] == [(2,)] * 6  # of the other, some force is believed in for a while
     assert numbers[-1] == ()
@@ -82,7 +84,7 @@ def test_contacts_are_told_a_few_frames_later_and_keep_their_numbers(followed):
 
 
 def test_a_look_ends_and_a_frame_is_looked_into_again_only_if_it_is_unexpected(followed):
-    looking = [state.look is not None for state in followed[0]]
+    looking = [state.backlog is not None for state in followed[0]]
     assert looking[8]
     assert not all(looking[12:47])
 
@@ -91,15 +93,32 @@ def seen(number):
     return Seen(np.full(1, number), Pads(np.zeros(1), np.ones(1)), 1.0)
 
 
-def test_frames_during_a_look_are_thinned_and_no_second_is_lost(followed):
-    look = next(state.look for state in followed[0] if state.look is not None)
-    look = replace(look, since=(), after=None)
+def test_frames_that_wait_are_thinned_and_no_second_is_lost(followed):
+    backlog = next(state.backlog for state in followed[0] if state.backlog and state.backlog.look)
+    backlog = replace(backlog, waiting=())
     for k in range(1, 50):
-        look = meanwhile(look, seen(k))
-        assert len(look.since) <= KEPT
-        assert sum(frame.seconds for frame in look.since) == k
-        assert look.since[-1].dv == k  # the newest frame is kept as it is
-    waiting = len(look.since)
-    look = meanwhile(replace(look, after=look.before), seen(50))
-    assert len(look.since) == waiting  # the frames to be followed do not become more
-    assert sum(frame.seconds for frame in look.since) == 50
+        backlog = meanwhile(backlog, seen(k))
+        assert len(backlog.waiting) <= KEPT
+        assert sum(frame.seconds for frame in backlog.waiting) == k
+        assert backlog.waiting[-1].dv == k  # the newest frame is kept as it is
+    count = len(backlog.waiting)
+    backlog = meanwhile(replace(backlog, look=None), seen(50))
+    assert len(backlog.waiting) == count  # while frames are followed, they do not become more
+    assert sum(frame.seconds for frame in backlog.waiting) == 50
+
+
+def test_contacts_begin_anew_after_an_update_that_is_not_finite(tracker, frame_of, followed):
+    """The gain stays as it was learned."""
+    now = followed[0][45]
+    assert len(now.numbers) == 2
+    broken = np.array(now.belief.covariance)
+    broken[2, 2] = -1.0
+    now = replace(now, belief=now.belief._replace(covariance=jnp.asarray(broken)), backlog=None)
+    lost = tracker.step(now, frame_of(truth(46)), SECONDS, whole=False)
+    assert lost.numbers == ()
+    np.testing.assert_array_equal(lost.belief.gain, now.belief.gain)
+    np.testing.assert_array_equal(lost.belief.covariance, broken[2 * SIZE :, 2 * SIZE :])
+    found = tracker.step(lost, frame_of(truth(47)), SECONDS)
+    places = np.sort([track.position[1] for track in found.tracks])
+    np.testing.assert_allclose(places, [0.08, 0.11], atol=2e-3)
+    assert found.numbers == (3, 4)
