@@ -8,7 +8,7 @@ host, in a thread of its own, and its result is taken over when nothing is loade
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -37,8 +37,8 @@ BLOCK = 500_000_000  # ns of a contact that make one observation
 SKIPPED = 200_000_000  # ns after the beginning of a contact
 MAX_BLOCKS = 4  # of one contact
 MAX_WAITING = 8  # blocks whose image is not computed yet
-MAX_CONTACTS = 200  # blocks that an update uses; older ones are forgotten
-MIN_CONTACTS = 8  # blocks before the first update
+MAX_CONTACTS = 200  # that an update uses, counted at each place; older ones are forgotten
+MIN_CONTACTS = 8  # before the first update
 MAX_MOVE = 0.3  # of a log gain, away from that of the calibration
 ZERO_TIME = 10.0  # s in which the zero follows
 QUIET_FRACTION = 0.1  # of the pressure of a loaded pad: the zero follows no faster than this in `ZERO_TIME`
@@ -50,6 +50,7 @@ SAVE_INTERVAL = 60.0  # s
 class _Block:
     """Sums over the frames of a part of a contact."""
 
+    contact: int  # its number
     start: int
     voltage: np.ndarray
     pressure: np.ndarray
@@ -59,23 +60,35 @@ class _Block:
         return self.voltage / self.frames, self.pressure / self.frames
 
 
-@dataclass
 class _Contacts:
-    """What an update takes, the newest last."""
+    """What an update takes: the newest blocks, of each contact one a place.
 
-    observed: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_CONTACTS))
-    place: deque[np.ndarray] = field(default_factory=lambda: deque(maxlen=MAX_CONTACTS))
-    force: deque[np.ndarray] = field(default_factory=lambda: deque(maxlen=MAX_CONTACTS))
-    slopes: deque[np.ndarray] = field(default_factory=lambda: deque(maxlen=MAX_CONTACTS))
+    Args:
+        distance: m within which two blocks of a contact are at one place, so that the stronger one counts.
+    """
 
-    def add(self, seen: SeenContacts) -> None:
-        for name in ("observed", "place", "force", "slopes"):
-            getattr(self, name).extend(getattr(seen, name))
+    def __init__(self, distance: float):
+        self._distance = distance
+        self._rows: deque[tuple[int, SeenContacts]] = deque()  # number of the contact, one block of it
 
-    def seen(self, gain: np.ndarray) -> SeenContacts:
-        columns = self.observed, self.place, self.force, self.slopes
-        observed, place, force, slopes = (np.array(column) for column in columns)
-        return SeenContacts(observed, place, force, slopes, gain)
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, contact: int, block: SeenContacts) -> None:
+        same = [row for row in self._rows if row[0] == contact and self._near(row[1], block)]
+        if any(row[1].force.sum() >= block.force.sum() for row in same):
+            return
+        kept = [row for row in self._rows if all(row is not one for one in same)]
+        self._rows = deque([*kept, (contact, block)], maxlen=MAX_CONTACTS)
+
+    def _near(self, one: SeenContacts, other: SeenContacts) -> bool:
+        return bool(np.linalg.norm(one.place - other.place) <= self._distance)
+
+    def seen(self) -> SeenContacts:
+        """All blocks, at the log gains of the first."""
+        blocks = [block for _, block in self._rows]
+        observed, place, force, slopes = (np.concatenate(part) for part in list(zip(*blocks, strict=True))[:4])
+        return SeenContacts(observed, place, force, slopes, blocks[0].gain)
 
 
 class LiveRecalibrator:
@@ -99,7 +112,7 @@ class LiveRecalibrator:
         self._prior = gain_prior(calibration, drift or GainDrift(), together=True)
         self._reference, self._noise = image_reference(calibration), press_noise(calibration.evaluation)
         self._threshold = loaded_pressures(calibration)
-        self._contacts = _Contacts()
+        self._contacts = _Contacts(self._noise.length)
         self._block: _Block | None = None
         self._touched: int | None = None  # since when a pad is loaded, ns
         self._blocks, self._last = 0, 0
@@ -135,7 +148,7 @@ class LiveRecalibrator:
         if now - self._touched < SKIPPED or self._blocks >= MAX_BLOCKS:
             return
         if self._block is None:
-            self._block = _Block(now, np.zeros_like(voltage), np.zeros_like(pressure))
+            self._block = _Block(self._touched, now, np.zeros_like(voltage), np.zeros_like(pressure))
         self._block.voltage += voltage
         self._block.pressure += pressure
         self._block.frames += 1
@@ -162,18 +175,19 @@ class LiveRecalibrator:
         if self._touched is not None:
             return
         if self._waiting:
-            self._see(*self._waiting.popleft().mean())
+            self._see(self._waiting.popleft())
         elif self._fresh and self._worker is None:
             self._begin_update()
 
-    def _see(self, voltage: np.ndarray, pressure: np.ndarray) -> None:
+    def _see(self, block: _Block) -> None:
+        voltage, pressure = block.mean()
         if not np.isfinite(pressure).all():
             return
         loads = contact_loads(self._calibration, voltage[None], pressure[None])
         if len(loads.observed):
             seen = seen_contacts(self._calibration, loads, self._prior.mean)
             if seen.force.sum() > self._noise.least_force:
-                self._contacts.add(seen)
+                self._contacts.add(block.contact, seen)
                 self._fresh += 1
 
     def _warm_up(self) -> None:
@@ -186,10 +200,11 @@ class LiveRecalibrator:
 
     def _begin_update(self) -> None:
         self._fresh = 0
-        if len(self._contacts.observed) < MIN_CONTACTS:
+        if len(self._contacts) < MIN_CONTACTS:
             return
-        seen = self._contacts.seen(self._prior.mean)
-        self._worker = threading.Thread(target=self._update, args=(seen,), daemon=True, name="recalibration")
+        self._worker = threading.Thread(
+            target=self._update, args=(self._contacts.seen(),), daemon=True, name="recalibration"
+        )
         self._worker.start()
 
     def _update(self, seen: SeenContacts) -> None:
@@ -214,7 +229,7 @@ class LiveRecalibrator:
             threading.Thread(target=self.save, daemon=True, name="saving the calibration").start()
 
     def _recorded(self, update: GainUpdate) -> Recalibration:
-        force = np.maximum(np.array(self._contacts.force), 0)
+        force = np.maximum(self._contacts.seen().force, 0)
         count = (force / force.sum(1, keepdims=True)).sum(0)
         level = np.zeros_like(self.offset) if self._calibration.rest is None else self._calibration.rest
         levels = rest_levels((level + self.offset)[None], np.zeros(1))

@@ -2,6 +2,7 @@
 
 import json
 import threading
+from copy import copy
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -12,9 +13,9 @@ import calib
 from calib.calibration import KnownForces, OrdinaryUse, assess
 from calib.calibration.recalibration.changes import Advice, Evidence, render
 from calib.calibration.recalibration.image_reference import fit_reference
-from calib.calibration.recalibration.ordinary_use import loaded_pressures, quiet_range, zero_and_loads
+from calib.calibration.recalibration.ordinary_use import distinct, loaded_pressures, quiet_range, zero_and_loads
 from calib.calibration.recalibration.press_noise import press_noise
-from calib.calibration.recalibration.procedure import LoadedPads, contact_loads, recorded, rest_levels
+from calib.calibration.recalibration.procedure import LoadedPads, SeenContacts, contact_loads, recorded, rest_levels
 from calib.cli import main
 from calib.fitting.gain_update import GainDrift, GainPrior, GainUpdate, relative, update_gains
 from calib.fitting.pad_gains import PadGains
@@ -23,7 +24,7 @@ from calib.live.engine import Engine, ReceivedFrame
 from calib.live.recalibrator import LiveRecalibrator
 from calib.session import read_archive
 
-from .weeks import SLOPE, S, Skin
+from .weeks import SLOPE, S, Skin, rough_sensitivity
 
 LATER = "2026-11-23T09:00:00+00:00"
 GAINS = np.array([1.08, 0.95, 1.0, 1.04])
@@ -60,9 +61,9 @@ def moved(calibration, ten):
 
 @pytest.fixture(scope="module")
 def use(later, tmp_path_factory):
-    """Ordinary use: sixty contacts of unknown force, the image and all pads 20 % stronger than at the calibration."""
+    """Ordinary use: 100 contacts of unknown force, the image and all pads 20 % stronger than at the calibration."""
     rng = np.random.default_rng(5)
-    place, force = rng.uniform(0.02, 0.18, (60, 2)), rng.uniform(5, 15, 60)
+    place, force = rng.uniform(0.02, 0.18, (100, 2)), rng.uniform(5, 15, 100)
     path = tmp_path_factory.mktemp("use") / "use.h5"
     return later.record(path, place, force, gains=GAINS, offset=OFFSET, image_gain=1.2, table=False, drift=300.0)
 
@@ -171,7 +172,7 @@ def test_ordinary_use_tells_gains_relative_to_each_other(used):
     true = np.log(GAINS) - np.log(GAINS).mean()
     error = np.sqrt(np.diag(relative(found.covariance)))
     assert (np.abs(found.log_gain - true) < 3 * error).all()
-    assert (error < 0.04).all()
+    assert (error < 0.05).all()
     assert found.determined.all()
     assert "relative to each other" in found.health
 
@@ -188,7 +189,7 @@ def test_a_common_gain_stays_with_a_wider_error(used):
 
 def test_levels_follow_the_drift_between_contacts(used):
     found = used.recalibration
-    middle = OFFSET + 300 * 60 * 3.5 / 3600 / 2
+    middle = OFFSET + 300 * 100 * 3.5 / 3600 / 2
     np.testing.assert_allclose(found.offset_change, middle, atol=2)
     assert (np.abs(found.drift - 300) < 4 * found.drift_error + 20).all()
 
@@ -203,6 +204,32 @@ def test_contacts_on_one_pad_say_nothing(calibration, later):
     levels = rest_levels(np.zeros((1, 4)), np.zeros(1))
     record = recorded(calibration, OrdinaryUse().kind, found, np.ones(4), levels, (LATER, "x"))
     assert record.advice is Advice.UNKNOWN
+
+
+def test_only_a_pad_that_moved_raises_an_alarm(later):
+    """Sheets of rough sensitivity, whose long variations differ from pad to pad."""
+    unmoved, moved, pulls = [], [], []
+    skin, levels = copy(later), rest_levels(np.zeros((1, 4)), np.zeros(1))
+    for seed in range(8):
+        skin.sensitivity = rough_sensitivity([31, seed])
+        calibration, rng = skin.calibration(), np.random.default_rng([32, seed])
+        place, force = rng.uniform(0.02, 0.18, (150, 2)), rng.uniform(5, 18, 150)
+        for gains, records in ((np.ones(4), unmoved), (np.array([1.3, 0.8, 1.0, 1.0]), moved)):
+            dv = skin.readings(place, force, 1.1) + rng.normal(0, 1e-7, (150, len(skin.v0)))
+            loads = contact_loads(calibration, dv, skin.pressures(place, force, gains))
+            found = OrdinaryUse().update(calibration, loads, press_noise(calibration.evaluation))
+            true = np.log(gains) - np.log(gains).mean()
+            pulls.append((found.mean - true) / np.sqrt(np.diag(relative(found.covariance))))
+            records.append(recorded(calibration, Evidence.ORDINARY_USE, found, np.ones(4), levels, (LATER, "x")))
+    assert not [one.health for one in unmoved if one.significant.any()]
+    assert sum(one.advice is Advice.RECALIBRATE for one in moved) >= 7
+    assert (np.abs(pulls) < 1.645).mean() > 0.85
+
+
+def test_blocks_of_one_contact_at_one_place_count_once():
+    contact, place = np.array([1, 1, 1, 2, 2]), np.array([[0, 0], [1e-3, 0], [0.03, 0], [0, 0], [2e-3, 0]])
+    kept = distinct(contact, place, np.array([3.0, 5.0, 4.0, 2.0, 1.0]), 5e-3)
+    assert kept.tolist() == [False, True, True, True, False]
 
 
 def test_the_zero_is_frozen_under_load_and_follows_drift():
@@ -274,7 +301,9 @@ def test_live_gains_and_zero_are_bounded(calibration):
     np.testing.assert_allclose(follower.offset, loaded_pressures(calibration))
     assert "not known" in follower.health
     follower._found = GainUpdate(np.array([2.0, -2.0, 0.0, 0.0]), np.eye(4), np.ones(4, bool), 1.0, np.ones(1))
-    follower._contacts.force.append(np.ones(4))
+    follower._contacts.add(
+        1, SeenContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
+    )
     follower._worker = threading.Thread()
     follower.add(dv, np.zeros(4), False, 3001 * S)
     np.testing.assert_allclose(follower.gains.log_gain, [0.3, -0.3, 0, 0])
@@ -389,7 +418,7 @@ def test_the_reference_of_the_image_knows_where_it_was_made():
     fitted = fit_reference(place, force, ratio(place, force) * force * np.exp(rng.normal(0, 0.02, 120)))
     new, load = rng.uniform(0.02, 0.18, (50, 2)), rng.uniform(5, 18, 50)
     mean, covariance, slope = fitted.predict(new, load)
-    pull = (mean - np.log(ratio(new, load))) / np.sqrt(np.diag(covariance))
+    pull = (mean - np.log(ratio(new, load))) / np.sqrt(np.diag(covariance) + fitted.scatter**2)
     assert np.std(mean - np.log(ratio(new, load))) < 0.04
     assert np.abs(pull).max() < 4
     np.testing.assert_allclose(slope, -0.2, atol=0.06)
@@ -424,9 +453,11 @@ def test_evaluate_tells_what_has_moved_and_widens_intervals(calibration, later, 
     np.testing.assert_allclose(same.half_width, calibration.pads.hold_forces(same.pressure)[1], rtol=0.15)
 
 
-def test_apply_tells_what_has_moved_in_the_file_too(calibration, use, tmp_path):
-    said = []
-    with calib.open_session(use) as session:
+def test_apply_tells_what_has_moved_in_the_file_too(calibration, later, tmp_path):
+    rng, said = np.random.default_rng(12), []
+    place, force = rng.uniform(0.02, 0.18, (60, 2)), rng.uniform(5, 15, 60)
+    path = later.record(tmp_path / "use.h5", place, force, gains=np.array([1.3, 0.8, 1.0, 1.0]), table=False)
+    with calib.open_session(path) as session:
         calib.apply(calibration, session, tmp_path / "map.h5", tell=said.append)
     (line,) = [one for one in said if "health" in one]
     outside = read_archive(tmp_path / "map.h5", "skin-forcemap").attrs["outside"]

@@ -24,6 +24,20 @@ REST, RAMP, HOLD, RELEASE, RECOVERY = 0.7, 0.3, 1.2, 0.3, 1.0  # s
 PERIOD = REST + RAMP + HOLD + RELEASE + RECOVERY
 
 
+def smooth_sensitivity(place):
+    """Sensitivity of the sheet (n,) at places (n, 2) m."""
+    return 1 + 0.25 * np.sin(25 * place[:, 0]) * np.cos(30 * place[:, 1])
+
+
+def rough_sensitivity(seed, deviation=0.15):
+    """A sensitivity with as much variation at 5 mm as at 100 mm: plane waves of random direction and phase."""
+    rng = np.random.default_rng(seed)
+    number = 2 * np.pi / np.exp(rng.uniform(np.log(5e-3), np.log(0.2), 400))
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, 400))
+    waves = number * np.stack([np.cos(angle), np.sin(angle)])
+    return lambda place: np.exp(deviation * np.sqrt(2 / 400) * np.cos(place @ waves + phase).sum(1))
+
+
 class Skin:
     """The skin with its pads and its sheet."""
 
@@ -34,6 +48,7 @@ class Skin:
         self.recon, self.masks = recon, je.pad_masks(self.skin, recon)
         self.jacobian = np.asarray(je.jacobian(model, basis=pixels))
         self.centres, self.areas = np.asarray(recon.centres), np.asarray(recon.areas)
+        self.sensitivity = smooth_sensitivity
 
     def share(self, place):
         """Part of the force on each pad, (n, 4): lower left, lower right, upper left, upper right."""
@@ -49,8 +64,7 @@ class Skin:
         """Change of the readings, (n, readings) V."""
         bump = np.exp(-0.5 * np.sum((place[:, None] - self.centres) ** 2, -1) / 0.015**2)
         bump /= bump @ self.areas[:, None]
-        sensitivity = 1 + 0.25 * np.sin(25 * place[:, 0]) * np.cos(30 * place[:, 1])
-        return (gain * 1e-6 * sensitivity * force**0.9)[:, None] * bump @ self.jacobian.T
+        return (gain * 1e-6 * self.sensitivity(place) * force**0.9)[:, None] * bump @ self.jacobian.T
 
     def calibration(self, places=10, loads=(5.0, 10.0, 20.0)):
         """A calibration of presses on a grid, with linear curves that are known to half a percent."""

@@ -15,7 +15,7 @@ from ...fitting.gain_update import relative
 from ...fitting.pad_gains import PadGains
 
 NOTICEABLE = 0.02  # change of a gain below which a recalibration is not worth it
-SIGNIFICANT = 2.0  # standard errors
+SIGNIFICANT = 3.0  # standard errors: the largest move of several pads is looked at, and while live again and again
 LARGE_MISFIT = 2.0  # residuals over the stated ones: a gain does not explain the readings
 
 

@@ -1,9 +1,12 @@
 """The integral of an image per newton at the calibration, over place and force, with its uncertainty.
 
 log(S / F) = b0 + b1 l + b2 l^2 + u(x) + e, with l the log of the force over its geometric mean, u a Gaussian process
-over the place x (squared exponential), and e independent scatter. Deviations of b are stated, so that a force or a
-place that was not pressed has a wide prediction instead of a wrong one. Length, scatter and size have the largest
-marginal likelihood on a small grid (Rasmussen and Williams 2006, 2.3 and 5.4.1).
+over the place x with the correlation exp(-(d / L)^p / 2) at a distance d, and e scatter. p = 2 is a smooth field of one
+length. p = 1 is a rough one that varies at all lengths, as a sheet with many separate protrusions does: a smooth field
+would follow its short variations, and take its long ones, which differ from pad to pad, for gains of the pads.
+Deviations of b are stated, so that a force or a place that was not pressed has a wide prediction instead of a wrong
+one. Length, roughness, scatter and size have the largest marginal likelihood on a small grid (Rasmussen and Williams
+2006, 2.3, 4.2.1 and 5.4.1).
 """
 
 from dataclasses import dataclass
@@ -16,6 +19,7 @@ from scipy.spatial.distance import cdist
 
 BASIS_DEVIATIONS = (2.0, 0.5, 0.2)  # of b0, b1, b2; b0 is of residuals about the median
 LENGTHS = (0.7, 1.5, 3.0, 6.0)  # over the median distance between neighbouring places
+POWERS = (1.0, 2.0)  # of the distance: a rough and a smooth field
 SHARES = (0.0, 0.5, 0.9, 0.99)  # part of the variance that depends on the place
 SIZES = (0.6, 1.0, 1.6)  # standard deviation about the basis, over the robust one of the data
 MIN_PRESSES = 8
@@ -33,6 +37,7 @@ class ImageReference:
     | middle  | geometric mean of the forces                                  | ()     | N     |
     | offset  | median of log(S / F)                                          | ()     | 1     |
     | length  | of the process                                                | ()     | m     |
+    | power   | of the distance in its correlation                            | ()     | 1     |
     | signal, scatter | standard deviations of u and e                        | ()     | 1     |
     | factor, solved  | of the covariance of the data, and its solution       |        |       |
     """
@@ -42,6 +47,7 @@ class ImageReference:
     middle: float
     offset: float
     length: float
+    power: float
     signal: float
     scatter: float
     factor: tuple[np.ndarray, bool]
@@ -50,16 +56,16 @@ class ImageReference:
     def predict(
         self, place: Float[np.ndarray, "n 2"], force: Float[np.ndarray, " n"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean (n,) of log(S / F), its covariance (n, n) with scatter, and its slope (n,) in the log of the force."""
+        """Mean (n,) of log(S / F), its covariance (n, n) but for scatter, and its slope (n,) in log force."""
         level = np.log(force / self.middle)
         across = self._kernel(place, level, self.place, self.level)
         mean = self.offset + across @ self.solved
         covariance = self._kernel(place, level, place, level) - across @ cho_solve(self.factor, across.T)
         slope = ((_basis_slope(level) * np.square(BASIS_DEVIATIONS)) @ _basis(self.level).T) @ self.solved
-        return mean, (covariance + covariance.T) / 2 + self.scatter**2 * np.eye(len(level)), slope
+        return mean, (covariance + covariance.T) / 2, slope
 
     def _kernel(self, x: np.ndarray, a: np.ndarray, y: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return _covariance(cdist(x, y), a, b, self.length, self.signal)
+        return _covariance(_correlation(cdist(x, y), self.length, self.power), a, b, self.signal)
 
 
 def fit_reference(
@@ -81,28 +87,33 @@ def fit_reference(
     spacing = np.median(np.where(distance > 1e-4, distance, np.inf).min(1))
     spacing = float(spacing) if np.isfinite(spacing) else 0.01
     size = max(float(np.std(values)), 1e-3)
-    best = max(
-        (_fitted(distance, level, values, spacing * length, size * total, share)
-         for length, total, share in product(LENGTHS, SIZES, SHARES)), key=lambda one: one[0])  # fmt: skip
-    _, length, signal, scatter, factor, solved = best
-    return ImageReference(place, level, middle, offset, length, signal, scatter, factor, solved)
+    kinds = ((spacing * length, power) for length, power in product(LENGTHS, POWERS))
+    fits = (
+        (kind, _fitted(_correlation(distance, *kind), level, values, size * total, share))
+        for kind, total, share in product(kinds, SIZES, SHARES)
+    )
+    (length, power), (_, signal, scatter, factor, solved) = max(fits, key=lambda one: one[1][0])
+    return ImageReference(place, level, middle, offset, length, power, signal, scatter, factor, solved)
 
 
 def _fitted(
-    distance: np.ndarray, level: np.ndarray, values: np.ndarray, length: float, total: float, share: float
-) -> tuple[float, float, float, float, tuple[np.ndarray, bool], np.ndarray]:
-    """Log marginal likelihood, length, signal, scatter, factor and solution of one choice."""
+    near: np.ndarray, level: np.ndarray, values: np.ndarray, total: float, share: float
+) -> tuple[float, float, float, tuple[np.ndarray, bool], np.ndarray]:
+    """Log marginal likelihood, signal, scatter, factor and solution of one choice."""
     signal, scatter = total * np.sqrt(share), total * np.sqrt(1 - share)
-    matrix = _covariance(distance, level, level, length, signal) + scatter**2 * np.eye(len(level))
+    matrix = _covariance(near, level, level, signal) + scatter**2 * np.eye(len(level))
     factor = cho_factor(matrix, lower=True)
     solved = cho_solve(factor, values)
     likelihood = -0.5 * values @ solved - np.log(np.diag(factor[0])).sum()
-    return float(likelihood), length, float(signal), float(scatter), factor, solved
+    return float(likelihood), float(signal), float(scatter), factor, solved
 
 
-def _covariance(distance: np.ndarray, a: np.ndarray, b: np.ndarray, length: float, signal: float) -> np.ndarray:
-    basis = (_basis(a) * np.square(BASIS_DEVIATIONS)) @ _basis(b).T
-    return np.asarray(basis + signal**2 * np.exp(-0.5 * (distance / length) ** 2))
+def _correlation(distance: np.ndarray, length: float, power: float) -> np.ndarray:
+    return np.asarray(np.exp(-0.5 * (distance / length) ** power))
+
+
+def _covariance(near: np.ndarray, a: np.ndarray, b: np.ndarray, signal: float) -> np.ndarray:
+    return np.asarray((_basis(a) * np.square(BASIS_DEVIATIONS)) @ _basis(b).T + signal**2 * near)
 
 
 def _basis(level: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import cdist
 
 from ...presses.means import press_means
 from ...presses.streams import MAD_TO_SIGMA, finite_mean, true_runs
@@ -36,12 +37,14 @@ class UseContacts(NamedTuple):
     |----------|------------------------------------------------|---------------|------|
     | dv       | change of the readings                         | (n, readings) | V    |
     | pressure | change of the pressures                        | (n, pads)     | Pa   |
+    | contact  | number of the contact                          | (n,)          |      |
     | rest     | gage pressure around the contacts              | (n, pads)     | Pa   |
     | time     | of each observation                            | (n,)          | ns   |
     """
 
     dv: np.ndarray
     pressure: np.ndarray
+    contact: np.ndarray
     rest: np.ndarray
     time: np.ndarray
 
@@ -70,13 +73,26 @@ def use_contacts(session: Session, calibration: Calibration) -> UseContacts:
     if not blocks:
         none = np.empty((0, pressure.channels))
         free = zero[~touched] if not touched.all() else zero[:1]
-        return UseContacts(np.empty((0, eit.channels)), none, free, time[: len(free)])
+        return UseContacts(np.empty((0, eit.channels)), none, np.empty(0, int), free, time[: len(free)])
     windows = _windows(np.array(blocks))
     corrections = {s.name: calibration.processing.of(s)[0] for s in (eit, pressure)}
     held = {s.name: press_means(s, windows, corrections=corrections[s.name]) for s in (eit, pressure)}
-    return UseContacts(
-        held["eit"].change.mean, held["pressure"].change.mean, held["pressure"].baseline, windows.hold.mean(1)
-    )
+    pads, number = held["pressure"], windows.rest_before[:, 1]  # blocks of one contact follow the same rest
+    return UseContacts(held["eit"].change.mean, pads.change.mean, number, pads.baseline, windows.hold.mean(1))
+
+
+def distinct(
+    contact: Int[np.ndarray, " n"], place: Float[np.ndarray, "n 2"], load: Float[np.ndarray, " n"], distance: float
+) -> Bool[np.ndarray, " n"]:
+    """Which observations are kept: of each contact the strongest, and others farther than `distance` (m) from it.
+
+    Observations of one contact at one place have the same error, which their number does not make smaller.
+    """
+    near = (contact[:, None] == contact) & (cdist(place, place) <= distance)
+    kept = np.zeros(len(load), bool)
+    for i in np.argsort(-load, kind="stable"):
+        kept[i] = not (near[i] & kept).any()
+    return kept
 
 
 def binned(stream: Stream) -> tuple[np.ndarray, np.ndarray]:

@@ -38,6 +38,10 @@ class PressNoise(NamedTuple):
         near = np.exp(-0.5 * (cdist(place, place) / self.length) ** 2)
         return np.asarray(np.outer(sigma, sigma) * (self.share * near + (1 - self.share) * np.eye(len(sigma))))
 
+    def with_scatter(self, scatter: float) -> "PressNoise":
+        """With a further standard deviation, which presses at one place have in common like the others."""
+        return self._replace(fraction=float(np.hypot(self.fraction, scatter)))
+
     @property
     def least_force(self) -> float:
         """Force (N) below which a press says little, because the floor is a fifth of it."""

@@ -30,7 +30,7 @@ from ..force_maps import USED, ForceLaw, law_of, unmoved_forces
 from ..localisation.press_images import Imager
 from .changes import Evidence, Recalibration
 from .image_reference import ImageReference, fit_reference
-from .ordinary_use import use_contacts
+from .ordinary_use import distinct, use_contacts
 from .press_noise import PressNoise, press_noise
 
 MIN_PRESSES = 3  # of a session that can be used; fewer are refused
@@ -170,18 +170,27 @@ def use_loads(calibration: Calibration, session: Session) -> LoadedPads:
     found = use_contacts(session, calibration)
     sound = np.isfinite(found.pressure).all(1)
     sound &= np.isfinite(found.dv[:, np.asarray(calibration.recon.channels)]).all(1)
-    loads = contact_loads(calibration, found.dv[sound], found.pressure[sound])
+    loads = contact_loads(calibration, found.dv[sound], found.pressure[sound], found.contact[sound])
     return loads._replace(rest=found.rest, time=found.time)
 
 
-def contact_loads(calibration: Calibration, dv: np.ndarray, pressure: np.ndarray) -> LoadedPads:
-    """Single contacts, from changes of frames (n, readings) V and of pressures (n, pads) Pa."""
+def contact_loads(
+    calibration: Calibration, dv: np.ndarray, pressure: np.ndarray, contact: np.ndarray | None = None
+) -> LoadedPads:
+    """Single contacts, from changes of frames (n, readings) V and of pressures (n, pads) Pa.
+
+    `contact` (n,) numbers the contacts of which these are parts; without it each is a contact of its own.
+    """
     images = _imager(calibration).presses(dv)
     place = images.estimated[estimator_of(calibration)]
     single = np.isfinite(place).all(1) & (images.integral > 0)
     every = calibration.locate(dv)
     if every is not None:
         single &= np.isfinite(np.asarray(every.position)).all(-1).sum(1) == 1
+    if contact is not None:
+        near = press_noise(calibration.evaluation).length
+        rows = np.flatnonzero(single)
+        single[rows] = distinct(contact[rows], place[rows], pressure[rows].sum(1), near)
     integral = np.where(images.integral > 0, images.integral, 1.0)
     loads = LoadedPads(pressure, np.log(integral), place, images.places, np.empty((0, pressure.shape[1])), np.empty(0))
     return loads.rows(single)
@@ -215,7 +224,7 @@ def update_from_use(prior: GainPrior, reference: ImageReference, noise: PressNoi
     def residuals(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return surplus - sensitivity @ (gain - seen.gain), sensitivity
 
-    covariance = spread + noise.covariance(total, seen.place)
+    covariance = spread + noise.with_scatter(reference.scatter).covariance(total, seen.place)
     # A gain of the image, and one of all pads, which reaches each contact by its own sensitivity.
     nuisance = np.stack([np.ones(len(total)), sensitivity.sum(1)], 1)
     return update_gains(prior, residuals, covariance, nuisance)
