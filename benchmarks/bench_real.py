@@ -4,6 +4,7 @@ FOLDER holds the public recordings eflesh (15 magnetic channels against a scale)
 force with friction) and insole_plenum (280 taxels against the pressure of a chamber, filled and emptied once; a newton
 stands for a bar).  Each is cut in two files of equal time, because a user too has one log to calibrate with and another
 to trust: `jaxeit import`, `check`, `calibrate --curve auto` on the first, `evaluate` and `apply` on the second.
+`rmse_goes_on` is the RMSE over the second half where `apply` is given the whole log, whose history is known.
 """
 
 import io
@@ -20,8 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.io import loadmat
 
+import calib
 from calib.cli import main as jaxeit
+from calib.fitting.validation import rmse
 from calib.runtime import set_up
+from calib.session import read_archive
 
 from .harness import Question, Run
 from .rows import Row
@@ -29,7 +33,16 @@ from .rows import Row
 GRAM = 9.80665e-3  # N
 EFLESH = "eflesh/20250401_014340_probe"
 FOLDERS = ("eflesh", "insole_plenum", "pneumatic_actuator")
-KEYS = ("force_rmse", "force_mape", "coverage", "coverage_low", "coverage_middle", "coverage_high", "outside_share")
+KEYS = (
+    "force_rmse",
+    "rmse_goes_on",
+    "force_mape",
+    "coverage",
+    "coverage_low",
+    "coverage_middle",
+    "coverage_high",
+    "outside_share",
+)
 
 
 def actuator(folder: Path, name: str) -> np.ndarray:
@@ -108,16 +121,27 @@ def measure(run: Run) -> Iterator[Row]:
 def through_commands(table: np.ndarray, streams: list[str], folder: Path, curve: str) -> Row:
     """Evaluation on the second half in time of the calibration of the first."""
     first = table[:, 0] - table[0, 0] < (table[-1, 0] - table[0, 0]) / 2
-    sessions = [str(folder / name) for name in ("first.h5", "second.h5")]
-    for session, rows in zip(sessions, (first, ~first), strict=True):
+    sessions = [str(folder / name) for name in ("first.h5", "second.h5", "whole.h5")]
+    for session, rows in zip(sessions, (first, ~first, np.ones_like(first)), strict=True):
         log = session.replace(".h5", ".csv")
         np.savetxt(log, table[rows], delimiter=",", fmt="%.17g")
         said("import", "csv", log, *streams, "-o", session)
         said("check", session)
     calibration, forces = str(folder / "calibration.h5"), str(folder / "forces.h5")
     said("calibrate", sessions[0], "--curve", curve, "-o", calibration)
-    said("apply", calibration, sessions[1], "-o", forces)
-    return json.loads(said("evaluate", calibration, sessions[1], "--json"))["second.h5"]
+    said("apply", calibration, sessions[2], "-o", forces)
+    found = json.loads(said("evaluate", calibration, sessions[1], "--json"))["second.h5"]
+    return found | {"rmse_goes_on": rmse_of_later_half(sessions[2], forces)}
+
+
+def rmse_of_later_half(session: str, forces: str) -> float:
+    """RMSE in N, over the second half in time, of a file of forces against the force of its session."""
+    found = read_archive(forces, "log-forces").arrays
+    with calib.open_session(session) as log:
+        stream = log.stream("force")
+        time, true = np.asarray(stream.time), stream.read()[:, 0]
+    later = np.isfinite(true) & (time - time[0] >= (time[-1] - time[0]) / 2)
+    return rmse(np.interp(time[later], found["time"], found["force"]), true[later])
 
 
 def said(*words: str) -> str:

@@ -1,9 +1,11 @@
 """Applying a calibration to a session: the force map of every frame, in a file."""
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from ..check.acceptance import accept
@@ -12,7 +14,7 @@ from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from .calibration import Calibration
 from .force_maps import USED, ForceEstimate, force_map
-from .frame_blocks import FrameBlock, FrameBlocks
+from .frame_blocks import BLOCK, FrameBlock, FrameBlocks
 from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, prepare_calibrated_tracker
 from .localisation.load_windows import WindowedFrames, fit_windows
 from .localisation.quiet_frames import ENOUGH, QuietFrames
@@ -71,7 +73,7 @@ def apply(
         also += [_Tracks(calibration, writer, blocks)] if track else []
         before = np.zeros((1, len(calibration.skin.pads)))
         for block in progress(blocks):
-            found = force_map(calibration, block.change, block.pressed, before=before)
+            found = _forces(calibration, block, before)
             if calibration.curves.curve.path:
                 before = remembered(np.concatenate([before, calibration.own_pressures(block.pressed)]))
             _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
@@ -80,6 +82,15 @@ def apply(
         for one in also:
             tell(one.end())
     return Path(path)
+
+
+def _forces(calibration: Calibration, block: FrameBlock, before: np.ndarray) -> ForceEstimate:
+    """Forces of a block; the last frame of a shorter one repeats, because each length compiles the program again."""
+    count = len(block.time)
+    rows = np.minimum(np.arange(BLOCK), count - 1)
+    found = force_map(calibration, block.change[rows], block.pressed[rows], before=before)
+    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
+    return cut._replace(map=replace(cut.map, areas=found.map.areas))
 
 
 def _attributes(calibration: Calibration, session: Session) -> dict[str, str | int]:

@@ -17,7 +17,7 @@ from ..fitting.fields.places import nowhere
 from ..fitting.pad_gains import PadGains
 from ..fitting.pads import PadModel
 from .calibration import Calibration
-from .localisation.locators import AbstractLocator
+from .localisation.locators import AbstractLocator, locate
 
 USED = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session from which forces are computed
 
@@ -101,7 +101,11 @@ def force_map(
     frames = jnp.asarray(frames, law.recon.dtype)
     pressures = jnp.asarray(pressures, law.pads.dtype)
     earlier = filled(law, before)
-    found = _force_map(law, frames, pressures, None if earlier is None else jnp.asarray(earlier), gate)
+    image, places = law.recon(frames), None
+    if law.locator is not None:
+        touched = jnp.any(is_loaded(law, pressures), 1, keepdims=True)
+        places = locate(law.locator, jnp.where(touched, frames, 0), law.recon, law.masks, image)
+    found = _fused(law, image, pressures, places, None if earlier is None else jnp.asarray(earlier), gate)
     return ForceEstimate(found.map, *map(np.asarray, found[1:]))
 
 
@@ -113,16 +117,6 @@ def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
     first = bucket(len(before))
     rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
     return rows.astype(law.pads.dtype)
-
-
-@je.verb
-def _force_map(law: ForceLaw, frames: Array, pressures: Array, before: Array | None, gate: float) -> ForceEstimate:
-    image = law.recon(frames)
-    places = None
-    if law.locator is not None:
-        touched = jnp.any(is_loaded(law, pressures), 1, keepdims=True)
-        places = law.locator(jnp.where(touched, frames, 0), image, law.recon, law.masks)
-    return fused(law, image, pressures, places, before, gate)
 
 
 def fused(
@@ -143,6 +137,9 @@ def fused(
     pad_force, pad_error = numbers
     found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
     return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places, shares))
+
+
+_fused = je.verb(fused)
 
 
 # Part of a contact's bump: a pad with less of it on its area does not bear that contact. A fitted bump has tails, and

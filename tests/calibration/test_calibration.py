@@ -18,7 +18,7 @@ import jaxeit as je
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.evaluation import render_table
 from calib.calibration.force_maps import fused, law_of
-from calib.calibration.localisation.locators import locator_from_numbers, locator_numbers
+from calib.calibration.localisation.locators import ROWS, CentroidLocator, locate, locator_from_numbers, locator_numbers
 from calib.calibration.localisation.press_images import fit_untouched_sheet
 from calib.calibration.storage import SEAL, to_archive
 from calib.fitting.curves import CURVES
@@ -207,6 +207,21 @@ def test_what_a_curve_remembers_of_the_past_is_enough(part):
         whole = play(jnp.asarray(np.r_[past[:, pad], now[:, pad]]), widths)[500:]
         short = play(jnp.asarray(np.r_[few[:, pad], now[:, pad]]), widths)[len(few) :]
         np.testing.assert_allclose(short, whole, atol=1e-12)
+
+
+def test_places_of_any_number_of_frames_take_one_program(calibration):
+    recon, rng, traced = calibration.recon, np.random.default_rng(0), []
+
+    class Counted(CentroidLocator):
+        def __call__(self, dv, *others):
+            traced.append(len(dv))
+            return super().__call__(dv, *others)
+
+    frames = rng.normal(0, 1e-4, (130, recon.readings))
+    found = [locate(Counted("half"), frames[:n], recon, calibration.masks) for n in (3, 70, 130)]
+    assert traced == [ROWS]
+    for some in found[:2]:
+        np.testing.assert_allclose(some.position, np.asarray(found[2].position)[: len(some.position)], atol=1e-9)
 
 
 def test_force_maps_sum_to_the_pads_and_know_their_limits(calibration):

@@ -448,7 +448,7 @@ def test_programs_for_one_frame_are_those_of_the_force_map(model, skin, pixels):
     programs.warm_up()
     for lacking in (frame, holes, few):
         found = programs.map(lacking, pressed, programs.nowhere, np.zeros((1, 4)))
-        other = fused(law, recon(lacking[None]), pressed[None], None, None, 0.6)
+        other = fused(law, recon(lacking[None]), jnp.asarray(pressed[None]), None, None, 0.6)
         np.testing.assert_allclose(found.map, other.map.force[0], rtol=1e-9, atol=1e-9 * abs(found.map).max())
         for mine, theirs in zip(found[1:4], other[1:4], strict=True):
             np.testing.assert_allclose(mine, theirs[0], rtol=1e-12)

@@ -73,6 +73,9 @@ class ContactLocator(AbstractLocator):
         return Places(position, shares.share, width, found.amplitude)
 
 
+ROWS = 64  # frames that are searched for contacts by one call
+
+
 @je.verb
 def _located(
     locator: AbstractLocator, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks
@@ -168,8 +171,19 @@ def locate(
 
     `image`: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
     """
-    frames = jnp.asarray(dv, recon.dtype)
-    return _located(locator, frames, recon(frames) if image is None else image, recon, masks)
+    frames = np.asarray(dv, recon.dtype)
+    images = np.asarray(recon(jnp.asarray(frames)) if image is None else image)
+    # The search for contacts takes seconds to compile for each length, so all frames go through it by one length.
+    starts = range(0, max(len(frames), 1), ROWS)
+    parts = [_located(locator, _rows(frames, first), _rows(images, first), recon, masks) for first in starts]
+    places: Places = jax.tree.map(lambda *part: jnp.asarray(np.concatenate(part)[: len(frames)]), *parts)
+    return places
+
+
+def _rows(values: np.ndarray, first: int) -> Array:
+    """`ROWS` rows from `first` on; zeros after the last."""
+    some = values[first : first + ROWS]
+    return jnp.asarray(np.concatenate([some, np.zeros((ROWS - len(some), *some.shape[1:]), some.dtype)]))
 
 
 # --- as numbers, for the calibration file ----------------------------------------------------------------------------
