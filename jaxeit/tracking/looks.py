@@ -89,21 +89,17 @@ def _possible(look: Look) -> list[Trial]:
 
 
 def _judged(look: Look, programs: Programs) -> Look:
-    """The look after the most probable event; the end of it if this is that nothing has happened."""
+    """The look after the most probable event; the end of it if this is that nothing more has happened."""
     best = max([look.best, *_possible(look)], key=lambda trial: trial.probability)
-    happened = best is not look.best
-    if happened:
-        event = best.event
-        before, best = look.before.under(event, event.belief), best._replace(event=event._replace(prior=0.0))
-        look = replace(look, before=before, best=best, events=look.events - 1, trials=None, happened=True)
-        if look.events:
-            return look
-    if not look.happened:
+    if best is look.best or best.attempt is None:
         return replace(look, after=look.otherwise)
-    attempt = look.best.attempt
-    assert attempt is not None
-    update = programs.concluded(look.before.belief, look.seen.dv, look.seen.pads, attempt)
-    return replace(look, after=settled(replace(look.before, since=0, misfit=float(update.misfit)), update))
+    event = best.event
+    update = programs.concluded(event.belief, look.seen.dv, look.seen.pads, best.attempt)
+    before = look.before.under(event, event.belief)
+    after = settled(replace(before, since=0, misfit=float(update.misfit)), update)
+    best, left = best._replace(event=event._replace(prior=0.0)), look.events - 1
+    look = replace(look, before=before, best=best, otherwise=after, events=left, trials=None)
+    return look if left else replace(look, after=after)
 
 
 def _is_ripple(before: Tracking, trial: Trial) -> bool:
@@ -120,7 +116,7 @@ def settled(now: Tracking, update: Update) -> Tracking:
     Without any if the update is not finite, as where rounding has left a covariance indefinite: the gain stays known,
     and contacts begin anew.
     """
-    if not _is_finite(update):
+    if not is_finite(update):
         return _without_contacts(now)
     loudness = np.asarray(update.loudness)
     faint = tuple(count + 1 if own < FAINT else 0 for count, own in zip(now.faint, loudness, strict=True))
@@ -132,7 +128,8 @@ def settled(now: Tracking, update: Update) -> Tracking:
     return now
 
 
-def _is_finite(update: Update) -> bool:
+def is_finite(update: Update) -> bool:
+    """Whether an update can be believed."""
     belief = update.belief
     numbers = (update.evidence, belief.contacts, belief.gain, np.diag(np.asarray(belief.covariance)))
     return all(bool(np.isfinite(np.asarray(one)).all()) for one in numbers)

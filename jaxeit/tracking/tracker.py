@@ -18,7 +18,7 @@ from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import Events
 from .filter import SIZE, Belief, ContactFilter, Pads, Update
-from .looks import begun, looked, meanwhile, settled
+from .looks import begun, is_finite, looked, meanwhile, settled
 from .preparation import prepare_filter
 from .programs import Programs
 from .settings import TrackerSettings
@@ -102,9 +102,11 @@ class Tracker:
             return now
         before, look, waiting = now.backlog.before, now.backlog.look, now.backlog.waiting
         if look is not None:
-            look = looked(look, self.programs, self.events)
+            otherwise, look = look.otherwise, looked(look, self.programs, self.events)
+            if look.otherwise is not otherwise:  # something has happened
+                now = self._until_now(look.otherwise, waiting)
             if look.after is not None:
-                now, before, look = self._until_now(now, look, waiting), look.after, None
+                before, look = look.after, None
         else:
             (before, look), waiting = self._followed(before, waiting[0]), waiting[1:]
         return before if look is None and not waiting else replace(now, backlog=Backlog(before, look, waiting))
@@ -113,17 +115,15 @@ class Tracker:
         """The contacts after a frame in which nothing happens, and the look into it if it is not expected."""
         moved, update = self.programs.followed(now.belief, *seen)
         after = settled(now, update)
-        if not self._is_unexpected(now, update):
+        if not is_finite(update) or not self._is_unexpected(now, update):
             return replace(after, since=now.since + 1), None
         after = replace(after, since=0, misfit=float(update.misfit))
         return after, begun(replace(now, belief=moved), after, seen)
 
-    def _until_now(self, now: Tracking, look: Look, waiting: tuple[Seen, ...]) -> Tracking:
-        """What is believed while the frames after an event wait: the contacts after it have moved on."""
+    def _until_now(self, after: Tracking, waiting: tuple[Seen, ...]) -> Tracking:
+        """What is believed while frames wait: the contacts after the last event have moved on."""
         seconds = sum(seen.seconds for seen in waiting)
-        if look.after is None or not (look.happened and seconds):
-            return now
-        return replace(look.after, belief=self.programs.predicted(look.after.belief, seconds))
+        return replace(after, belief=self.programs.predicted(after.belief, seconds)) if waiting else after
 
     def _frame(self, dv: Float[ArrayLike, " readings"]) -> Float[np.ndarray, " readings"]:
         frame, readings = np.asarray(dv, self.filter.places.dtype), self.filter.finder.readings

@@ -125,11 +125,10 @@ class Look:
     |-------------------------------------------------------------------------------------|
     | seen: the frame                                                                     |
     | before: contacts before it, after the events that have been found                   |
-    | otherwise: contacts after it if nothing has happened                                |
+    | otherwise: contacts after it if nothing more has happened                           |
     | best: the contacts before it                                                        |
     | events: number of events that are still looked for                                  |
     | trials: what else may have happened; None: not asked yet                            |
-    | happened: whether an event has been found                                           |
     | after: contacts after the frame; None: not yet known                                |
     """
 
@@ -139,7 +138,6 @@ class Look:
     best: Trial
     events: int
     trials: tuple[Trial, ...] | None = None
-    happened: bool = False
     after: Tracking | None = None
 
 
