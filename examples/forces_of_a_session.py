@@ -15,6 +15,6 @@ with calib.open_session(sessions / "testbed_grid.h5") as session:
     calibration = calib.calibrate([session], recipe=recipe)  # seconds; calibration.save("calibration.h5") keeps it
 
 with calib.open_session(sessions / "testbed_presses.h5") as other:
-    verdict = calib.evaluate(calibration, [other])
+    verdict = calib.evaluate(calibration, other)
 for name, value in verdict.summary().items():
     print(f"{name}: {value:.3g}")

@@ -7,6 +7,7 @@ import sys
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax  # noqa: F401, gives stop_gradient its transpose rule, as every use of optimistix does
 import numpy as np
 import pytest
 
