@@ -13,8 +13,9 @@ from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.
 HALF = 0.012
-# How far contacts may jump: x, y, log width, log force, half length, shape, velocity.
-JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, *6 * [0.1], 0.1, 0.1])
+# How far contacts may jump: x, y, log width, log force, half length, shape, velocity. With another shape a jump
+# would explain a second contact.
+JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, *6 * [0.0], 0.1, 0.1])
 # Half length of an edge over the distance of the two contacts that were taken for it.
 BETWEEN = 0.8
 # Directions of an edge that are tried.
@@ -24,7 +25,8 @@ PLACE, SPEED = 0.012, 0.05
 # Half an edge that is none: what keeps its covariance definite, m.
 ROUND = 1e-4
 # How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
-LENGTHEN, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, *6 * [0.1], 0.0, 0.0]), 0.3
+# Its pressure along the line is even: an edge of any shape would explain two contacts.
+LENGTHEN, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, *6 * [0.02], 0.0, 0.0]), 0.3
 
 
 class Hypothesis(NamedTuple):
@@ -125,11 +127,10 @@ def jumped(belief: Belief) -> Belief:
 def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     """With contact k as an edge in about this direction."""
     contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
-    own = np.arange(SIZE * k, SIZE * (k + 1))
+    _loosen(covariance, k)
     contacts[k, EDGE] = HALF * np.cos(angle), HALF * np.sin(angle)
     contacts[k, 2] -= NARROWER
     contacts[k, SHAPE] = 0.0
-    covariance[own, own] += LENGTHEN**2
     return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
 
 
@@ -141,6 +142,12 @@ def joined(belief: Belief, first: int, second: int) -> Belief:
     contacts[first, :3] = force @ pair[:, :3] / force.sum()
     contacts[first, 3], contacts[first, EDGE] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
     contacts[first, SHAPE], contacts[first, VELOCITY] = 0.0, pair[:, VELOCITY].mean(0)
-    own = np.arange(SIZE * first, SIZE * (first + 1))
-    covariance[own, own] += LENGTHEN**2
+    _loosen(covariance, first)
     return without(Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance)), second)
+
+
+def _loosen(covariance: Float[np.ndarray, "n n"], k: int) -> None:
+    """Contact k may change as one that turns out to be an edge; nothing is known of its shape but what edges have."""
+    own = np.arange(SIZE * k, SIZE * (k + 1))
+    covariance[own[SHAPE]], covariance[:, own[SHAPE]] = 0.0, 0.0
+    covariance[own, own] += LENGTHEN**2

@@ -9,6 +9,9 @@ import numpy as np
 from .events import Hypothesis
 from .filter import EDGE, SIZE, VELOCITY, Attempt, Belief, Pads
 
+# Half an edge, m, below which it is handed out as a contact of another shape, as by `LoadSettings.shortest`.
+SHORT = 0.012
+
 
 class Track(NamedTuple):
     """A contact as it is now.
@@ -166,6 +169,6 @@ def track_of(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -
         width=float(np.exp(row[2])),
         force=float(np.exp(row[3])),
         log_force_error=float(np.sqrt(covariance[3, 3])),
-        half=row[EDGE] if edge else np.zeros(2),
+        half=row[EDGE] if edge and np.linalg.norm(row[EDGE]) > SHORT else np.zeros(2),
         velocity=row[VELOCITY],
     )
