@@ -8,25 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .filter import EDGE, SHAPE, SIZE, VELOCITY, Belief
+from .filter import SIZE, Belief
 from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.
 HALF = 0.012
-# How far contacts may jump: x, y, log width, log force, half length, shape, velocity. With another shape a jump
-# would explain a second contact.
-JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, *6 * [0.0], 0.1, 0.1])
+# How far contacts may jump: x, y, log width, log force, half length, velocity.
+JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, 0.1, 0.1])
 # Half length of an edge over the distance of the two contacts that were taken for it.
 BETWEEN = 0.8
 # Directions of an edge that are tried.
 DIRECTIONS = np.pi * np.arange(4) / 4
 # Prior deviations of the place and the velocity of a contact that begins, m and m/s.
-PLACE, SPEED = 0.012, 0.05
+PLACE, VELOCITY = 0.012, 0.05
 # Half an edge that is none: what keeps its covariance definite, m.
 ROUND = 1e-4
 # How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
-# Its pressure along the line is even: an edge of any shape would explain two contacts.
-LENGTHEN, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, *6 * [0.02], 0.0, 0.0]), 0.3
+EDGE, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, 0.0, 0.0]), 0.3
 
 
 class Hypothesis(NamedTuple):
@@ -92,9 +90,8 @@ class Events:
 
     def with_contact(self, belief: Belief, place: Float[np.ndarray, "2"]) -> Belief:
         """The belief with a contact more, that begins about a place, m."""
-        row, spread = np.zeros((2, SIZE))
-        row[:4], spread[:4] = [*place, *self._usual], [PLACE, PLACE, *self._spread]
-        spread[EDGE], spread[SHAPE], spread[VELOCITY] = ROUND, self._settings.shape, SPEED
+        row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])
+        spread = np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
         return inserted(belief, row, spread)
 
 
@@ -127,10 +124,10 @@ def jumped(belief: Belief) -> Belief:
 def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     """With contact k as an edge in about this direction."""
     contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
-    _loosen(covariance, k)
-    contacts[k, EDGE] = HALF * np.cos(angle), HALF * np.sin(angle)
+    own = np.arange(SIZE * k, SIZE * (k + 1))
+    contacts[k, 4:6] = HALF * np.cos(angle), HALF * np.sin(angle)
     contacts[k, 2] -= NARROWER
-    contacts[k, SHAPE] = 0.0
+    covariance[own, own] += EDGE**2
     return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
 
 
@@ -140,14 +137,8 @@ def joined(belief: Belief, first: int, second: int) -> Belief:
     pair = contacts[[first, second]]
     force = np.exp(pair[:, 3])
     contacts[first, :3] = force @ pair[:, :3] / force.sum()
-    contacts[first, 3], contacts[first, EDGE] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
-    contacts[first, SHAPE], contacts[first, VELOCITY] = 0.0, pair[:, VELOCITY].mean(0)
-    _loosen(covariance, first)
+    contacts[first, 3], contacts[first, 4:6] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
+    contacts[first, 6:] = pair[:, 6:].mean(0)
+    own = np.arange(SIZE * first, SIZE * (first + 1))
+    covariance[own, own] += EDGE**2
     return without(Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance)), second)
-
-
-def _loosen(covariance: Float[np.ndarray, "n n"], k: int) -> None:
-    """Contact k may change as one that turns out to be an edge; nothing is known of its shape but what edges have."""
-    own = np.arange(SIZE * k, SIZE * (k + 1))
-    covariance[own[SHAPE]], covariance[:, own[SHAPE]] = 0.0, 0.0
-    covariance[own, own] += LENGTHEN**2

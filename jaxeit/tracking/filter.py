@@ -1,11 +1,10 @@
 """The belief of contacts and of the contact layer's gain, and how one frame changes it.
 
 An extended Kalman filter (Jazwinski 1970, ch. 8), whose update is iterated until it is linear enough. A contact is a
-load (place, width, force, half length of an edge, shape) with a velocity; loads add as pressure, and the law of the
-contact layer turns pressure times gain into conductivity, of which `Reanalysis` knows the readings. The gain
-``exp(level + field)`` is the same in all frames, so its modes are part of the belief: the uncertainty of a place that
-the gain causes does not shrink while a contact rests, and the gain is learned where contacts move. Nor does that which
-an unknown shape causes, which hardly changes while a contact lasts.
+load (place, width, force, half length of an edge) with a velocity; loads add as pressure, and the law of the contact
+layer turns pressure times gain into conductivity, of which `Reanalysis` knows the readings. The gain ``exp(level +
+field)`` is the same in all frames, so its modes are part of the belief: the uncertainty of a place that the gain causes
+does not shrink while a contact rests, and the gain is learned where contacts move.
 
 Only the parameters that a frame tells of are active in an update: places, widths, forces, half lengths, the level and
 the modes around contacts. With their covariance ``P = C C^T`` the update minimises ``|y - h|^2 / s^2 + |z|^2`` over z,
@@ -27,10 +26,8 @@ from ..least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt,
 from ..linalg import lapack
 from .response import LoadedSheet, Near, Shown
 
-# Numbers of a contact: x, y, log width, log force, half an edge along x and y, six of its shape (`pressure.shaped`),
-# velocity along x and y; of these all but the velocity are seen in a frame.
-SIZE, SEEN = 14, 12
-EDGE, SHAPE, VELOCITY = slice(4, 6), slice(6, SEEN), slice(SEEN, SIZE)
+# Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
+SIZE, SEEN = 8, 6
 # Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
 # of an ordinary frame, whose next step would lower it by 0.001 then, and of one that begins far from its end.
 FALL, CAREFUL_FALL = 10.0, 1.0
@@ -57,12 +54,12 @@ class Belief(NamedTuple):
 
     | meaning                                                                  | shape    | unit  |
     |--------------------------------------------------------------------------|----------|-------|
-    | contacts: x, y, log width, log force, half an edge (2), shape (6), velocity (2) | (K, 14) | mixed |
+    | contacts: x, y, log width, log force, half an edge (2), velocity (2)     | (K, 8)   | mixed |
     | gain: level, then modes of the field, in units of their prior deviations | (g,)     | 1     |
     | covariance of contacts and gain                                          | (n, n)   | mixed |
     """
 
-    contacts: Float[Array, "K 14"]
+    contacts: Float[Array, "K 8"]
     gain: Float[Array, " g"]
     covariance: Float[Array, "n n"]
 
@@ -116,7 +113,7 @@ class ContactFilter(eqx.Module):
     | places: where the modes of the gain lie; the first is the level          | (g, 2)           | m    |
     | model_error: part of the signal by which mesh, sheet and load shape err  | ()               | 1    |
     | persistence of that error                                                | ()               | s    |
-    | rates: random walk of each number of a contact                           | (14,)            | per sqrt(s) |
+    | rates: random walk of each number of a contact                           | (8,)             | per sqrt(s) |
     """
 
     finder: ContactFinder
@@ -125,7 +122,7 @@ class ContactFilter(eqx.Module):
     places: Float[Array, "g 2"]
     model_error: Float[Array, ""]
     persistence: Float[Array, ""]
-    rates: Float[Array, "14"]
+    rates: Float[Array, "8"]
     active_modes: int = eqx.field(static=True)
 
 
@@ -133,17 +130,12 @@ class ContactFilter(eqx.Module):
 def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""]) -> Belief:
     """The belief so many seconds later: contacts move on, and may change."""
     count, size = len(belief.contacts), belief.contacts.size
-    step = jnp.eye(SIZE).at[:2, VELOCITY].set(seconds * jnp.eye(2))
+    step = jnp.eye(SIZE).at[:2, 6:].set(seconds * jnp.eye(2))
     # A velocity that walks at random: the integrated Wiener process, exactly.
     walk = jnp.diag(tracker.rates**2 * seconds)
-    drift = tracker.rates[VELOCITY] ** 2
+    drift = tracker.rates[6:] ** 2
     walk = walk.at[:2, :2].add(jnp.diag(drift * seconds**3 / 3))
-    walk = (
-        walk.at[:2, VELOCITY]
-        .add(jnp.diag(drift * seconds**2 / 2))
-        .at[VELOCITY, :2]
-        .add(jnp.diag(drift * seconds**2 / 2))
-    )
+    walk = walk.at[:2, 6:].add(jnp.diag(drift * seconds**2 / 2)).at[6:, :2].add(jnp.diag(drift * seconds**2 / 2))
     whole = jnp.kron(jnp.eye(count), step)
     rows = belief.covariance.at[:size].set(whole @ belief.covariance[:size])
     both = rows.at[:, :size].set(rows[:, :size] @ whole.T)
@@ -205,7 +197,7 @@ def _residual(z: Float[Array, " a"], problem: _Problem) -> Float[Array, " n"]:
     return problem.residual(z, problem.shown(z))
 
 
-def _active(tracker: ContactFilter, contacts: Float[Array, "K 14"]) -> Int[Array, " a"]:
+def _active(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
     """Numbers of the belief that a frame tells of: of the contacts, the level, and the modes around contacts."""
     count = len(contacts)
     own = (SIZE * np.arange(count)[:, None] + np.arange(SEEN)).ravel()

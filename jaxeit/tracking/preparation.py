@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
 from ..contacts.bump_responses import points_of
-from ..contacts.loads.gain_modes import field_modes
 from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
@@ -78,8 +77,7 @@ def _loaded_sheet(
         points_of(coarse, loads.width),
     )
     centres = np.asarray(fine.centres, float)
-    chart = np.asarray(coarse.chart, float)
-    places, of_elements, of_pixels = field_modes(loads.gain_length, chart, np.asarray(coarse.centroids, float), centres)
+    places, of_elements, of_pixels = _gain_modes(coarse, centres, loads.gain_length)
 
     def with_level(modes: np.ndarray) -> Array:
         return light(np.concatenate([np.full((len(modes), 1), settings.level), loads.gain * modes], 1))
@@ -151,7 +149,22 @@ def _carried(model: Model, sigma: Float[Array, " elements"], other: Model) -> np
 
 def _rates(settings: TrackerSettings) -> list[float]:
     """Random walk of each number of a contact, per root of a second; a place moves by its velocity alone."""
-    width, force, shape = settings.width_rate, settings.force_rate, settings.shape_rate
-    rates = [1e-4, 1e-4, width, force, 1e-4, 1e-4, *6 * [shape], *2 * [settings.acceleration]]
+    rates = [1e-4, 1e-4, settings.width_rate, settings.force_rate, 1e-4, 1e-4, *2 * [settings.acceleration]]
     assert len(rates) == SIZE
     return rates
+
+
+def _gain_modes(
+    model: Model, pixels: Float[np.ndarray, "p 2"], length: float
+) -> tuple[Float[np.ndarray, "g 2"], Float[np.ndarray, "elements g"], Float[np.ndarray, "p g"]]:
+    """Where the modes of a Gaussian field of variance one lie, and their values on elements and pixels: bumps whose sum
+    of products is exp(-d^2 / 2 length^2)."""
+    chart = np.asarray(model.chart, float)
+    corners = zip(chart.min(0), chart.max(0), strict=True)
+    axes = [np.arange(low - length, high + 1.5 * length, length) for low, high in corners]
+    nodes = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    values = [
+        np.exp(-((at[:, None] - nodes) ** 2).sum(-1) / length**2) for at in (np.asarray(model.centroids, float), pixels)
+    ]
+    norm = np.sqrt(np.mean((values[0] ** 2).sum(-1)))
+    return nodes, values[0] / norm, values[1] / norm

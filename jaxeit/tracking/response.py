@@ -5,18 +5,22 @@ first order of the readings is that of an image on a fine mesh, what is beyond i
 the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that an evaluation solves once.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
-from ..contacts.loads.pressure import line, line_polynomials, shaped
 from ..effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
+# Least half length, m: an edge of length zero has no direction.
+SHORTEST = 1e-4
+ROOT_OF_2, ROOT_OF_2PI = math.sqrt(2), math.sqrt(2 * math.pi)
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
 LENGTHS, ANGLES = (0.015, 0.03), 4
 
@@ -48,12 +52,12 @@ class Neighbours(eqx.Module):
     pixels: Int[Array, "edges cells n"]
     shape: tuple[int, int] = eqx.field(static=True)
 
-    def near(self, loads: Float[Array, "K 12"], elements: int, pixels: int) -> Near:
+    def near(self, loads: Float[Array, "K 6"], elements: int, pixels: int) -> Near:
         """What is near loads, of a mesh of so many elements and an image of so many pixels."""
         rows, columns = self.shape
         x, y = jnp.floor((loads[:, :2] - self.low) / self.pitch).astype(jnp.int32).T
         cell = jnp.clip(y, 0, rows - 1) * columns + jnp.clip(x, 0, columns - 1)
-        edge = _edge_number(loads[:, 4:6])
+        edge = _edge_number(loads[:, 4:])
         under, unknowns, around = (table[edge, cell].ravel() for table in (self.elements, self.unknowns, self.pixels))
         count = len(loads)
         return Near(under, unknowns, around, _once(under, count, elements), _once(around, count, pixels))
@@ -129,12 +133,12 @@ class LoadedSheet(eqx.Module):
     pad_area: Float[Array, "p pads"]
     law: ContactPiezoresistance
 
-    def near(self, contacts: Float[Array, "K 12"]) -> Near:
+    def near(self, contacts: Float[Array, "K 6"]) -> Near:
         """What is near contacts."""
         return self.neighbours.near(contacts.astype(self.points.dtype), len(self.sigma), len(self.pixels))
 
     def shown(
-        self, contacts: Float[Array, "K 12"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> Shown:
         """What frames and pads show of contacts, with slopes in their numbers and in some modes of the gain."""
         loads = contacts.astype(self.points.dtype)
@@ -154,7 +158,7 @@ class LoadedSheet(eqx.Module):
         )
 
     def _first_order(
-        self, loads: Float[Array, "K 12"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+        self, loads: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Forces on pads and their slopes (pads, a); readings of the image and their slopes (a, r)."""
         pixels, table = near.pixels, self.pixel_modes[near.pixels]
@@ -168,7 +172,7 @@ class LoadedSheet(eqx.Module):
         return (area @ pressure, area @ slopes), (relative @ response, moved.T @ response)
 
     def _changes(
-        self, loads: Float[Array, "K 12"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+        self, loads: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> tuple[Float[Array, " e"], Float[Array, "e a"]]:
         """Change of conductivity of the elements, S, and its slopes."""
         elements, table = near.elements, self.modes[near.elements]
@@ -192,7 +196,7 @@ class LoadedSheet(eqx.Module):
 
 
 def _pressures(
-    loads: Float[Array, "K 12"], points: Float[Array, "n 2"]
+    loads: Float[Array, "K 6"], points: Float[Array, "n 2"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
     """Pressure of all loads at points, Pa, and its slopes in their numbers."""
     values, slopes = zip(*(_with_slopes(load, points) for load in loads), strict=True)
@@ -200,9 +204,20 @@ def _pressures(
 
 
 def _with_slopes(
-    load: Float[Array, "12"], points: Float[Array, "n 2"]
-) -> tuple[Float[Array, " n"], Float[Array, "n 12"]]:
-    value, push = jax.linearize(lambda one: shaped(one, load[6:], points), load[:6])
-    slopes = jax.vmap(push, out_axes=1)(jnp.eye(6, dtype=load.dtype))
-    even = line(load[:6], points)
-    return value, jnp.concatenate([slopes, jnp.stack([even * p for p in line_polynomials(load[:6], points)], 1)], 1)
+    load: Float[Array, "6"], points: Float[Array, "n 2"]
+) -> tuple[Float[Array, " n"], Float[Array, "n 6"]]:
+    value, push = jax.linearize(lambda load: load_pressure(load, points), load)
+    return value, jax.vmap(push, out_axes=1)(jnp.eye(len(load), dtype=load.dtype))
+
+
+def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+    """Pressure at points, Pa, of a load (x, y, log width, log force, half length along x and y): even along a line,
+    blurred by a Gaussian; of a length near zero, a Gaussian."""
+    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + SHORTEST**2)
+    away = points - load[:2]
+    along = away @ load[4:] / half
+    across = jnp.sum(away**2, -1) - along**2
+    root = ROOT_OF_2 * width
+    spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
+    found: Array = jnp.exp(load[3] - 0.5 * across / width**2) * spread / (ROOT_OF_2PI * width)
+    return found

@@ -8,10 +8,6 @@ from ..contacts.loads import LoadSettings
 from ..imaging.noise import InverseError
 from ..model.fidelity import Fidelity
 
-# Part of the signal by which a coarse mesh with an image, and the shape of a load beyond its six numbers, err.
-MODEL_ERROR = 0.01
-POSITIVE = (*("level", "persistence", "acceleration", "width_rate", "force_rate", "shape", "shape_rate", "birth_rate"),)
-
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -21,10 +17,9 @@ class TrackerSettings:
     |--------------------------------------------------------------------------------|---------|-----------|
     | loads: the law of pressure, the gain of the contact layer, usual sizes and forces |       |           |
     | level: standard deviation of the log of the gain that all places share         | 0.3     | 1         |
-    | persistence: time over which errors of mesh and load shape stay as they are    | 2       | s         |
+    | persistence: time over which errors of mesh and load shape stay as they are    | 0.5     | s         |
     | acceleration: change of a contact's velocity                                   | 0.3     | m/s/sqrt(s) |
     | width_rate, force_rate: change of the logs of width and force                  | 0.5, 5  | 1/sqrt(s) |
-    | shape, shape_rate: deviation of each number of a load's shape, and its change  | 0.2, 0.1 | 1, 1/sqrt(s) |
     | birth_rate: of contacts anywhere on the skin                                   | 0.5     | 1/s       |
     | most: contacts followed at once                                                | 3       |           |
     | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
@@ -37,14 +32,12 @@ class TrackerSettings:
         InverseError: for a value out of range.
     """
 
-    loads: LoadSettings = field(default_factory=lambda: LoadSettings(model_error=MODEL_ERROR))
+    loads: LoadSettings = field(default_factory=LoadSettings)
     level: float = 0.3
-    persistence: float = 2.0
+    persistence: float = 0.5
     acceleration: float = 0.3
     width_rate: float = 0.5
     force_rate: float = 5.0
-    shape: float = 0.2
-    shape_rate: float = 0.1
     birth_rate: float = 0.5
     most: int = 3
     unknowns: int = 96
@@ -55,7 +48,7 @@ class TrackerSettings:
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
-        for name in POSITIVE:
+        for name in ("level", "persistence", "acceleration", "width_rate", "force_rate", "birth_rate"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
         for name in ("most", "unknowns", "modes", "columns", "pixels"):

@@ -34,17 +34,17 @@ JUMPED = 1 + 1e-6
 
 
 class Transition(NamedTuple):
-    """From the numbers of a contact in one frame to those in the next: matrix (14, 14) and covariance of the walk."""
+    """From the numbers of a contact in one frame to those in the next: matrix (8, 8) and covariance of the walk."""
 
-    matrix: Float[np.ndarray, "14 14"]
-    walk: Float[np.ndarray, "14 14"]
+    matrix: Float[np.ndarray, "8 8"]
+    walk: Float[np.ndarray, "8 8"]
 
 
 class State(NamedTuple):
-    """Numbers of one contact in a frame: mean (14,) and covariance (14, 14), in the order of `Belief`."""
+    """Numbers of one contact in a frame: mean (8,) and covariance (8, 8), in the order of `Belief`."""
 
-    mean: Float[np.ndarray, "14"]
-    covariance: Float[np.ndarray, "14 14"]
+    mean: Float[np.ndarray, "8"]
+    covariance: Float[np.ndarray, "8 8"]
 
 
 def transition(tracker: Tracker, seconds: float) -> Transition:

@@ -7,10 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .events import Hypothesis
-from .filter import EDGE, SIZE, VELOCITY, Attempt, Belief, Pads
-
-# Half an edge, m, below which it is handed out as a contact of another shape, as by `LoadSettings.shortest`.
-SHORT = 0.012
+from .filter import SIZE, Attempt, Belief, Pads
 
 
 class Track(NamedTuple):
@@ -161,7 +158,7 @@ class Backlog:
 
 
 def track_of(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -> Track:
-    """A contact from its numbers (14,) and their covariance (14, 14)."""
+    """A contact from its numbers (8,) and their covariance (8, 8)."""
     return Track(
         number=number,
         position=row[:2],
@@ -169,6 +166,6 @@ def track_of(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -
         width=float(np.exp(row[2])),
         force=float(np.exp(row[3])),
         log_force_error=float(np.sqrt(covariance[3, 3])),
-        half=row[EDGE] if edge and np.linalg.norm(row[EDGE]) > SHORT else np.zeros(2),
-        velocity=row[VELOCITY],
+        half=row[4:6] if edge else np.zeros(2),
+        velocity=row[6:],
     )

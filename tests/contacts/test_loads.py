@@ -10,7 +10,7 @@ import jaxeit as je
 from benchmarks.problems import pressed
 from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
-from jaxeit.contacts.loads.gain_modes import field_modes
+from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import MOST, SIZE, Form, elongations, line, pressure, shape_directions, spot
 from jaxeit.imaging import InverseError
 from jaxeit.model.forward_model import coefficients, transfer
@@ -205,7 +205,7 @@ def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
 def test_fields_that_are_not_known_have_their_size_and_length():
     points = np.random.default_rng(2).uniform(0.05, 0.15, (60, 2))
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
-    modes = field_modes(0.015, corners, points)[1]
+    modes = field_modes(np.concatenate([points, corners]), 0.015)[:60]
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
     np.testing.assert_allclose(modes @ modes.T, np.exp(-(distance**2) / (2 * 0.015**2)), atol=0.12)
 

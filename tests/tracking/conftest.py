@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.contacts.loads.pressure import line
 from jaxeit.tracking import TrackerSettings, prepare_tracker
+from jaxeit.tracking.response import load_pressure
 
 SECONDS = 0.01
 SETTINGS = TrackerSettings(most=2, unknowns=64, modes=8, pixels=250, columns=40)
@@ -30,7 +30,7 @@ def frame_of(model, blank):
 
     @jax.jit
     def change(loads):
-        pressure = sum(line(load, model.centroids) for load in loads)
+        pressure = sum(load_pressure(load, model.centroids) for load in loads)
         return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
 
     v0, noise = blank

@@ -16,7 +16,6 @@ from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ..bump_responses import mean_conductivity, points_of
 from .fitter import LoadFitter
-from .gain_modes import field_modes
 from .pressure import MOST, SIZE, Form
 from .settings import LoadSettings
 from .sheet import PressedSheet
@@ -83,8 +82,7 @@ def _sheet(
     put = partial(jnp.asarray, dtype=model.dtype)
     points, weights = points_of(model, settings.width)
     centroids = np.einsum("q,eqd->ed", weights, points)
-    corners = np.asarray(model.chart, float)
-    modes = coat * field_modes(settings.coat_length, corners, centroids)[1] if coat else np.zeros((len(centroids), 0))
+    modes = coat * field_modes(centroids, settings.coat_length) if coat else np.zeros((len(centroids), 0))
     sheet = PressedSheet(
         model=model,
         sigma=sigma,
@@ -93,7 +91,7 @@ def _sheet(
         untouched=jnp.zeros(len(factor), model.dtype),
         points=put(points),
         weights=put(weights),
-        gain=put(settings.gain * field_modes(settings.gain_length, corners, centroids)[1]),
+        gain=put(settings.gain * field_modes(centroids, settings.gain_length)),
         coat=put(modes),
         by_coat=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),
@@ -135,3 +133,12 @@ def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"
 def _reach(centroids: Float[np.ndarray, "elements 2"], radius: float) -> int:
     """Largest number of elements within a circle around one of them."""
     return max(int((((centroids - one) ** 2).sum(1) < radius**2).sum()) for one in centroids)
+
+
+def field_modes(points: Float[np.ndarray, "n 2"], length: float) -> Float[np.ndarray, "n g"]:
+    """Modes of a Gaussian field of variance one at points: bumps whose sum of products is exp(-d^2 / 2 length^2)."""
+    low, high = points.min(0), points.max(0)
+    axes = [np.arange(a - length, b + 1.5 * length, length) for a, b in zip(low, high, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    modes = np.exp(-((points[:, None] - nodes) ** 2).sum(-1) / length**2)
+    return np.asarray(modes / np.sqrt(np.mean((modes**2).sum(-1))))

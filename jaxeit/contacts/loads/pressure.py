@@ -5,7 +5,6 @@ length. One table of parameters for all kinds of loads means one compiled progra
 and how, is an array of `Form`.
 """
 
-import math
 from enum import IntEnum
 
 import jax
@@ -17,9 +16,7 @@ from jaxtyping import Array, Float, Int
 MOST, SIZE = 3, 6  # loads, and parameters of each
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
-SQRT_2 = math.sqrt(2)
-# Half length of an edge at least, m: one of length zero has no direction, and its ends are lost in single precision.
-SHORTEST = 1e-4
+SQRT_2 = np.sqrt(2.0)
 ELONGATION = 0.3  # standard deviation of second moments over that of the others
 
 
@@ -54,35 +51,13 @@ def spot(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, 
 
 def line(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
     """Pressure of an edge: even along a line, blurred by a Gaussian."""
-    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + SHORTEST**2)
+    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + 1e-10)  # m; a length of zero has no direction
     away = points - one[:2]
     along = away @ one[4:] / half
     across = jnp.sum(away**2, -1) - along**2
     root = jnp.sqrt(2.0) * width
     spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
     return jnp.exp(one[3] - 0.5 * across / width**2) * spread / (jnp.sqrt(2 * jnp.pi) * width)
-
-
-def shaped(one: Float[Array, "6"], shape: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    """Pressure of an edge or a round load of another shape: that of `line` times ``1 + shape . polynomials``.
-
-    The polynomials are those of `shape_directions`, in units of the standard deviation along the edge and across it.
-    """
-    factor = sum(
-        (a * p for a, p in zip(shape, line_polynomials(one, points), strict=True)), start=jnp.ones_like(shape[0])
-    )
-    return line(one, points) * factor
-
-
-def line_polynomials(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> list[Float[Array, "..."]]:
-    """The polynomials of `shaped` at points."""
-    variance, square = jnp.exp(2 * one[2]), one[4:] @ one[4:] + SHORTEST**2
-    away = points - one[:2]
-    # Along the edge the variance is larger by a third of the square of its half length.
-    shrink = (jnp.sqrt(variance / (variance + square / 3)) - 1) / square
-    scale = jnp.exp(-one[2])
-    moved = away + (shrink * (away @ one[4:]))[..., None] * one[4:]
-    return polynomials(moved[..., 0] * scale, moved[..., 1] * scale)
 
 
 def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "... d"]:
@@ -102,17 +77,14 @@ def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 
 
 def _bent(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
     u = (points - one[:2]) * jnp.exp(-one[2])
-    return spot(one, points)[..., None] * jnp.stack(polynomials(u[..., 0], u[..., 1]), -1)
-
-
-def polynomials(x: Float[Array, "..."], y: Float[Array, "..."]) -> list[Float[Array, "..."]]:
-    """The polynomials of `shape_directions` at places in units of the width: two for all loads, four for each."""
-    r = 0.5 * (x**2 + y**2)
-    tilt = (r - 2) / SQRT_2
-    second = [ELONGATION * 0.5 * (x**2 - y**2), ELONGATION * x * y]
-    return [1 - 2 * r + r**2 / 2, 1 - 3 * r + 1.5 * r**2 - r**3 / 6, x * tilt, y * tilt, *second]
+    r = 0.5 * jnp.sum(u**2, -1, keepdims=True)
+    radial = [1 - 2 * r + r**2 / 2, 1 - 3 * r + 1.5 * r**2 - r**3 / 6]
+    polynomials = jnp.concatenate([*radial, u * (r - 2) / SQRT_2], -1)
+    return jnp.concatenate([spot(one, points)[..., None] * polynomials, ELONGATION * elongations(one, points)], -1)
 
 
 def elongations(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
     """Change of pressure of a round load by second moments: half of those along x minus along y, and of x and y."""
-    return _bent(one, points)[..., -2:] / ELONGATION
+    u = (points - one[:2]) * jnp.exp(-one[2])
+    both = jnp.stack([0.5 * (u[..., 0] ** 2 - u[..., 1] ** 2), u[..., 0] * u[..., 1]], -1)
+    return spot(one, points)[..., None] * both
