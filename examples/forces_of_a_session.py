@@ -16,5 +16,6 @@ with calib.open_session(sessions / "testbed_grid.h5") as session:
 
 with calib.open_session(sessions / "testbed_presses.h5") as other:
     verdict = calib.evaluate(calibration, other)
-for name, value in verdict.summary().items():
-    print(f"{name}: {value:.3g}")
+found = verdict.summary()
+print(f"{found['presses']:.0f} presses that were not fitted: force within {found['force_rmse']:.2f} N (RMSE)")
+print(f"place of the contact within {1e3 * found['localisation_fitted_mean']:.2f} mm (mean)")
