@@ -26,6 +26,8 @@ MIN_LOUDNESS, RIPPLE = 12.0, 0.05
 KEPT = 8
 # Events that one frame may show.
 EVENTS = 4
+# A look is given up when frames of so many seconds wait: contacts that moved on unseen for so long are not believed.
+PATIENCE = 2.0
 
 
 def begun(before: Tracking, otherwise: Tracking, seen: Seen) -> Look:
@@ -41,6 +43,11 @@ def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
     elif len(waiting) >= KEPT:
         waiting = _merged(waiting)
     return replace(backlog, waiting=(*waiting, seen))
+
+
+def is_given_up(backlog: Backlog) -> bool:
+    """Whether so many frames wait that no spare time can be hoped for, as on a machine that is too slow or too busy."""
+    return sum(seen.seconds for seen in backlog.waiting) > PATIENCE
 
 
 def _merged(frames: tuple[Seen, ...]) -> tuple[Seen, ...]:
@@ -117,7 +124,7 @@ def settled(now: Tracking, update: Update) -> Tracking:
     and contacts begin anew.
     """
     if not is_finite(update):
-        return _without_contacts(now)
+        return without_contacts(now)
     loudness = np.asarray(update.loudness)
     faint = tuple(count + 1 if own < FAINT else 0 for count, own in zip(now.faint, loudness, strict=True))
     now = replace(now, belief=update.belief, faint=faint)
@@ -135,7 +142,8 @@ def is_finite(update: Update) -> bool:
     return all(bool(np.isfinite(np.asarray(one)).all()) for one in numbers)
 
 
-def _without_contacts(now: Tracking) -> Tracking:
+def without_contacts(now: Tracking) -> Tracking:
+    """No contact is believed in any longer; the gain stays known."""
     left = _as_is(now)
     while left.numbers:
         left = left.without(0, 0.0)

@@ -18,7 +18,7 @@ from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import Events
 from .filter import SIZE, Belief, ContactFilter, Pads, Update
-from .looks import begun, is_finite, looked, meanwhile, settled
+from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
 from .preparation import prepare_filter
 from .programs import Programs
 from .settings import TrackerSettings
@@ -72,7 +72,8 @@ class Tracker:
             pad_forces: on the pads, (pads,) N; default, or NaN: not known.
             pad_errors: their standard errors, (pads,) N.
             whole: an unexpected frame is looked into at once, which may take as long as a hundred ordinary frames.
-                Otherwise `look` does so, piece by piece; the contacts are those without an event until then.
+                Otherwise `look` does so, piece by piece; the contacts are those without an event until then. If `look`
+                is not called often enough, contacts are given up after some seconds and begin anew.
 
         Raises:
             InverseError: if an array has another shape, or `seconds` is not above zero.
@@ -80,6 +81,8 @@ class Tracker:
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         seen = Seen(self._frame(dv), self._pads(pad_forces, pad_errors), seconds)
+        if now.backlog is not None and is_given_up(now.backlog):
+            now = replace(without_contacts(now), backlog=None)
         if now.backlog is not None:
             moved, update = self.programs.followed(now.belief, *seen)
             # What the contacts do not explain would bend them: until it is explained they move on as they did.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxeit.tracking.filter import PIECE, SIZE, STEPS, Pads
-from jaxeit.tracking.looks import KEPT, meanwhile
+from jaxeit.tracking.looks import KEPT, PATIENCE, meanwhile
 from jaxeit.tracking.programs import Programs
 from jaxeit.tracking.tracks import Seen
 
@@ -120,3 +120,21 @@ def test_contacts_begin_anew_after_an_update_that_is_not_finite(tracker, frame_o
     found = tracker.step(lost, frame_of(truth(31)), SECONDS)
     assert found.numbers
     assert min(found.numbers) == 3  # a number is never given twice
+
+
+def test_without_spare_time_contacts_are_given_up_and_found_again_once_there_is_some(tracker, frame_of, followed):
+    """A machine that is too slow for looks tells no contact, rather than one that has moved on unseen."""
+    now = next(state for state in followed[0] if state.backlog is not None and state.numbers)
+    still, quarter = frame_of(truth(55)), PATIENCE / 4  # one contact is left
+    shown = []
+    for _ in range(16):
+        now = tracker.step(now, still, quarter, whole=False)
+        shown.append(now.numbers)
+    assert shown[0] != ()
+    assert shown[-1] == ()
+    for _ in range(40):
+        now = tracker.step(now, still, SECONDS, whole=False)
+        for _ in range(PIECES):
+            now = tracker.look(now)
+    assert len(now.numbers) == 1
+    assert np.linalg.norm(now.tracks[0].position - truth(55)[0][:2]) < 2e-3
