@@ -77,7 +77,12 @@ class LiveFollower:
         before = self._tracker.start() if self._now is None else self._now
         self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error), whole=False)
         self._last = host
-        return self._now.tracks
+        return self._on_sheet(self._now.tracks)
+
+    def _on_sheet(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:
+        """Without those that have left the sheet, which happens while an unexpected frame is looked into."""
+        low, high = self._calibration.skin.domain.bounds
+        return tuple(one for one in tracks if (low <= one.position).all() and (one.position <= high).all())
 
     def use_spare_time(self, seconds: float) -> None:
         """Look further into an unexpected frame, as far as the time until the next frame allows, or `MAX_PAUSE` asks.

@@ -110,7 +110,15 @@ def calibration(monkeypatch, skin):
     weights = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
     return stand_in(
         calib.Calibration,
-        skin=stand_in(je.Skin, name="small", toml="", pads=pads, electrode_positions=positions, protocol=protocol),
+        skin=stand_in(
+            je.Skin,
+            domain=je.Rectangle(0.2, 0.2),
+            name="small",
+            toml="",
+            pads=pads,
+            electrode_positions=positions,
+            protocol=protocol,
+        ),
         recon=recon,
         masks=stand_in(je.PadMasks, weights=weights),
         simulated=True,
@@ -425,6 +433,19 @@ def test_contacts_are_forgotten_when_zero_is_set_again(following):
         assert engine.step(arrival([10.0, 20.0], host)) is None
     assert engine.step(arrival([31.0, 20.0], 5 * S)).touches.number.tolist() == [1]
     assert len(tracker.steps) == 2
+
+
+def test_contacts_that_have_left_the_sheet_are_not_shown(calibration, monkeypatch):
+    low, high = (np.array(corner) for corner in calibration.skin.domain.bounds)
+    places = [low - np.array([0.2, 0.0]), (low + high) / 2, high + np.array([0.0, 1e-3])]
+    tracks = tuple(
+        Track(k, place, np.eye(2), 0.01, 5.0, 0.1, np.zeros(2), np.zeros(2)) for k, place in enumerate(places)
+    )
+    monkeypatch.setattr(FakeTracker, "step", lambda *_, **options: stand_in(Tracking, tracks=tracks))
+    follower = LiveFollower(calibration, lambda calibration, untouched, noise: FakeTracker(untouched, noise))
+    follower._tracker = FakeTracker(None, None)
+    shown = follower.step(np.zeros(READINGS), np.zeros(PADS), np.ones(PADS), S)
+    assert [one.number for one in shown] == [1]
 
 
 def test_frames_at_rest_without_noise_are_refused(calibration):
