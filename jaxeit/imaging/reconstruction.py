@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from math import prod
 
 import equinox as eqx
@@ -70,8 +71,8 @@ class AbstractReconstructor(AbstractPictured):
             InverseError: if the last axis does not hold the readings of a frame.
         """
         require_frames(dv, self.readings)
-        program = _imaged if is_traced(self, dv) or not np.isfinite(np.asarray(dv)).all() else _imaged_whole
-        images: Array = program(self, dv)
+        whole = not is_traced(self, dv) and bool(np.isfinite(np.asarray(dv)).all())
+        images: Array = _imaged(self, dv, whole)
         return images
 
     def compiled(self) -> Callable[[Float[ArrayLike, "... readings"]], Float[Array, "... basis"]]:
@@ -119,14 +120,13 @@ class AbstractReconstructor(AbstractPictured):
         return self.whitening.channels
 
 
-@jax.jit
-def _imaged(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
-    return recon._image(recon._sums(jnp.asarray(dv, recon.predict.dtype)))
-
-
-@jax.jit
-def _imaged_whole(recon: AbstractReconstructor, dv: Float[Array, "... readings"]) -> Float[Array, "... basis"]:
-    return recon._image(recon.whitening.sums(jnp.asarray(dv, recon.predict.dtype)))
+@partial(jax.jit, static_argnames="whole")
+def _imaged(
+    recon: AbstractReconstructor, dv: Float[ArrayLike, "... readings"], whole: bool
+) -> Float[Array, "... basis"]:
+    """The image; without code for missing readings if it is known that all are there."""
+    dv = jnp.asarray(dv, recon.predict.dtype)
+    return recon._image(recon.whitening.sums(dv) if whole else recon._sums(dv))
 
 
 class Reconstructor(AbstractReconstructor):
