@@ -5,22 +5,20 @@ first order of the readings is that of an image on a fine mesh, what is beyond i
 the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that an evaluation solves once.
 """
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
+from ..contacts.loads.pressure import line
 from ..effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
 SHORTEST = 1e-4
-ROOT_OF_2, ROOT_OF_2PI = math.sqrt(2), math.sqrt(2 * math.pi)
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
 LENGTHS, ANGLES = (0.015, 0.03), 4
 
@@ -211,13 +209,6 @@ def _with_slopes(
 
 
 def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    """Pressure at points, Pa, of a load (x, y, log width, log force, half length along x and y): even along a line,
-    blurred by a Gaussian; of a length near zero, a Gaussian."""
-    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + SHORTEST**2)
-    away = points - load[:2]
-    along = away @ load[4:] / half
-    across = jnp.sum(away**2, -1) - along**2
-    root = ROOT_OF_2 * width
-    spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
-    found: Array = jnp.exp(load[3] - 0.5 * across / width**2) * spread / (ROOT_OF_2PI * width)
+    """Pressure at points, Pa, of a load (x, y, log width, log force, half length along x and y)."""
+    found: Array = line(load, points, SHORTEST)
     return found

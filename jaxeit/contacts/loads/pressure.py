@@ -49,9 +49,12 @@ def spot(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, 
     return jnp.exp(one[3] - 0.5 * square / variance) / (2 * jnp.pi * variance)
 
 
-def line(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    """Pressure of an edge: even along a line, blurred by a Gaussian."""
-    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + 1e-10)  # m; a length of zero has no direction
+def line(one: Float[Array, "6"], points: Float[Array, "... 2"], shortest: float = 1e-5) -> Float[Array, "..."]:
+    """Pressure of an edge: even along a line, blurred by a Gaussian; of a length near zero, a Gaussian.
+
+    Half a line is at least `shortest`, m, since a length of zero has no direction.
+    """
+    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + shortest**2)
     away = points - one[:2]
     along = away @ one[4:] / half
     across = jnp.sum(away**2, -1) - along**2
