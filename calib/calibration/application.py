@@ -64,11 +64,11 @@ def apply(
         tell(f"note: {line}")
     blocks = FrameBlocks(session, processing, levels)
     with ArchiveWriter(path, FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
-        kinds = _rows(calibration)
-        writer.add("centres", np.asarray(calibration.recon.centres), "m", "centres of the pixels")
-        writer.add("areas", np.asarray(calibration.recon.areas), "m2", "areas of the pixels")
-        for name, kind in kinds.items():
-            writer.add_rows(name, *kind)
+        kinds = _rows(calibration, session.epoch)
+        sizes = _add_coordinates(writer, calibration)
+        for name, (dims, units, meaning, dtype) in kinds.items():
+            tail = tuple(sizes[dim] for dim in dims)
+            writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
         also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress)]
         also += [_Tracks(calibration, writer, blocks)] if track else []
         before = np.zeros((1, len(calibration.skin.pads)))
@@ -105,7 +105,28 @@ def _attributes(calibration: Calibration, session: Session) -> dict[str, str | i
         "image_rows": recon.shape[0],
         "image_columns": recon.shape[1],
         "calibration_created_utc": calibration.provenance["created_utc"],
+        "coordinates": "x y",
     }
+
+
+def _add_coordinates(writer: ArchiveWriter, calibration: Calibration) -> dict[str, int]:
+    """Write the coordinates of all axes but time, and where the pixels lie; returns the lengths of the axes."""
+    pads, centres = calibration.skin.pads, np.asarray(calibration.recon.centres)
+    contacts = 0 if calibration.locator is None else calibration.locator.contacts
+    about = {
+        "pixel": (len(centres), "number of the pixel, row by row"),
+        "pad": (len(pads), "number of the pad: " + ", ".join(f"{i} {pad.name}" for i, pad in enumerate(pads))),
+        "axis": (2, "0: x, 1: y"),
+        "contact": (contacts, "number of the contact in its frame"),
+    }
+    for name, (size, meaning) in about.items():
+        if size:
+            writer.add(name, np.arange(size, dtype="i4"), "1", meaning, (name,))
+    writer.add("centres", centres, "m", "centres of the pixels", ("pixel", "axis"))
+    for name, values in zip("xy", centres.T, strict=True):
+        writer.add(name, values, "m", f"centres of the pixels along {name}", ("pixel",))
+    writer.add("areas", np.asarray(calibration.recon.areas), "m2", "areas of the pixels", ("pixel",))
+    return {name: size for name, (size, _) in about.items()}
 
 
 def _append(writer: ArchiveWriter, rows: Mapping[str, np.ndarray], names: Iterable[str], group: str = "") -> None:
@@ -165,27 +186,27 @@ class _Tracks:
         return self._tracks.render()
 
 
-def _rows(calibration: Calibration) -> dict[str, tuple[tuple[int, ...], str, str, str]]:
-    """Arrays of a force map file with one row per frame: shape of a row, unit, meaning and type."""
-    pixels, pads = calibration.recon.areas.shape, (len(calibration.skin.pads),)
+def _rows(calibration: Calibration, epoch: str) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
+    """Arrays of a force map file with one row per frame: axes of a row, unit, meaning and type."""
+    none: tuple[str, ...] = ()
+    pixels, pads = ("pixel",), ("pad",)
     rows = {
-        "time": ((), "ns", "since time_epoch_utc", "i8"),
+        "time": (none, f"nanoseconds since {epoch}", "time of the frame", "i8"),
         "force": (pixels, "N", "force on each pixel", "f4"),
         "force_se": (pixels, "N", "standard error of a pixel's force, for the shape as it is", "f4"),
         "pad_force": (pads, "N", "force on each pad", "f8"),
         "pad_force_se": (pads, "N", "standard error of a pad's force", "f8"),
         "pad_force_half": (pads, "N", "half the interval that 90 % of readings of a pad's force fall into", "f8"),
-        "total_force": ((), "N", "sum of the forces on the pads", "f8"),
-        "total_force_half": ((), "N", "half the 90 % interval of a reading of the sum", "f8"),
+        "total_force": (none, "N", "sum of the forces on the pads", "f8"),
+        "total_force_half": (none, "N", "half the 90 % interval of a reading of the sum", "f8"),
         "pad_valid": (pads, "1", "pressure in the calibrated range", "u1"),
         "shape_valid": (pads, "1", "1: shape from the image; 0: even", "u1"),
     }
     if calibration.locator is None:
         return rows
-    contacts = (calibration.locator.contacts,)
     return rows | {
-        "contact_position": ((*contacts, 2), "m", "of each contact found; NaN: none", "f8"),
-        "contact_force": (contacts, "N", "its shares of the forces on pads that it lies on", "f8"),
+        "contact_position": (("contact", "axis"), "m", "of each contact found; NaN: none", "f8"),
+        "contact_force": (("contact",), "N", "its shares of the forces on pads that it lies on", "f8"),
     }
 
 

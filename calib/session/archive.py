@@ -27,6 +27,7 @@ from .hdf5.storage import (
     AttributeValue,
     FileWriter,
     GrowingArray,
+    attach,
     make_array,
     make_dataset,
     make_group,
@@ -42,6 +43,7 @@ MAX_ARRAYS = 4096
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 DIMENSION = re.compile(r"dim_\d+[a-d]?")
 OWN_ATTRIBUTES = {"format", "format_version", "Conventions", "complete"}
+Dims = tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -63,16 +65,17 @@ def write_archive(
     format: str,
     attrs: Mapping[str, AttributeValue],
     arrays: Mapping[str, tuple[ArrayLike, str, str]],
+    dims: Mapping[str, Dims] = MappingProxyType({}),
 ) -> None:
     """Write a result file, whole or not at all. Equal input gives equal bytes.
 
     ``arrays`` maps a name, which may be nested (``pads/0/covariance``), to (values, units, long name). Values are
-    numbers, bools or texts of rank 0 to 4. Raises `SessionError` for names, types and attributes that the format
-    cannot hold.
+    numbers, bools or texts of rank 0 to 4. ``dims`` names axes, as for `ArchiveWriter`.
+    Raises `SessionError` for names, types and attributes that the format cannot hold.
     """
     with ArchiveWriter(path, format, attrs) as writer:
         for name, (values, units, long_name) in arrays.items():
-            writer.add(name, values, units, long_name)
+            writer.add(name, values, units, long_name, dims.get(name, ()))
 
 
 def read_archive(path: str | os.PathLike[str], format: str) -> Archive:
@@ -100,7 +103,9 @@ class ArchiveWriter(FileWriter):
     """Write a result file piece by piece; use it as a context manager.
 
     ``add`` writes a whole array. ``add_rows`` declares an array that ``append`` extends, so that it may be larger
-    than memory. The file appears under its name only after a successful end.
+    than memory. ``dims`` names the axes of an array after arrays of the file's root that were added before, its
+    coordinates; an array with the name of its only axis is such a coordinate. Axes without names are numbered. The
+    file appears under its name only after a successful end.
     """
 
     def __init__(self, path: str | os.PathLike[str], format: str, attrs: Mapping[str, AttributeValue]):
@@ -113,21 +118,22 @@ class ArchiveWriter(FileWriter):
         self._attrs = {**own, **attrs}
         self._names: set[str] = set()
         self._growing: dict[str, tuple[GrowingArray, tuple[int, ...], dict[str, AttributeValue]]] = {}
+        self._dims: dict[str, Dims] = {}
 
     def _start(self, file: h5py.File) -> None:
         put_attributes(file, self._attrs)
 
     def _finish(self, file: h5py.File) -> None:
-        for growing, _, attrs in self._growing.values():
-            self._name_axes(growing.finish(attrs))
+        for name, (growing, _, attrs) in self._growing.items():
+            self._name_axes(growing.finish(attrs), name)
         put_attributes(file, {"complete": True})
 
-    def add(self, name: str, values: ArrayLike, units: str, long_name: str = "") -> None:
+    def add(self, name: str, values: ArrayLike, units: str, long_name: str = "", dims: Dims = ()) -> None:
         """Write one array of numbers, bools or texts."""
         array, kind = _storable(self.path, name, np.asarray(values))
-        group, leaf = self._place(name)
+        group, leaf = self._place(name, dims)
         attrs = {"units": units, "long_name": long_name, **kind}
-        self._name_axes(make_array(group, leaf, array, attrs))
+        self._name_axes(make_array(group, leaf, array, attrs), name)
         self._check_disk()
 
     def add_rows(
@@ -137,13 +143,14 @@ class ArchiveWriter(FileWriter):
         units: str,
         long_name: str = "",
         dtype: DTypeLike = "f8",
+        dims: Dims = (),
     ) -> None:
         """Declare an array of shape (rows, *tail) that ``append`` fills."""
         dtype = np.dtype(dtype)
         _storable(self.path, name, np.empty((0, *tail), dtype))
         if dtype.kind == "b":
             raise problem(self.path, name, "bool rows", "use dtype u1")
-        group, leaf = self._place(name)
+        group, leaf = self._place(name, dims)
         attrs: dict[str, AttributeValue] = {"units": units, "long_name": long_name}
         self._growing[name] = (GrowingArray(group, leaf, tail, dtype), tail, attrs)
 
@@ -158,7 +165,7 @@ class ArchiveWriter(FileWriter):
         growing.append(array)
         self._check_disk()
 
-    def _place(self, name: str) -> tuple[h5py.Group, str]:
+    def _place(self, name: str, dims: Dims) -> tuple[h5py.Group, str]:
         """The group of an array, created if it does not exist, and the name of the array in it."""
         parts = name.split("/")
         bad = [p for p in parts if not PART.fullmatch(p) or DIMENSION.fullmatch(p)]
@@ -166,20 +173,31 @@ class ArchiveWriter(FileWriter):
                     for n in self._names)  # fmt: skip
         if bad or taken or len(parts) > MAX_DEPTH:
             raise problem(self.path, name, "cannot be used as a name", "use letters, digits, _ and -")
+        if unknown := set(dims) - self._names - {name}:
+            raise problem(self.path, name, f"has axes {sorted(unknown)}", "add arrays of these names before")
         self._names.add(name)
+        self._dims[name] = dims
         group = self._open()
         for part in parts[:-1]:
             group = group[part] if part in group else make_group(group, part, {})
         return group, parts[-1]
 
-    def _name_axes(self, dataset: h5py.Dataset) -> None:
-        """Attach a dimension to every axis; axes of equal length in one array get different ones."""
+    def _name_axes(self, dataset: h5py.Dataset, name: str) -> None:
+        """Attach a dimension to every axis; without names, axes of equal length in one array get different ones."""
+        if dims := self._dims[name]:
+            return self._attach(dataset, name, dims)
         seen: list[int] = []
         for axis, size in enumerate(dataset.shape):
             repeats = seen.count(size)
             seen.append(size)
             scale = self._dimension(f"dim_{size}" + ("" if not repeats else "abcd"[repeats]), size)
             dataset.dims[axis].attach_scale(scale)
+
+    def _attach(self, dataset: h5py.Dataset, name: str, dims: Dims) -> None:
+        if dims == (name,):
+            dataset.make_scale(name)
+        else:
+            attach(dataset, *(self._open()[dim] for dim in dims))
 
     def _dimension(self, name: str, size: int) -> h5py.Dataset:
         """A dimension without values, in the form that netCDF-4 writes."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 from datetime import datetime
 
 import equinox as eqx
+import h5netcdf
 import h5py
 import jax
 import jax.numpy as jnp
@@ -270,6 +271,12 @@ def test_apply_writes_the_force_of_every_frame(calibration, grid, folder):
     with calib.open_session(grid) as session:
         calib.apply(calibration, session, out)
         frames = len(session.stream("eit"))
+    with h5netcdf.File(out, "r") as file:  # as xarray opens it
+        axes = {name: file.variables[name].dimensions for name in ("force", "pad_force", "centres", "x")}
+        time, epoch = file.variables["time"].attrs["units"], file.attrs["time_epoch_utc"]
+    named = {"force": ("time", "pixel"), "pad_force": ("time", "pad"), "centres": ("pixel", "axis"), "x": ("pixel",)}
+    assert axes == named
+    assert np.bytes_(time).decode() == f"nanoseconds since {np.bytes_(epoch).decode()}"
     archive = calib.session.read_archive(out, "skin-forcemap")
     force, pads = archive.arrays["force"], archive.arrays["pad_force"]
     assert force.shape == (frames, 400)

@@ -307,13 +307,14 @@ def apply_log(
     }
     attrs |= {"ignored_errors": "\n".join(ignored)} if ignored else {}
     attrs["note"] = calibration.unseen(found.force)
-    write_archive(path, FORCE_FORMAT, attrs, _force_arrays(signal.time, found))
+    arrays = _force_arrays(signal.time, session.epoch, found)
+    write_archive(path, FORCE_FORMAT, attrs, arrays, dict.fromkeys(arrays, ("time",)))
     return found
 
 
-def _force_arrays(time: np.ndarray, found: LogPrediction) -> Mapping[str, tuple[np.ndarray, str, str]]:
+def _force_arrays(time: np.ndarray, epoch: str, found: LogPrediction) -> Mapping[str, tuple[np.ndarray, str, str]]:
     return {
-        "time": (np.asarray(time), "ns", "since the epoch"),
+        "time": (np.asarray(time), f"nanoseconds since {epoch}", "time of the sample"),
         "force": (found.force, "N", "NaN where a channel is missing"),
         "standard_error": (found.standard_error, "N", "of a reading"),
         "low": (found.low, "N", "lower end of the 90 % interval of a reading"),
