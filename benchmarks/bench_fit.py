@@ -7,6 +7,7 @@ fits: every pad's power law through all of its samples with the same robust loss
 same start, by `calib.fit_curves` (all pads in one compiled call) and by `scipy.optimize.least_squares`, pad by pad,
 with an exact Jacobian as users write it; parameters must agree to 1e-5 before a clock is read.  Ours finds the scale of
 the residuals and the covariance over places too; SciPy is given the scale and finds no covariance.
+memory: of a process that calibrates the bundled session again and again.
 """
 
 import tempfile
@@ -28,6 +29,7 @@ from calib.runtime import set_up
 
 from .clock import in_turns, require_agreement, seconds, spread
 from .harness import ROOT, Question, Run
+from .memory import growth, resident
 from .rows import Row
 
 SESSION = ROOT / "data" / "sessions" / "testbed_grid.h5"
@@ -110,7 +112,20 @@ def by_scipy(data: PressData, pad: int, law: calib.PowerLaw, scale: float) -> np
     return np.array([np.exp(found.x[0]) * size, np.exp(found.x[1])])
 
 
-main = Question("fit", __doc__, {"end_to_end": end_to_end, "fits": fits}, prepare=set_up)
+def memory(run: Run) -> Iterator[Row]:
+    """MB after the first calibration, after half of them and at the end, and growth over the later half."""
+    count, recipe, used = 12 if run.smoke else 200, calib.Recipe(location=calib.PadEdge()), []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(count):
+            stages(SESSION, recipe, Path(folder) / "calibration.h5")
+            used.append((3.6 * number, resident()))  # so that an hour stands for 1,000 sessions
+    found, mb = growth(np.array(used)), [round(used[at][1], 1) for at in (0, count // 2, -1)]
+    names = ("mb_per_1000_sessions", "mb_per_1000_sessions_error")
+    rates = {name: round(value, 1) for name, value in zip(names, found, strict=True)}
+    yield {"memory": {"sessions": count, "first_half_last_mb": mb} | rates}
+
+
+main = Question("fit", __doc__, {"end_to_end": end_to_end, "fits": fits, "memory": memory}, prepare=set_up)
 
 if __name__ == "__main__":
     main()

@@ -6,6 +6,9 @@ rows of the second kind the calibration is that without faults, and only the pre
 
 CV is that of estimated over true force, bias their mean ratio less one; `rmse_scaled_n` is the error that is left after
 division by that ratio.  Coverage is the share of presses within their 90 % interval.
+
+`weeks`: gains of the pads have moved by 6 %, levels at rest by 40 Pa, and the image has become 20 % stronger; the
+calibration is moved by ten presses of known force, or by contacts of ordinary use.  Means over skins of other seeds.
 """
 
 import tempfile
@@ -18,14 +21,15 @@ import numpy as np
 
 import calib
 import jaxeit as je
-from calib.calibration import Calibration
+from calib.calibration import Calibration, KnownForces, OrdinaryUse
+from calib.calibration.evaluation import Evaluation
 from calib.fitting import FitError
 from calib.fitting.validation import rmse
 from calib.session import Session
 from tests.oracles.bench import Bench, Faults, simulate, write
 
 from .harness import Question, Run
-from .rows import Row
+from .rows import Row, averaged, grouped
 
 BOTH = {
     "none": Faults(),
@@ -90,7 +94,7 @@ def predicted(calibration: Calibration, bench: Bench, faults: Faults) -> Row:
     """Errors of place and force of a calibration on another session, rounded."""
     with _recorded(bench, faults, seed=2) as session:
         found = calib.evaluate(calibration, session)
-    ratio = found.total_force / found.force
+    ratio = _ratio(found)
     row = {"rmse_n": rmse(found.total_force, found.force), "cv": ratio.std(ddof=1), "bias": ratio.mean() - 1}
     row["rmse_scaled_n"] = rmse(found.total_force / ratio.mean(), found.force)
     row |= {name: value for name, value in found.summary().items() if name.startswith("coverage")}
@@ -99,7 +103,55 @@ def predicted(calibration: Calibration, bench: Bench, faults: Faults) -> Row:
     return {name: round(float(value), 4) for name, value in row.items()}
 
 
-main = Question("oracle", __doc__, {"rows": measure})
+# --- a week later
+
+WEEK = Faults(moved_gain=0.06, moved_offset=40.0, moved_layer=np.log(1.2))
+PRESSES = {"after ten presses of known force": (10, (12.0,), KnownForces())} | {
+    f"after {2 * places} contacts of ordinary use": (places, (8.0, 15.0), OrdinaryUse()) for places in (10, 30, 100)
+}
+
+
+def weeks(run: Run) -> Iterator[Row]:
+    """Relative errors of forces at places that were not pressed, before and after each update, moved or not."""
+    bench, recipe = (SMOKE, DRAFT) if run.smoke else (FULL, RECIPE)
+    rows = []
+    for seed in run.sizes(range(21, 27), (21,)):
+        skin = replace(bench, skin_seed=seed)
+        with _recorded(skin, Faults(), seed=1) as session:
+            calibration = calib.calibrate([session], recipe=recipe)
+        for moved, faults in (("yes", WEEK), ("no", Faults())):
+            rows += [{"moved": moved} | row for row in updated(calibration, skin, faults, run.smoke)]
+            print(rows[-1], flush=True)
+    yield {"weeks": [averaged(rows) | {"skins": len(rows)} for rows in grouped(rows, "gains", "moved").values()]}
+
+
+def updated(calibration: Calibration, bench: Bench, faults: Faults, smoke: bool) -> Iterator[Row]:
+    """A row for each update of a calibration to sessions of a skin with these faults."""
+    with _recorded(bench, faults, seed=2) as later:
+        yield {"gains": "those of the calibration"} | _relative(calib.evaluate(calibration, later))
+        for seed, (name, (places, levels, evidence)) in enumerate(list(PRESSES.items())[: 1 if smoke else None], 3):
+            with _recorded(replace(bench, places=places, levels=levels), faults, seed=seed) as session:
+                new = calib.recalibrate(calibration, session, evidence, ignore_errors=True)
+            told = float(np.mean(new.recalibration.significant))
+            yield {"gains": name} | _relative(calib.evaluate(new, later)) | {"pads_moved": told}
+
+
+def _relative(found: Evaluation) -> Row:
+    ratio = _ratio(found)
+    spread = ratio.std(ddof=1) / ratio.mean()
+    return {
+        "rmse": float(np.sqrt(np.mean((ratio - 1) ** 2))),
+        "spread": spread,
+        "coverage": found.summary()["coverage"],
+    }
+
+
+def _ratio(found: Evaluation) -> np.ndarray:
+    """Estimated over true force, (presses,)."""
+    return found.total_force / found.force
+
+
+main = Question("oracle", __doc__, {"rows": measure, "weeks": weeks})
 
 if __name__ == "__main__":
     main()

@@ -42,7 +42,7 @@ except ImportError:  # a system without it
     fcntl = None  # type: ignore[assignment]
 
 _DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
-_SESSIONS_PER_WORKER = 16  # then a worker is replaced, because its memory grows by megabytes per session
+_SESSIONS_PER_WORKER = 16  # then a worker is replaced: each new skin leaves its compiled programs in memory
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..session.units import SECOND
 from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, WindowMeans, correct, window_means
-from .streams import ReadableStream, index_ranges
+from .streams import ReadableStream, ReadAhead, index_ranges
 from .times import PressColumns
 from .windows import PressWindows
 
@@ -43,7 +43,7 @@ def _span(time: np.ndarray, windows: PressWindows, i: int) -> tuple[int, int]:
 def read_press(
     stream: ReadableStream, windows: PressWindows, i: int, corrections: Sequence[AbstractCorrection]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Time stamps (n,) ns and corrected values (n, channels) around press `i`; nothing else is read into memory."""
+    """Time stamps (n,) ns and corrected values (n, channels) around press `i`."""
     a, b = _span(stream.time, windows, i)
     time = stream.time[a:b]
     return time, correct(corrections, time, stream.read(a, b), stream.name)
@@ -65,7 +65,7 @@ def press_means(
     baseline: AbstractBaseline | None = None,
     corrections: Sequence[AbstractCorrection] = (),
 ) -> PressMeans:
-    """Average each press over its hold and remove the baseline. The stream is read press by press, never as a whole.
+    """Average each press over its hold and remove the baseline. The stream is read in blocks, never as a whole.
 
     Args:
       baseline: `TwoSided()` by default.
@@ -73,7 +73,8 @@ def press_means(
     Returns: rows for all presses; NaN where a channel has no finite sample in a window that the baseline uses.
     """
     rule = TwoSided() if baseline is None else baseline
-    parts = [_averaged_windows(stream, windows, i, corrections) for i in range(len(windows.hold))]
+    ahead = ReadAhead(stream)
+    parts = [_averaged_windows(ahead, windows, i, corrections) for i in range(len(windows.hold))]
     held, before, after = (_nth_window(parts, k, stream.channels) for k in range(3))
     centres = tuple(windows.centre(name) for name in AVERAGED_WINDOWS)
     change = rule.remove(held, before, after, centres)

@@ -7,7 +7,7 @@ import numpy as np
 
 from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, weighted
 from .means import read_press
-from .streams import ReadableStream, finite_mean, index_ranges, resample
+from .streams import ReadableStream, ReadAhead, finite_mean, index_ranges, resample
 from .times import PressColumns
 from .windows import PressWindows
 
@@ -77,7 +77,9 @@ def press_samples(
     Only the first column of the force stream is used. A missing sample of either stream is NaN.
     """
     rule = TwoSided() if baseline is None else baseline
-    rows = [_one_press(force, pressure, windows, int(i), rule, corrections) for i in np.flatnonzero(presses.accepted)]
+    force_ahead, pressure_ahead = ReadAhead(force), ReadAhead(pressure)
+    accepted = np.flatnonzero(presses.accepted)
+    rows = [_one_press(force_ahead, pressure_ahead, windows, int(i), rule, corrections) for i in accepted]
     if not rows:
         empty = np.empty(0, int)
         return PressSamples(empty, np.empty((0, pressure.channels)), np.empty(0), empty, empty)

@@ -56,6 +56,25 @@ class ArrayStream:
         return self.values[start:stop]
 
 
+READ_AHEAD_BYTES = 4 << 20  # of float64 values; one call of `read` takes as long as reading 30 kB
+
+
+class ReadAhead:
+    """A stream whose slices are read in the order of time: one call of its `read` serves many slices that follow."""
+
+    def __init__(self, stream: ReadableStream) -> None:
+        self._stream, self._start, self._block = stream, 0, np.empty((0, stream.channels))
+        self.name, self.channels, self.time = stream.name, stream.channels, stream.time
+
+    def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Values (samples, channels) of the samples from `start` to before `stop`, not to be written to."""
+        stop = len(self.time) if stop is None else stop
+        if not self._start <= start <= stop <= self._start + len(self._block):
+            rows = max(stop - start, READ_AHEAD_BYTES // (8 * max(self.channels, 1)))
+            self._start, self._block = start, self._stream.read(start, min(start + rows, len(self.time)))
+        return self._block[start - self._start : stop - self._start]
+
+
 def recording_end(streams: Iterable[ReadableStream]) -> int:
     """Earliest end of the streams in ns. A stream ends one ns after its last sample, since windows are half open.
 

@@ -225,8 +225,18 @@ def test_faults_change_what_they_name():
     changed = {
         "crosstalk": (0.05, {"pressure"}), "hysteresis": (0.1, {"pressure"}), "creep": (0.05, {"pressure", "eit"}),
         "misplaced": (1e-3, {"eit"}), "coating": (0.1, {"eit"}), "temperature": (1.0, {"pressure", "eit"}),
-        "moved_gain": (0.05, {"pressure"}), "shape": ("ring", {"pressure", "eit"}),
+        "moved_gain": (0.05, {"pressure"}), "shape": ("ring", {"pressure", "eit"}), "moved_layer": (0.1, {"eit"}),
     }  # fmt: skip
     for name, (value, streams) in changed.items():
         found = simulate(replace(plain, faults=replace(plain.faults, **{name: value}))).streams
         assert {key for key in base if not np.array_equal(base[key][2], found[key][2])} == streams, name
+
+
+def test_later_sessions_of_a_skin_are_moved_alike():
+    """Sessions of other lengths and seeds: levels at rest differ by the drift, not by the move."""
+    faults = Faults(noise=0, drift=0, moved_offset=50.0)
+    sessions = [Bench(faults, seed=seed, places=seed, levels=(4.0,), spacing=8e-3) for seed in (1, 2)]
+    first, second = (simulate(one).streams["pressure"][2][0] for one in sessions)
+    rest = simulate(replace(sessions[0], faults=replace(faults, moved_offset=0.0))).streams["pressure"][2][0]
+    np.testing.assert_allclose(first, second, rtol=1e-12)
+    assert np.count_nonzero(first - rest) >= 3  # of four; a sensor tells steps of 10.5 Pa

@@ -21,7 +21,8 @@ class Faults:
     | temperature: amplitude of its swing, K                                                        |
     | noise: of all sensors, in multiples of a usual bench's                                        |
     | moved_gain, moved_offset: change of the pads since the skin was made: of the log of their     |
-    | gains, and of their offsets in Pa (standard deviations, drawn by the session's seed)          |
+    | gains, and of their offsets in Pa (standard deviations; every later session of a skin has the |
+    | same change); moved_layer: change of the log of the protrusions' gains, one number            |
     """
 
     crosstalk: float = 0.0
@@ -37,3 +38,4 @@ class Faults:
     noise: float = 1.0
     moved_gain: float = 0.0
     moved_offset: float = 0.0
+    moved_layer: float = 0.0

@@ -1,6 +1,6 @@
 """One session of presses: skin, faults and stage put together to the streams that a bench records."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,7 @@ def simulate(bench: Bench = Bench()) -> Session:
     own = np.random.default_rng([bench.skin_seed, 11])
     bolts = skin.bolts + bench.faults.misplaced * own.standard_normal(skin.bolts.shape)
     layer = contact.make_layer(skin, bolts, bench.faults.scatter, own)
+    layer = replace(layer, gain=layer.gain * np.exp(bench.faults.moved_layer))
     cells = pads.make_pads(len(skin.pads), bench.faults.crosstalk, own)
     mesh = make_mesh(skin, bolts, bench.spacing)
     sheet = make_sheet(mesh, coating(mesh.points[mesh.triangles].mean(1), bench.faults.coating, own) / skin.resistance,
@@ -115,9 +116,10 @@ def _pressure(bench, skin, presses, layer, cells, shares, end, rng) -> np.ndarra
     load = pads.late(pads.yielding(load, faults.hysteresis), PAD_RATE, faults.creep)
     step = 0.3 * faults.drift * np.sqrt(1 / PAD_RATE)  # 0.3 Pa after a second, 18 Pa after an hour
     slow = pads.warmed(_warmth(bench, times), PAD_RATE)[:, None] + step * rng.standard_normal(load.shape).cumsum(0)
+    later = np.random.default_rng([bench.skin_seed, 13])
     moved = pads.Pads(
-        cells.gain * np.exp(faults.moved_gain * rng.standard_normal(len(cells.gain))),
-        cells.offset + faults.moved_offset * rng.standard_normal(len(cells.gain)),
+        cells.gain * np.exp(faults.moved_gain * later.standard_normal(len(cells.gain))),
+        cells.offset + faults.moved_offset * later.standard_normal(len(cells.gain)),
         cells.mixing,
     )
     return pads.sensed(moved, pads.cell_pressure(load) + slow, 5.0 * faults.noise * rng.standard_normal(load.shape))
