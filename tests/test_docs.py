@@ -72,6 +72,11 @@ def follow(page, folder):
     return names
 
 
+def force_error(table):
+    """RMSE (N) of the first row "calibrated" that a command printed."""
+    return float(re.search(r"calibrated \(.*?\) +[\d.]+ +\([\d.]+\) +([\d.]+)", table)[1])
+
+
 @pytest.mark.slow
 def test_an_own_skin_is_simulated_calibrated_and_shown_live(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -80,8 +85,11 @@ def test_an_own_skin_is_simulated_calibrated_and_shown_live(root, tmp_path, monk
     assert "Nothing wrong was found" in told.out
     assert 9 < names["picture"].sum() < 11
     assert int(re.findall(r"(\d+) frames$", told.err, re.MULTILINE)[-1]) > 0
-    (rmse,) = re.findall(r"calibrated .* ([\d.]+) +[\d.]+ +[\d.]+ +[\d.]+$", told.out.split("held out by session")[1], re.MULTILINE)
-    assert float(rmse) < 0.1
+    assert force_error(told.out.split("held out by session")[1]) < 0.1  # N
+    follow(root / "docs" / "own-recordings.md", tmp_path)
+    imported = capsys.readouterr().out
+    assert "Presses  54 of 54 usable" in imported
+    assert abs(force_error(imported) - force_error(told.out)) < 0.02
 
 
 def test_the_files_of_an_own_skin_are_read(root, tmp_path, monkeypatch):
