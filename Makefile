@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo
 
-.PHONY: demo test slow lint clean
+.PHONY: demo test slow docs lint clean
 
 # One stamp per set of extras: pip runs again only when pyproject.toml changes.
 $(VENV)/.report: pyproject.toml
@@ -17,6 +17,11 @@ $(VENV)/.dev: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	touch $@ $(VENV)/.report
 
+$(VENV)/.docs: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	touch $@
+
 demo: $(VENV)/.report
 	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 --location edge --test data/sessions/testbed_presses.h5 \
 	    -o $(OUT)/calibration.h5 --report $(OUT)/report.html
@@ -26,6 +31,11 @@ test: $(VENV)/.dev
 
 slow: $(VENV)/.dev
 	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -m slow
+
+# build/site, to be read without a network; a broken link is an error.
+docs: $(VENV)/.docs  # --quiet would also silence what --strict counts
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "open build/site/index.html"
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -114,6 +114,7 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
     "quarter": LevelCentroid(0.25),
     "positive": PositiveCentroid(),
 }
+"""Estimators by the names that reports use."""
 
 
 def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:

@@ -54,7 +54,8 @@ class Bench:
     | slide                                | displacement of all tips during the hold      | (2,)       | m         |
     | blank                                | time without contact at the start             | ()         | s         |
     | eit_rate, pad_rate                   | of EIT frames; of pressures and forces        | ()         | Hz        |
-    | eit_step, pressure_step, force_step  | SI value of one stored count                  | ()         | V, Pa, N  |
+    | eit_step, pressure_step, force_step  | SI value of one stored count; eit_step None:  | ()         | V, Pa, N  |
+    |                                      | twice the largest reading at rest is stored   |            |           |
     | temperature_rate, barometer_rate     | change of the surrounding air                 | ()         | K/s, Pa/s |
     | seed                                 | of all random numbers                         |            |           |
     | toml                                 | the scene file as text                        |            |           |
@@ -74,7 +75,7 @@ class Bench:
     blank: float = 60.0
     eit_rate: float = 180.0
     pad_rate: float = 200.0
-    eit_step: float = 1e-6
+    eit_step: float | None = None
     pressure_step: float = 1.0
     force_step: float = 0.01
     temperature_rate: float = 0.0

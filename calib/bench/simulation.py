@@ -158,7 +158,7 @@ def _write(made: SimulatedStreams, store: _BlockStore, path: Path) -> None:
         ),
     )
     about = {
-        "eit": ("voltage", "V", bench.eit_step),
+        "eit": ("voltage", "V", bench.eit_step or 2 * float(np.abs(made.eit.resting).max()) / np.iinfo("i2").max),
         "pressure": ("pressure", "Pa", bench.pressure_step),
         "force": ("force", "N", bench.force_step),
     }

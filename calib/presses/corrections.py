@@ -187,8 +187,9 @@ class PreOnly(AbstractBaseline):
 
 
 CORRECTIONS = Registry(AbstractCorrection, "correction", "calib.corrections")
+"""Corrections by the names that recipes use."""
 BASELINES = Registry(AbstractBaseline, "baseline", "calib.baselines")
-"""Corrections and baselines by the names that recipes use."""
+"""Baselines by the names that recipes use."""
 
 
 # Samples within a window are correlated (filters, drift); means over this many blocks are nearly independent.

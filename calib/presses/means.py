@@ -93,7 +93,8 @@ def hold_positions(presses: PressColumns, stage: ReadableStream) -> np.ndarray:
     hold = np.stack([presses.t_hold0, presses.t_hold1], axis=1)
     rows = [stage.read(int(a), int(b)) for a, b in index_ranges(stage.time, hold)]
     with np.errstate(all="ignore"):
-        return np.stack([np.median(r, axis=0) if len(r) else np.full(r.shape[1], np.nan) for r in rows])
+        places = [np.median(r, axis=0) if len(r) else np.full(r.shape[1], np.nan) for r in rows]
+    return np.array(places).reshape(len(rows), stage.channels)
 
 
 DOMINANT_SHARE = 0.9  # of a press, with which a pad carries it alone

@@ -45,10 +45,10 @@ class LoadSpreading(AbstractLoadEffect):
     ``p / load = exp(-r^2 / (2 s^2)) / (2 pi s^2)``, whose integral over the plane is one; the frame
     carries the part outside the sheet, which is lost; the rest is not renormalised.
 
-    | meaning                                  | default | range   | unit | source          |
-    |------------------------------------------|---------|---------|------|-----------------|
-    | width s, tip included                    | 12      | 6 to 20 | mm   | assumption; the |
-    | half-space under a 20 mm tip: 7 to 10 mm |         |         |      | pad is hollow   |
+    | meaning                                                          | default | range   | unit | source          |
+    |------------------------------------------------------------------|---------|---------|------|-----------------|
+    | width s, tip included; half-space under a 20 mm tip: 7 to 10 mm  | 12      | 6 to 20 | mm   | assumption; the |
+    |                                                                  |         |         |      | pad is hollow   |
     """
 
     alternative: ClassVar[str] = "how a load spreads"

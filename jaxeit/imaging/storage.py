@@ -55,6 +55,7 @@ ITERATIVE_NUMBERS = {
     **_SHARED,
 }
 NUMBERS = LINEAR_NUMBERS | ITERATIVE_NUMBERS
+"""Shape, unit and meaning of each array of a stored reconstructor, by its name."""
 
 _KINDS = {"pairs": "iu", "edges": "iu", "channels": "b"}
 _WORDS = {"f": "floating point", "iu": "integers", "b": "boolean"}

@@ -27,7 +27,7 @@ class Fidelity:
     | growth: largest ratio of edge lengths from one ring to the next        |                  |
     | solver: a linear solver, or None to choose by the number of unknowns   |                  |
     | interpolation: error of simulated frames joined from few solves, over  |                  |
-    | the largest change of their press; 0: every frame is solved            |                  |
+    |   the largest change of their press; 0: every frame is solved          |                  |
 
     ``edge_length`` is relative so that one fidelity means the same on a 60 mm tank and a 280 mm
     chest: 0.025 is 5 mm on the 200 mm testbed.

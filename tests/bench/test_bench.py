@@ -138,6 +138,16 @@ def test_pads_and_load_cell_feel_all_tips(skin):
     np.testing.assert_allclose(pads.sum(1), force[:, 0] / skin.pads[0].area, rtol=0.03, atol=1.0)
 
 
+def test_the_converter_holds_what_the_skin_reads(skin, tmp_path):
+    """A step of the converter that the scene leaves open suits a sheet of any resistance."""
+    resistive = dataclasses.replace(skin, sheet_resistance=40 * skin.sheet_resistance)
+    bench = _bench(resistive, *SHEET)
+    with calib.open_session(simulate(bench, tmp_path / "session.h5", fidelity=DRAFT)) as session:
+        recorded = session.streams["eit"].read()
+    exact = _all(simulated_streams(bench, DRAFT).eit).values
+    np.testing.assert_allclose(recorded, exact, rtol=0, atol=1e-4 * np.abs(exact).max())
+
+
 def test_effects_of_the_stage_and_the_clock_reach_the_file(skin, tmp_path):
     unsteady = je.effects.StageError(position=1e-3, jitter=0.0, ripple=0.0)
     bench = _bench(skin, unsteady, je.effects.DropOut(probability=0.2), je.effects.ClockError(jitter=0.01))

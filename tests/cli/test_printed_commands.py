@@ -108,7 +108,7 @@ def test_the_record_line_of_a_served_scene_records(served, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     words = shlex.split(served[served.index("jaxeit record") :])
     assert main([*words[1:], "--seconds", "0.5"]) == 0
-    assert (tmp_path / "session.h5").exists()
+    assert (tmp_path / "recorded.h5").exists()
     assert "eit" in capsys.readouterr().out
 
 

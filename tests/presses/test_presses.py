@@ -253,7 +253,7 @@ def test_dominant_pad_and_position():
     times = edges(2)
     time = clock(14.0, 50.0)
     xyz = np.where(time[:, None] < 8 * SECOND, [0.03, 0.05, 0.0], [0.1, 0.2, 0.0])
-    np.testing.assert_allclose(
-        hold_positions(timeline(times), ArrayStream("stage", time, xyz)), [[0.03, 0.05, 0.0], [0.1, 0.2, 0.0]]
-    )
+    stage = ArrayStream("stage", time, xyz)
+    np.testing.assert_allclose(hold_positions(timeline(times), stage), [[0.03, 0.05, 0.0], [0.1, 0.2, 0.0]])
+    assert hold_positions(timeline(times[:0]), stage).shape == (0, 3)
     assert TwoSided().weights(0.5, 0.0, 1.0) == (0.5, 0.5)

@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 from ..arguments import prepare_outputs, skin_of
@@ -67,10 +68,13 @@ def _serve(path: str) -> int:
         names = [name for name in ("eit", "pressure", "force") if name in session.streams]
         skin = _name_skin(session.skin_name, session.skin_toml, Path(path))
     with SimulatedDevice([recording_packets(path, [name], rounds=10**6) for name in names]) as device:
-        urls = [word for name, url in zip(names, device.urls, strict=True) for word in (f"--{name}", url)]
-        command = shlex.join(["jaxeit", "record", "--skin", skin, *urls, "-o", "session.h5"])
+        urls = {name: (f"--{name}", url) for name, url in zip(names, device.urls, strict=True)}
+        record = shlex.join(["jaxeit", "record", "--skin", skin, *chain(*urls.values()), "-o", "recorded.h5"])
+        shown = chain(*(urls[name] for name in ("eit", "pressure") if name in urls))
+        live = shlex.join(["jaxeit", "live", "--calibration", "calibration.h5", *shown])
         with suppress(KeyboardInterrupt):
-            print(f"serving {path}, SIMULATED; in another terminal: {command}", flush=True)
+            print(f"serving {path}, SIMULATED; in another terminal: {record}", flush=True)
+            print(f"or, with a calibration: {live}", flush=True)
             threading.Event().wait()
     return 0
 

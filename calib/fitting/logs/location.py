@@ -21,8 +21,8 @@ from ..fields import AbstractField, FittedField, Geometry, fit_field, log_gain, 
 LOADED = 0.1
 # Distance of two presses at one place at most, as part of the diagonal of the box of all presses.
 SAME_PLACE = 0.03
-# Fewer places determine no field.
 MIN_PLACES = 8
+"""Places of contact without which a log determines no field."""
 # Part of the box of the presses by which a place may lie outside it; as for the range of a channel.
 TOLERANCE = 0.05
 # Least side of the box over the longer one: presses along a line determine a field along it.

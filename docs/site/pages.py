@@ -1,0 +1,56 @@
+"""Hooks of MkDocs: the pages of the site are the files of the repository where they lie, and a page for each room.
+
+Links between pages are those of the repository, so that they work on a Git host as well. Names such as `je.prepare` in
+the text become links to the pages of their rooms.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from public_names import identifiers, public_names, room_page
+
+ROOT = Path(__file__).parents[2]
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "*/README.md", "data/schema/README.md")
+FILES = ("docs/**/*.png", "docs/site/*.css", "docs/site/*.js", "jaxeit/skin/skins/*.toml", "calib/bench/scenes/*.toml",
+         "data/sessions/*.toml")  # fmt: skip
+CODE = re.compile(r"^( *)```.*?^\1```|`[^`\n]+`(?!\])", re.DOTALL | re.MULTILINE)
+NAME = re.compile(r"`(?:je|jaxeit|calib)\.([\w.]+)(?:\(.*\))?`", re.DOTALL)
+EXAMPLE = re.compile(r"\]\((\w+)\.py\)")
+
+
+def _linked(text: str, paths: Mapping[str, str]) -> str:
+    """The text with names in code linked. Programs and links stay as they are."""
+
+    def link(found: re.Match[str]) -> str:
+        dotted = NAME.fullmatch(found[0])
+        known = [part for part in dotted[1].split(".") if part in paths] if dotted else []
+        return f"[{found[0]}][{paths[known[0]]}]" if known else found[0]
+
+    return CODE.sub(link, text)
+
+
+def _with_programs(text: str) -> str:
+    """The list of examples, and below it the programs themselves."""
+    programs = {name: (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8") for name in EXAMPLE.findall(text)}
+    shown = [f"\n## {name}\n\n```python\n{program}```\n" for name, program in programs.items()]
+    return EXAMPLE.sub(r"](#\1)", text) + "".join(shown)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Put the files of the repository and the pages of the rooms in the place of what MkDocs found under docs/."""
+    kept = [file for file in files if file.src_dir != config.docs_dir]
+    paths = sorted({path for pattern in (*PAGES, *FILES) for path in ROOT.glob(pattern)})
+    ours = [File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)) for path in paths]
+    for path, names in public_names().items():
+        ours.append(File.generated(config, f"api/{path}.md", content=room_page(path, names)))
+    return Files([*kept, *ours])
+
+
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
+    if page.file.src_uri == "examples/README.md":
+        return _with_programs(markdown)
+    return markdown if page.file.src_uri.startswith("api/") else _linked(markdown, identifiers())

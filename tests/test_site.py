@@ -1,0 +1,78 @@
+"""The documentation site shows every public name once, and asks nothing of the network."""
+
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from html.parser import HTMLParser
+from importlib import import_module, util
+from types import ModuleType
+
+import pytest
+
+from tests.test_laws import _public_names
+
+
+@pytest.fixture
+def pages(root, monkeypatch):
+    """Path of each room -> its page as it is given to MkDocs."""
+    monkeypatch.syspath_prepend(str(root / "docs" / "site"))
+    names = import_module("public_names")
+    return {path: names.room_page(path, listed) for path, listed in names.public_names().items()}
+
+
+def test_every_public_name_is_shown_once(pages):
+    shown = Counter(
+        line.rpartition(".")[2] for page in pages.values() for line in page.splitlines() if line.startswith("::: ")
+    )
+    public = {name for name, (thing, *_) in _public_names().items() if not isinstance(thing, ModuleType)}
+    assert public <= shown.keys()
+    assert [name for name, times in shown.items() if times > 1] == []
+
+
+def test_every_page_of_a_room_is_in_the_contents(pages, root):
+    contents = re.findall(r"^ +- api/(.*)\.md$", (root / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(contents) == sorted(pages)
+
+
+def test_names_are_headed_as_users_type_them(pages):
+    assert "heading: je.Noser}" in pages["jaxeit.imaging"]
+    assert "heading: je.effects.Creep}" in pages["jaxeit.effects"]
+    assert "heading: calib.record.Source}" in pages["calib.record"]
+
+
+class Page(HTMLParser):
+    """What a browser loads for a page, the headings that links may lead to, and the code of the signatures."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.headings: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag in ("script", "img", "iframe", "source"):
+            self.loaded.append(given.get("src") or "")
+        if tag == "link" and given.get("rel") in ("stylesheet", "icon", "preload", "preconnect"):
+            self.loaded.append(given["href"])
+        if tag == "h3" and "id" in given:
+            self.headings.append(given["id"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
+def test_the_site_is_built_and_whole(pages, root, tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    read = {path: Page(path.read_text(encoding="utf-8")) for path in (tmp_path / "site").rglob("*.html")}
+    assert [url for page in read.values() for url in page.loaded if re.match(r"(https?:)?//", url)] == []
+    for path, page in pages.items():
+        expected = re.findall(r"^::: (.*)$", page, re.MULTILINE)
+        headings = Counter(read[tmp_path / "site" / "api" / f"{path}.html"].headings)
+        assert {name: headings[name] for name in expected} == dict.fromkeys(expected, 1)
+    styles = "".join(path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.css"))
+    assert re.findall(r"url\(['\"]?(?:https?:)?//", styles) == []
