@@ -56,7 +56,9 @@ class ArrayStream:
         return self.values[start:stop]
 
 
-READ_AHEAD_BYTES = 4 << 20  # of float64 values; one call of `read` takes as long as reading 30 kB
+# Of float64 values. A call of `read` takes as long as copying 40 kB; where presses are not listed in the order of time,
+# much larger blocks cost more than the calls.
+READ_AHEAD_BYTES = 256 << 10
 
 
 class ReadAhead:
