@@ -138,12 +138,8 @@ def updated(calibration: Calibration, bench: Bench, faults: Faults, smoke: bool)
 
 def _relative(found: Evaluation) -> Row:
     ratio = _ratio(found)
-    spread = ratio.std(ddof=1) / ratio.mean()
-    return {
-        "rmse": float(np.sqrt(np.mean((ratio - 1) ** 2))),
-        "spread": spread,
-        "coverage": found.summary()["coverage"],
-    }
+    spread = float(ratio.std(ddof=1) / ratio.mean())
+    return {"rmse": rmse(ratio, np.ones_like(ratio)), "spread": spread, "coverage": found.summary()["coverage"]}
 
 
 def _ratio(found: Evaluation) -> np.ndarray:

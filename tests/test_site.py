@@ -43,7 +43,7 @@ def test_names_are_headed_as_users_type_them(pages):
 
 
 class Page(HTMLParser):
-    """What a browser loads for a page, the headings that links may lead to, and the code of the signatures."""
+    """What a browser loads for a page, and the headings that links may lead to."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

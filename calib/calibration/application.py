@@ -188,17 +188,16 @@ class _Tracks:
 
 def _rows(calibration: Calibration, epoch: str) -> dict[str, tuple[tuple[str, ...], str, str, str]]:
     """Arrays of a force map file with one row per frame: axes of a row, unit, meaning and type."""
-    none: tuple[str, ...] = ()
     pixels, pads = ("pixel",), ("pad",)
-    rows = {
-        "time": (none, f"nanoseconds since {epoch}", "time of the frame", "i8"),
+    rows: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+        "time": ((), f"nanoseconds since {epoch}", "time of the frame", "i8"),
         "force": (pixels, "N", "force on each pixel", "f4"),
         "force_se": (pixels, "N", "standard error of a pixel's force, for the shape as it is", "f4"),
         "pad_force": (pads, "N", "force on each pad", "f8"),
         "pad_force_se": (pads, "N", "standard error of a pad's force", "f8"),
         "pad_force_half": (pads, "N", "half the interval that 90 % of readings of a pad's force fall into", "f8"),
-        "total_force": (none, "N", "sum of the forces on the pads", "f8"),
-        "total_force_half": (none, "N", "half the 90 % interval of a reading of the sum", "f8"),
+        "total_force": ((), "N", "sum of the forces on the pads", "f8"),
+        "total_force_half": ((), "N", "half the 90 % interval of a reading of the sum", "f8"),
         "pad_valid": (pads, "1", "pressure in the calibrated range", "u1"),
         "shape_valid": (pads, "1", "1: shape from the image; 0: even", "u1"),
     }

@@ -116,9 +116,8 @@ class ArchiveWriter(FileWriter):
             raise problem(self.path, "attributes", what, "use other names")
         own = {"format": format, "format_version": ARCHIVE_VERSION, "Conventions": "CF-1.11"}
         self._attrs = {**own, **attrs}
-        self._names: set[str] = set()
         self._growing: dict[str, tuple[GrowingArray, tuple[int, ...], dict[str, AttributeValue]]] = {}
-        self._dims: dict[str, Dims] = {}
+        self._dims: dict[str, Dims] = {}  # of each array
 
     def _start(self, file: h5py.File) -> None:
         put_attributes(file, self._attrs)
@@ -170,12 +169,11 @@ class ArchiveWriter(FileWriter):
         parts = name.split("/")
         bad = [p for p in parts if not PART.fullmatch(p) or DIMENSION.fullmatch(p)]
         taken = any(name == n or name.startswith(n + "/") or n.startswith(name + "/")
-                    for n in self._names)  # fmt: skip
+                    for n in self._dims)  # fmt: skip
         if bad or taken or len(parts) > MAX_DEPTH:
             raise problem(self.path, name, "cannot be used as a name", "use letters, digits, _ and -")
-        if unknown := set(dims) - self._names - {name}:
+        if unknown := set(dims) - self._dims.keys() - {name}:
             raise problem(self.path, name, f"has axes {sorted(unknown)}", "add arrays of these names before")
-        self._names.add(name)
         self._dims[name] = dims
         group = self._open()
         for part in parts[:-1]:
