@@ -199,9 +199,8 @@ BLOCKS_PER_WINDOW = 8
 def _window_mean(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, standard error and count of finite samples per channel of one window (n, channels)."""
     good = np.isfinite(values)
-    if len(values) and good.all():  # the usual case, in a third of the time
-        mean = values.mean(axis=0)
-        return mean, _scatter_of_blocks(values - mean), np.full(values.shape[1], len(values))
+    if len(values) and good.all():  # the usual case, in a fifth of the time
+        return *_finite_window(values), np.full(values.shape[1], len(values))
     count = good.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = finite_mean(values)
@@ -209,22 +208,27 @@ def _window_mean(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _block_edges(rows: int) -> np.ndarray:
+    """First rows of the blocks of a window, and its length."""
     blocks = min(BLOCKS_PER_WINDOW, rows)
-    return np.arange(blocks) * rows // max(blocks, 1)
+    return np.arange(blocks + 1) * rows // max(blocks, 1)
 
 
-def _scatter_of_blocks(residual: np.ndarray) -> np.ndarray:
-    """`_standard_error` of finite samples."""
-    edges = _block_edges(len(residual))
-    if len(edges) < 2:
-        return np.full(residual.shape[1], np.nan)
-    sums = np.add.reduceat(residual, edges, axis=0)
-    return np.asarray(np.sqrt(np.einsum("bc,bc->c", sums, sums) * (len(edges) / (len(edges) - 1))) / len(residual))
+def _finite_window(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and `_standard_error` of finite samples, from the sums of the blocks."""
+    rows, edges = len(values), _block_edges(len(values))
+    blocks = len(edges) - 1
+    sums = np.add.reduceat(values - values[0], edges[:-1], axis=0)  # of differences: levels are large, noise is small
+    shift = sums.sum(axis=0) / rows
+    if blocks < 2:
+        return values[0] + shift, np.full(values.shape[1], np.nan)
+    sums -= (edges[1:] - edges[:-1])[:, None] * shift
+    scatter = np.einsum("bc,bc->c", sums, sums) * (blocks / (blocks - 1))
+    return values[0] + shift, np.sqrt(scatter) / rows
 
 
 def _standard_error(residual: np.ndarray, good: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Standard error of a mean from the scatter of block sums (batch means); NaN with fewer than two blocks."""
-    edges = _block_edges(len(residual))
+    edges = _block_edges(len(residual))[:-1]
     if not len(edges):
         return np.full(count.shape, np.nan)
     sums = np.add.reduceat(residual, edges, axis=0)

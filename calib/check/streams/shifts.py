@@ -8,6 +8,7 @@ columns before.
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ...session.units import SECOND
 from ..report import Finding, Severity
@@ -84,7 +85,8 @@ def _noise(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size[~np.isfinite(size)] = 0.0
     least = np.where(size > 0, size, np.inf).min(0)
     start = np.unique(np.append(np.arange(0, len(values) - window, window // 2), len(values) - window))
-    level = np.stack([np.median(size[a + 1 : a + window - 1], axis=0) for a in start])
+    inner = sliding_window_view(size, window - 2, axis=0)
+    level = np.stack([np.median(inner[start + 1, column], axis=1) for column in range(size.shape[1])], 1)
     return start, np.log(np.maximum(level, np.where(np.isfinite(least), least / 2, 1.0)))
 
 

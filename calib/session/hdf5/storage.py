@@ -1,8 +1,9 @@
 """Write HDF5 files; all session and result files are written by these functions.
 
 Format bounds are v110 (checksums on metadata). Every dataset has chunks of about 256 kB with gzip 1, shuffle and
-fletcher32. Texts are fixed-length UTF-8. There are no time stamps, so that equal input gives equal bytes.
-Dimension scales let netCDF4, h5netcdf and xarray open the file. A file appears under its name only when it is whole.
+fletcher32; a long array that gzip would hardly shorten has only the checksum. Texts are fixed-length UTF-8. There are
+no time stamps, so that equal input gives equal bytes. Dimension scales let netCDF4, h5netcdf and xarray open the file.
+A file appears under its name only when it is whole.
 """
 
 import abc
@@ -14,6 +15,7 @@ import os
 import re
 import stat
 import uuid
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -33,6 +35,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 CHUNK_BYTES = 256 << 10
+PACKED_UNTRIED, TRIED_BYTES = 512 << 10, 32 << 10  # sizes of arrays that are packed untried, and of the part tried
 DIMENSION_NAME = "This is a netCDF dimension but not a netCDF variable. %9d"
 """Name that netCDF-4 gives to a dimension scale without values."""
 
@@ -313,7 +316,7 @@ def chunk_shape(shape: Sequence[int], itemsize: int) -> tuple[int, ...]:
     return tuple(chunk)
 
 
-def _creation(chunk: tuple[int, ...] | None, itemsize: int) -> h5p.PropDCID:
+def _creation(chunk: tuple[int, ...] | None, itemsize: int, packed: bool) -> h5p.PropDCID:
     """Creation properties without time stamps: chunks with filters, or compact storage for a scalar."""
     plist = h5p.create(h5p.DATASET_CREATE)
     plist.set_obj_track_times(False)
@@ -321,11 +324,22 @@ def _creation(chunk: tuple[int, ...] | None, itemsize: int) -> h5p.PropDCID:
         plist.set_layout(h5d.COMPACT)  # stored in the object header, which has a checksum
         return plist
     plist.set_chunk(chunk)
-    if itemsize > 1:
+    if packed and itemsize > 1:
         plist.set_shuffle()
-    plist.set_deflate(1)
+    if packed:
+        plist.set_deflate(1)
     plist.set_fletcher32()
     return plist
+
+
+def _packs(values: np.ndarray) -> bool:
+    """Whether gzip shortens an array by a fifth; short arrays are not tried."""
+    if values.nbytes < PACKED_UNTRIED:
+        return True
+    middle = values.size // 2
+    tried = values.reshape(-1)[middle : middle + TRIED_BYTES // values.itemsize].view(np.uint8)
+    shuffled = tried.reshape(-1, values.itemsize).T.tobytes()
+    return len(zlib.compress(shuffled, 1)) < 0.8 * len(shuffled)
 
 
 def _file_type(dtype: np.dtype) -> h5t.TypeID:
@@ -336,21 +350,27 @@ def _file_type(dtype: np.dtype) -> h5t.TypeID:
 
 
 def make_dataset(
-    parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype, growing: bool = False
+    parent: h5py.Group,
+    name: str,
+    shape: tuple[int, ...],
+    dtype: np.dtype,
+    *,
+    growing: bool = False,
+    packed: bool = True,
 ) -> h5py.Dataset:
-    """Create a dataset; with `growing`, its first axis can be extended later."""
+    """Create a dataset; with `growing`, its first axis can be extended later; `packed` with gzip."""
     dtype = np.dtype(dtype)
     maximum = (h5s.UNLIMITED, *shape[1:]) if growing else shape
     space = h5s.create_simple(shape, maximum) if shape else h5s.create(h5s.SCALAR)
-    plist = _creation(chunk_shape(shape, dtype.itemsize) if shape else None, dtype.itemsize)
+    plist = _creation(chunk_shape(shape, dtype.itemsize) if shape else None, dtype.itemsize, packed)
     kind = _file_type(dtype)
     return h5py.Dataset(h5d.create(parent.id, name.encode(), kind, space, plist))
 
 
 def make_array(parent: h5py.Group, name: str, values: np.ndarray, attrs: Mapping[str, AttributeValue]) -> h5py.Dataset:
     """Create a dataset that holds `values`."""
-    values = np.asarray(values)
-    dataset = make_dataset(parent, name, values.shape, values.dtype)
+    values = np.ascontiguousarray(values).reshape(np.shape(values))
+    dataset = make_dataset(parent, name, values.shape, values.dtype, packed=_packs(values))
     if values.size:
         dataset[...] = values.astype(dataset.dtype)  # the library takes the type S of texts in memory for ASCII
     put_attributes(dataset, attrs)
