@@ -33,8 +33,10 @@ class Recipe:
     | folds: parts into which the places are divided; each is predicted from the others           | 5                |
     | imaging: how images are computed from frames                                                | `jaxeit.Imaging` |
     | fidelity: accuracy of the finite-element model from which images are computed               | standard         |
+    | even_sheet: take the sheet for even; otherwise the untouched frames tell its conductivity   | False            |
 
-    The default is the recipe of the paper (arXiv 2605.28468). Sequences of curves and locations become tuples.
+    The default is the recipe of the paper (arXiv 2605.28468), except that the paper takes the sheet for even. Sequences
+    of curves and locations become tuples.
 
     Raises:
         RecipeError: if no curve or location is given, if there is less than one fold, if the basis has no pixels, or
@@ -49,6 +51,7 @@ class Recipe:
     folds: int = 5
     imaging: je.Imaging = field(default_factory=je.Imaging)
     fidelity: je.Fidelity = field(default_factory=je.Fidelity.standard)
+    even_sheet: bool = False
 
     def __post_init__(self) -> None:
         for name in ("curve", "location"):

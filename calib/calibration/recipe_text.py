@@ -3,6 +3,7 @@
 curve = ["linear", "power"]                       # several: one is chosen by cross-validation; "auto": the usual ones
 location = {type = "edge", width = 0.008}         # or "edge:width=0.008", as on the command line
 fidelity = "standard"
+even_sheet = false
 
 [imaging]
 method = "one-step"
@@ -95,6 +96,7 @@ def recipe_fields(table: TomlTable, base: "Recipe") -> dict[str, Any]:
         "loss": lambda: _choice(table, "loss", LOSSES),
         "folds": lambda: table.count("folds"),
         "fidelity": lambda: _read_fidelity(table),
+        "even_sheet": lambda: table.get("even_sheet", lambda v: isinstance(v, bool), "true or false"),
         "imaging": lambda: read_imaging(table.table("imaging"), base.imaging),
         "processing": lambda: read_processing(table.table("processing"), base.processing),
     }
@@ -217,6 +219,7 @@ def recipe_to_toml(recipe: "Recipe") -> str:
         "loss": LOSSES.settings(recipe.loss),
         "folds": recipe.folds,
         "fidelity": _fidelity_settings(recipe.fidelity),
+        "even_sheet": recipe.even_sheet,
     }
     weight = imaging.hyperparameter
     images = {

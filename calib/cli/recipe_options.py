@@ -54,6 +54,8 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     text = "folds of the cross-validation over places; with K of at least the number of places, "
     group.add_argument("--folds", type=count, metavar="K", help=text + "one place is left out at a time; default: 5")
     _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
+    text = "take the conductive sheet for even; default: its conductivity is fitted to the untouched frames"
+    group.add_argument("--even-sheet", action="store_true", help=text)
     _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")
     add_low_pass_argument(group)
     add_imaging_arguments(parser)
@@ -101,6 +103,7 @@ def recipe_of(args: argparse.Namespace) -> Recipe:
     }
     given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name) is not None}
     given |= {} if args.folds is None else {"folds": args.folds}
+    given |= {"even_sheet": True} if args.even_sheet else {}
     processing = processing_of(args, recipe.processing)
     recipe = replace(recipe, **given, processing=processing, imaging=imaging_of(args, recipe.imaging))
     if args.locator is not None and not recipe.locates:

@@ -466,12 +466,23 @@ def test_bundled_sessions_say_that_they_are_simulated(bundled):
 
 
 def test_an_untouched_frame_that_fits_no_sheet_is_said(model):
-    """Contacts are then placed on an even sheet."""
+    """Images and contacts then are those of an even sheet."""
     v0 = np.asarray(je.forward(model))
-    sigma, note = fit_untouched_sheet(model, -v0, np.ones(len(v0), bool))
+    sigma, (note,) = fit_untouched_sheet(model, -v0, np.ones(len(v0), bool))
     assert sigma is None
-    assert "even sheet" in note
+    assert "taken for even" in note
     assert "polarity" in note
+
+
+def test_images_are_those_of_the_sheet_that_the_untouched_frames_show(bundled):
+    """The bundled bench has an uneven coat; images then are nearer to the presses than those of an even sheet."""
+    with calib.open_session(bundled[0]) as session:
+        known, even = (
+            calib.calibrate([session], recipe=replace(QUICK, even_sheet=e)).evaluation for e in (False, True)
+        )
+    for name, ratio in (("half", 1.0), ("positive", 0.7)):
+        error, assumed = (np.linalg.norm(e.estimated[name] - e.position, axis=1).mean() for e in (known, even))
+        assert error < ratio * assumed
 
 
 OWN_CURVE = """

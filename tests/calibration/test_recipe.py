@@ -62,6 +62,7 @@ def test_recipes_that_differ_have_texts_that_differ():
         {"imaging": je.Imaging(hyperparameter=0.2)},
         {"imaging": je.Imaging(noise=je.imaging.MeasuredNoise())},
         {"fidelity": je.Fidelity.draft()},
+        {"even_sheet": True},
     ]
     texts += [replace(calib.Recipe(), **change).to_toml() for change in changes]
     assert len(set(texts)) == len(texts)
@@ -92,6 +93,7 @@ def test_a_file_gives_some_choices_and_the_rest_stays(tmp_path):
         ('curve = "powr"', "r.toml: curve: no curve 'powr'; did you mean 'power'"),
         ('curv = "power"', "r.toml: curv: unknown key; did you mean 'curve'"),
         ("curve = []", "recipe: curve is empty; give one or more"),
+        ("even_sheet = 1", "r.toml: even_sheet: is 1; give true or false"),
         ("curve = 3", "r.toml: curve: is 3; give a curve, or a list of them"),
         ('[imaging]\nprior = "nosr"', r"r.toml: \[imaging\]: prior: no prior 'nosr'; did you mean 'noser'"),
         ('[imaging]\nprior = {type = "noser", exponent = "x"}', "exponent: is 'x'; give a number"),
@@ -149,6 +151,10 @@ def test_options_come_before_the_file_and_the_file_before_the_defaults(tmp_path)
     assert plain.imaging == je.Imaging(je.Pixels(20), noise=je.imaging.MeasuredNoise())
     assert plain.processing.baseline == calib.presses.PreOnly()
     assert plain.fidelity == je.Fidelity.draft(order=2)
+    assert not plain.even_sheet
+    assert options("--even-sheet").even_sheet
+    path.write_text("even_sheet = true\n")
+    assert options("--recipe", str(path)).even_sheet
 
 
 @pytest.mark.parametrize(

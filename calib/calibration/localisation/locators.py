@@ -7,7 +7,7 @@ neither mesh nor solver.
 import abc
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, get_type_hints
 
 import equinox as eqx
 import jax
@@ -84,9 +84,7 @@ def _located(
 
 
 class AbstractLocatorChoice(abc.ABC):
-    """Choice of an estimator of the place of a contact. `looks_through_sheet`: whether `prepare` uses `sigma`."""
-
-    looks_through_sheet: ClassVar[bool] = True
+    """Choice of an estimator of the place of a contact."""
 
     @abc.abstractmethod
     def prepare(
@@ -107,8 +105,6 @@ class ImageCentroid(AbstractLocatorChoice):
 
     Raises: `ValueError` for a name that is not in `jaxeit.metrics.ESTIMATORS`.
     """
-
-    looks_through_sheet: ClassVar[bool] = False
 
     estimator: str = "half"
 

@@ -1,17 +1,18 @@
 """Images of the frames of presses, and the places of the presses estimated from these frames."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 import jaxeit as je
 
 from ...fitting.fields import Places
 from ...presses.pooled import PooledPresses
 from ..recipe import Recipe
-from .locators import AbstractLocator, AbstractLocatorChoice, locate
+from .locators import AbstractLocator, locate
 
 
 class PressImages(NamedTuple):
@@ -67,34 +68,26 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
     Raises:
         InverseError, HyperparameterError: if no image can be made with these choices.
     """
-    imaging = recipe.imaging
-    model = je.discretise(je.Scene(skin), recipe.fidelity)
+    imaging, model = recipe.imaging, je.discretise(je.Scene(skin), recipe.fidelity)
+    sheet = (None, ()) if recipe.even_sheet else fit_untouched_sheet(model, presses.untouched, presses.channels)
+    sigma, notes = sheet
     recon = imaging.prepare(
         model,
         quiet=presses.quiet_frames(recipe.processing) if imaging.noise.needs_frames else None,
         frames=presses.dv,
         channels=presses.channels,
+        sigma=sigma,
     )
     masks = je.pad_masks(skin, recon)
-    if not recipe.locates:
-        return Imager(recon, masks)
-    locator, note = _prepare_locator(recipe.locator, model, presses)
-    return Imager(recon, masks, locator, (note,) if note else ())
+    locator = recipe.locator.prepare(model, presses.noise, presses.channels, sigma) if recipe.locates else None
+    return Imager(recon, masks, locator, notes)
 
 
-def _prepare_locator(
-    choice: AbstractLocatorChoice, model: je.Model, presses: PooledPresses
-) -> tuple[AbstractLocator, str]:
-    """The locator, prepared with the sheet of the untouched frames, and a note if a uniform sheet was assumed."""
-    sigma, note = None, ""
-    if choice.looks_through_sheet:
-        sigma, note = fit_untouched_sheet(model, presses.untouched, presses.channels)
-    return choice.prepare(model, presses.noise, presses.channels, sigma), note
-
-
-def fit_untouched_sheet(model: je.Model, untouched: np.ndarray, channels: np.ndarray) -> tuple[Any, str]:
-    """Conductivity of the untouched sheet (elements,) S; or None, and a note that a uniform sheet is assumed."""
+def fit_untouched_sheet(
+    model: je.Model, untouched: np.ndarray, channels: np.ndarray
+) -> tuple[Array | None, tuple[str, ...]]:
+    """Conductivity of the untouched sheet (elements,) S; or None, with a note that the sheet is taken for even."""
     try:
-        return je.fit_background(model, np.where(channels, untouched, np.nan)), ""
+        return je.fit_background(model, np.where(channels, untouched, np.nan)), ()
     except je.imaging.InverseError as error:
-        return None, f"contacts are placed on an even sheet, as the untouched frame shows none that fits: {error}"
+        return None, (f"the sheet is taken for even, as the untouched frame shows none that fits: {error}",)
