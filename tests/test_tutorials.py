@@ -92,3 +92,13 @@ def test_pyeit_itself_gives_the_same_voltages_and_the_same_image(pyeit, root):
     weight = pyeit["from_pyeit"](model, 0.01, 0.5)
     recon = je.prepare(model, je.Noser(exponent=0.5), basis=je.Elements(), hyperparameter=weight)
     close(recon(v1 - v0), np.real(theirs["ds"]))
+
+
+@pytest.mark.slow
+def test_a_network_trained_on_drawn_skins_is_nearer_than_the_image(root, capsys):
+    names = run(root / "docs" / "train.md", {})
+    assert names["dv"].shape == (3000, 550)
+    assert bool(jnp.isfinite(names["dv"]).all())
+    assert float(names["error"]) < 0.003
+    assert float(names["error"]) < 0.8 * float(names["of_images"])
+    assert "error of the place: network" in capsys.readouterr().out
