@@ -1,8 +1,8 @@
 """Tables in Markdown from rows of results.
 
 A cell is a format string over a row, as ``"{frames:,}"``. Added to Python's formats are ``{x:ms}``, three figures or
-whole numbers from 100 on, ``{x:.1f %}``, a fraction in percent, and the factors ``{x:.1f milli}`` (in thousandths)
-and ``{x:.1f kilo}`` (in thousands). A cell is empty where the row lacks the number.
+whole numbers from 100 on, ``{x:.1f %}``, a fraction in percent, and the factors ``{x:.1f milli}`` (in thousandths),
+``{x:.1f kilo}`` (in thousands) and ``{x:.0f mega}`` (in millions). A cell is empty where the row lacks the number.
 """
 
 import re
@@ -12,7 +12,7 @@ from typing import Any
 
 from .rows import Row
 
-FACTORS = {"%": 100, "milli": 1e3, "kilo": 1e-3}
+FACTORS = {"%": 100, "milli": 1e3, "kilo": 1e-3, "mega": 1e-6}
 
 
 class _Format(string.Formatter):

@@ -114,6 +114,21 @@ def _images(results: Row) -> Iterator[Row]:
         yield {"seeds": results["seeds"]} | row | {"error": min(row[name] for name in names if name in row)}
 
 
+def _priors(results: Row) -> Iterator[Row]:
+    """The rows of `_images` that differ in the prior, or basis, of one step alone."""
+    for row in _images(results):
+        method, _, prior = row["method"].partition(", ")
+        if method == "one step":
+            yield row | {"prior": re.sub(" [(].*", "", prior)}
+
+
+def _methods(results: Row) -> Iterator[Row]:
+    """The rows of `_images` that differ in the method: of one step only that with the default prior."""
+    for row in _images(results):
+        if not row["method"].startswith("one step") or row["method"].endswith("NOSER"):
+            yield row
+
+
 def _ktc(results: Row) -> list[Row]:
     """Mean scores by method and level, and their total."""
     by_level = [row | {"head": f"level {row['level']}", "score": f"{row['mean']:.3f}"} for row in results["rows"]]
@@ -144,6 +159,43 @@ def _ladder(skin: int) -> Callable[[Row], Iterator[Row]]:
     return rows
 
 
+def _fidelities(results: Row) -> Iterator[Row]:
+    """The rungs of both skins in float64, by the names that `Fidelity` gives them, with their settings."""
+    for ladder in results["ladders"]:
+        for row in ladder["rungs"]:
+            if row["label"] in ("draft", "draft P2", "standard", "fine", "reference"):
+                yield row | {"skin": ladder["skin"]}
+
+
+def _precisions(results: Row) -> Iterator[Row]:
+    """The rungs of both skins that were measured in both precisions, side by side."""
+    for ladder in results["ladders"]:
+        rungs = {row["label"]: row for row in ladder["rungs"]}
+        for label, row in rungs.items():
+            if f"{label} f32" in rungs:
+                yield {"skin": ladder["skin"], "label": label, "double": row, "single": rungs[f"{label} f32"]}
+
+
+SOLVERS = {
+    "None": "default: `NestedDissection()`",
+    "ConjugateGradient(preconditioner=Single(solver=NestedDissection()))": (
+        "`ConjugateGradient(Single(NestedDissection()))`"
+    ),
+    "Single(solver=NestedDissection())": "`Single(NestedDissection())`",
+}
+
+
+def _solvers(results: Row) -> Iterator[Row]:
+    """The rungs of the testbed that differ in the linear solver alone, beside those of the default."""
+    rungs = [row for row in results["ladders"][0]["rungs"] if row["forward"]]
+    others = [row for row in rungs if row["fidelity"]["solver"] != "None"]
+    for other in others:
+        same = {**other["fidelity"], "solver": "None"}
+        default = next(row for row in rungs if row["fidelity"] == same)
+        for row in (default, other):
+            yield row | {"of": default["label"], "solver": SOLVERS[row["fidelity"]["solver"]]}
+
+
 def _frame(results: Row) -> Iterator[Row]:
     """One frame to its image: in a stream of frames, after other work, and in a batch."""
     kinds = ("single", "single, after other work", "batch")
@@ -157,6 +209,24 @@ def _calibration(results: Row) -> list[Row]:
     scattered = [row for row in results["presses"] if row["spread"] == "scattered"]
     every = [row for row in results["presses"] if row["presses"] == 225]
     return sorted(scattered, key=lambda row: row["presses"]) + every
+
+
+def _levels(results: Row) -> Iterator[Row]:
+    """Error of held-out forces by curve and by the levels of force that its presses had."""
+    for row in results["levels"]:
+        levels = "all samples" if row["levels"] is None else f"{row['levels']} level" + "s" * (row["levels"] > 1)
+        yield row | {"fitted": levels}
+
+
+def _locations(results: Row) -> Iterator[Row]:
+    """Error of held-out forces with and without a correction by location, and where the presses were."""
+    return (row for row in results["presses"] if row["curve"] == "linear")
+
+
+def _scans(results: Row) -> Iterator[Row]:
+    """Readings chosen for the whole sheet, for a pad or for a place, and at random."""
+    known = ("D-optimal", "around the pad", "around the place", "at random")
+    return (row for row in results["rows"] if row["way"] in known)
 
 
 def _events(results: Row) -> Iterator[Row]:
@@ -188,6 +258,14 @@ ROWS: dict[str, Callable] = {
     "onto": _onto,
     "repeat": _repeat,
     "images": _images,
+    "priors": _priors,
+    "methods": _methods,
+    "fidelities": _fidelities,
+    "precisions": _precisions,
+    "solvers": _solvers,
+    "levels": _levels,
+    "locations": _locations,
+    "scans": _scans,
     "ktc": _ktc,
     "paper": _paper,
     "ladder_testbed": _ladder(0),

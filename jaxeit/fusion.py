@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
-from ._compile import require_known
+from ._compile import is_traced, require_known
 from .model.bases import AbstractPictured, overlap_areas
+from .notebook import card, picture
 from .skin.description import Skin
 
 __all__ = [
@@ -33,10 +34,12 @@ class PadMasks(eqx.Module):
     |----------------------------------------------------------|----------------|------|
     | weights: share of each pad in each pixel; the sum over pads is at most 1 | (pads, pixels) | |
     | areas of the pixels                                      | (pixels,)      | m^2  |
+    | shape: (rows, columns) of the image; None: not known     |                |      |
     """
 
     weights: Float[Array, "pads pixels"]
     areas: Float[Array, " pixels"]
+    shape: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
 
 class ForceMap(eqx.Module):
@@ -50,6 +53,7 @@ class ForceMap(eqx.Module):
     | discarded: negative part of the image, which has no force        | (..., pads)   | S m^2|
     | areas of the pixels                                              | (pixels,)     | m^2  |
     | standard_error of each pixel's force; None: pad_errors not given | (..., pixels) | N    |
+    | shape: (rows, columns) of the image; None: not known             |               |      |
 
     The standard error propagates the errors of the pads' forces alone, with the shape taken as exact; within a pad the
     errors of all pixels are fully correlated.
@@ -61,6 +65,7 @@ class ForceMap(eqx.Module):
     discarded: Float[Array, "... pads"]
     areas: Float[Array, " pixels"]
     standard_error: Float[Array, "... pixels"] | None = None
+    shape: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def pressure(self) -> Float[Array, "... pixels"]:
@@ -70,6 +75,27 @@ class ForceMap(eqx.Module):
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self.force, dtype=dtype)
+
+    def _repr_html_(self) -> str:
+        if is_traced(self):
+            return card("Force map", [("state", "traced by JAX: its numbers are hidden")])
+        frames = np.asarray(self.force, float).reshape(-1, self.force.shape[-1])
+        if not len(frames):
+            return card("Force map", [("frames", "0")])
+        totals = np.nansum(frames, axis=1)
+        shown = int(totals.argmax())
+        pressures = np.asarray(self.pressure, float).reshape(frames.shape)[shown]
+        valid = np.asarray(self.valid).reshape(len(frames), self.valid.shape[-1])[shown]
+        rows = [
+            ("frames", f"{len(frames):,}" + (f"; shown: {shown}, of the largest force" if len(frames) > 1 else "")),
+            ("force", f"{totals[shown]:.3g} N"),
+            ("largest pressure", f"{np.nanmax(pressures, initial=0.0) / 1e3:.3g} kPa"),
+            ("pads whose image gives the shape", f"{int(valid.sum())} of {len(valid)}"),
+        ]
+        flat = self.shape is None or len(self.shape) != 2
+        return card(
+            "Force map", rows, "" if flat else picture(pressures.reshape(self.shape), "Pressure over the sheet")
+        )
 
 
 def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
@@ -94,7 +120,7 @@ def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
         if not (mask * areas).any():
             raise FusionError(f"pad {pad.name!r} covers no part of the image")
     weights = weights / np.maximum(weights.sum(0), 1.0)
-    return PadMasks(jnp.asarray(weights, image.areas.dtype), image.areas)
+    return PadMasks(jnp.asarray(weights, image.areas.dtype), image.areas, image.shape)
 
 
 def _coverage(outline: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -216,7 +242,7 @@ def fuse(
     silent = (~known).astype(mass.dtype) @ masks.weights > 0
     force = jnp.where(silent, jnp.nan, force)
     error = None if pad_errors is None else _root((part**2 * (pad_errors**2)[..., None]).sum(-2))
-    return ForceMap(force, valid, concentration, discarded, masks.areas, error)
+    return ForceMap(force, valid, concentration, discarded, masks.areas, error, masks.shape)
 
 
 def _root(square: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -5,8 +5,11 @@ import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 from contextlib import contextmanager
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,10 +17,12 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.cli import main
+from calib.cli import _parser, main
+from calib.cli.recipe_options import recipe_of
 
 FENCE = re.compile(r"^( *)```(\w*)(?: title=\"(.+?)\")?\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 SHELL = ("sed ", "python ")
+DECISIONS = sorted((Path(__file__).parents[1] / "docs").glob("which-*.md"))
 
 
 def blocks(page):
@@ -73,6 +78,16 @@ def follow(page, folder):
     return names
 
 
+@pytest.fixture(scope="module")
+def touch(model):
+    """What the programs about images take for given: a model, a touch at (60, 130) mm, the noise of the readings."""
+    distance = jnp.linalg.norm(model.centroids - jnp.array([0.06, 0.13]), axis=1)
+    v0 = je.forward(model)
+    dv = je.forward(model, jnp.where(distance < 0.01, 1.5, 1) * model.background) - v0
+    noise = jnp.full(len(v0), 1e-4 * float(jnp.abs(v0).max()))
+    return {"je": je, "jnp": jnp, "model": model, "v0": v0, "dv": dv, "noise": noise, "distance": distance}
+
+
 def force_error(table):
     """RMSE (N) of the first row "calibrated" that a command printed."""
     return float(re.search(r"calibrated \(.*?\) +[\d.]+ +\([\d.]+\) +([\d.]+)", table)[1])
@@ -121,14 +136,78 @@ def test_programs_about_import(root, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_programs_about_images(root, model):
-    place = jnp.array([0.06, 0.13])
-    distance = jnp.linalg.norm(model.centroids - place, axis=1)
-    v0 = je.forward(model)
-    dv = je.forward(model, model.background * (1 + 0.5 * (distance < 0.01))) - v0
-    noise = jnp.full(len(v0), 1e-4 * float(jnp.abs(v0).max()))
-    given = {"je": je, "jnp": jnp, "model": model, "v0": v0, "dv": dv, "noise": noise, "distance": distance}
-    names = run(root / "docs" / "methods.md", given | {"finder": je.prepare_contacts(model, noise=noise)})
+def test_programs_about_images(root, model, skin, touch):
+    frames = [(dv, 0.01, None, None) for dv in (0 * touch["dv"], touch["dv"], touch["dv"])]
+    given = {"skin": skin, "frames": frames, "finder": je.prepare_contacts(model, noise=touch["noise"])}
+    names = run(root / "docs" / "methods.md", touch | given)
     assert abs(float(names["figures"].position_error)) < 0.01
     assert 0.3 < float(names["likeness"]) <= 1
+    place = jnp.array([0.06, 0.13])
     assert float(je.localisation_error(je.contacts.strongest(names["contacts"]), place)) < 0.01
+    (track,) = names["now"].tracks
+    np.testing.assert_allclose(track.position, place, atol=0.001)
+
+
+# --- a page for each decision
+
+
+def recipe_of_command(text):
+    """The recipe that the command line of a page makes."""
+    (line,) = [line for line in text.splitlines() if line.startswith("jaxeit calibrate ")]
+    return recipe_of(_parser(["calibrate"]).parse_args(shlex.split(line)[1:]))
+
+
+@pytest.fixture(scope="module")
+def defined_by(root, skin, touch):
+    """What the programs of a decision define, by the name of its page; each page is run once."""
+    given = touch | {"calib": calib, "skin": skin}
+    return cache(lambda name: run(root / "docs" / f"{name}.md", dict(given)))
+
+
+@pytest.mark.parametrize("page", DECISIONS, ids=lambda page: page.stem)
+def test_a_decision_has_its_default_first_one_table_and_two_ways_to_say_it(page, defined_by, root):
+    text = page.read_text(encoding="utf-8")
+    assert re.match(r"# Which [\w -]+\?\n\n\*\*(Default|Recommended): ", text)
+    assert re.findall(r"^<!-- ([\w-]+): written by", text, re.MULTILINE) == [page.stem]
+    assert f"- docs/{page.name}\n" in (root / "mkdocs.yml").read_text(encoding="utf-8")
+    (python, _, _), (language, _, said) = blocks(page)
+    assert python == "python"
+    if page.stem != "which-scan":  # a scan is no choice of a recipe
+        written = calib.Recipe.from_toml(said) if language == "toml" else recipe_of_command(said)
+        assert written.to_toml() == defined_by(page.stem)["recipe"].to_toml() != calib.Recipe().to_toml()
+
+
+def test_the_images_of_decisions_are_at_the_touch(defined_by):
+    place = jnp.array([0.06, 0.13])
+    for name in ("which-prior", "which-method", "which-precision"):
+        names = defined_by(name)
+        centroid = je.LevelCentroid(0.5)(names["image"], names["recon"])
+        assert float(je.localisation_error(centroid.astype(float), place)) < 0.01, name
+
+
+def test_the_curves_voltages_and_scans_of_decisions_are_as_said(defined_by, touch, root):
+    curve = defined_by("which-curve")
+    np.testing.assert_allclose(curve["force"], 2e-3 * curve["pressure"] ** 1.1, rtol=1e-5)
+    largest = float(jnp.abs(touch["v0"]).max())
+    np.testing.assert_allclose(defined_by("which-solver")["single"], touch["v0"], atol=1e-4 * largest)
+    assert 1e-3 < float(defined_by("which-fidelity")["error"]) < 2e-2
+    assert defined_by("which-scan")["protocol"].readings == 80
+    assert defined_by("which-scan")["rate"] == pytest.approx(1250)
+    (_, (_, _, protocol)) = blocks(root / "docs" / "which-scan.md")
+    shipped = (root / "jaxeit" / "skin" / "skins" / "testbed.toml").read_text(encoding="utf-8")
+    described = tomllib.loads(protocol)["protocol"]
+    assert described == {key: tomllib.loads(shipped)["protocol"][key] for key in described}
+
+
+@pytest.mark.slow
+def test_the_command_lines_of_decisions_calibrate(root, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "session.h5").symlink_to(root / "data" / "sessions" / "testbed_grid.h5")
+    for page in DECISIONS:
+        write_files(page, tmp_path)
+        lines = "".join(text for language, _, text in blocks(page) if not language)
+        follow_commands(lines, [])
+        if lines:
+            assert calib.load_calibration("calibration.h5").recipe.to_toml() == recipe_of_command(lines).to_toml()
+    assert main(["calibrate", "session.h5", "-o", "again.h5", "--recipe", "recipe.toml"]) == 0
+    capsys.readouterr()

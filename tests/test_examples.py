@@ -5,23 +5,52 @@ import runpy
 import jax.numpy as jnp
 import pytest
 
+from benchmarks.gallery import DRAWN
+
 FINDS = {
+    "bending": lambda names: (
+        names["changes"]["rolled, radius 50 mm"] < 0.005 < 0.01 < names["changes"]["on a ball, radius 200 mm"]
+    ),
     "forces_of_a_session": lambda names: names["found"]["force_rmse"] < 1,
     "gradient_of_a_loss": lambda names: jnp.abs(names["guess"] - jnp.array([0.07, 0.12, 0.5])).max() < 1e-3,
+    "image_and_forces": lambda names: jnp.abs(names["on_pads"] - names["forces"]).max() < 1e-9,
     "many_presses": lambda names: names["error"] < 0.015,
+    "mesh_of_my_own": lambda names: 0.001 < names["change"] < 0.02,
     "missing_readings": lambda names: names["changes"]["left out"] < 0.1 < names["changes"]["taken for zero"],
     "my_own_effect": lambda names: jnp.abs(names["wet"] - names["dry"]).max() > 0,
     "my_own_prior": lambda names: names["far"]["Near"] < 0.5 * names["far"]["Noser"],
+    "noise_of_an_image": lambda names: names["apart"] < 0.1,
     "one_effect_at_a_time": lambda names: (
         [change > 0 for change in names["largest"].values()] == [False, True, True, True]
     ),
+    "pressure_to_force": lambda names: (
+        names["errors"]["power"] < 0.05 < names["errors"]["linear"] and bool(names["found"].valid.all())
+    ),
+    "reciprocity": lambda names: names["found"]["sound"] < 1e-12 < 1e-3 < names["found"]["two readings swapped"],
+    "sharpness": lambda names: names["errors"].max() < 0.006,
+    "strength_of_the_prior": lambda names: (
+        names["figures"]["0.1"][0] < 0.6 * names["figures"]["weak, 0.001"][0]
+        and names["figures"]["0.1"][0] < 0.8 * names["figures"]["strong, 10"][0]
+    ),
     "tank": lambda names: jnp.linalg.norm(names["found"][:2] - names["middle"]) < 0.005,
+    "two_fingers": lambda names: names["valleys"][20] > 0.9 and names["valleys"][80] < 0.1,
     "uneven_coating": lambda names: (
         names["errors"]["fitted to the frame without contact"] < names["errors"]["assumed even"]
     ),
     "where_is_the_contact": lambda names: jnp.linalg.norm(names["found"][:2] - names["place"]) < 5e-4,
+    "which_readings": lambda names: names["shares"]["chosen"] > 0.7 > 0.5 > names["shares"]["at random"],
+    "write_a_session": lambda names: names["pressures"].shape == (1000, 2) and names["forces"].max() > 14.9,
 }
-QUICK = {"missing_readings", "my_own_effect", "tank"}
+QUICK = {
+    "bending",
+    "image_and_forces",
+    "missing_readings",
+    "my_own_effect",
+    "noise_of_an_image",
+    "reciprocity",
+    "tank",
+    "write_a_session",
+}
 
 
 def test_every_example_is_run_and_listed(root):
@@ -29,6 +58,12 @@ def test_every_example_is_run_and_listed(root):
     assert files == set(FINDS)
     page = (root / "examples" / "README.md").read_text(encoding="utf-8")
     assert all(f"({name}.py)" in page for name in files)
+    assert files == set(DRAWN) == {path.stem for path in (root / "docs" / "examples").glob("*.png")}
+    for name in files:
+        lines = (root / "examples" / f"{name}.py").read_text(encoding="utf-8").splitlines()
+        assert len(lines) <= 60, name
+        assert "?" in lines[0], name
+        assert f"(../docs/examples/{name}.png)" in page
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "budget", "files", "_compile", "toml",
+    "budget", "files", "notebook", "_compile", "toml",
     "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "__main__",
 ]  # fmt: skip

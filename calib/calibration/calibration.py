@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 import jaxeit as je
+from jaxeit.notebook import card
 
 from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
@@ -137,6 +138,29 @@ class Calibration:
     def dtype(self) -> np.dtype:
         """Precision of the fitted curves."""
         return self.curves.parameters.dtype
+
+    def _repr_html_(self) -> str:
+        found = self.evaluation
+        error = found.total_force - found.force
+        places = found.estimated.get("fitted", found.estimated.get("half"))
+        sessions = [line.split("  ")[-1] for line in self.provenance.get("sessions", "").splitlines()]
+        rows = [
+            ("sessions", ", ".join(sessions)),
+            ("presses", f"{len(found.force)}" + (", simulated" if self.simulated else "")),
+            ("curve, location", found.recipe),
+            (f"error of force, held out by {found.held_out_by}", f"{np.sqrt(np.nanmean(error**2)):.3g} N, RMSE"),
+        ]
+        if places is not None:
+            distance = np.linalg.norm(places - found.position, axis=1)
+            rows.append(("error of place, mean", f"{1e3 * np.nanmean(distance):.3g} mm"))
+        if self.recalibration is not None:
+            rows.append(("recalibrated", "yes"))
+        rows += [("note", note) for note in self.notes]
+        drawing = self.skin.drawing
+        drawing.crosses(found.position)
+        return card(
+            f"Calibration of {self.skin.name}", rows, drawing.svg(f"Sheet and {len(found.force)} places pressed")
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the calibration, whole or not at all, as HDF5 in the format skin-calibration."""

@@ -223,7 +223,9 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "skin": skin,
         "recon": recon,
         "masks": je.PadMasks(
-            jnp.asarray(_shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")), recon.areas
+            jnp.asarray(_shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")),
+            recon.areas,
+            recon.shape,
         ),
         "curves": FittedCurve(curve=curve, **fitted),
         "evaluation": Evaluation.restore(attrs, arrays, "evaluation_", "presses/"),

@@ -5,7 +5,7 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -25,6 +25,7 @@ COMMANDS = {
     "live": "show force maps on a web page as frames arrive",
     "doctor": "examine this machine: versions, device, threads, cache, disk, ports",
     "recover": "make a session from the journal that a crash left",
+    "completion": "print a script that completes commands and options in a shell",
 }
 """What each command does; ``name`` is the module ``commands/name_command.py`` with `add_arguments` and `run`."""
 
@@ -80,7 +81,11 @@ def is_out_of_memory(error: Exception) -> bool:
 
 def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     """The parser of all commands, with the arguments of the called command only, because each module costs imports."""
-    chosen = next((word for word in argv if not word.startswith("-")), None)
+    return parser_with([word for word in argv if not word.startswith("-")][:1], argv)
+
+
+def parser_with(loaded: Collection[str], argv: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The parser of all commands, with the arguments of those that are ``loaded``, for a command line ``argv``."""
     parser = argparse.ArgumentParser(
         prog="jaxeit",
         description="Force maps in newtons from EIT-pneumatic robot skins.",
@@ -89,7 +94,7 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=CommandParser)
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        if name == chosen:
+        if name in loaded:
             module = import_module(f".commands.{name}_command", __name__)
             command.set_defaults(command=module.run)
             command.words = argv

@@ -84,7 +84,11 @@ def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _choice(parser: Any, option: str, names: Iterable[str], text: str, default: str) -> None:
-    parser.add_argument(option, metavar="NAME", help=f"{text} (default: {default}); one of {', '.join(names)}")
+    names = tuple(names)
+    text = f"{text} (default: {default}); one of {', '.join(names)}"
+    action = parser.add_argument(option, metavar="NAME", help=text)
+    # A choice may have settings, so that these are not all of its texts; a shell completes them.
+    action.suggestions = tuple(name for name in names if " " not in name)
 
 
 def recipe_of(args: argparse.Namespace) -> Recipe:

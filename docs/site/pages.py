@@ -36,7 +36,8 @@ def _linked(text: str, paths: Mapping[str, str]) -> str:
 def _with_programs(text: str) -> str:
     """The list of examples, and below it the programs themselves."""
     programs = {name: (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8") for name in EXAMPLE.findall(text)}
-    shown = [f"\n## {name}\n\n```python\n{program}```\n" for name, program in programs.items()]
+    picture = "\n## {0}\n\n![{0}](../docs/examples/{0}.png)\n\n```python\n{1}```\n"
+    shown = [picture.format(name, program) for name, program in programs.items()]
     return EXAMPLE.sub(r"](#\1)", text) + "".join(shown)
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .._compile import compiler_options, is_traced, require_known
 from ..linalg.array_libraries import JAX
 from ..model.bases import AbstractPictured, Picture
+from ..notebook import card, picture
 from .methods import AbstractIterativeMethod, Problem
 from .missing import mended_sums, removed, without_readings
 from .noise import InverseError, Whitening, as_flags, require_frames, require_some
@@ -104,6 +105,25 @@ class AbstractReconstructor(AbstractPictured):
     ) -> Callable[[Float[np.ndarray, "... readings"]], Float[np.ndarray, "... basis"]]:
         """The reconstructor as a function of NumPy arrays: frames (..., readings) V to images (..., basis) S."""
 
+    def _repr_html_(self) -> str:
+        if is_traced(self):
+            return card(type(self).__name__, [("state", "traced by JAX: its numbers are hidden")])
+        used = int(np.asarray(self.channels).sum())
+        rows = [
+            (
+                "image",
+                " x ".join(map(str, self.shape[::-1])) + f", {int((np.asarray(self.areas) > 0).sum())} on the sheet",
+            ),
+            ("readings", f"{self.readings}" + ("" if used == self.readings else f", of which {used} are used")),
+            ("precision", self.dtype),
+            *self.provenance.items(),
+        ]
+        return card(type(self).__name__, rows, self._drawing())
+
+    def _drawing(self) -> str:
+        """A picture of the reconstructor for a notebook; none if there is nothing to show."""
+        return ""
+
     @property
     def dtype(self) -> np.dtype:
         """Precision in which images are made."""
@@ -148,6 +168,12 @@ class Reconstructor(AbstractReconstructor):
 
     def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
         return sums @ self.factor.T
+
+    def _drawing(self) -> str:
+        if len(self.shape) != 2:
+            return ""
+        noise = np.linalg.norm(np.asarray(self.matrix, float), axis=1).reshape(self.shape)
+        return picture(noise, "Noise of each pixel, if all readings have the same")
 
     @property
     def matrix(self) -> Float[Array, "basis readings"]:

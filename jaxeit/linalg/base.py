@@ -187,7 +187,7 @@ def inverse_columns(
 def _columns(
     values: Float[Array, " nnz"], factor: Any, plan: AbstractPlan, solver: AbstractLinearSolver
 ) -> Float[Array, "n r"]:
-    return solver.columns(factor)
+    return solver.columns(factor).astype(values.dtype)  # a solver may compute in lower precision
 
 
 def _columns_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from ..meshing.elements import Space, function_space
 from ..meshing.footprints import AbstractFootprint
 from ..meshing.generation import expected_nodes, triangulate
 from ..meshing.triangles import Mesh
+from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
 from ..skin.electrodes import touched
 from .fidelity import Fidelity, require_dtype
@@ -75,6 +76,23 @@ class Model(eqx.Module):
     def dtype(self) -> np.dtype:
         """Precision of every floating-point array of the model."""
         return self.background.dtype
+
+    def _repr_html_(self) -> str:
+        if is_traced(self):
+            return card("Model", [("state", "traced by JAX: its numbers are hidden")])
+        chart, triangles = np.asarray(self.chart), np.asarray(self.triangles)
+        edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        drawing = Drawing(chart.min(0), chart.max(0))
+        drawing.lines(*chart[edges].swapaxes(0, 1))
+        nodes, elements = len(chart), len(triangles)
+        rows = [
+            ("mesh", f"{nodes:,} nodes, {elements:,} triangles" + ("" if len(edges) <= MAX_LINES else "; not drawn")),
+            ("sheet", f"{1e4 * float(self.areas.sum()):.4g} cm^2, {'flat' if self.nodes.shape[1] == 2 else 'curved'}"),
+            ("scan", f"{self.electrodes} electrodes, {len(self.pattern)} readings, {1e3 * float(self.current):.3g} mA"),
+            ("effects", ", ".join(type(effect).__name__ for effect in self.effects) or "none"),
+            ("precision, solver", f"{self.dtype}, {type(self.solver).__name__}"),
+        ]
+        return card("Model", rows, drawing.svg(f"Mesh of {elements} triangles"))
 
 
 def discretise(

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections import Counter
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
+from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
 from .electrodes import ELECTRODES, AbstractElectrode
@@ -71,6 +73,32 @@ class Skin:
     def electrode_positions(self) -> np.ndarray:
         """Centres of the electrodes in the sheet's flat coordinates, (electrodes, 2) m."""
         return np.array([e.centre(self.domain) for e in self.electrodes])
+
+    @property
+    def drawing(self) -> Drawing:
+        """The flat sheet with its pads and electrodes, to be drawn on."""
+        low, high = self.domain.bounds
+        drawing = Drawing(np.array(low), np.array(high))
+        for pad in self.pads:
+            drawing.polygon(pad.outline, fill=0.08)
+        rim = np.append(self.domain.corners, np.linspace(0, self.domain.perimeter, 129)[:-1])
+        drawing.polygon(self.domain.boundary_point(np.unique(rim)))
+        drawing.dots(self.electrode_positions, (f"electrode {n}" for n in range(len(self.electrodes))))
+        return drawing
+
+    def _repr_html_(self) -> str:
+        low, high = np.array(self.domain.bounds)
+        kinds = Counter(electrode.name for electrode in self.electrodes)
+        width, height = 1e3 * (high - low)
+        rows = [
+            ("sheet", f"{width:.4g} x {height:.4g} mm, {self.sheet_resistance:.4g} ohm per square"),
+            ("surface", "flat" if self.surface is None else type(self.surface).__name__.lower()),
+            ("electrodes", ", ".join(f"{count} of kind {kind}" for kind, count in kinds.items())),
+            ("readings", f"{self.protocol.readings} in {1e3 * self.protocol.frame_time:.3g} ms"),
+            ("pads", ", ".join(pad.name for pad in self.pads) or "none"),
+        ]
+        label = f"Sheet with {len(self.electrodes)} electrodes and {len(self.pads)} pads"
+        return card(f"Skin {self.name}", rows, self.drawing.svg(label))
 
 
 def shipped_skins() -> tuple[str, ...]:

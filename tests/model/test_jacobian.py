@@ -109,3 +109,12 @@ def test_a_new_conductivity_compiles_nothing(small, compilations):
     je.jacobian(small, sigma)
     je.forward(small, sigma)
     assert not compilations
+
+
+def test_factors_in_single_precision_give_a_jacobian_of_the_models_precision():
+    single = je.Fidelity.draft(solver=je.linalg.Single(je.linalg.NestedDissection()))
+    scene, basis = je.Scene(je.load_skin("testbed")), je.Pixels(8)
+    found = je.jacobian(je.discretise(scene, single), basis=basis)
+    expected = je.jacobian(je.discretise(scene, je.Fidelity.draft()), basis=basis)
+    assert found.dtype == expected.dtype == np.float64
+    np.testing.assert_allclose(found, expected, atol=1e-4 * float(jnp.abs(expected).max()))

@@ -5,6 +5,7 @@ import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import numpy as np
@@ -549,3 +550,18 @@ def test_curve_and_band_are_those_of_the_fit(calibration):
     top = band[np.isclose(band[:, 0], 2.0)][:, 1].max()
     assert top == pytest.approx(2000 * (SLOPE + 1.96e-4))
     assert len(axes.lines[0].get_xdata()) == 8  # two places a side, two levels
+
+
+def test_a_notebook_shows_errors_and_places_of_a_calibration(located):
+    named = replace(located, skin=replace(located.skin, name="<b>skin"), notes=("grid.h5: <i>1</i> & more",))
+    tree = ElementTree.fromstring(named._repr_html_())
+    rows = {row[0].text: row[1].text for row in tree.iter("tr")}
+    found = named.evaluation
+    error = np.sqrt(np.mean((found.total_force - found.force) ** 2))
+    assert rows["error of force, held out by location"] == f"{error:.3g} N, RMSE"
+    assert rows["error of place, mean"] == "1.41 mm"  # 1 mm along x and along y
+    assert rows["sessions"] == "grid.h5"
+    assert rows["note"] == "grid.h5: <i>1</i> & more"
+    assert tree.find(".//strong").text == "Calibration of <b>skin"
+    (crosses,) = tree.iter("{http://www.w3.org/2000/svg}path")
+    assert crosses.attrib["d"].count("M") == len(found.force)
