@@ -6,6 +6,10 @@ and the pads tell their forces, from the load on their rectangles, to 3 % and 0.
 many contacts as tips, each within half their distance of its own, at most 15 mm; of an edge, one. "kept": the number of
 each contact is the same in all frames at full force. "covered": the ellipse of 90 % holds the place, in these frames.
 
+coverage: single tips of several shapes (those of `bench_loads`), noise 40, 60 and 80 dB below the readings, the sheet
+known or not: how often ellipses and intervals of 90 % hold place and force;
+at 60 dB without forces on pads too.
+
 What may have happened is asked at once, as in a recording, or by a bounded number of pieces after each frame, as live
 does. "delay": from the first force of the last tip until as many contacts are told; "kept": from then on.
 """
@@ -22,6 +26,7 @@ from calib.calibration.localisation.load_windows import FIDELITY
 from calib.live.follower import PIECES
 from jaxeit.tracking import Tracker, Tracking, prepare_tracker
 
+from .bench_loads import NOISES, SHAPES, TIP_SPREAD, WITHIN, Touch, shaped
 from .clock import seconds
 from .harness import Question, Run, with_one_blas_thread
 from .problems import matched, pressed, uneven
@@ -34,16 +39,19 @@ GAP, SPEED = 0.04, 0.1  # m between contacts that cross, and m/s
 TIPS = 9  # of an edge
 PAD_ERROR = (0.03, 0.1)  # relative, and N
 INSIDE = float(chi2.ppf(0.9, 2))
+HELD, FIRST_SHAPES = 16, 620  # frames of a tip of another shape; first seed of their skins
 PRESSES = 40  # of a seed, one after the other, from which the gain of the contact layer is learned
 
 
 class Scene(NamedTuple):
-    """Name, places (frames, k, 2) m and loads (frames, k) N of tips, and whether they are one edge."""
+    """Name, places (frames, k, 2) m and loads (frames, k) N of tips, whether they are one edge, and the standard
+    deviation, m, to which the pad spreads each."""
 
     name: str
     places: np.ndarray
     loads: np.ndarray
     edge: bool = False
+    spread: float = SPREAD
 
     def truth(self, frame: int) -> np.ndarray:
         """Places (n, 2) m of the contacts of a frame: of an edge, its middle."""
@@ -113,7 +121,7 @@ def pad_loads(skin: je.Skin, scene: Scene) -> np.ndarray:
     out = []
     for pad in skin.pads:
         low, high = np.min(pad.outline, 0), np.max(pad.outline, 0)
-        share = norm.cdf((high - scene.places) / SPREAD) - norm.cdf((low - scene.places) / SPREAD)
+        share = norm.cdf((high - scene.places) / scene.spread) - norm.cdf((low - scene.places) / scene.spread)
         out.append((share.prod(2) * scene.loads).sum(1))
     return np.stack(out, 1)
 
@@ -121,24 +129,30 @@ def pad_loads(skin: je.Skin, scene: Scene) -> np.ndarray:
 class Bench:
     """A skin of one seed, its tracker, and how frames of a scene are simulated on it."""
 
-    def __init__(self, model: je.Model, seed: int):
+    def __init__(self, model: je.Model, seed: int, decibels: int = 60, known: bool = True):
         self.skin, self._seed, self._effects = je.load_skin("testbed"), seed, uneven(seed)
         self.rng = np.random.default_rng([seed, 7])
         blank = pressed(self._effects, np.full((1, 1, 2), 0.1), np.zeros((1, 1)))
+        blank = blank._replace(noise=blank.noise * 10 ** ((60 - decibels) / 20))
         untouched, _ = blank.frames(self.rng)
         self.noise = np.full(untouched.size, blank.noise)
-        self.tracker: Tracker = prepare_tracker(
-            model, self.skin, noise=self.noise, sigma=je.fit_background(model, untouched)
-        )
+        sheet = je.fit_background(model, untouched) if known else None
+        self.tracker: Tracker = prepare_tracker(model, self.skin, noise=self.noise, sigma=sheet)
 
-    def frames(self, scene: Scene) -> list[Shown]:
-        """What the tracker is shown of a scene."""
-        found = pressed(self._effects, scene.places, scene.loads)
+    def changes(self, scene: Scene) -> np.ndarray:
+        """How the readings change in the frames of a scene, without noise, (frames, readings) V."""
+        return pressed(self._effects, scene.places, scene.loads, spread=scene.spread).change
+
+    def frames(self, scene: Scene, changes: np.ndarray | None = None, pads: bool = True) -> list[Shown]:
+        """What the tracker is shown of a scene, whose `changes` may be given; without pads it is told no forces."""
         shown = []
-        for change, exact in zip(found.change, pad_loads(self.skin, scene), strict=True):
+        for change, exact in zip(
+            self.changes(scene) if changes is None else changes, pad_loads(self.skin, scene), strict=True
+        ):
             frame = change + self.noise * self.rng.normal(size=change.size)
-            errors = np.hypot(PAD_ERROR[0] * exact, PAD_ERROR[1])
-            shown.append(Shown(frame, 1 / RATE, exact + errors * self.rng.normal(size=errors.size), errors))
+            errors = np.hypot(PAD_ERROR[0] * exact, PAD_ERROR[1]) if pads else np.full(len(exact), np.inf)
+            heard = np.where(np.isfinite(errors), errors, 0) * self.rng.normal(size=errors.size)
+            shown.append(Shown(frame, 1 / RATE, exact + heard, errors))
         return shown
 
     def followed(
@@ -296,13 +310,70 @@ def learning(run: Run) -> Iterator[Row]:
     yield {"presses": [averaged(same, "none") for same in grouped(rows, "learned", "presses").values()]}
 
 
+def coverage(run: Run) -> Iterator[Row]:
+    """Single tips of several shapes, each followed while it presses and rests."""
+    seeds, count = run.sizes((1, 10), (1, 1))
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    rows: list[Row] = []
+    for seed in range(FIRST_SHAPES, FIRST_SHAPES + seeds):
+        rng, changes = np.random.default_rng(seed), {}
+        touches = [touch for shape in SHAPES for touch in shaped(rng, shape, count)]
+        for decibels in NOISES:
+            for known in (True, False):
+                bench = Bench(model, seed, decibels, known)
+                for number, touch in enumerate(touches):
+                    scene = _held(touch)
+                    if number not in changes:
+                        changes[number] = bench.changes(scene)
+                    for pads in (True, False) if decibels == 60 else (True,):
+                        row = _covered(bench, scene, touch, changes[number], pads)
+                        rows.append({"shape": touch.name, "decibels": decibels, "sheet": _sheet(known)} | row)
+        print(f"shapes, seed {seed}", flush=True)
+    keys = ("shape", "decibels", "sheet", "pads")
+    yield {"coverage": [averaged(same, "none") | {"trials": len(same)} for same in grouped(rows, *keys).values()]}
+
+
+def _sheet(known: bool) -> str:
+    return "known" if known else "unknown"
+
+
+def _held(touch: Touch) -> Scene:
+    """A tip that presses within four frames and rests for twelve."""
+    loads = np.minimum(np.arange(HELD) / 4, 1)[:, None] * touch.loads * LOAD / touch.loads.sum()
+    places = np.broadcast_to(touch.places, (HELD, *touch.places.shape))
+    return Scene(touch.name, places, loads, spread=SPREAD if touch.name == "gaussian" else TIP_SPREAD)
+
+
+def _covered(bench: Bench, scene: Scene, touch: Touch, changes: np.ndarray, pads: bool) -> Row:
+    """Whether ellipse and interval of 90 % hold place and force of a tip, in the frames at full force."""
+    place: list[tuple[float, bool]] = []
+    force, several = [], 0
+    for frame, now, _ in bench.followed(bench.frames(scene, changes, pads)):
+        several = max(several, len(now.tracks) - 1)
+        if scene.loads[frame].sum() > 0.99 * LOAD and now.tracks:
+            place += _nearest(now, touch.truth)
+            track = max(now.tracks, key=lambda t: t.force)
+            force.append(abs(np.log(track.force / LOAD)) < WITHIN * track.log_force_error)
+    return {
+        "pads": "yes" if pads else "no",
+        "error_mm": 1e3 * float(np.mean([error for error, _ in place])) if place else None,
+        "place": float(np.mean([inside for _, inside in place])) if place else None,
+        "force": float(np.mean(force)) if force else None,
+        "several": float(several > 0),
+    }
+
+
 def _stage(press: int) -> str:
     edges = (0, 5, 10, 20, PRESSES)
     place = int(np.searchsorted(edges, press, side="right"))
     return f"{edges[place - 1]} to {edges[place] - 1}"
 
 
-main = Question("tracking", __doc__, {"scenes": scenes, "schedules": schedules, "times": times, "learning": learning})
+main = Question(
+    "tracking",
+    __doc__,
+    {"scenes": scenes, "schedules": schedules, "times": times, "learning": learning, "coverage": coverage},
+)
 
 if __name__ == "__main__":
     with_one_blas_thread()  # small matrices: threads that wait for one another cost ten times as much

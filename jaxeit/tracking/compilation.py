@@ -1,7 +1,9 @@
 """Compilation of a tracker's programs before the first frame."""
 
+import jax.numpy as jnp
 import numpy as np
 
+from .filter import Pads
 from .tracker import Tracker
 from .tracks import Tracking
 
@@ -27,4 +29,6 @@ def compile_tracker(tracker: Tracker) -> None:
         now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count)
         tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
         tracker.programs.predicted(belief, SECONDS)
+        if count:
+            tracker.programs.shape_covariance(belief, Pads(jnp.zeros(pads), jnp.ones(pads)))
         belief = tracker.events.with_contact(belief, places[count * len(places) // (most + 1)])

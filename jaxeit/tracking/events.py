@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .filter import SIZE, Belief
+from .filter import PLACE, SIZE, Belief
 from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.
@@ -19,8 +19,8 @@ JUMP = np.array([0.01, 0.01, 0.3, 1.5, 0.0, 0.0, 0.1, 0.1])
 BETWEEN = 0.8
 # Directions of an edge that are tried.
 DIRECTIONS = np.pi * np.arange(4) / 4
-# Prior deviations of the place and the velocity of a contact that begins, m and m/s.
-PLACE, VELOCITY = 0.012, 0.05
+# Prior deviation of the velocity of a contact that begins, m/s.
+VELOCITY = 0.05
 # Half an edge that is none: what keeps its covariance definite, m.
 ROUND = 1e-4
 # How far a contact may change when it turns out to be an edge, and how much narrower its load then is.

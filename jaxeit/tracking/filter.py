@@ -28,6 +28,8 @@ from .response import LoadedSheet, Near, Shown
 
 # Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
 SIZE, SEEN = 8, 6
+# Prior deviation of the place of a contact that begins, m.
+PLACE = 0.012
 # Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
 # of an ordinary frame, whose next step would lower it by 0.001 then, and of one that begins far from its end.
 FALL, CAREFUL_FALL = 10.0, 1.0
@@ -113,6 +115,8 @@ class ContactFilter(eqx.Module):
     | places: where the modes of the gain lie; the first is the level          | (g, 2)           | m    |
     | model_error: part of the signal by which mesh, sheet and load shape err  | ()               | 1    |
     | persistence of that error                                                | ()               | s    |
+    | shape: standard deviation of each moment of a load's shape               | ()               | 1    |
+    | spread: of place (2), log width and log force before a contact is seen   | (4,)             | m, 1 |
     | rates: random walk of each number of a contact                           | (8,)             | per sqrt(s) |
     """
 
@@ -123,6 +127,8 @@ class ContactFilter(eqx.Module):
     model_error: Float[Array, ""]
     persistence: Float[Array, ""]
     rates: Float[Array, "8"]
+    shape: Float[Array, ""]
+    spread: Float[Array, "4"]
     active_modes: int = eqx.field(static=True)
 
 
@@ -197,7 +203,7 @@ def _residual(z: Float[Array, " a"], problem: _Problem) -> Float[Array, " n"]:
     return problem.residual(z, problem.shown(z))
 
 
-def _active(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
+def active_numbers(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
     """Numbers of the belief that a frame tells of: of the contacts, the level, and the modes around contacts."""
     count = len(contacts)
     own = (SIZE * np.arange(count)[:, None] + np.arange(SEEN)).ravel()
@@ -224,7 +230,7 @@ def _problem(
 ) -> _Problem:
     frame, whole, share = _seen(tracker, dv)
     scale, alone = _scales(tracker, share, seconds)
-    active = _active(tracker, belief.contacts)
+    active = active_numbers(tracker, belief.contacts)
     factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
     near = tracker.sheet.near(belief.contacts[:, :SEEN])
     return _Problem(tracker, frame, whole, pads, belief, active, factor, scale, alone, near)

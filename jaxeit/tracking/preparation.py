@@ -19,7 +19,7 @@ from ..model.forward_model import conductivity
 from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
-from .filter import SIZE, ContactFilter
+from .filter import PLACE, SIZE, ContactFilter
 from .reanalysis import prepare_reanalysis
 from .response import LoadedSheet, Neighbours, half_lengths
 from .settings import TrackerSettings
@@ -54,6 +54,8 @@ def prepare_filter(
         model_error=put(loads.model_error),
         persistence=put(settings.persistence),
         rates=put(_rates(settings)),
+        shape=put(loads.shape),
+        spread=put([PLACE, PLACE, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,
     )
 

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from .._compile import bind
 from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, predicted, unexplained
+from .shapes import shape_covariance
 
 
 class Programs:
@@ -17,6 +18,7 @@ class Programs:
         self._predicted: Callable[..., Belief] = bind(predicted, tracker)
         self._attempted: Callable[..., Attempt] = bind(attempted, tracker)
         self._concluded: Callable[..., Update] = bind(concluded, tracker)
+        self._shape_covariance: Callable[..., Array] = bind(shape_covariance, tracker)
         self._unexplained: Callable[..., Array] = bind(unexplained, tracker)
         self._atoms, self._starts = np.asarray(tracker.finder.atoms), np.asarray(tracker.finder.starts)[:, :2]
         self._dtype = tracker.places.dtype
@@ -40,6 +42,10 @@ class Programs:
     def concluded(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt) -> Update:
         """See `filter.concluded`."""
         return self._concluded(belief, dv, pads, attempt)
+
+    def shape_covariance(self, belief: Belief, pads: Pads) -> Float[np.ndarray, "K 6 6"]:
+        """See `shapes.shape_covariance`."""
+        return np.asarray(self._shape_covariance(belief, pads))
 
     def unexplained_place(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads

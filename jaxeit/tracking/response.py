@@ -5,6 +5,7 @@ first order of the readings is that of an image on a fine mesh, what is beyond i
 the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that an evaluation solves once.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,12 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..contacts.loads.pressure import line
+from ..contacts.loads.pressure import line, line_shapes
 from ..effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
 SHORTEST = 1e-4
+# Of one load: from its six numbers and points (n, 2), its pressure (n,) and slopes (n, 6).
+SlopesOf = Callable[[Array, Array], tuple[Array, Array]]
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
 LENGTHS, ANGLES = (0.015, 0.03), 4
 
@@ -139,9 +142,27 @@ class LoadedSheet(eqx.Module):
         self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> Shown:
         """What frames and pads show of contacts, with slopes in their numbers and in some modes of the gain."""
+        return self._shown(contacts, gain, modes, near, _with_slopes)
+
+    def shape_slopes(
+        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Near
+    ) -> tuple[Float[Array, "s r"], Float[Array, "s pads"]]:
+        """Slopes of readings and of forces on pads in six moments of each contact's shape (`pressure.line_shapes`)."""
+        none = jnp.zeros(0, near.elements.dtype)
+        found = self._shown(contacts, gain, none, near, _with_shapes)
+        return found.reading_slopes, found.pad_slopes
+
+    def _shown(
+        self,
+        contacts: Float[Array, "K 6"],
+        gain: Float[Array, " g"],
+        modes: Int[Array, " b"],
+        near: Near,
+        slopes_of: SlopesOf,
+    ) -> Shown:
         loads = contacts.astype(self.points.dtype)
-        pads, pixels = self._first_order(loads, gain, modes, near)
-        change, slopes = self._changes(loads, gain, modes, near)
+        pads, pixels = self._first_order(loads, gain, modes, near, slopes_of)
+        change, slopes = self._changes(loads, gain, modes, near, slopes_of)
         found = self.sheet.beyond(near.elements, near.unknowns, change)
         beyond = self.sheet.beyond_slopes(found, slopes.T)
         readings, first = pixels
@@ -156,11 +177,16 @@ class LoadedSheet(eqx.Module):
         )
 
     def _first_order(
-        self, loads: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+        self,
+        loads: Float[Array, "K 6"],
+        gain: Float[Array, " g"],
+        modes: Int[Array, " b"],
+        near: Near,
+        slopes_of: SlopesOf,
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Forces on pads and their slopes (pads, a); readings of the image and their slopes (a, r)."""
         pixels, table = near.pixels, self.pixel_modes[near.pixels]
-        pressure, slopes = _pressures(loads, self.pixels[pixels])
+        pressure, slopes = _pressures(loads, self.pixels[pixels], slopes_of)
         own = near.own_pixels
         pressure, slopes = jnp.where(own, pressure, 0), jnp.where(own[:, None], slopes, 0)
         area = self.pad_area[pixels].T
@@ -170,12 +196,17 @@ class LoadedSheet(eqx.Module):
         return (area @ pressure, area @ slopes), (relative @ response, moved.T @ response)
 
     def _changes(
-        self, loads: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+        self,
+        loads: Float[Array, "K 6"],
+        gain: Float[Array, " g"],
+        modes: Int[Array, " b"],
+        near: Near,
+        slopes_of: SlopesOf,
     ) -> tuple[Float[Array, " e"], Float[Array, "e a"]]:
         """Change of conductivity of the elements, S, and its slopes."""
         elements, table = near.elements, self.modes[near.elements]
         points = self.points[elements]
-        pressure, slopes = _pressures(loads, points.reshape(-1, 2))
+        pressure, slopes = _pressures(loads, points.reshape(-1, 2), slopes_of)
         factor = jnp.exp(table @ gain.astype(table.dtype))
         relative, along, by_gain = self._conducting(pressure.reshape(points.shape[:2]), factor[:, None])
         scale = jnp.where(near.own_elements, self.sigma[elements], 0)
@@ -194,10 +225,10 @@ class LoadedSheet(eqx.Module):
 
 
 def _pressures(
-    loads: Float[Array, "K 6"], points: Float[Array, "n 2"]
+    loads: Float[Array, "K 6"], points: Float[Array, "n 2"], slopes_of: SlopesOf
 ) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
-    """Pressure of all loads at points, Pa, and its slopes in their numbers."""
-    values, slopes = zip(*(_with_slopes(load, points) for load in loads), strict=True)
+    """Pressure of all loads at points, Pa, and its slopes in six numbers of each."""
+    values, slopes = zip(*(slopes_of(load, points) for load in loads), strict=True)
     return jnp.sum(jnp.stack(values), 0), jnp.concatenate(slopes, 1)
 
 
@@ -206,6 +237,12 @@ def _with_slopes(
 ) -> tuple[Float[Array, " n"], Float[Array, "n 6"]]:
     value, push = jax.linearize(lambda load: load_pressure(load, points), load)
     return value, jax.vmap(push, out_axes=1)(jnp.eye(len(load), dtype=load.dtype))
+
+
+def _with_shapes(
+    load: Float[Array, "6"], points: Float[Array, "n 2"]
+) -> tuple[Float[Array, " n"], Float[Array, "n 6"]]:
+    return load_pressure(load, points), line_shapes(load, points, SHORTEST)
 
 
 def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:

@@ -15,7 +15,7 @@ class TrackerSettings:
 
     | meaning                                                                        | default | unit      |
     |--------------------------------------------------------------------------------|---------|-----------|
-    | loads: the law of pressure, the gain of the contact layer, usual sizes and forces |       |           |
+    | loads: the law of pressure, the gain of the contact layer, usual sizes, forces, shapes |  |           |
     | level: standard deviation of the log of the gain that all places share         | 0.3     | 1         |
     | persistence: time over which errors of mesh and load shape stay as they are    | 0.5     | s         |
     | acceleration: change of a contact's velocity                                   | 0.3     | m/s/sqrt(s) |

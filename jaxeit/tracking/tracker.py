@@ -17,11 +17,12 @@ from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import Events
-from .filter import SIZE, Belief, ContactFilter, Pads, Update
+from .filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
 from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
 from .preparation import prepare_filter
 from .programs import Programs
 from .settings import TrackerSettings
+from .shapes import ShapeErrors
 from .tracks import Backlog, Look, Seen, Tracking
 
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
@@ -81,6 +82,9 @@ class Tracker:
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         seen = Seen(self._frame(dv), self._pads(pad_forces, pad_errors), seconds)
+        return self._with_shapes(self._stepped(now, seen, whole), seen.pads)
+
+    def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
             now = replace(without_contacts(now), backlog=None)
         if now.backlog is not None:
@@ -93,7 +97,7 @@ class Tracker:
             return after
         now = replace(look.before, backlog=Backlog(after, look))
         while whole and now.backlog is not None:
-            now = self.look(now)
+            now = self._looked(now, now.backlog)
         return now
 
     def look(self, now: Tracking) -> Tracking:
@@ -101,9 +105,22 @@ class Tracker:
 
         A piece is at most `filter.STEPS` evaluations of what contacts show, as an ordinary frame, and mostly two.
         """
-        if now.backlog is None:
+        backlog = now.backlog
+        if backlog is None:
             return now
-        before, look, waiting = now.backlog.before, now.backlog.look, now.backlog.waiting
+        last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.seen
+        return self._with_shapes(self._looked(now, backlog), last.pads)
+
+    def _with_shapes(self, now: Tracking, pads: Pads) -> Tracking:
+        """With what unknown shapes make the contacts err by."""
+        contacts = np.asarray(now.belief.contacts)
+        if not now.numbers or now.shapes.holds(now.numbers, contacts):
+            return now
+        covariance = self.programs.shape_covariance(now.belief, pads)
+        return replace(now, shapes=ShapeErrors(now.numbers, contacts[:, :SEEN], covariance))
+
+    def _looked(self, now: Tracking, backlog: Backlog) -> Tracking:
+        before, look, waiting = backlog.before, backlog.look, backlog.waiting
         if look is not None:
             otherwise, look = look.otherwise, looked(look, self.programs, self.events)
             if look.otherwise is not otherwise:  # something has happened

@@ -1,13 +1,14 @@
 """What is known of contacts after a frame."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from .events import Hypothesis
 from .filter import SIZE, Attempt, Belief, Pads
+from .shapes import ShapeErrors
 
 
 class Track(NamedTuple):
@@ -46,6 +47,7 @@ class Tracking:
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
     | misfit: chi-square of the last frame that was looked into, and frames since then |
+    | shapes: what unknown shapes of loads make the contacts err by         |
     | backlog: frames that are not explained yet; the belief is that without events since then |
     """
 
@@ -56,14 +58,16 @@ class Tracking:
     begun: int = 0
     misfit: float = 0.0
     since: int = 0
+    shapes: ShapeErrors = field(default_factory=ShapeErrors)
     backlog: "Backlog | None" = None
 
     @property
     def tracks(self) -> tuple[Track, ...]:
         """The contacts, in the order in which they began."""
         contacts, covariance = np.asarray(self.belief.contacts), np.asarray(self.belief.covariance)
+        blocks = [covariance[own, own] for own in (slice(SIZE * k, SIZE * (k + 1)) for k in range(len(contacts)))]
         return tuple(
-            track_of(number, contacts[k], covariance[SIZE * k : SIZE * (k + 1), SIZE * k : SIZE * (k + 1)], edge)
+            track_of(number, contacts[k], self.shapes.added(number, blocks[k]), edge)
             for k, (number, edge) in enumerate(zip(self.numbers, self.edges, strict=True))
         )
 

@@ -6,7 +6,7 @@ import pytest
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings
-from jaxeit.tracking.filter import SEEN, SIZE, Pads, _active, predicted, updated
+from jaxeit.tracking.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
 
 from .conftest import SECONDS, load
 
@@ -102,7 +102,7 @@ def test_missing_readings_are_left_out(tracker, frame_of, followed):
 def test_an_update_is_the_conditional_normal_distribution(tracker, followed):
     """At a frame as it is expected: the covariance given the frame, by dense algebra."""
     filter_, belief = tracker.filter, predicted(tracker.filter, followed[0][6].belief, jnp.asarray(SECONDS))
-    active = np.asarray(_active(filter_, belief.contacts))
+    active = np.asarray(active_numbers(filter_, belief.contacts))
     contacts = belief.contacts[:, :SEEN]
     shown = filter_.sheet.shown(contacts, belief.gain, jnp.asarray(active[SEEN:] - SIZE), filter_.sheet.near(contacts))
     y, compress = np.asarray(shown.readings), np.asarray(filter_.compress)

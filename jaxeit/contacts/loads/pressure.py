@@ -5,6 +5,7 @@ length. One table of parameters for all kinds of loads means one compiled progra
 and how, is an array of `Form`.
 """
 
+import math
 from enum import IntEnum
 
 import jax
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float, Int
 MOST, SIZE = 3, 6  # loads, and parameters of each
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
-SQRT_2 = np.sqrt(2.0)
+SQRT_2 = math.sqrt(2)
 ELONGATION = 0.3  # standard deviation of second moments over that of the others
 
 
@@ -79,15 +80,30 @@ def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 
 
 
 def _bent(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
-    u = (points - one[:2]) * jnp.exp(-one[2])
-    r = 0.5 * jnp.sum(u**2, -1, keepdims=True)
-    radial = [1 - 2 * r + r**2 / 2, 1 - 3 * r + 1.5 * r**2 - r**3 / 6]
-    polynomials = jnp.concatenate([*radial, u * (r - 2) / SQRT_2], -1)
-    return jnp.concatenate([spot(one, points)[..., None] * polynomials, ELONGATION * elongations(one, points)], -1)
+    return spot(one, points)[..., None] * _polynomials((points - one[:2]) * jnp.exp(-one[2]))
+
+
+def _polynomials(u: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
+    """The polynomials of `shape_directions` at places in units of the width: two for all loads, four for each."""
+    x, y = u[..., 0], u[..., 1]
+    r = 0.5 * (x**2 + y**2)
+    radial, tilt = [1 - 2 * r + r**2 / 2, 1 - 3 * r + 1.5 * r**2 - r**3 / 6], (r - 2) / SQRT_2
+    return jnp.stack([*radial, x * tilt, y * tilt, ELONGATION * 0.5 * (x**2 - y**2), ELONGATION * x * y], -1)
+
+
+def line_shapes(one: Float[Array, "6"], points: Float[Array, "... 2"], shortest: float) -> Float[Array, "... 6"]:
+    """Change of pressure by each moment by which an edge, or a round load, may differ from that of `line`.
+
+    The polynomials are those of `shape_directions`, in units of the standard deviation along the edge and across it:
+    along the edge the variance is larger by a third of the square of its half length.
+    """
+    variance, square = jnp.exp(2 * one[2]), one[4:] @ one[4:] + shortest**2
+    away = points - one[:2]
+    shrink = (jnp.sqrt(variance / (variance + square / 3)) - 1) / square
+    moved = away + (shrink * (away @ one[4:]))[..., None] * one[4:]
+    return line(one, points, shortest)[..., None] * _polynomials(moved * jnp.exp(-one[2]))
 
 
 def elongations(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
     """Change of pressure of a round load by second moments: half of those along x minus along y, and of x and y."""
-    u = (points - one[:2]) * jnp.exp(-one[2])
-    both = jnp.stack([0.5 * (u[..., 0] ** 2 - u[..., 1] ** 2), u[..., 0] * u[..., 1]], -1)
-    return spot(one, points)[..., None] * both
+    return _bent(one, points)[..., -2:] / ELONGATION

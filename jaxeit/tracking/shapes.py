@@ -1,0 +1,85 @@
+"""What contacts err by because the shapes of their loads are not known.
+
+The filter takes a load for Gaussian, or for even along an edge. A tip of another shape is the same in all frames, so
+that no frame lessens what it makes the contact err by; and a filter that learned shapes would take a second contact for
+the shape of the first. So the filter leaves shapes out, and what they may cause is added where a contact is handed out:
+a "consider" covariance (Schmidt 1966, Advances in Control Systems 3; Bierman 1977, ch. 8). With the slopes J of frames
+and pads in the numbers of the belief, S in the moments s of the shapes, and the covariance P of these numbers before
+any frame, contacts that rest for n frames come to err by
+
+    (n J^T J + P^-1)^-1 n J^T S s,      s ~ N(0, shape^2).
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._compile import verb
+from ..linalg import lapack
+from .filter import SEEN, Belief, ContactFilter, Pads, active_numbers
+
+# Frames n, each with an error of the model of its own, after which contacts are told by the frames and not by P.
+FRAMES = 10
+# Moments of the shape of each load, and half an edge at least, m: a contact that is none has no direction.
+MOMENTS, ROUND = 6, 1e-4
+# Changes of place, log width, log force and half an edge within which the covariance is taken for the same.
+CHANGED = np.array([0.002, 0.002, 0.1, 0.2, 0.002, 0.002])
+
+
+@verb
+def shape_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Float[Array, "K 6 6"]:
+    """Covariance of the first six numbers of each contact that unknown shapes of all loads cause.
+
+    Args:
+        belief: of one contact or more.
+        pads: whose errors say how closely they tell forces.
+    """
+    contacts, count = belief.contacts[:, :SEEN], len(belief.contacts)
+    active = active_numbers(tracker, belief.contacts)
+    near = tracker.sheet.near(contacts)
+    modes = active[contacts.size :] - belief.contacts.size
+    shown = tracker.sheet.shown(contacts, belief.gain, modes, near)
+    by_shape, on_pads = tracker.sheet.shape_slopes(contacts, belief.gain, near)
+    share = tracker.model_error**2 * (shown.readings @ shown.readings) / len(shown.readings)
+    scale, error = jnp.sqrt((1 + share) / FRAMES), pads.error / math.sqrt(FRAMES)
+    slopes = jnp.concatenate([shown.reading_slopes / scale, shown.pad_slopes / error], 1)
+    bent = jnp.concatenate([by_shape / scale, on_pads / error], 1)
+    usual = jnp.broadcast_to(tracker.spread, (count, len(tracker.spread)))
+    halves = jnp.maximum(jnp.abs(contacts[:, 4:]), ROUND)
+    of_gain = jnp.ones(len(modes), halves.dtype)
+    before = jnp.concatenate([jnp.concatenate([usual, halves], 1).ravel(), of_gain])
+    whitened = before[:, None] * slopes
+    root = lapack.cholesky(whitened @ whitened.T + jnp.eye(len(before), dtype=before.dtype), lower=True)
+    moved = before[:, None] * lapack.cho_solve((root, True), whitened @ bent.T) * tracker.shape
+    own = moved[: contacts.size].reshape(count, SEEN, MOMENTS * count)
+    return jnp.einsum("kim,kjm->kij", own, own)
+
+
+class ShapeErrors(NamedTuple):
+    """What unknown shapes make contacts err by.
+
+    | meaning                                                                | shape     | unit  |
+    |------------------------------------------------------------------------|-----------|-------|
+    | numbers: of the contacts                                               |           |       |
+    | contacts: the first six numbers of each, for which this was found      | (K, 6)    | mixed |
+    | covariance that is added to that of the belief                         | (K, 6, 6) | mixed |
+    """
+
+    numbers: tuple[int, ...] = ()
+    contacts: np.ndarray = np.zeros((0, SEEN))
+    covariance: np.ndarray = np.zeros((0, SEEN, SEEN))
+
+    def holds(self, numbers: tuple[int, ...], contacts: Float[np.ndarray, "K 8"]) -> bool:
+        """Whether the covariance is that of these contacts still."""
+        return numbers == self.numbers and bool((np.abs(contacts[:, :SEEN] - self.contacts) < CHANGED).all())
+
+    def added(self, number: int, covariance: Float[np.ndarray, "8 8"]) -> Float[np.ndarray, "8 8"]:
+        """The covariance of a contact, with what its unknown shape adds; nothing is added of one that is not known."""
+        if number not in self.numbers:
+            return covariance
+        whole = np.array(covariance)
+        whole[:SEEN, :SEEN] += self.covariance[self.numbers.index(number)]
+        return whole
