@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from math import prod
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -27,8 +27,10 @@ from jax import lax
 from jaxtyping import Array, Float, Integer
 
 from .._compile import by_platform
-from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, on_device
+from .base import AbstractLinearSolver, SparsityPattern, index_arrays, jacobi_scale, on_device
+from .batches import gather_tables, lanewise, swept_lanes, written_levels
 from .dissection import dissect
+from .fronts import Front, LevelPlan, NestedDissectionFactor, NestedDissectionPlan, Panel
 from .lapack import portion_of, portioned
 from .small_matrices import stacked_product, summed
 from .symbolic import Level, lay_out
@@ -45,66 +47,6 @@ MAX_UNROLLED_PARTS = 8
 
 
 T = TypeVar("T")
-
-
-class LevelPlan(eqx.Module):
-    """One level of m fronts with p pivots and b boundary places; see `symbolic.Level`.
-
-    ``among`` holds the entries between pivots, ``beside`` those between pivots and boundary.
-    """
-
-    up: Integer[Array, "m b"]
-    down: Integer[Array, "m c q"]
-    among: Integer[Array, "m p p"]
-    beside: Integer[Array, "m p b"]
-
-    @property
-    def pivots(self) -> int:
-        """Number p of pivot places of each front."""
-        return self.among.shape[1]
-
-
-class NestedDissectionPlan(AbstractPlan):
-    """The pattern, the levels from the root down, and the permutations in and out of them.
-
-    | meaning                                                             | shape      |
-    |---------------------------------------------------------------------|------------|
-    | gather: unknown at each pivot place of all levels, n where padded   | (places,)  |
-    | scatter: pivot place of each unknown                                | (n,)       |
-    """
-
-    rows: Integer[Array, " nnz"]
-    cols: Integer[Array, " nnz"]
-    diagonal: Integer[Array, " n"]
-    root: Integer[Array, " r"]
-    gather: Integer[Array, " places"]
-    scatter: Integer[Array, " n"]
-    levels: tuple[LevelPlan, ...]
-    n: int = eqx.field(static=True)
-    subtrees: int = eqx.field(static=True)
-
-    @property
-    def panel_shapes(self) -> list[tuple[int, int, int]]:
-        """Number of fronts, of places in a front, and of pivots, for each level."""
-        return [(level.down.shape[0], level.down.shape[2], level.pivots) for level in self.levels]
-
-
-class Panel(NamedTuple):
-    """Factor of a level for up to `MAX_PANEL_PIVOTS` pivots: U and W, whose b places include the later pivots."""
-
-    upper: Float[Array, "m p p"]
-    beside: Float[Array, "m p b"]
-
-
-Front = tuple[Panel, ...]  # the panels of a level, in the order of elimination
-
-
-class NestedDissectionFactor(eqx.Module):
-    """The levels from the root down, the scaling D, and the plan."""
-
-    levels: tuple[Front, ...]
-    scale: Float[Array, " n"]
-    plan: NestedDissectionPlan
 
 
 class NestedDissection(AbstractLinearSolver):
@@ -129,8 +71,7 @@ class NestedDissection(AbstractLinearSolver):
         )
 
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
-        scale, scaled = jacobi_scale(plan, values)
-        return NestedDissectionFactor(_eliminated(plan, scaled, keep=True), scale, plan)
+        return NestedDissectionFactor(*_factored(plan, values), plan)
 
     def solve(self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
@@ -146,9 +87,8 @@ class NestedDissection(AbstractLinearSolver):
         return scale * x[plan.scatter]
 
     def corner(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
-        scale, scaled = jacobi_scale(plan, values)
-        y = jnp.concatenate(_root_loads(plan, _eliminated(plan, scaled, keep=False)[0]), 1)[0] * scale[plan.root]
-        return y.T @ y
+        found: Array = _root_corner(plan, values)
+        return found
 
 
 def _index(array: np.ndarray) -> Integer[Array, "..."]:
@@ -159,6 +99,62 @@ def _level_plan(level: Level) -> LevelPlan:
     pivots = level.pivots.shape[1]
     among, beside = np.split(level.entries, [pivots], 2)
     return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(beside))
+
+
+def _suits_lanes(plan: NestedDissectionPlan) -> bool:
+    """Whether most fronts are narrow enough for `swept_lanes`."""
+    return written_levels(plan.levels) < len(plan.levels)
+
+
+def _factored_lanes(
+    plan: NestedDissectionPlan, values: Float[Array, "lanes nnz"]
+) -> tuple[tuple[Front, ...], Float[Array, "lanes n"]]:
+    scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
+    return _eliminated_lanes(plan, scaled, keep=True), scale
+
+
+@partial(lanewise, lanes=_factored_lanes, suits=_suits_lanes)
+def _factored(
+    plan: NestedDissectionPlan, values: Float[Array, " nnz"]
+) -> tuple[tuple[Front, ...], Float[Array, " n"]]:
+    """The factors of all fronts of the scaled matrix, from the root down, and the scale."""
+    scale, scaled = jacobi_scale(plan, values)
+    return _eliminated(plan, scaled, keep=True), scale
+
+
+def _root_corner_lanes(plan: NestedDissectionPlan, values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
+    scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
+    root = _eliminated_lanes(plan, scaled, keep=False)[0]
+    return jax.vmap(partial(_corner_of, plan))(root, scale)
+
+
+@partial(lanewise, lanes=_root_corner_lanes, suits=_suits_lanes)
+def _root_corner(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
+    """The inverse on the root."""
+    scale, scaled = jacobi_scale(plan, values)
+    return _corner_of(plan, _eliminated(plan, scaled, keep=False)[0], scale)
+
+
+def _corner_of(plan: NestedDissectionPlan, root: Front, scale: Float[Array, " n"]) -> Float[Array, "r r"]:
+    """The inverse on the root, from the factor of its front and the scale."""
+    y = jnp.concatenate(_root_loads(plan, root), 1)[0] * scale[plan.root]
+    return y.T @ y
+
+
+def _eliminated_lanes(plan: NestedDissectionPlan, values: Float[Array, "lanes nnz"], keep: bool) -> tuple[Front, ...]:
+    """`_eliminated` of many matrices; the narrow fronts with the lanes as the last axis (`batches`)."""
+    ends = jnp.broadcast_to(jnp.array([0.0, 1.0], values.dtype), (len(values), 2))
+    padded = jnp.concatenate([values, ends], 1)
+    top = written_levels(plan.levels)
+    low = plan.levels[top:]
+    update, panels = swept_lanes(low, gather_tables(low), lax.optimization_barrier(padded.T), keep)
+
+    def upper(padded: Array, update: Array) -> tuple[Front, ...]:
+        update, middle = _swept(plan.levels[1:top], padded, update, keep)
+        return _swept(plan.levels[:1], padded, update, True)[1] + middle
+
+    fronts: tuple[Front, ...] = jax.vmap(upper)(padded, update)
+    return fronts + tuple((panel,) for panel in panels)
 
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
