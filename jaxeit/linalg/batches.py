@@ -28,7 +28,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Integer
 
 from .._compile import by_platform
-from .fronts import LevelPlan, Panel
+from .fronts import LevelPlan
 
 # Bytes of the numbers of all lanes at one place: two cache lines. With more, the fronts of a level leave the cache.
 LANE_BYTES = 128
@@ -57,7 +57,7 @@ class Block(NamedTuple):
 
 P = TypeVar("P")
 T = TypeVar("T")
-Tables = list[list[Integer[Array, "m rows columns"]]]  # for each block: rows of the values, then of children's updates
+Tables = list[list[Integer[Array, "_ _ _"]]]  # for each block: rows of the values, then of children's updates
 
 
 def lane_count(dtype: np.dtype) -> int:
@@ -66,12 +66,12 @@ def lane_count(dtype: np.dtype) -> int:
 
 
 def lanewise(
-    function: Callable[[P, Array], T], lanes: Callable[[P, Array], T], suits: Callable[[P], bool]
+    function: Callable[[P, Array], T], lanes: Callable[[P], Callable[[Array], T]], suits: Callable[[P], bool]
 ) -> Callable[[P, Array], T]:
-    """``function(plan, values)``, whose `jax.vmap` over values calls ``lanes`` for `lane_count` of them at a time.
+    """``function(plan, values)``, whose `jax.vmap` over values calls ``lanes(plan)`` for `lane_count` values at a time.
 
-    ``lanes`` gets and returns arrays with one more axis, in front. Batches of fewer than `MIN_BATCH`, plans that do not
-    suit, batches of plans and other devices than CPUs use `jax.vmap` of ``function``.
+    That function gets and returns arrays with one more axis, in front. Batches of fewer than `MIN_BATCH`, plans that
+    do not suit, batches of plans and other devices than CPUs use `jax.vmap` of ``function``.
     """
     single = custom_vmap(function)
 
@@ -83,12 +83,12 @@ def lanewise(
         return by_platform(plan, values, cpu=partial(_in_portions, lanes), default=plainly)
 
     @single.def_vmap
-    def _(size: int, batched: tuple[Any, bool], plan: P, values: Array) -> tuple[T, Any]:
+    def _(size: int, batched: Sequence[Any], plan: P, values: Array) -> tuple[T, Any]:
         found = several(plan, values) if _values_only(batched) else _mapped(function, batched, plan, values)
         return found, jax.tree.map(lambda _: True, found)
 
     @several.def_vmap
-    def _(size: int, batched: tuple[Any, bool], plan: P, values: Array) -> tuple[T, Any]:
+    def _(size: int, batched: Sequence[Any], plan: P, values: Array) -> tuple[T, Any]:
         if _values_only(batched):
             count = values.shape[1]
             flat = several(plan, values.reshape(size * count, -1))
@@ -100,24 +100,26 @@ def lanewise(
     return single
 
 
-def _values_only(batched: tuple[Any, bool]) -> bool:
-    return batched[1] and not any(jax.tree.leaves(batched[0]))
+def _values_only(batched: Sequence[Any]) -> bool:
+    of_plan, of_values = batched
+    return bool(of_values) and not any(jax.tree.leaves(of_plan))
 
 
-def _mapped(function: Callable[[P, Array], T], batched: tuple[Any, bool], plan: P, values: Array) -> T:
+def _mapped(function: Callable[[P, Array], T], batched: Sequence[Any], plan: P, values: Array) -> T:
     """`jax.vmap` of ``function`` over the arrays that have a batch."""
-    mapped, shared = eqx.partition((plan, values), batched)
+    mapped, shared = eqx.partition((plan, values), tuple(batched))
     found: T = jax.vmap(lambda mapped: function(*eqx.combine(mapped, shared)))(mapped)
     return found
 
 
-def _in_portions(lanes: Callable[[P, Array], T], plan: P, values: Float[Array, "batch nnz"]) -> T:
-    """``lanes`` of one portion after another; the last matrix fills up the last portion."""
+def _in_portions(lanes: Callable[[P], Callable[[Array], T]], plan: P, values: Float[Array, "batch nnz"]) -> T:
+    """``lanes(plan)`` of one portion after another; the last matrix fills up the last portion."""
     batch, width = len(values), lane_count(values.dtype)
     count = -(-batch // width)
     filled = jnp.concatenate([values, jnp.broadcast_to(values[-1], (count * width - batch, values.shape[1]))])
-    found = lax.map(partial(lanes, plan), filled.reshape(count, width, -1))
-    return jax.tree.map(lambda a: a.reshape(count * width, *a.shape[2:])[:batch], found)
+    found = lax.map(lanes(plan), filled.reshape(count, width, -1))
+    whole: T = jax.tree.map(lambda a: a.reshape(count * width, *a.shape[2:])[:batch], found)
+    return whole
 
 
 def written_levels(levels: Sequence[LevelPlan]) -> int:
@@ -133,9 +135,9 @@ def gather_tables(levels: Sequence[LevelPlan]) -> list[Tables]:
 
 
 def swept_lanes(
-    levels: Sequence[LevelPlan], tables: Sequence[Tables], values: Float[Array, "nnz_and_2 lanes"], keep: bool
-) -> tuple[Float[Array, "lanes m b b"], tuple[Panel, ...]]:
-    """Eliminate these levels, the last one first: the update of the level above, and the factors if ``keep``.
+    levels: Sequence[LevelPlan], tables: Sequence[Tables], values: Float[Array, "nnz_and_2 lanes"]
+) -> Float[Array, "lanes m b b"]:
+    """The update of the level above, after elimination of these levels, the last one first.
 
     Args:
         levels: a level and all below it, each with at most `MAX_WRITTEN_PIVOTS` pivots.
@@ -143,13 +145,10 @@ def swept_lanes(
         values: entries of the matrices, then a zero and a one.
     """
     update = None
-    panels: list[Panel] = []
     for level, table in zip(reversed(levels), reversed(tables), strict=True):
-        rows, update = _eliminate(level, table, values, update)
-        if keep:
-            panels.append(_panel(level, rows))
+        update = _eliminate(level, table, values, update)
     assert update is not None
-    return _whole(levels[0], update), tuple(panels[::-1])
+    return _whole(levels[0], update)
 
 
 def _blocks(level: LevelPlan) -> tuple[list[Block], list[Block]]:
@@ -185,7 +184,7 @@ def _level_tables(level: LevelPlan, child: LevelPlan | None) -> Tables:
     return tables
 
 
-def _child_places(level: LevelPlan, child: LevelPlan, block: Block) -> list[Integer[Array, "m rows columns"]]:
+def _child_places(level: LevelPlan, child: LevelPlan, block: Block) -> list[Integer[Array, "_ _ _"]]:
     """Places of a block's entries in the updates of the first and of the second children."""
     offsets, size = _row_offsets(child)
     # An offset may be negative; unsigned sums are right all the same, since they count modulo 2^32.
@@ -202,35 +201,39 @@ def _child_places(level: LevelPlan, child: LevelPlan, block: Block) -> list[Inte
 
 def _eliminate(
     level: LevelPlan, tables: Tables, values: Float[Array, "nnz_and_2 lanes"], update: Float[Array, "_ lanes"] | None
-) -> tuple[list[Float[Array, "m rows columns lanes"]], Float[Array, "_ lanes"]]:
-    """The rows of U and W block by block, and the update of the level above (`_row_offsets`)."""
+) -> Float[Array, "_ lanes"]:
+    """The update of the level above, laid out as `_row_offsets` says."""
     panels, boundary = _blocks(level)
     rows: list[Array] = []
     found = []
     for block, table in zip(panels + boundary, tables, strict=True):
-        front = _assembled(block, table, values, update)
+        front = _assembled(level, block, table, values, update)
         front = lax.optimization_barrier(front - _products(rows, block) if rows else front)
         if block.first < level.pivots:
             rows.append(lax.optimization_barrier(_pivot_rows(front)))
         else:
             found.append(front.reshape(front.shape[0], -1, front.shape[3]))
     joined = jnp.concatenate(found, 1)
-    return rows, lax.optimization_barrier(joined.reshape(-1, joined.shape[2]))
+    kept: Array = lax.optimization_barrier(joined.reshape(-1, joined.shape[2]))
+    return kept
 
 
 def _assembled(
+    level: LevelPlan,
     block: Block,
-    table: list[Integer[Array, "m rows columns"]],
+    table: list[Integer[Array, "_ _ _"]],
     values: Float[Array, "nnz_and_2 lanes"],
     update: Float[Array, "_ lanes"] | None,
-) -> Float[Array, "..."]:
+) -> Float[Array, "m rows columns lanes"]:
     """The block's entries of the matrices and of the children's updates."""
     children = 0 if update is None else 2
     terms = [_rows_at(values, places) for places in table[: len(table) - children]]
     if update is not None:
         terms += [_rows_at(update, places) for places in table[len(table) - children :]]
     if not terms:
-        return jnp.zeros((), values.dtype)
+        fronts, pivots, boundary = level.beside.shape
+        shape = fronts, block.last - block.first, pivots + boundary - block.first, values.shape[1]
+        return jnp.zeros(shape, values.dtype)
     return sum(terms[1:], start=terms[0])
 
 
@@ -238,13 +241,13 @@ def _rows_at(array: Float[Array, "_ lanes"], places: Integer[Array, "..."]) -> F
     return array.at[places].get(mode="promise_in_bounds")
 
 
-def _products(rows: list[Array], block: Block) -> Float[Array, "..."]:
+def _products(rows: list[Array], block: Block) -> Array:
     """``sum_k u_ki u_kj`` over all rows so far, for i in the block and j from its first column on."""
     places = rows[0].shape[2]
     done = [panel[:, :, block.first - places + panel.shape[2] :] for panel in rows]
     u = done[0] if len(done) == 1 else jnp.concatenate(done, 1)
     count = block.last - block.first
-    total = u[:, 0, :count, None] * u[:, 0, None]
+    total: Array = u[:, 0, :count, None] * u[:, 0, None]
     for k in range(1, u.shape[1]):
         total = total + u[:, k, :count, None] * u[:, k, None]
     return total
@@ -259,14 +262,6 @@ def _pivot_rows(front: Float[Array, "m rows columns lanes"]) -> Float[Array, "m 
             row = row - above[:, i - k, None] * above[:, i - k :]
         rows.append(row * lax.rsqrt(row[:, :1]))
     return jnp.stack([jnp.pad(row, ((0, 0), (i, 0), (0, 0))) for i, row in enumerate(rows)], 1)
-
-
-def _panel(level: LevelPlan, rows: list[Float[Array, "m rows columns lanes"]]) -> Panel:
-    """A level's factor as the module `nested_dissection` has it, with the lanes in front."""
-    places = level.pivots + level.beside.shape[2]
-    whole = [jnp.pad(panel, ((0, 0), (0, 0), (places - panel.shape[2], 0), (0, 0))) for panel in rows]
-    factor = jnp.moveaxis(jnp.concatenate(whole, 1), -1, 0)
-    return Panel(factor[..., : level.pivots], factor[..., level.pivots :])
 
 
 def _whole(level: LevelPlan, update: Float[Array, "_ lanes"]) -> Float[Array, "lanes m b b"]:

@@ -13,7 +13,7 @@ a level keeps U and W for the sweeps of a solve:
 `corner`, the inverse on the unknowns of the root, needs no sweep, since the last front determines it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from math import prod
@@ -71,7 +71,8 @@ class NestedDissection(AbstractLinearSolver):
         )
 
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
-        return NestedDissectionFactor(*_factored(plan, values), plan)
+        scale, scaled = jacobi_scale(plan, values)
+        return NestedDissectionFactor(_eliminated(plan, scaled, keep=True), scale, plan)
 
     def solve(self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
@@ -106,26 +107,25 @@ def _suits_lanes(plan: NestedDissectionPlan) -> bool:
     return written_levels(plan.levels) < len(plan.levels)
 
 
-def _factored_lanes(
-    plan: NestedDissectionPlan, values: Float[Array, "lanes nnz"]
-) -> tuple[tuple[Front, ...], Float[Array, "lanes n"]]:
-    scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
-    return _eliminated_lanes(plan, scaled, keep=True), scale
+def _root_corner_lanes(plan: NestedDissectionPlan) -> Callable[[Float[Array, "lanes nnz"]], Float[Array, "lanes r r"]]:
+    """`_root_corner` of many matrices: lanes are the last axis of narrow fronts (`batches`), the first of wide ones."""
+    top = written_levels(plan.levels)
+    narrow = plan.levels[top:]
+    tables = lax.optimization_barrier(gather_tables(narrow))
 
+    def several(values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
+        scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
+        padded = jax.vmap(_padded)(scaled)
+        update = swept_lanes(narrow, tables, lax.optimization_barrier(padded.T))
+        found: Float[Array, "lanes r r"] = jax.vmap(beyond)(padded, update, scale)
+        return found
 
-@partial(lanewise, lanes=_factored_lanes, suits=_suits_lanes)
-def _factored(
-    plan: NestedDissectionPlan, values: Float[Array, " nnz"]
-) -> tuple[tuple[Front, ...], Float[Array, " n"]]:
-    """The factors of all fronts of the scaled matrix, from the root down, and the scale."""
-    scale, scaled = jacobi_scale(plan, values)
-    return _eliminated(plan, scaled, keep=True), scale
+    def beyond(padded: Array, update: Float[Array, "m b b"], scale: Float[Array, " n"]) -> Float[Array, "r r"]:
+        update, _ = _swept(plan.levels[1:top], padded, update, keep=False)
+        _, (root,) = _swept(plan.levels[:1], padded, update, keep=True)
+        return _corner_of(plan, root, scale)
 
-
-def _root_corner_lanes(plan: NestedDissectionPlan, values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
-    scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
-    root = _eliminated_lanes(plan, scaled, keep=False)[0]
-    return jax.vmap(partial(_corner_of, plan))(root, scale)
+    return several
 
 
 @partial(lanewise, lanes=_root_corner_lanes, suits=_suits_lanes)
@@ -141,25 +141,14 @@ def _corner_of(plan: NestedDissectionPlan, root: Front, scale: Float[Array, " n"
     return y.T @ y
 
 
-def _eliminated_lanes(plan: NestedDissectionPlan, values: Float[Array, "lanes nnz"], keep: bool) -> tuple[Front, ...]:
-    """`_eliminated` of many matrices; the narrow fronts with the lanes as the last axis (`batches`)."""
-    ends = jnp.broadcast_to(jnp.array([0.0, 1.0], values.dtype), (len(values), 2))
-    padded = jnp.concatenate([values, ends], 1)
-    top = written_levels(plan.levels)
-    low = plan.levels[top:]
-    update, panels = swept_lanes(low, gather_tables(low), lax.optimization_barrier(padded.T), keep)
-
-    def upper(padded: Array, update: Array) -> tuple[Front, ...]:
-        update, middle = _swept(plan.levels[1:top], padded, update, keep)
-        return _swept(plan.levels[:1], padded, update, True)[1] + middle
-
-    fronts: tuple[Front, ...] = jax.vmap(upper)(padded, update)
-    return fronts + tuple((panel,) for panel in panels)
+def _padded(values: Float[Array, " nnz"]) -> Float[Array, " nnz_and_2"]:
+    """The values, then what `symbolic.Level` has where there is none: a zero, and a one for padded pivots."""
+    return jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
 
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
     """The factors of all fronts, from the root down; of the root only, unless ``keep``."""
-    padded = jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
+    padded = _padded(values)
     top = max(plan.subtrees, 1)
     update, low = by_platform(
         plan.levels[top:],
