@@ -34,10 +34,13 @@ from .fronts import LevelPlan
 LANE_BYTES = 128
 
 # Smallest batch that is eliminated in lanes; for fewer, the program takes longer to compile than it saves.
-MIN_BATCH = 16
+MIN_BATCH = 32
 
 # Largest number of pivots whose elimination is written out; compilation takes a fraction of a second for each level.
 MAX_WRITTEN_PIVOTS = 32
+
+# Number of unknowns of a subtree whose fronts fit in a processor's cache, all lanes of them.
+SUBTREE_UNKNOWNS = 300
 
 PANEL_ROWS = 4  # pivots in a block of rows; the rows of a block are eliminated in one loop, which repeats some work
 BOUNDARY_BLOCKS = 3  # blocks of the other rows; each computes a few numbers below the diagonal
@@ -58,6 +61,16 @@ class Block(NamedTuple):
 P = TypeVar("P")
 T = TypeVar("T")
 Tables = list[list[Integer[Array, "_ _ _"]]]  # for each block: rows of the values, then of children's updates
+
+
+class LanePlan(NamedTuple):
+    """The narrow levels and their tables: those above the subtrees, and those of the subtrees, which have an axis in
+    front that counts subtrees."""
+
+    above: tuple[LevelPlan, ...]
+    tables: list[Tables]
+    below: tuple[LevelPlan, ...]
+    tables_below: list[Tables]
 
 
 def lane_count(dtype: np.dtype) -> int:
@@ -128,32 +141,54 @@ def written_levels(levels: Sequence[LevelPlan]) -> int:
     return max([0, *wide]) + 1
 
 
-def gather_tables(levels: Sequence[LevelPlan]) -> list[Tables]:
-    """For each level, the places from which `swept_lanes` takes the entries of each block of rows."""
+def lane_plan(levels: Sequence[LevelPlan], unknowns: int) -> LanePlan:
+    """What `swept_lanes` needs for all levels from `written_levels` on."""
+    top = written_levels(levels)
+    depth = round(np.log2(max(1, unknowns / SUBTREE_UNKNOWNS)))
+    cut = min(max(depth, top), len(levels) - 1) if depth > 0 else len(levels)
+    above, below = tuple(levels[top:cut]), tuple(levels[cut:])
+    count = 1 << cut
+    apart = jax.tree.map(lambda a: a.reshape(count, a.shape[0] // count, *a.shape[1:]), below)
+    tables = _gather_tables((*above, *below[:1]))[: len(above)]
+    return LanePlan(above, tables, apart, jax.vmap(_gather_tables)(apart) if below else [])
+
+
+def _gather_tables(levels: Sequence[LevelPlan]) -> list[Tables]:
+    """For each level, the places from which `_eliminate` takes the entries of each block of rows."""
     below = [*levels[1:], None]
     return [_level_tables(level, child) for level, child in zip(levels, below, strict=True)]
 
 
-def swept_lanes(
-    levels: Sequence[LevelPlan], tables: Sequence[Tables], values: Float[Array, "nnz_and_2 lanes"]
-) -> Float[Array, "lanes m b b"]:
-    """The update of the level above, after elimination of these levels, the last one first.
+def swept_lanes(plan: LanePlan, values: Float[Array, "nnz_and_2 lanes"]) -> Float[Array, "lanes m b b"]:
+    """The update of the wide levels, after elimination of the narrow ones, the last one first.
 
     Args:
-        levels: a level and all below it, each with at most `MAX_WRITTEN_PIVOTS` pivots.
-        tables: their `gather_tables`.
         values: entries of the matrices, then a zero and a one.
     """
     update = None
+    if plan.below:
+        subtrees = lax.map(lambda part: _swept(part[0], part[1], values, None), (plan.below, plan.tables_below))
+        update = subtrees.reshape(-1, values.shape[1])
+    update = _swept(plan.above, plan.tables, values, update)
+    return _whole((*plan.above, *plan.below)[0], update)
+
+
+def _swept(
+    levels: Sequence[LevelPlan],
+    tables: Sequence[Tables],
+    values: Float[Array, "nnz_and_2 lanes"],
+    update: Float[Array, "_ lanes"] | None,
+) -> Float[Array, "_ lanes"]:
+    """The update of the level above these, laid out as `_row_offsets` says, from that of the level below them."""
     for level, table in zip(reversed(levels), reversed(tables), strict=True):
         update = _eliminate(level, table, values, update)
     assert update is not None
-    return _whole(levels[0], update)
+    return update
 
 
 def _blocks(level: LevelPlan) -> tuple[list[Block], list[Block]]:
     """Blocks of pivots, and blocks of boundary rows."""
-    pivots, boundary = level.pivots, level.beside.shape[2]
+    pivots, boundary = level.beside.shape[-2:]
     count = min(BOUNDARY_BLOCKS, max(1, boundary // MIN_BOUNDARY_ROWS))
     cuts = np.linspace(pivots, pivots + boundary, count + 1).astype(int).tolist()
     panels = [Block(first, min(first + PANEL_ROWS, pivots)) for first in range(0, pivots, PANEL_ROWS)]
@@ -165,7 +200,7 @@ def _row_offsets(level: LevelPlan) -> tuple[np.ndarray, int]:
 
     The blocks of boundary rows follow one another, each (rows, columns from its first row on).
     """
-    pivots, boundary = level.pivots, level.beside.shape[2]
+    pivots, boundary = level.beside.shape[-2:]
     offsets, size = np.zeros(boundary, np.int64), 0
     for block in _blocks(level)[1]:
         first, last = block.first - pivots, block.last - pivots

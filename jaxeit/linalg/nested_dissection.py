@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Integer
 
 from .._compile import by_platform
 from .base import AbstractLinearSolver, SparsityPattern, index_arrays, jacobi_scale, on_device
-from .batches import gather_tables, lanewise, swept_lanes, written_levels
+from .batches import lane_plan, lanewise, swept_lanes, written_levels
 from .dissection import dissect
 from .fronts import Front, LevelPlan, NestedDissectionFactor, NestedDissectionPlan, Panel
 from .lapack import portion_of, portioned
@@ -110,13 +110,12 @@ def _suits_lanes(plan: NestedDissectionPlan) -> bool:
 def _root_corner_lanes(plan: NestedDissectionPlan) -> Callable[[Float[Array, "lanes nnz"]], Float[Array, "lanes r r"]]:
     """`_root_corner` of many matrices: lanes are the last axis of narrow fronts (`batches`), the first of wide ones."""
     top = written_levels(plan.levels)
-    narrow = plan.levels[top:]
-    tables = lax.optimization_barrier(gather_tables(narrow))
+    narrow = lax.optimization_barrier(lane_plan(plan.levels, plan.n))
 
     def several(values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
         scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
         padded = jax.vmap(_padded)(scaled)
-        update = swept_lanes(narrow, tables, lax.optimization_barrier(padded.T))
+        update = swept_lanes(narrow, lax.optimization_barrier(padded.T))
         found: Float[Array, "lanes r r"] = jax.vmap(beyond)(padded, update, scale)
         return found
 

@@ -10,7 +10,7 @@ import pytest
 import jaxeit as je
 from jaxeit._compile import compiler_options
 from jaxeit.linalg import NestedDissection, SparsityPattern, nested_dissection
-from jaxeit.linalg.batches import MIN_BATCH, lane_count, swept_lanes, written_levels
+from jaxeit.linalg.batches import MIN_BATCH, lane_count, lane_plan, swept_lanes, written_levels
 
 from ..helpers import skin_of
 from .test_solvers import SHAPES, as_pattern, relative, square_sheet
@@ -40,7 +40,7 @@ def strengths(count):
     return np.random.default_rng(1).uniform(0.5, 2, (count, 1))
 
 
-def sheet(contrast=1.0, side=10):
+def sheet(contrast=1.0, side=8):
     """A plan with complete electrodes at the root, and matrices that differ by more than a factor."""
     conductances = np.array([1e-2, 1.0, 1e4])
     several = [square_sheet(side, contrast, g * conductances) for g in strengths(COUNT)[:, 0]]
@@ -53,9 +53,9 @@ def sweeps(monkeypatch):
     """Numbers of lanes of the sweeps that have been traced."""
     lanes = []
 
-    def recorded(levels, tables, values):
+    def recorded(plan, values):
         lanes.append(values.shape[1])
-        return swept_lanes(levels, tables, values)
+        return swept_lanes(plan, values)
 
     monkeypatch.setattr(nested_dissection, "swept_lanes", recorded)
     return lanes
@@ -90,12 +90,14 @@ def test_shapes_that_break_orderings(shape):
     np.testing.assert_allclose(corners(plan, batch), expected, rtol=1e-10)
 
 
-def test_wide_fronts_under_narrow_ones():
-    """The root and the level below it have more pivots than are written out; the levels below those do not."""
+def test_narrow_fronts_under_wide_ones():
+    """The root and the level below it have more pivots than are written out; the others are done subtree by subtree."""
     matrix, coords = square_sheet(80, 0.5, np.ones(2))
     pattern, values = as_pattern(matrix, coords, [6400, 6401])
     plan = SOLVER.analyse(pattern)
     assert 1 < written_levels(plan.levels) < len(plan.levels)
+    assert lane_plan(plan.levels, plan.n).above
+    assert lane_plan(plan.levels, plan.n).below
     batch = values * strengths(MIN_BATCH)
     expected = quick(SOLVER.corner)(plan, values) / strengths(MIN_BATCH)[..., None]
     assert relative(corners(plan, batch), expected) < 1e-11
@@ -141,7 +143,7 @@ def test_a_pivot_that_is_negative_anywhere_spoils_its_lane(place):
     assert np.isfinite(np.delete(spoiled, 3, 0)).all()
 
 
-@pytest.mark.parametrize("shape", [(2, 18), (12, 3)])
+@pytest.mark.parametrize("shape", [pytest.param((2, 18), marks=pytest.mark.slow), (12, 3)])
 def test_batches_of_batches(shape, sweeps):
     """All matrices form one batch, also where a batch within is small."""
     plan, values = sheet()
