@@ -292,8 +292,13 @@ def one_by_one(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
 
 
 BATCH = (
-    *(Entry(f"jaxeit float64, batches of {n}", partial(batched, batch=n)) for n in (1, 8, 32)),
-    Entry("jaxeit float32, batches of 8", partial(batched, batch=8, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
+    *(Entry(f"jaxeit float64, batches of {n}", partial(batched, batch=n)) for n in (1, 8, CONTACTS)),
+    *(
+        Entry(
+            f"jaxeit float32, batches of {n}", partial(batched, batch=n, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE
+        )
+        for n in (8, CONTACTS)
+    ),
     Entry(superlu.NAME, one_by_one(superlu.prepare), superlu),
     Entry(cholmod.NAME, one_by_one(cholmod.prepare), cholmod),
 )

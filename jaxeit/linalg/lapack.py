@@ -88,8 +88,8 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
 
     @stacked.def_vmap
     def _(size: int, batched: Sequence[bool], *stacks: Array) -> tuple[Stacks, Any]:
-        whole = (s.reshape(-1, *s.shape[2:]) for s in _spread(size, batched, stacks))
-        apart = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), stacked(*whole))
+        whole = (s.reshape(s.shape[0] * s.shape[1], *s.shape[2:]) for s in _spread(size, batched, stacks))
+        apart = jax.tree.map(lambda a: a.reshape(size, len(a) // size, *a.shape[1:]), stacked(*whole))
         return apart, jax.tree.map(lambda _: True, apart)
 
     return stacked

@@ -13,11 +13,11 @@ a level keeps U and W for the sweeps of a solve:
 `corner`, the inverse on the unknowns of the root, needs no sweep, since the last front determines it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from math import prod
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -27,8 +27,10 @@ from jax import lax
 from jaxtyping import Array, Float, Integer
 
 from .._compile import by_platform
-from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, on_device
+from .base import AbstractLinearSolver, SparsityPattern, index_arrays, jacobi_scale, on_device
+from .batches import lane_plan, lanewise, swept_lanes, written_levels
 from .dissection import dissect
+from .fronts import Front, LevelPlan, NestedDissectionFactor, NestedDissectionPlan, Panel
 from .lapack import portion_of, portioned
 from .small_matrices import stacked_product, summed
 from .symbolic import Level, lay_out
@@ -45,66 +47,6 @@ MAX_UNROLLED_PARTS = 8
 
 
 T = TypeVar("T")
-
-
-class LevelPlan(eqx.Module):
-    """One level of m fronts with p pivots and b boundary places; see `symbolic.Level`.
-
-    ``among`` holds the entries between pivots, ``beside`` those between pivots and boundary.
-    """
-
-    up: Integer[Array, "m b"]
-    down: Integer[Array, "m c q"]
-    among: Integer[Array, "m p p"]
-    beside: Integer[Array, "m p b"]
-
-    @property
-    def pivots(self) -> int:
-        """Number p of pivot places of each front."""
-        return self.among.shape[1]
-
-
-class NestedDissectionPlan(AbstractPlan):
-    """The pattern, the levels from the root down, and the permutations in and out of them.
-
-    | meaning                                                             | shape      |
-    |---------------------------------------------------------------------|------------|
-    | gather: unknown at each pivot place of all levels, n where padded   | (places,)  |
-    | scatter: pivot place of each unknown                                | (n,)       |
-    """
-
-    rows: Integer[Array, " nnz"]
-    cols: Integer[Array, " nnz"]
-    diagonal: Integer[Array, " n"]
-    root: Integer[Array, " r"]
-    gather: Integer[Array, " places"]
-    scatter: Integer[Array, " n"]
-    levels: tuple[LevelPlan, ...]
-    n: int = eqx.field(static=True)
-    subtrees: int = eqx.field(static=True)
-
-    @property
-    def panel_shapes(self) -> list[tuple[int, int, int]]:
-        """Number of fronts, of places in a front, and of pivots, for each level."""
-        return [(level.down.shape[0], level.down.shape[2], level.pivots) for level in self.levels]
-
-
-class Panel(NamedTuple):
-    """Factor of a level for up to `MAX_PANEL_PIVOTS` pivots: U and W, whose b places include the later pivots."""
-
-    upper: Float[Array, "m p p"]
-    beside: Float[Array, "m p b"]
-
-
-Front = tuple[Panel, ...]  # the panels of a level, in the order of elimination
-
-
-class NestedDissectionFactor(eqx.Module):
-    """The levels from the root down, the scaling D, and the plan."""
-
-    levels: tuple[Front, ...]
-    scale: Float[Array, " n"]
-    plan: NestedDissectionPlan
 
 
 class NestedDissection(AbstractLinearSolver):
@@ -146,9 +88,8 @@ class NestedDissection(AbstractLinearSolver):
         return scale * x[plan.scatter]
 
     def corner(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
-        scale, scaled = jacobi_scale(plan, values)
-        y = jnp.concatenate(_root_loads(plan, _eliminated(plan, scaled, keep=False)[0]), 1)[0] * scale[plan.root]
-        return y.T @ y
+        found: Array = _root_corner(plan, values)
+        return found
 
 
 def _index(array: np.ndarray) -> Integer[Array, "..."]:
@@ -161,9 +102,52 @@ def _level_plan(level: Level) -> LevelPlan:
     return LevelPlan(_index(level.up), _index(level.down), _index(among), _index(beside))
 
 
+def _suits_lanes(plan: NestedDissectionPlan) -> bool:
+    """Whether most fronts are narrow enough for `swept_lanes`."""
+    return written_levels(plan.levels) < len(plan.levels)
+
+
+def _root_corner_lanes(plan: NestedDissectionPlan) -> Callable[[Float[Array, "lanes nnz"]], Float[Array, "lanes r r"]]:
+    """`_root_corner` of many matrices: lanes are the last axis of narrow fronts (`batches`), the first of wide ones."""
+    top = written_levels(plan.levels)
+    narrow = lax.optimization_barrier(lane_plan(plan.levels, plan.n))
+
+    def several(values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
+        scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
+        padded = jax.vmap(_padded)(scaled)
+        update = swept_lanes(narrow, lax.optimization_barrier(padded.T))
+        found: Float[Array, "lanes r r"] = jax.vmap(beyond)(padded, update, scale)
+        return found
+
+    def beyond(padded: Array, update: Float[Array, "m b b"], scale: Float[Array, " n"]) -> Float[Array, "r r"]:
+        update, _ = _swept(plan.levels[1:top], padded, update, keep=False)
+        _, (root,) = _swept(plan.levels[:1], padded, update, keep=True)
+        return _corner_of(plan, root, scale)
+
+    return several
+
+
+@partial(lanewise, lanes=_root_corner_lanes, suits=_suits_lanes)
+def _root_corner(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
+    """The inverse on the root."""
+    scale, scaled = jacobi_scale(plan, values)
+    return _corner_of(plan, _eliminated(plan, scaled, keep=False)[0], scale)
+
+
+def _corner_of(plan: NestedDissectionPlan, root: Front, scale: Float[Array, " n"]) -> Float[Array, "r r"]:
+    """The inverse on the root, from the factor of its front and the scale."""
+    y = jnp.concatenate(_root_loads(plan, root), 1)[0] * scale[plan.root]
+    return y.T @ y
+
+
+def _padded(values: Float[Array, " nnz"]) -> Float[Array, " nnz_and_2"]:
+    """The values, then what `symbolic.Level` has where there is none: a zero, and a one for padded pivots."""
+    return jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
+
+
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
     """The factors of all fronts, from the root down; of the root only, unless ``keep``."""
-    padded = jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
+    padded = _padded(values)
     top = max(plan.subtrees, 1)
     update, low = by_platform(
         plan.levels[top:],
