@@ -87,6 +87,7 @@ def export_c(
     parts = {
         "SIZES": _about(calibration, numbers, sizes),
         "TABLES": tables,
+        "EXACT": _exact(numbers),
         "CURVE": "\n".join(f"    {line}" for line in numbers.curve.body),
     }
     text = re.sub(r"/\*@(\w+)@\*/", lambda found: parts[found[1]], TEMPLATE.read_text(encoding="ascii"))
@@ -105,19 +106,22 @@ def _sizes(numbers: Numbers, flash: int) -> HeaderSizes:
         rest=4 * (readings + pads),
         tare=12 * (readings + pads),
         result=-(-result // 4) * 4 + 4,
-        stack=4 * pairs + 4 * pads + 2 * MAX_MISSING + 4 * MAX_MISSING * (MAX_MISSING + 1) + 8 * MAX_MISSING,
+        stack=(4 + _TYPES[_exact(numbers)][1]) * pairs
+        + 4 * pads
+        + 2 * MAX_MISSING
+        + 4 * MAX_MISSING * (MAX_MISSING + 1)
+        + 8 * MAX_MISSING,
         operations=5 * readings + pixels * pairs + pads**2 + 5 * len(numbers.mask_area),
     )
 
 
 def _tables(numbers: Numbers) -> tuple[str, int]:
     """The tables in C, and their bytes."""
-    exact = "double" if numbers.exact else "float"
     tables = (
         ("uint16_t", "pairs", "[SKIN_READINGS][4]", "pair sums that a reading is made of", numbers.pairs),
-        ("float", "weight", "[SKIN_READINGS]", "of a reading, 1/V^2; 0: not used", numbers.weight),
+        ("skin_exact", "weight", "[SKIN_READINGS]", "of a reading, 1/V^2; 0: not used", numbers.weight),
         ("float", "factor", "[SKIN_PIXELS][SKIN_PAIRS]", "image per pair sum, S V", numbers.factor),
-        (exact, "predict", "[SKIN_PAIRS * (SKIN_PAIRS + 1) / 2]", "predicts pair sums, V^2", numbers.predict),
+        ("skin_exact", "predict", "[SKIN_PAIRS * (SKIN_PAIRS + 1) / 2]", "predicts pair sums, V^2", numbers.predict),
         ("float", "unmix", "[SKIN_PADS][SKIN_PADS]", "own pressure of a pad per pressure read", numbers.unmix),
         ("float", "curves", f"[SKIN_PADS][{numbers.curve.coefficients.shape[1]}]", f"CURVE: {numbers.curve.formula}",
          numbers.curve.coefficients),
@@ -128,10 +132,15 @@ def _tables(numbers: Numbers) -> tuple[str, int]:
     )  # fmt: skip
     texts, flash = [], 0
     for kind, name, shape, meaning, values in tables:
-        dtype, size = _TYPES[kind]
+        dtype, size = _TYPES[_exact(numbers) if kind == "skin_exact" else kind]
         flash += size * values.size
         texts.append(f"/* {meaning} */\nstatic const {kind} skin_{name}{shape} = {_initialiser(name, values, dtype)};")
     return "\n\n".join(texts), flash
+
+
+def _exact(numbers: Numbers) -> str:
+    """Type of the numbers from which missing readings are predicted."""
+    return "double" if numbers.exact else "float"
 
 
 def _initialiser(name: str, values: np.ndarray, dtype: DTypeLike) -> str:

@@ -16,9 +16,9 @@ from .c_curves import CurveInC, curve_in_c
 from .errors import ExportError
 
 RANGE_TOLERANCE = 0.05  # as `FittedCurve.predict`
-# Least part of a reading that the image of the others leaves open (`_open_part`): with less, single precision of T
-# would lose more than three of its seven digits in the image of a frame without these readings.
-LEAST_OPEN_PART = 1e-3
+# Least part of a reading that the image of the others leaves open (`_open_part`): with less, single precision would
+# lose more than two of its seven digits in the image of a frame without these readings.
+LEAST_OPEN_PART = 1e-2
 
 
 class Numbers(NamedTuple):
@@ -30,7 +30,7 @@ class Numbers(NamedTuple):
     | weight of each reading; 0: not used                                              | (readings,)     | 1/V^2 |
     | factor': image per pair sum t'                                                   | (pixels, k)     | S V   |
     | predict: lower triangle of T', row by row                                        | (k (k + 1) / 2,)| V^2   |
-    | exact: whether `predict` needs double precision                                  | ()              |       |
+    | exact: whether weight and predict need double precision                          | ()              |       |
     | unmix: own pressures at the calibration per reading of a pad now                 | (pads, pads)    | 1     |
     | curve of the pads                                                                |                 |       |
     | range: lowest and highest pressure that count as calibrated                      | (pads, 2)       | Pa    |

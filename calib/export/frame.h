@@ -26,6 +26,9 @@
 
 #define SKIN_CHANNELS (SKIN_READINGS + SKIN_PADS)
 
+/* Numbers from which missing readings are predicted; double where the images need more than float keeps. */
+typedef /*@EXACT@*/ skin_exact;
+
 /*@TABLES@*/
 
 /* The skin without contact. NaN: this reading or pressure is never used. */
@@ -92,7 +95,7 @@ static inline double skin_predicted(uint32_t i, uint32_t j)
 
 /* Complete the pair sums t of a frame by what the image of its other readings predicts for the missing ones:
    (1/w - B T B^T) q = B T t, then t += B^T q. Returns 0 if the other readings do not determine it. */
-static inline int skin_complete(const uint16_t *missing, uint32_t count, float *sums)
+static inline int skin_complete(const uint16_t *missing, uint32_t count, skin_exact *sums)
 {
     static const double sign[4] = {1.0, -1.0, -1.0, 1.0};
     double lower[SKIN_MAX_MISSING * (SKIN_MAX_MISSING + 1) / 2], value[SKIN_MAX_MISSING];
@@ -133,26 +136,40 @@ static inline int skin_complete(const uint16_t *missing, uint32_t count, float *
         for (uint32_t b = a + 1; b < count; b++)
             value[a] -= lower[b * (b + 1) / 2 + a] * value[b];
         for (uint32_t s = 0; s < 4; s++)
-            sums[skin_pairs[missing[a]][s]] += (float)(sign[s] * value[a]);
+            sums[skin_pairs[missing[a]][s]] += (skin_exact)(sign[s] * value[a]);
     }
     return 1;
+}
+
+/* Product of two vectors of pair sums. Eight sums side by side wait for each other an eighth of the time. */
+static inline float skin_dot(const float *a, const float *b)
+{
+    float part[8] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    uint32_t j = 0;
+    for (; j + 8 <= SKIN_PAIRS; j += 8)
+        for (uint32_t i = 0; i < 8; i++)
+            part[i] += a[j + i] * b[j + i];
+    for (; j < SKIN_PAIRS; j++)
+        part[0] += a[j] * b[j];
+    return ((part[0] + part[4]) + (part[1] + part[5])) + ((part[2] + part[6]) + (part[3] + part[7]));
 }
 
 /* The image of a frame. Returns 0, or 1 if it has too many missing readings: the image is then NaN. */
 static inline int skin_imaged(const skin_rest *rest, const float *readings, skin_result *out)
 {
-    float sums[SKIN_PAIRS];
+    skin_exact sums[SKIN_PAIRS];
+    float single[SKIN_PAIRS];
     uint16_t missing[SKIN_MAX_MISSING];
     int known;
     for (uint32_t j = 0; j < SKIN_PAIRS; j++)
-        sums[j] = 0.0f;
+        sums[j] = 0;
     out->missing = 0;
     for (uint32_t i = 0; i < SKIN_READINGS; i++) {
         const float change = readings[i] - rest->readings[i];
-        if (skin_weight[i] == 0.0f)
+        if (skin_weight[i] == 0)
             continue; /* a channel that the calibration does not use */
         if (isfinite(change)) {
-            const float weighed = skin_weight[i] * change;
+            const skin_exact weighed = skin_weight[i] * change;
             sums[skin_pairs[i][0]] += weighed;
             sums[skin_pairs[i][1]] -= weighed;
             sums[skin_pairs[i][2]] -= weighed;
@@ -164,12 +181,10 @@ static inline int skin_imaged(const skin_rest *rest, const float *readings, skin
         }
     }
     known = out->missing <= SKIN_MAX_MISSING && skin_complete(missing, out->missing, sums);
-    for (uint32_t p = 0; p < SKIN_PIXELS; p++) {
-        float value = 0.0f;
-        for (uint32_t j = 0; j < SKIN_PAIRS; j++)
-            value += skin_factor[p][j] * sums[j];
-        out->image[p] = known ? value : NAN;
-    }
+    for (uint32_t j = 0; j < SKIN_PAIRS; j++)
+        single[j] = (float)sums[j];
+    for (uint32_t p = 0; p < SKIN_PIXELS; p++)
+        out->image[p] = known ? skin_dot(skin_factor[p], single) : NAN;
     return !known;
 }
 

@@ -26,6 +26,7 @@ STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler: there is no program cc")
 TARE, FRAMES = 20, 1000
 ROUNDING = 300 * 6e-8  # of sums of 300 products in single precision
+LOST_DIGIT = 10  # a frame without a reading and its partner, which are predicted in single precision
 
 # Frames from standard input: the first 20 for the tare, then results to standard output.
 DRIVER = r"""
@@ -105,8 +106,10 @@ def recorded(model, pixels, recon):
     pressed = rng.uniform(-100, 3000, (FRAMES, 4)) * (rng.random((FRAMES, 4)) < 0.7)  # 2.4 kPa were calibrated
     untouched = np.hstack([rest + 1e-6 * rng.normal(size=(TARE, readings)), 1e5 + rng.normal(size=(TARE, 4))])
     frames = np.hstack([rest + change, 1e5 + pressed])
+    partner = je.skin.reciprocal_rows(np.asarray(model.pattern))
     for frame in frames[::2]:
-        lost = rng.choice(readings, rng.integers(1, 17), replace=False)
+        lost = rng.choice(readings, rng.integers(1, 9), replace=False)
+        lost = np.unique([lost, partner[lost]])  # what the partner reads is as good as the reading itself
         frame[lost] = rng.choice([np.nan, np.inf, -np.inf], len(lost))
     frames[::3, readings + 1] = np.nan  # a pad that tells nothing
     frames[::7, readings + 2] = np.inf  # and one whose converter says so that it is saturated
@@ -131,7 +134,7 @@ def run_c(program, recorded, readings, pads, pixels):
     return np.frombuffer(out[:first], "f4"), np.frombuffer(out[first:], row)
 
 
-def compare(calibration, recorded, program, rounding=ROUNDING):
+def compare(calibration, recorded, program, exact=False):
     """Run the program, and compare each frame with Python."""
     readings, pads, pixels = calibration.recon.readings, 4, len(calibration.masks.areas)
     rest, found = run_c(program, recorded, readings, pads, pixels)
@@ -143,15 +146,17 @@ def compare(calibration, recorded, program, rounding=ROUNDING):
     image, force = np.asarray(calibration.recon(change[:, :readings])), np.asarray(wanted.force)
     largest = np.abs(image).max(1, keepdims=True)
     error = np.abs(found["image"] - image) / largest
-    assert error.max() < rounding, error.max()
-    np.testing.assert_array_equal(found["missing"], (~np.isfinite(change[:, :readings])).sum(1))
+    missing = (~np.isfinite(change[:, :readings])).sum(1)
+    rounding = ROUNDING * np.where((missing > 0) & (not exact), LOST_DIGIT, 1)
+    assert (error.max(1) < rounding).all(), error.max()
+    np.testing.assert_array_equal(found["missing"], missing)
     assert not found["unknown"].any()
 
     np.testing.assert_array_equal(np.isnan(found["force"]), np.isnan(change[:, readings:]))
     np.testing.assert_allclose(found["force"], force, rtol=3e-6, atol=3e-6)
     own = np.asarray(calibration.own_pressures(change[:, readings:]))
-    low, high = (np.asarray(calibration.curves.pressure_range).T + np.array([[-1], [1]]) * 0.05
-                 * np.ptp(np.asarray(calibration.curves.pressure_range), axis=1))  # fmt: skip
+    low, high = np.asarray(calibration.curves.pressure_range).T
+    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
     clear = (np.abs(own - low) > 1e-3) & (np.abs(own - high) > 1e-3)
     np.testing.assert_array_equal(found["in_range"][clear], np.asarray(wanted.valid)[clear])
     assert {0, 1} == set(found["in_range"][np.isfinite(own)].ravel())  # saturated or not
@@ -164,8 +169,8 @@ def compare(calibration, recorded, program, rounding=ROUNDING):
     silent = np.asarray(calibration.masks.weights)[None] * np.isnan(force)[..., None] > 0
     np.testing.assert_array_equal(np.isnan(found["map"]), silent.any(1))
     scale = np.maximum(np.nanmax(np.abs(np.asarray(wanted.map.force)), 1, keepdims=True), 1e-6)  # N
-    error = np.abs(found["map"] - np.asarray(wanted.map.force))[sure] / scale[sure]
-    assert np.nanmax(error) < 5 * rounding, np.nanmax(error)
+    error = np.abs(found["map"] - np.asarray(wanted.map.force)) / scale
+    assert (np.nanmax(error, 1, initial=0) < 5 * rounding)[sure].all(), np.nanmax(error[sure])
     assert {0, 1} == set(found["shaped"].ravel())
 
 
@@ -218,8 +223,8 @@ def test_readings_that_the_others_hardly_predict_need_double_precision(calibrati
     """With little regularisation a missing reading takes nearly all that is known of some pair sums with it."""
     weak = je.prepare(model, basis=je.Pixels(20), hyperparameter=1e-3)
     calib.export_c(replace(calibration, recon=weak), tmp_path / "skin.h")
-    assert "static const double skin_predict[" in (tmp_path / "skin.h").read_text()
-    compare(replace(calibration, recon=weak), recorded, built(tmp_path), rounding=1000)
+    assert "typedef double skin_exact;" in (tmp_path / "skin.h").read_text()
+    compare(replace(calibration, recon=weak), recorded, built(tmp_path), exact=True)
 
 
 @needs_compiler
@@ -309,3 +314,18 @@ def test_the_command(calibration, tmp_path, capsys, monkeypatch):
     assert main(["export", "c", "calibration.h5", "-o", str(tmp_path / "x.h"), "--prefix", "X"]) == 2
     assert "lower-case" in capsys.readouterr().err
     assert not (tmp_path / "x.h").exists()
+
+
+@needs_compiler
+def test_the_program_of_the_page(calibration, recorded, root, tmp_path):
+    """`docs/firmware.md` shows a program; its output is what Python finds."""
+    (source,) = re.findall(r'```c title="main.c"\n(.*?)```', (root / "docs" / "firmware.md").read_text(), re.DOTALL)
+    calib.export_c(calibration, tmp_path / "skin.h")
+    untouched = np.repeat(recorded[:1], 50, 0)
+    untouched[np.isnan(untouched)] = 0.05
+    frames = np.vstack([untouched, recorded[TARE : TARE + 20]])
+    program = built(tmp_path, source=source)
+    out = subprocess.run([program], input=frames.tobytes(), capture_output=True, text=False, check=True).stdout
+    printed = np.array([line.split() for line in out.decode().splitlines()], float)
+    wanted = calibration.pad_forces((frames[50:] - frames[0])[:, 550:].astype(float))[0]
+    np.testing.assert_allclose(printed, np.where(np.isfinite(wanted), wanted, np.nan), atol=1e-3, rtol=1e-5)
