@@ -1,12 +1,14 @@
-"""A frame in C by the header of `jaxeit export c`, beside NumPy: the image, the image without a reading, and all of it.
+"""A frame in C by the header of `jaxeit export c`, beside NumPy: the image, also without a reading, and all of it.
 
-C is compiled by `cc -O2`, so that the header itself counts and no option of one processor. NumPy is the reconstructor on
-the host in float32; for the whole frame its image goes through the compiled program of the live engine for one frame.
+C is compiled by `cc -O2`, so that the header itself counts and no option of one processor. NumPy is the reconstructor
+on the host in float32; for the whole frame its image goes through the compiled program of the live engine. Both are
+seconds of the processor, in which other programs do not count.
 """
 
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,6 @@ from calib.calibration.force_maps import law_of
 from calib.live.engine import FramePrograms
 
 from .bench_live import made_up
-from .clock import seconds
 from .harness import Question, Run, with_one_blas_thread
 from .rows import Row
 
@@ -105,16 +106,19 @@ def measured(calibration: calib.Calibration, folder: Path, calls: int) -> Iterat
     rounds = []
     for _ in range(ROUNDS):
         out = subprocess.run([folder / "main", str(calls)], capture_output=True, text=True, check=True).stdout
-        in_numpy = [seconds(repeated, part, calls)[0] / calls for part in numpy_parts]
+        in_numpy = [repeated(part, calls) / calls for part in numpy_parts]
         rounds.append([[float(line) for line in out.split()], in_numpy])
     medians = 1e6 * np.median(rounds, 0)
     for part, c, numpy in zip(PARTS, *medians.tolist(), strict=True):
         yield {"part": part, "c_us": round(c, 2), "numpy_us": round(numpy, 2)}
 
 
-def repeated(call: Callable[[], Any], times: int) -> None:
+def repeated(call: Callable[[], Any], times: int) -> float:
+    """Seconds of the processor."""
+    start = time.process_time()
     for _ in range(times):
         call()
+    return time.process_time() - start
 
 
 main = Question("firmware", __doc__, {"times": times})

@@ -33,12 +33,14 @@ class HeaderSizes:
     | meaning                                                                     | unit  |
     |-----------------------------------------------------------------------------|-------|
     | flash: tables, without the code                                             | bytes |
+    | predict: of these the table for missing readings, if `MAX_MISSING` is not 0 | bytes |
     | rest, tare, result: the structures of these names                           | bytes |
     | stack: about, with `MAX_MISSING` missing readings                           | bytes |
     | operations: multiply-adds of a frame with all its readings                  |       |
     """
 
     flash: int
+    predict: int
     rest: int
     tare: int
     result: int
@@ -103,6 +105,7 @@ def _sizes(numbers: Numbers, flash: int) -> HeaderSizes:
     result = 8 * pixels + 4 * pads + 2 * pads
     return HeaderSizes(
         flash=flash,
+        predict=_TYPES[_exact(numbers)][1] * len(numbers.predict),
         rest=4 * (readings + pads),
         tare=12 * (readings + pads),
         result=-(-result // 4) * 4 + 4,
@@ -134,7 +137,8 @@ def _tables(numbers: Numbers) -> tuple[str, int]:
     for kind, name, shape, meaning, values in tables:
         dtype, size = _TYPES[_exact(numbers) if kind == "skin_exact" else kind]
         flash += size * values.size
-        texts.append(f"/* {meaning} */\nstatic const {kind} skin_{name}{shape} = {_initialiser(name, values, dtype)};")
+        text = f"/* {meaning} */\nstatic const {kind} skin_{name}{shape} = {_initialiser(name, values, dtype)};"
+        texts.append(f"#if SKIN_MAX_MISSING > 0\n{text}\n#endif" if name == "predict" else text)
     return "\n\n".join(texts), flash
 
 
@@ -178,7 +182,7 @@ def _about(calibration: Calibration, numbers: Numbers, sizes: HeaderSizes) -> st
         f"curve: {numbers.curve.formula}",
         *([] if calibration.field is None else ["The correction by location is left out: its gain is 1."]),
         "",
-        f"flash  {sizes.flash:,} bytes of tables, and the code",
+        f"flash  {sizes.flash:,} bytes of tables, and the code; of these {sizes.predict:,} for missing readings",
         f"RAM    skin_rest {sizes.rest:,}, skin_result {sizes.result:,} bytes; while the skin is at rest "
         f"skin_tare {sizes.tare:,} bytes",
         f"stack  about {sizes.stack:,} bytes with SKIN_MAX_MISSING {MAX_MISSING}",

@@ -10,7 +10,8 @@
 
 /*@SIZES@*/
 
-/* Missing readings of one frame that are left out exactly. The stack of skin_frame() grows with the square. */
+/* Missing readings of one frame that are left out exactly. The stack of skin_frame() grows with the square.
+   0: a frame with a missing reading has no image, and the table skin_predict takes no flash. */
 #ifndef SKIN_MAX_MISSING
 #define SKIN_MAX_MISSING 16
 #endif
@@ -20,8 +21,8 @@
 #define SKIN_GATE 0.6f
 #endif
 
-#if SKIN_MAX_MISSING < 1
-#error "SKIN_MAX_MISSING: give a whole number above zero"
+#if SKIN_MAX_MISSING < 0
+#error "SKIN_MAX_MISSING: give a whole number, zero or more"
 #endif
 
 #define SKIN_CHANNELS (SKIN_READINGS + SKIN_PADS)
@@ -87,6 +88,7 @@ static inline void skin_tare_rest(const skin_tare *tare, skin_rest *rest)
     }
 }
 
+#if SKIN_MAX_MISSING > 0
 /* Element of the symmetric matrix that predicts pair sums; its lower triangle is kept, row by row. */
 static inline double skin_predicted(uint32_t i, uint32_t j)
 {
@@ -140,6 +142,7 @@ static inline int skin_complete(const uint16_t *missing, uint32_t count, skin_ex
     }
     return 1;
 }
+#endif
 
 /* Product of two vectors of pair sums. Eight sums side by side wait for each other an eighth of the time. */
 static inline float skin_dot(const float *a, const float *b)
@@ -159,7 +162,9 @@ static inline int skin_imaged(const skin_rest *rest, const float *readings, skin
 {
     skin_exact sums[SKIN_PAIRS];
     float single[SKIN_PAIRS];
-    uint16_t missing[SKIN_MAX_MISSING];
+#if SKIN_MAX_MISSING > 0
+    uint16_t missing[SKIN_MAX_MISSING] = {0};
+#endif
     int known;
     for (uint32_t j = 0; j < SKIN_PAIRS; j++)
         sums[j] = 0;
@@ -175,12 +180,18 @@ static inline int skin_imaged(const skin_rest *rest, const float *readings, skin
             sums[skin_pairs[i][2]] -= weighed;
             sums[skin_pairs[i][3]] += weighed;
         } else {
+#if SKIN_MAX_MISSING > 0
             if (out->missing < SKIN_MAX_MISSING)
                 missing[out->missing] = (uint16_t)i;
+#endif
             out->missing++;
         }
     }
-    known = out->missing <= SKIN_MAX_MISSING && skin_complete(missing, out->missing, sums);
+#if SKIN_MAX_MISSING > 0
+    known = out->missing == 0 || (out->missing <= SKIN_MAX_MISSING && skin_complete(missing, out->missing, sums));
+#else
+    known = out->missing == 0;
+#endif
     for (uint32_t j = 0; j < SKIN_PAIRS; j++)
         single[j] = (float)sums[j];
     for (uint32_t p = 0; p < SKIN_PIXELS; p++)

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import calib
 import jaxeit as je
+from benchmarks import bench_firmware
 from calib.calibration.recalibration.changes import Recalibration
 from calib.cli import main
 from calib.export import ExportError
@@ -142,7 +144,7 @@ def compare(calibration, recorded, program, exact=False):
     change = recorded[TARE:].astype(float) - rest
     change[:, readings:][~np.isfinite(change[:, readings:])] = np.nan
     wanted = calib.force_map(calibration, change[:, :readings], change[:, readings:])
-    assert len(found) == FRAMES
+    assert len(found) == len(change)
     image, force = np.asarray(calibration.recon(change[:, :readings])), np.asarray(wanted.force)
     largest = np.abs(image).max(1, keepdims=True)
     error = np.abs(found["image"] - image) / largest
@@ -211,11 +213,23 @@ def test_more_missing_readings_than_there_is_room_for(calibration, recorded, tmp
     assert not found["shaped"].any()
     whole = np.isfinite(found["force"]).all(1)
     np.testing.assert_allclose(found["map"][whole].sum(1), found["force"][whole].sum(1), rtol=1e-5, atol=1e-5)
-    compare(calibration, lost, built(tmp_path, flags=(*STRICT, "-DSKIN_MAX_MISSING=64")))
+    compare(calibration, lost[: TARE + 40], built(tmp_path, flags=(*STRICT, "-DSKIN_MAX_MISSING=64")))
     none = np.where(np.arange(554) < 550, np.nan, lost).astype("f4")
     _, found = run_c(built(tmp_path, flags=(*STRICT, "-DSKIN_MAX_MISSING=550")), none, 550, 4, 400)
     np.testing.assert_array_equal(found["image"], 0)
     assert not found["shaped"].any()
+
+
+@needs_compiler
+def test_without_room_for_missing_readings(calibration, recorded, tmp_path):
+    """The table that predicts them is left out too."""
+    sizes = calib.export_c(calibration, tmp_path / "skin.h")
+    small, large = (built(tmp_path, flags=(*STRICT, f"-DSKIN_MAX_MISSING={n}")).read_bytes() for n in (0, 1))
+    assert len(large) - len(small) > 0.95 * sizes.predict
+    program = built(tmp_path, flags=(*STRICT, "-DSKIN_MAX_MISSING=0"))
+    compare(calibration, np.vstack([recorded[:TARE], recorded[TARE + 1 :: 2]]), program)
+    _, found = run_c(program, np.vstack([recorded[:TARE], recorded[TARE::2]]), 550, 4, 400)
+    assert found["unknown"].all()
 
 
 @needs_compiler
@@ -329,3 +343,13 @@ def test_the_program_of_the_page(calibration, recorded, root, tmp_path):
     printed = np.array([line.split() for line in out.decode().splitlines()], float)
     wanted = calibration.pad_forces((frames[50:] - frames[0])[:, 550:].astype(float))[0]
     np.testing.assert_allclose(printed, np.where(np.isfinite(wanted), wanted, np.nan), atol=1e-3, rtol=1e-5)
+
+
+@needs_compiler
+def test_the_benchmark_runs(root):
+    command = [sys.executable, "-m", "benchmarks.bench_firmware", "--smoke"]
+    printed = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
+    for part in bench_firmware.PARTS:
+        assert re.search(
+            rf"^\| 10 \| 928 \| {part} \| [\d.]*[1-9][\d.]* \| [\d.]*[1-9][\d.]* \|$", printed, re.MULTILINE
+        )
