@@ -69,7 +69,7 @@ def numbers_of(calibration: Calibration, *, without_location: bool = False) -> N
     if recon.whitening.weight.ndim == 2:
         raise ExportError(
             "noise: the covariance between readings needs tables of readings squared, which are not exported; "
-            "calibrate with --noise as deviations"
+            "calibrate with --noise equal or --noise measured"
         )
     if calibration.field is not None and not without_location:
         raise ExportError(

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -295,6 +297,9 @@ def test_what_cannot_be_exported_is_refused(calibration, model, tmp_path):
     refused(replace(calibration, curves=fitted(Play())), tmp_path, r"curve 'play'.*remembers.*linear, affine, power")
     iterative = je.prepare(model, basis=je.Pixels(20), method=je.NonNegative())
     refused(replace(calibration, recon=iterative), tmp_path, r"solves a problem for each frame.*--method one-step")
+    correlated = eqx.tree_at(lambda r: r.whitening.weight, calibration.recon, jnp.eye(550))
+    refused(replace(calibration, recon=correlated), tmp_path, r"covariance between readings.*--noise measured")
+    refused(stand_in(calib.LogCalibration), tmp_path, "a log has no EIT")
     located = replace(calibration, field=stand_in(FittedField))
     refused(located, tmp_path, r"location.*--without-location")
     assert calib.export_c(located, tmp_path / "skin.h", without_location=True).flash > 0
