@@ -5,6 +5,7 @@ from . import (
     bench as bench,
     calibration as calibration,
     check as check,
+    export as export,
     fitting as fitting,
     live as live,
     presses as presses,
@@ -30,6 +31,7 @@ from .calibration import (
     recalibrate as recalibrate,
 )
 from .check import check_session as check_session
+from .export import export_c as export_c
 from .fitting import (
     Affine as Affine,
     Linear as Linear,
