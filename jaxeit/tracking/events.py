@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .filter import PLACE, SIZE, Belief
+from .filter import PLACE, ROUND, SIZE, Belief
 from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.
@@ -21,8 +21,6 @@ BETWEEN = 0.8
 DIRECTIONS = np.pi * np.arange(4) / 4
 # Prior deviation of the velocity of a contact that begins, m/s.
 VELOCITY = 0.05
-# Half an edge that is none: what keeps its covariance definite, m.
-ROUND = 1e-4
 # How far a contact may change when it turns out to be an edge, and how much narrower its load then is.
 EDGE, NARROWER = np.array([0.01, 0.01, 0.4, 0.5, HALF, HALF, 0.0, 0.0]), 0.3
 

@@ -30,6 +30,8 @@ from .response import LoadedSheet, Near, Shown
 SIZE, SEEN = 8, 6
 # Prior deviation of the place of a contact that begins, m.
 PLACE = 0.012
+# Half an edge that is none: what keeps its covariance definite, m.
+ROUND = 1e-4
 # Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
 # of an ordinary frame, whose next step would lower it by 0.001 then, and of one that begins far from its end.
 FALL, CAREFUL_FALL = 10.0, 1.0

@@ -6,6 +6,7 @@ the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that 
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,8 +21,8 @@ from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
 SHORTEST = 1e-4
-# Of one load: from its six numbers and points (n, 2), its pressure (n,) and slopes (n, 6).
-SlopesOf = Callable[[Array, Array], tuple[Array, Array]]
+# Of all loads: from points (n, 2) to their pressure (n,) and its slopes (n, a).
+Pressures = Callable[[Array], tuple[Array, Array]]
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
 LENGTHS, ANGLES = (0.015, 0.03), 4
 
@@ -139,30 +140,21 @@ class LoadedSheet(eqx.Module):
         return self.neighbours.near(contacts.astype(self.points.dtype), len(self.sigma), len(self.pixels))
 
     def shown(
-        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
-    ) -> Shown:
-        """What frames and pads show of contacts, with slopes in their numbers and in some modes of the gain."""
-        return self._shown(contacts, gain, modes, near, _with_slopes)
-
-    def shape_slopes(
-        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Near
-    ) -> tuple[Float[Array, "s r"], Float[Array, "s pads"]]:
-        """Slopes of readings and of forces on pads in six moments of each contact's shape (`pressure.line_shapes`)."""
-        none = jnp.zeros(0, near.elements.dtype)
-        found = self._shown(contacts, gain, none, near, _with_shapes)
-        return found.reading_slopes, found.pad_slopes
-
-    def _shown(
         self,
         contacts: Float[Array, "K 6"],
         gain: Float[Array, " g"],
         modes: Int[Array, " b"],
         near: Near,
-        slopes_of: SlopesOf,
+        shapes: bool = False,
     ) -> Shown:
-        loads = contacts.astype(self.points.dtype)
-        pads, pixels = self._first_order(loads, gain, modes, near, slopes_of)
-        change, slopes = self._changes(loads, gain, modes, near, slopes_of)
+        """What frames and pads show of contacts, with slopes in their numbers and in some modes of the gain.
+
+        Args:
+            shapes: after the slopes in the numbers of a contact come those in its shape (`pressure.line_shapes`).
+        """
+        pressures = partial(_pressures, contacts.astype(self.points.dtype), shapes=shapes)
+        pads, pixels = self._first_order(pressures, gain, modes, near)
+        change, slopes = self._changes(pressures, gain, modes, near)
         found = self.sheet.beyond(near.elements, near.unknowns, change)
         beyond = self.sheet.beyond_slopes(found, slopes.T)
         readings, first = pixels
@@ -177,16 +169,11 @@ class LoadedSheet(eqx.Module):
         )
 
     def _first_order(
-        self,
-        loads: Float[Array, "K 6"],
-        gain: Float[Array, " g"],
-        modes: Int[Array, " b"],
-        near: Near,
-        slopes_of: SlopesOf,
+        self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Forces on pads and their slopes (pads, a); readings of the image and their slopes (a, r)."""
         pixels, table = near.pixels, self.pixel_modes[near.pixels]
-        pressure, slopes = _pressures(loads, self.pixels[pixels], slopes_of)
+        pressure, slopes = pressures(self.pixels[pixels])
         own = near.own_pixels
         pressure, slopes = jnp.where(own, pressure, 0), jnp.where(own[:, None], slopes, 0)
         area = self.pad_area[pixels].T
@@ -196,17 +183,12 @@ class LoadedSheet(eqx.Module):
         return (area @ pressure, area @ slopes), (relative @ response, moved.T @ response)
 
     def _changes(
-        self,
-        loads: Float[Array, "K 6"],
-        gain: Float[Array, " g"],
-        modes: Int[Array, " b"],
-        near: Near,
-        slopes_of: SlopesOf,
+        self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> tuple[Float[Array, " e"], Float[Array, "e a"]]:
         """Change of conductivity of the elements, S, and its slopes."""
         elements, table = near.elements, self.modes[near.elements]
         points = self.points[elements]
-        pressure, slopes = _pressures(loads, points.reshape(-1, 2), slopes_of)
+        pressure, slopes = pressures(points.reshape(-1, 2))
         factor = jnp.exp(table @ gain.astype(table.dtype))
         relative, along, by_gain = self._conducting(pressure.reshape(points.shape[:2]), factor[:, None])
         scale = jnp.where(near.own_elements, self.sigma[elements], 0)
@@ -225,24 +207,19 @@ class LoadedSheet(eqx.Module):
 
 
 def _pressures(
-    loads: Float[Array, "K 6"], points: Float[Array, "n 2"], slopes_of: SlopesOf
+    loads: Float[Array, "K 6"], points: Float[Array, "n 2"], shapes: bool
 ) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
-    """Pressure of all loads at points, Pa, and its slopes in six numbers of each."""
-    values, slopes = zip(*(slopes_of(load, points) for load in loads), strict=True)
+    """Pressure of all loads at points, Pa, and its slopes in the six numbers of each, and in its shape if asked for."""
+    values, slopes = zip(*(_with_slopes(load, points, shapes) for load in loads), strict=True)
     return jnp.sum(jnp.stack(values), 0), jnp.concatenate(slopes, 1)
 
 
 def _with_slopes(
-    load: Float[Array, "6"], points: Float[Array, "n 2"]
-) -> tuple[Float[Array, " n"], Float[Array, "n 6"]]:
+    load: Float[Array, "6"], points: Float[Array, "n 2"], shapes: bool
+) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
     value, push = jax.linearize(lambda load: load_pressure(load, points), load)
-    return value, jax.vmap(push, out_axes=1)(jnp.eye(len(load), dtype=load.dtype))
-
-
-def _with_shapes(
-    load: Float[Array, "6"], points: Float[Array, "n 2"]
-) -> tuple[Float[Array, " n"], Float[Array, "n 6"]]:
-    return load_pressure(load, points), line_shapes(load, points, SHORTEST)
+    slopes: Array = jax.vmap(push, out_axes=1)(jnp.eye(len(load), dtype=load.dtype))
+    return value, jnp.concatenate([slopes, line_shapes(load, points, SHORTEST)], 1) if shapes else slopes
 
 
 def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:

@@ -19,12 +19,12 @@ from jaxtyping import Array, Float
 
 from .._compile import verb
 from ..linalg import lapack
-from .filter import SEEN, Belief, ContactFilter, Pads, active_numbers
+from .filter import ROUND, SEEN, Belief, ContactFilter, Pads, active_numbers
 
 # Frames n, each with an error of the model of its own, after which contacts are told by the frames and not by P.
 FRAMES = 10
-# Moments of the shape of each load, and half an edge at least, m: a contact that is none has no direction.
-MOMENTS, ROUND = 6, 1e-4
+# Moments of the shape of each load.
+MOMENTS = 6
 # Changes of place, log width, log force and half an edge within which the covariance is taken for the same.
 CHANGED = np.array([0.002, 0.002, 0.1, 0.2, 0.002, 0.002])
 
@@ -41,12 +41,14 @@ def shape_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Floa
     active = active_numbers(tracker, belief.contacts)
     near = tracker.sheet.near(contacts)
     modes = active[contacts.size :] - belief.contacts.size
-    shown = tracker.sheet.shown(contacts, belief.gain, modes, near)
-    by_shape, on_pads = tracker.sheet.shape_slopes(contacts, belief.gain, near)
+    shown = tracker.sheet.shown(contacts, belief.gain, modes, near, shapes=True)
     share = tracker.model_error**2 * (shown.readings @ shown.readings) / len(shown.readings)
     scale, error = jnp.sqrt((1 + share) / FRAMES), pads.error / math.sqrt(FRAMES)
-    slopes = jnp.concatenate([shown.reading_slopes / scale, shown.pad_slopes / error], 1)
-    bent = jnp.concatenate([by_shape / scale, on_pads / error], 1)
+    every = jnp.concatenate([shown.reading_slopes / scale, shown.pad_slopes / error], 1)
+    of_loads, of_modes = jnp.split(every, [count * (SEEN + MOMENTS)])
+    of_numbers, bent = jnp.split(of_loads.reshape(count, SEEN + MOMENTS, -1), [SEEN], 1)
+    slopes = jnp.concatenate([of_numbers.reshape(count * SEEN, -1), of_modes])
+    bent = bent.reshape(count * MOMENTS, -1)
     usual = jnp.broadcast_to(tracker.spread, (count, len(tracker.spread)))
     halves = jnp.maximum(jnp.abs(contacts[:, 4:]), ROUND)
     of_gain = jnp.ones(len(modes), halves.dtype)
