@@ -69,8 +69,7 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
         InverseError, HyperparameterError: if no image can be made with these choices.
     """
     imaging, model = recipe.imaging, je.discretise(je.Scene(skin), recipe.fidelity)
-    sheet = (None, ()) if recipe.even_sheet else fit_untouched_sheet(model, presses.untouched, presses.channels)
-    sigma, notes = sheet
+    sigma, notes = (None, ()) if recipe.even_sheet else fit_untouched_sheet(model, presses.untouched, presses.channels)
     recon = imaging.prepare(
         model,
         quiet=presses.quiet_frames(recipe.processing) if imaging.noise.needs_frames else None,

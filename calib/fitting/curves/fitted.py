@@ -13,6 +13,9 @@ import jaxeit as je
 from ..results import FitResult
 from .base import AbstractCurve
 
+# Part of the fitted range of pressures by which a pressure beyond it still counts as calibrated.
+RANGE_TOLERANCE = 0.05
+
 
 class Prediction(NamedTuple):
     """Force (N), standard error of the curve (N; without the noise of a new sample), and whether both are valid."""
@@ -65,7 +68,7 @@ class FittedCurve(eqx.Module):
         """The outcome of the fit in one sentence, and what to do about it (one pad)."""
         return FitResult(int(self.result)).message
 
-    def predict(self, pressure: Real[ArrayLike, "..."], tolerance: float = 0.05) -> Prediction:
+    def predict(self, pressure: Real[ArrayLike, "..."], tolerance: float = RANGE_TOLERANCE) -> Prediction:
         """Force of one pad at `pressure` (any shape, Pa); by the delta method, se^2 = g' C g with g = dh/dparameters.
 
         `valid` is false for NaN, for a failed fit, and more than `tolerance` of the fitted range outside that range.
@@ -81,7 +84,9 @@ class FittedCurve(eqx.Module):
 
 
 @je.verb
-def predict_pads(fitted: FittedCurve, pressures: Float[Array, "pads n"], tolerance: float = 0.05) -> Prediction:
+def predict_pads(
+    fitted: FittedCurve, pressures: Float[Array, "pads n"], tolerance: float = RANGE_TOLERANCE
+) -> Prediction:
     """`FittedCurve.predict` for every pad of a batch, from pressures (pads, n) Pa; arrays are (pads, n)."""
     found: Prediction = eqx.filter_vmap(lambda f, p: f.predict(p, tolerance))(fitted, pressures)
     return found
