@@ -273,7 +273,13 @@ def _by_other_pads(
     )
     if not len(empty) or int(together.result[0]) != FitResult.SUCCESS:
         return found
-    curves = jax.tree.map(lambda pads, one: pads.at[empty].set(one[0]), found.curves, together)
+
+    def filled(pads: jax.Array, one: jax.Array) -> np.ndarray:
+        every = np.array(pads)
+        every[empty] = one[0]
+        return every
+
+    curves = jax.device_put(jax.tree.map(filled, found.curves, together))
     return replace(found, curves=curves, field=_levelled(found.field, empty))
 
 

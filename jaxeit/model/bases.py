@@ -338,8 +338,17 @@ def overlap_areas(polygons: np.ndarray, low: np.ndarray, high: np.ndarray) -> np
         polygons: (pairs, corners, 2), counter-clockwise, convex or not.
         low, high: corners of the boxes, (pairs, 2).
     """
+    areas = _enclosed(polygons)
+    cut = ((polygons.min(1) < low) | (polygons.max(1) > high)).any(1)
+    parts = polygons[cut]
     for axis in (0, 1):
-        polygons = _clamped(polygons, axis, low[:, axis], high[:, axis])
+        parts = _clamped(parts, axis, low[cut, axis], high[cut, axis])
+    areas[cut] = _enclosed(parts)
+    return areas
+
+
+def _enclosed(polygons: np.ndarray) -> np.ndarray:
+    """Areas (polygons,) by the shoelace formula."""
     x, y = np.moveaxis(polygons, -1, 0)
     areas: np.ndarray = 0.5 * np.sum(x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1), 1)
     return areas

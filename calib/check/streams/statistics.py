@@ -102,10 +102,13 @@ def _statistics(stream: Stream, limit: float, progress: Progress) -> StreamStati
     activity, fingerprint = np.zeros(len(stream)), np.zeros(len(stream))
     weights = np.random.default_rng(0).uniform(1.0, 2.0, n)
     for start, stop, values in progress(stream.blocks()):
-        finite += np.isfinite(values).sum(0)
-        full += (values >= limit).sum(0)
-        at_low, low = _count_extreme(np.where(np.isnan(values), np.inf, values), at_low, low)
-        at_high, high = _count_extreme(np.where(np.isnan(values), np.inf, -values), at_high, -high)
+        good = np.isfinite(values)
+        finite += good.sum(0)
+        if np.isfinite(limit):
+            full += (values >= limit).sum(0)
+        low_side, high_side = (values, -values) if good.all() else np.where(np.isnan(values), np.inf, (values, -values))
+        at_low, low = _count_extreme(low_side, at_low, low)
+        at_high, high = _count_extreme(high_side, at_high, -high)
         high = -high
         activity[start:stop] = _activity(values)
         fingerprint[start:stop] = np.nan_to_num(values) @ weights

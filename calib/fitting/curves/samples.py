@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
@@ -66,7 +65,7 @@ def gather(
     own = p.dtype
     parts = (p, 0), (f.astype(own), 0), (s.astype(own), 1), (valid, False), (group, 0)
     wide = (np.pad(part, ((0, 0), (0, extra)), constant_values=filler) for part, filler in parts)
-    return Samples(*map(jnp.asarray, wide)), 0 if groups is None else len(labels)
+    return Samples(*jax.device_put(tuple(wide))), 0 if groups is None else len(labels)
 
 
 def _numbers(values: Any, what: str, dtype: Any) -> np.ndarray:
