@@ -5,6 +5,7 @@ from .calibration import Calibration
 from .evaluation import Evaluation
 from .files import load_calibration
 from .force_maps import ForceEstimate, force_map
+from .layer import learn_layer
 from .localisation.locators import (
     LOCATORS,
     AbstractLocator,
@@ -46,6 +47,7 @@ __all__ = [
     "evaluate",
     "evaluate_log",
     "force_map",
+    "learn_layer",
     "load_calibration",
     "locate",
     "recalibrate",

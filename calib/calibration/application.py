@@ -1,23 +1,20 @@
 """Applying a calibration to a session: the force map of every frame, in a file."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from ..check.acceptance import accept
-from ..fitting.curves.play_operators import remembered
 from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from .calibration import Calibration
-from .force_maps import USED, ForceEstimate, force_map
-from .frame_blocks import BLOCK, FrameBlock, FrameBlocks
-from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, prepare_calibrated_tracker
+from .force_maps import USED, ForceEstimate
+from .frame_blocks import FrameBlock, FrameBlocks
+from .layer import estimated, quiet_tracker
+from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed
 from .localisation.load_windows import WindowedFrames, fit_windows
-from .localisation.quiet_frames import ENOUGH, QuietFrames
 from .recalibration.agreement import agreement_of_use
 
 FORMAT = "skin-forcemap"
@@ -71,26 +68,13 @@ def apply(
             writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
         also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress)]
         also += [_Tracks(calibration, writer, blocks)] if track else []
-        before = np.zeros((1, len(calibration.skin.pads)))
-        for block in progress(blocks):
-            found = _forces(calibration, block, before)
-            if calibration.curves.curve.path:
-                before = remembered(np.concatenate([before, calibration.own_pressures(block.pressed)]))
+        for block, found in estimated(calibration, progress(blocks)):
             _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
             for one in also:
                 one.add(block, found)
         for one in also:
             tell(one.end())
     return Path(path)
-
-
-def _forces(calibration: Calibration, block: FrameBlock, before: np.ndarray) -> ForceEstimate:
-    """Forces of a block; the last frame of a shorter one repeats, because each length compiles the program again."""
-    count = len(block.time)
-    rows = np.minimum(np.arange(BLOCK), count - 1)
-    found = force_map(calibration, block.change[rows], block.pressed[rows], before=before)
-    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
-    return cut._replace(map=replace(cut.map, areas=found.map.areas))
 
 
 def _attributes(calibration: Calibration, session: Session) -> dict[str, str | int]:
@@ -160,13 +144,8 @@ class _Tracks:
     def __init__(self, calibration: Calibration, writer: ArchiveWriter, blocks: FrameBlocks):
         self._writer, self._why = writer, ""
         self._tracks: ContactTracks | None = None
-        quiet = QuietFrames(calibration.recon.readings)
-        for block in blocks:
-            quiet.add(block.frames, block.change, block.loaded(calibration))
-            if quiet.count >= ENOUGH:
-                break
         try:
-            self._tracks = ContactTracks(prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise))
+            self._tracks = ContactTracks(quiet_tracker(calibration, blocks), layer=calibration.layer)
         except NotFollowed as error:
             self._why = f"contacts: none followed: {error}"
             return

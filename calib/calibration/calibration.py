@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 import jaxeit as je
 from jaxeit.notebook import card
+from jaxeit.tracking import LearnedLayer
 
 from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
@@ -55,9 +56,12 @@ class Calibration:
     | image_gain: force over the integral of the image, N / (S m^2), likewise  |
     | loops: one complete press of each pad, loading and unloading             |
     | examples: a few presses as they were read                                |
+    | probes: presses all over the sheet, likewise                             |
     | tried: candidate curves and fields, with their held-out errors           |
     | rest: gage pressure of the pads without contact, (pads,) Pa              |
     | recalibration: how pads have moved since; None: never recalibrated       |
+    | layer: gain of the contact layer, by which contacts are followed; None:  |
+    |   not learned (`learn_layer`)                                            |
     """
 
     skin: je.Skin
@@ -78,8 +82,10 @@ class Calibration:
     loops: Loops | None = None
     tried: tuple[Candidate, ...] = ()
     examples: PressExamples | None = None
+    probes: PressExamples | None = None
     rest: np.ndarray | None = None
     recalibration: Recalibration | None = None
+    layer: LearnedLayer | None = None
 
     @cached_property
     def pads(self) -> PadModel:
@@ -155,6 +161,8 @@ class Calibration:
             rows.append(("error of place, mean", f"{1e3 * np.nanmean(distance):.3g} mm"))
         if self.recalibration is not None:
             rows.append(("recalibrated", "yes"))
+        if self.layer is not None:
+            rows.append(("gain of the contact layer", f"learned from {self.layer.contacts} contacts"))
         rows += [("note", note) for note in self.notes]
         drawing = self.skin.drawing
         drawing.crosses(found.position)

@@ -1,4 +1,4 @@
-"""A few presses of a calibration, kept as they were read, so that a report shows their images and force maps."""
+"""Some presses of a calibration, kept as they were read: for the report, and for what the model of the skin errs by."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ import jaxeit as je
 from ..presses.pooled import PooledPresses
 
 COUNT = 4
+PROBES = 24  # presses all over the sheet
 FULL_FORCE = 0.9  # fraction of the largest force: presses above it may be examples
 
 
@@ -54,5 +55,21 @@ def press_examples(presses: PooledPresses, skin: je.Skin) -> PressExamples:
     pads = [skin.pads[k] for k in np.unique(np.linspace(0, len(skin.pads) - 1, COUNT - 1).round().astype(int))]
     middles = [rows[np.linalg.norm(position[rows] - np.mean(pad.outline, 0), axis=1).argmin()] for pad in pads]
     chosen = list(dict.fromkeys([int(shared), *map(int, middles)]))
+    return _rows(presses, chosen)
+
+
+def press_probes(presses: PooledPresses) -> PressExamples:
+    """Presses all over the sheet and of all forces: each is the one farthest from those before it."""
+    span = np.ptp(presses.position, axis=0).max() or 1.0
+    every = np.column_stack([presses.position / span, presses.data.force / presses.data.force.max()])
+    chosen = [int(np.linalg.norm(every - every.mean(0), axis=1).argmin())]
+    away = np.full(len(every), np.inf)
+    while len(chosen) < min(PROBES, len(every)):
+        away = np.minimum(away, np.linalg.norm(every - every[chosen[-1]], axis=1))
+        chosen.append(int(away.argmax()))
+    return _rows(presses, chosen)
+
+
+def _rows(presses: PooledPresses, chosen: list[int]) -> PressExamples:
     readings = np.concatenate([recording.pressure for recording in presses.recordings])
-    return PressExamples(presses.dv[chosen], readings[chosen], position[chosen], force[chosen])
+    return PressExamples(presses.dv[chosen], readings[chosen], presses.position[chosen], presses.data.force[chosen])

@@ -19,13 +19,15 @@ from ..session import Session, SessionError
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
+from .layer import learn_layer
 from .localisation.press_images import Imager, PressImages, prepare_imager
-from .press_examples import press_examples
+from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
 from .recipe import Recipe
 from .storage import describe
 
 STAGES = ("reading", "model and images", "fitting", "holding out")
+LEARNING = "learning the contact layer"  # a further stage, if the recipe asks for it
 
 
 def calibrate(
@@ -44,7 +46,7 @@ def calibrate(
         recipe: all choices of the procedure; default: those of the paper.
         ignore_errors: calibrate also from sessions in which `check_session` finds an error; the errors are then kept in
             the calibration's notes and provenance.
-        progress: called with the name of each of the `STAGES` when the stage begins.
+        progress: called with the name of each of the `STAGES`, or `LEARNING`, when the stage begins.
 
     Raises:
         SessionError: a session cannot be used, or was recorded on another skin.
@@ -70,7 +72,7 @@ def calibrate(
     true_position = presses.position if presses.true_place else None
     held_out = hold_out_response(folds, response, presses.groups, images.integral, true_position)
     choice, model = response.choice, response.model
-    return Calibration(
+    calibration = Calibration(
         skin=skin,
         recon=imager.recon,
         masks=imager.masks,
@@ -102,8 +104,14 @@ def calibrate(
         loops=typical_loops(presses, _gains(model, images)),
         tried=choice.tried,
         examples=press_examples(presses, skin),
+        probes=press_probes(presses),
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
     )
+    if recipe.learn_layer:
+        progress(LEARNING)
+        for session in sessions:
+            calibration = learn_layer(calibration, session, ignore_errors=ignore_errors)
+    return calibration
 
 
 def _gains(model: PadModel, images: PressImages) -> np.ndarray | None:

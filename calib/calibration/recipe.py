@@ -34,6 +34,8 @@ class Recipe:
     | imaging: how images are computed from frames                                                | `jaxeit.Imaging` |
     | fidelity: accuracy of the finite-element model from which images are computed               | standard         |
     | even_sheet: take the sheet for even; otherwise the untouched frames tell its conductivity   | False            |
+    | learn_layer: follow the contacts through the sessions and keep what they tell of the contact | False           |
+    |   layer's gain, by which `apply` and `live` then follow contacts                            |                  |
 
     The default is the recipe of the paper (arXiv 2605.28468), except that the paper takes the sheet for even. Sequences
     of curves and locations become tuples.
@@ -52,6 +54,7 @@ class Recipe:
     imaging: je.Imaging = field(default_factory=je.Imaging)
     fidelity: je.Fidelity = field(default_factory=je.Fidelity.standard)
     even_sheet: bool = False
+    learn_layer: bool = False
 
     def __post_init__(self) -> None:
         for name in ("curve", "location"):

@@ -4,6 +4,7 @@ curve = ["linear", "power"]                       # several: one is chosen by cr
 location = {type = "edge", width = 0.008}         # or "edge:width=0.008", as on the command line
 fidelity = "standard"
 even_sheet = false
+learn_layer = false
 
 [imaging]
 method = "one-step"
@@ -17,6 +18,7 @@ baseline = "two-sided"
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import jaxeit as je
@@ -45,6 +47,8 @@ LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
     "standard": je.Fidelity.standard,
     "reference": je.Fidelity.reference,
 }
+SWITCHES = ("even_sheet", "learn_layer")
+"""Fields of a recipe that are true or false."""
 
 # --- choices by name, as words ---------------------------------------------------------------------------------------
 
@@ -96,7 +100,7 @@ def recipe_fields(table: TomlTable, base: "Recipe") -> dict[str, Any]:
         "loss": lambda: _choice(table, "loss", LOSSES),
         "folds": lambda: table.count("folds"),
         "fidelity": lambda: _read_fidelity(table),
-        "even_sheet": lambda: table.get("even_sheet", lambda v: isinstance(v, bool), "true or false"),
+        **{name: partial(_read_switch, table, name) for name in SWITCHES},
         "imaging": lambda: read_imaging(table.table("imaging"), base.imaging),
         "processing": lambda: read_processing(table.table("processing"), base.processing),
     }
@@ -183,6 +187,11 @@ def _corrections(table: TomlTable) -> tuple[Any, ...] | None:
     return tuple(_choice(row, "corrections", CORRECTIONS) for row in rows)
 
 
+def _read_switch(table: TomlTable, name: str) -> bool:
+    found: bool = table.get(name, lambda v: isinstance(v, bool), "true or false")
+    return found
+
+
 def _read_fidelity(table: TomlTable) -> je.Fidelity:
     known = ", ".join(LEVELS)
     value = table.get("fidelity", lambda v: isinstance(v, str | dict), f"one of {known}, or a table")
@@ -219,7 +228,7 @@ def recipe_to_toml(recipe: "Recipe") -> str:
         "loss": LOSSES.settings(recipe.loss),
         "folds": recipe.folds,
         "fidelity": _fidelity_settings(recipe.fidelity),
-        "even_sheet": recipe.even_sheet,
+        **{name: getattr(recipe, name) for name in SWITCHES},
     }
     weight = imaging.hyperparameter
     images = {

@@ -23,11 +23,13 @@ from ..presses.table import Processing
 from ..session import Archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
+from .localisation.layer_arrays import layer_arrays, layer_from
 from .localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
 from .press_examples import PressExamples
 from .recalibration.changes import Recalibration
 from .recipe import Recipe
 from .recipe_text import read_imaging, read_processing
+from .stored_arrays import shaped
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -80,13 +82,16 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         arrays[f"presses/{name}"] = value
     if cal.loops is not None:
         arrays |= {f"loops/{name}": value for name, value in cal.loops.arrays().items()}
-    if cal.examples is not None:
-        arrays |= {f"examples/{name}": value for name, value in cal.examples.arrays().items()}
+    for kind, kept in (("examples", cal.examples), ("probes", cal.probes)):
+        if kept is not None:
+            arrays |= {f"{kind}/{name}": value for name, value in kept.arrays().items()}
     if cal.rest is not None:
         arrays["pads/rest"] = (cal.rest, "Pa", "gage pressure without contact")
     if cal.recalibration is not None:
         attrs |= cal.recalibration.attributes()
         arrays |= cal.recalibration.arrays()
+    if cal.layer is not None:
+        arrays |= layer_arrays(cal.layer)
     given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
     return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
 
@@ -214,7 +219,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
     choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
     for name, array in choices.items():
-        _shaped(choices, name, (len(skin.pads), *array.shape[1:]), "f")
+        shaped(choices, name, (len(skin.pads), *array.shape[1:]), "f")
     curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
     fitted = _fitted(arrays, "pads/", len(skin.pads), kind())
     _require_possible(arrays)
@@ -223,7 +228,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "skin": skin,
         "recon": recon,
         "masks": je.PadMasks(
-            jnp.asarray(_shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")),
+            jnp.asarray(shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")),
             recon.areas,
             recon.shape,
         ),
@@ -240,9 +245,11 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "baseline": _baseline_from(arrays, len(skin.pads)),
         "image_gain": float(attrs.get("image_gain", "nan")),
         "loops": Loops.restore(arrays, "loops/"),
-        "examples": _examples_from(arrays, len(skin.pads), recon.readings),
-        "rest": _shaped(arrays, "pads/rest", (len(skin.pads),), "f") if "pads/rest" in arrays else None,
+        "examples": _examples_from(arrays, "examples", len(skin.pads), recon.readings),
+        "probes": _examples_from(arrays, "probes", len(skin.pads), recon.readings),
+        "rest": shaped(arrays, "pads/rest", (len(skin.pads),), "f") if "pads/rest" in arrays else None,
         "recalibration": Recalibration.restore(attrs, arrays, len(skin.pads)),
+        "layer": layer_from(arrays),
         "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
     }
     _require_sealed(archive)  # last: what does not fit is named by the checks above
@@ -268,13 +275,13 @@ def _locator_from(arrays: Mapping[str, np.ndarray], dtype: Any) -> AbstractLocat
     return locator_from_numbers(numbers, dtype)
 
 
-def _examples_from(arrays: Mapping[str, np.ndarray], pads: int, readings: int) -> PressExamples | None:
+def _examples_from(arrays: Mapping[str, np.ndarray], kind: str, pads: int, readings: int) -> PressExamples | None:
     """Some presses as they were read; None for a file of an early version."""
-    found = PressExamples.restore(arrays, "examples/")
+    found = PressExamples.restore(arrays, f"{kind}/")
     if found is not None:
         count = len(found.force)
         for name, tail in {"dv": (readings,), "pressure": (pads,), "position": (2,), "force": ()}.items():
-            _shaped(arrays, f"examples/{name}", (count, *tail), "f")
+            shaped(arrays, f"{kind}/{name}", (count, *tail), "f")
     return found
 
 
@@ -282,7 +289,7 @@ def _crosstalk_from(arrays: Mapping[str, np.ndarray], pads: int) -> Crosstalk | 
     """The crosstalk; None for a file of an early version."""
     if "pads/crosstalk" not in arrays:
         return None
-    matrix, error = (_shaped(arrays, f"pads/{name}", (pads, pads), "f") for name in ("crosstalk", "crosstalk_se"))
+    matrix, error = (shaped(arrays, f"pads/{name}", (pads, pads), "f") for name in ("crosstalk", "crosstalk_se"))
     if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > MAX_CONDITION or (np.diagonal(matrix) != 1).any():
         raise ValueError("pads/crosstalk is no crosstalk: singular, not finite, or not one on the diagonal")
     return Crosstalk(matrix, error)
@@ -294,7 +301,7 @@ def _noise_from(arrays: Mapping[str, np.ndarray], name: str, fitted: Mapping[str
         return None
     rms = fitted["residual_rms"]
     shapes = {"scale": (len(rms),)}
-    numbers = {f.name: _shaped(arrays, f"pads/{name}-{f.name}", shapes.get(f.name, ()), "f") for f in fields(NoiseLaw)}
+    numbers = {f.name: shaped(arrays, f"pads/{name}-{f.name}", shapes.get(f.name, ()), "f") for f in fields(NoiseLaw)}
     return NoiseLaw(**{name: jnp.asarray(number, rms.dtype) for name, number in numbers.items()})
 
 
@@ -310,17 +317,9 @@ def _fitted(arrays: Mapping[str, np.ndarray], where: str, pads: int, curve: Abst
     tails = {"parameters": (curve.size,), "covariance": (curve.size, curve.size), "pressure_range": (2,)}
     kinds = dict.fromkeys(("n", "n_missing", "n_groups", "rank", "result"), "iu")
     return {
-        name: jnp.asarray(_shaped(arrays, where + name, (pads, *tails.get(name, ())), kinds.get(name, "f")))
+        name: jnp.asarray(shaped(arrays, where + name, (pads, *tails.get(name, ())), kinds.get(name, "f")))
         for name in _CURVE_FIELDS
     }
-
-
-def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray:
-    """The named array; raises ValueError unless it has this shape and one of these kinds of type."""
-    array = arrays[name]
-    if array.shape != shape or array.dtype.kind not in kinds or array.dtype == np.float16:
-        raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not numbers of shape {shape}")
-    return array
 
 
 _NOT_NEGATIVE = (
@@ -333,7 +332,13 @@ _NOT_NEGATIVE = (
     "location/spread",
 )
 _RANGES = ("pads/pressure_range", "baseline/pressure_range")
-_COVARIANCES = ("pads/covariance", "baseline/covariance", "location/covariance", "recalibration/covariance")
+_COVARIANCES = (
+    "pads/covariance",
+    "baseline/covariance",
+    "location/covariance",
+    "recalibration/covariance",
+    "layer/covariance",
+)
 
 
 def _require_possible(arrays: Mapping[str, np.ndarray]) -> None:

@@ -17,6 +17,7 @@ from ..calibration.recipe_text import (
     AUTO,
     LEVELS,
     NONE,
+    SWITCHES,
     curve_choice,
     fidelity_choice,
     hyperparameter_choice,
@@ -56,6 +57,8 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
     text = "take the conductive sheet for even; default: its conductivity is fitted to the untouched frames"
     group.add_argument("--even-sheet", action="store_true", help=text)
+    text = "follow the contacts and keep what they tell of the contact layer's gain; helps `--track` of apply and live"
+    group.add_argument("--learn-layer", action="store_true", help=text)
     _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")
     add_low_pass_argument(group)
     add_imaging_arguments(parser)
@@ -107,7 +110,7 @@ def recipe_of(args: argparse.Namespace) -> Recipe:
     }
     given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name) is not None}
     given |= {} if args.folds is None else {"folds": args.folds}
-    given |= {"even_sheet": True} if args.even_sheet else {}
+    given |= {name: True for name in SWITCHES if getattr(args, name)}
     processing = processing_of(args, recipe.processing)
     recipe = replace(recipe, **given, processing=processing, imaging=imaging_of(args, recipe.imaging))
     if args.locator is not None and not recipe.locates:

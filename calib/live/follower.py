@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxeit.tracking import Track, Tracker, TrackerSettings, Tracking, compile_tracker
+from jaxeit.tracking import LearnedLayer, Track, Tracker, TrackerSettings, Tracking, compile_tracker
 
 from ..calibration.calibration import Calibration
 from ..calibration.localisation.contact_tracks import MIN_SECONDS, pad_errors, prepare_calibrated_tracker
@@ -32,6 +32,7 @@ class LiveFollower:
         self._calibration, self._prepare = calibration, prepare
         self._tracker: Tracker | None = None
         self._now: Tracking | None = None
+        self._layer = calibration.layer
         self._last: int | None = None
         self._looked, self._piece = 0.0, 0.0  # s: end of the last piece of a look, and how long pieces take
 
@@ -60,8 +61,15 @@ class LiveFollower:
         compile_tracker(self._tracker)
         self.restart()
 
+    def learned(self) -> LearnedLayer | None:
+        """The gain of the contact layer, as the calibration knows it and contacts have told it since; None: unknown."""
+        if self._tracker is None or self._now is None:
+            return self._layer
+        return self._tracker.learned(self._now, self._layer)
+
     def restart(self) -> None:
-        """Forget the contacts, as after a new measurement of the rest levels."""
+        """Forget the contacts, as after a new measurement of the rest levels, but not what they told of the layer."""
+        self._layer = self.learned()
         self._now, self._last = None, None
 
     def step(self, change: np.ndarray, force: np.ndarray, error: np.ndarray, host: int) -> tuple[Track, ...]:
@@ -74,7 +82,7 @@ class LiveFollower:
         """
         assert self._tracker is not None
         seconds = FIRST_SECONDS if self._last is None else max((host - self._last) / 1e9, MIN_SECONDS)
-        before = self._tracker.start() if self._now is None else self._now
+        before = self._tracker.start(self._layer) if self._now is None else self._now
         self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error), whole=False)
         self._last = host
         return self._on_sheet(self._now.tracks)

@@ -174,9 +174,10 @@ def run_live(
         engine = LogEngine(calibration, settings.rest)
     else:
         _check(calibration, sources)
-        if settings.recalibrate:
-            recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn)
         follower = LiveFollower(calibration) if settings.track else None
+        if settings.recalibrate:
+            layer = None if follower is None else follower.learned
+            recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
         engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower)
     queue = FrameQueue(*(source.plan for source in sources))
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)

@@ -15,6 +15,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from jaxeit.tracking import LearnedLayer
+
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw
 from ..calibration.recalibration.changes import Evidence, Recalibration
@@ -99,6 +101,7 @@ class LiveRecalibrator:
         path: calibration file to which the moved calibration is written, every minute and at the end; None: none.
         drift: how far gains may have moved since the calibration.
         tell: called with the health of the calibration when the advice changes.
+        layer: tells the gain of the contact layer that followed contacts have told, which is written too; None: none.
     """
 
     def __init__(
@@ -107,8 +110,9 @@ class LiveRecalibrator:
         path: str | Path | None = None,
         drift: GainDrift | None = None,
         tell: Callable[[str], object] = lambda line: None,
+        layer: Callable[[], LearnedLayer | None] | None = None,
     ):
-        self._calibration, self._path, self._tell = calibration, path, tell
+        self._calibration, self._path, self._tell, self._layer = calibration, path, tell, layer
         self._prior = gain_prior(calibration, drift or GainDrift(), together=True)
         self._reference, self._noise = image_reference(calibration), press_noise(calibration.evaluation)
         self._threshold = loaded_pressures(calibration)
@@ -226,7 +230,8 @@ class LiveRecalibrator:
             self._tell(self.health)
         if self._saved + SAVE_INTERVAL * 1e9 < self._last:
             self._saved = self._last
-            threading.Thread(target=self.save, daemon=True, name="saving the calibration").start()
+            moved = self._moved()  # here, because the other thread must not ask JAX for numbers
+            threading.Thread(target=self._write, args=(moved,), daemon=True, name="saving the calibration").start()
 
     def _recorded(self, update: GainUpdate) -> Recalibration:
         force = np.maximum(self._contacts.seen().force, 0)
@@ -239,7 +244,17 @@ class LiveRecalibrator:
         return recorded(self._calibration, Evidence.ORDINARY_USE, update, count, levels, (now, "live"), notes)
 
     def save(self) -> None:
-        """Write the moved calibration to its file; nothing before the first update."""
-        if self._path is not None and self.record is not None:
-            moved = replace(self._calibration, recalibration=self.record, notes=(*self._calibration.notes, self.health))
+        """Write the moved calibration to its file; nothing before anything is learned."""
+        self._write(self._moved())
+
+    def _moved(self) -> Calibration:
+        """The calibration with all that is known now."""
+        layer = None if self._layer is None else self._layer()
+        found = self._calibration if layer is None else replace(self._calibration, layer=layer)
+        if self.record is None:
+            return found
+        return replace(found, recalibration=self.record, notes=(*self._calibration.notes, self.health))
+
+    def _write(self, moved: Calibration) -> None:
+        if self._path is not None and moved is not self._calibration:
             moved.save(self._path)

@@ -1,12 +1,16 @@
 """Contacts followed through time, by frames and pad forces together."""
 
 from .compilation import compile_tracker
+from .layer import GainField, LearnedLayer
+from .model_error import fit_model_error, press_evidence
 from .settings import TrackerSettings
 from .smoothing import Smoother, TimedTracks
 from .tracker import Tracker, prepare_tracker
 from .tracks import Track, Tracking
 
 __all__ = [
+    "GainField",
+    "LearnedLayer",
     "Smoother",
     "TimedTracks",
     "Track",
@@ -14,5 +18,7 @@ __all__ = [
     "TrackerSettings",
     "Tracking",
     "compile_tracker",
+    "fit_model_error",
     "prepare_tracker",
+    "press_evidence",
 ]

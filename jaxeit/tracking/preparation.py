@@ -20,6 +20,7 @@ from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
 from .filter import PLACE, SIZE, ContactFilter
+from .layer import GainField
 from .reanalysis import prepare_reanalysis
 from .response import LoadedSheet, Neighbours, half_lengths
 from .settings import TrackerSettings
@@ -35,8 +36,8 @@ def prepare_filter(
     noise: Float[ArrayLike, "..."],
     sigma: Float[Array, " elements"] | None,
     channels: Bool[ArrayLike, " readings"] | None,
-) -> ContactFilter:
-    """The filter of a skin; see `prepare_tracker`."""
+) -> tuple[ContactFilter, GainField]:
+    """The filter of a skin and the gain before any contact; see `prepare_tracker`."""
     loads = settings.loads
     found = whitened_readings(model, noise, channels)
     finder = prepare_contacts(model, ContactSettings(most=1), noise=noise, sigma=sigma, channels=channels)
@@ -44,13 +45,13 @@ def prepare_filter(
     kept = np.asarray(finder.compress, float) @ found.factor.T
     put = partial(jnp.asarray, dtype=model.dtype)
     whole = conductivity(model) if sigma is None else sigma
-    places, sheet = _loaded_sheet(model, skin, settings, whole, found.electrodes, kept @ found.factor)
+    field, sheet = _loaded_sheet(model, skin, settings, whole, found.electrodes, kept @ found.factor)
     unit = jnp.eye(len(finder.whitening.channels), dtype=model.dtype)
-    return ContactFilter(
+    tracker = ContactFilter(
         finder=finder,
         compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
         sheet=sheet,
-        places=put(places),
+        places=put(field.places),
         model_error=put(loads.model_error),
         persistence=put(settings.persistence),
         rates=put(_rates(settings)),
@@ -58,6 +59,7 @@ def prepare_filter(
         spread=put([PLACE, PLACE, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,
     )
+    return tracker, field
 
 
 def _loaded_sheet(
@@ -67,8 +69,8 @@ def _loaded_sheet(
     sigma: Float[Array, " elements"],
     pairs: np.ndarray,
     mixing: np.ndarray,
-) -> tuple[np.ndarray, LoadedSheet]:
-    """Where the modes of the gain lie, (g, 2) m, and what contacts show."""
+) -> tuple[GainField, LoadedSheet]:
+    """The gain before any contact, and what contacts show."""
     loads, light = settings.loads, partial(jnp.asarray, dtype=np.dtype(settings.dtype))
     coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(settings.columns).on(model)
     response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
@@ -79,25 +81,22 @@ def _loaded_sheet(
         points_of(coarse, loads.width),
     )
     centres = np.asarray(fine.centres, float)
-    places, of_elements, of_pixels = _gain_modes(coarse, centres, loads.gain_length)
-
-    def with_level(modes: np.ndarray) -> Array:
-        return light(np.concatenate([np.full((len(modes), 1), settings.level), loads.gain * modes], 1))
-
+    chart, middles = np.asarray(coarse.chart, float), np.asarray(coarse.centroids, float)
+    field = GainField.over(np.stack([chart.min(0), chart.max(0)]), middles, loads, settings.level)
     sheet = LoadedSheet(
         sheet=prepare_reanalysis(coarse, jnp.asarray(mean, coarse.dtype), pairs, mixing, light(0).dtype),
         neighbours=_neighbours(coarse, centres, settings),
         sigma=light(mean),
         points=light(points),
         weights=light(weights),
-        modes=with_level(of_elements),
+        modes=light(field.modes_at(middles)),
         pixels=light(centres),
         pixel_response=light(response * background[:, None]),
-        pixel_modes=with_level(of_pixels),
+        pixel_modes=light(field.modes_at(centres)),
         pad_area=light((masks.weights * masks.areas).T),
         law=loads.law,
     )
-    return np.concatenate([np.full((1, 2), np.inf), places]), sheet
+    return field, sheet
 
 
 def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings) -> Neighbours:
@@ -154,19 +153,3 @@ def _rates(settings: TrackerSettings) -> list[float]:
     rates = [1e-4, 1e-4, settings.width_rate, settings.force_rate, 1e-4, 1e-4, *2 * [settings.acceleration]]
     assert len(rates) == SIZE
     return rates
-
-
-def _gain_modes(
-    model: Model, pixels: Float[np.ndarray, "p 2"], length: float
-) -> tuple[Float[np.ndarray, "g 2"], Float[np.ndarray, "elements g"], Float[np.ndarray, "p g"]]:
-    """Where the modes of a Gaussian field of variance one lie, and their values on elements and pixels: bumps whose sum
-    of products is exp(-d^2 / 2 length^2)."""
-    chart = np.asarray(model.chart, float)
-    corners = zip(chart.min(0), chart.max(0), strict=True)
-    axes = [np.arange(low - length, high + 1.5 * length, length) for low, high in corners]
-    nodes = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-    values = [
-        np.exp(-((at[:, None] - nodes) ** 2).sum(-1) / length**2) for at in (np.asarray(model.centroids, float), pixels)
-    ]
-    norm = np.sqrt(np.mean((values[0] ** 2).sum(-1)))
-    return nodes, values[0] / norm, values[1] / norm

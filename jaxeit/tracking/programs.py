@@ -51,6 +51,9 @@ class Programs:
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads
     ) -> Float[np.ndarray, "2"]:
         """Where a contact would explain most of what the contacts leave of a frame, m."""
-        left = np.asarray(self._unexplained(belief, dv, pads))
-        place: np.ndarray = self._starts[int(np.argmax(self._atoms @ left))]
+        place: np.ndarray = self._starts[int(np.argmax(self._atoms @ self.unexplained(belief, dv, pads)))]
         return place
+
+    def unexplained(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Float[np.ndarray, " r"]:
+        """See `filter.unexplained`."""
+        return np.asarray(self._unexplained(belief, dv, pads))

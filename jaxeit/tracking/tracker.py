@@ -5,6 +5,7 @@ into (`looks`).
 """
 
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from ..model.discretisation import Model
 from ..skin.description import Skin
 from .events import Events
 from .filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
+from .layer import GainField, LearnedLayer
 from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
 from .preparation import prepare_filter
 from .programs import Programs
@@ -28,6 +30,8 @@ from .tracks import Backlog, Look, Seen, Tracking
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
 # of the belief changes by much more than it may.
 UNEXPECTED, SURPRISING = 4.0, 25.0
+# Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
+MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
 PATIENCE, WORSE = 10, 1.3
 
@@ -41,8 +45,9 @@ class Tracker:
         print(now.tracks)
     """
 
-    def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float):
-        self.filter, self.events = tracker, Events(settings, area)
+    def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float, field: GainField):
+        self.filter, self.events, self.field = tracker, Events(settings, area), field
+        self.area = area
         self._settings, self.programs = settings, Programs(tracker)
 
     @property
@@ -50,11 +55,28 @@ class Tracker:
         """What is known of contacts before they are followed."""
         return self._settings
 
-    def start(self) -> Tracking:
-        """No contact, and the gain as it is known before the first frame."""
-        size = len(self.filter.places)
-        dtype = self.filter.places.dtype
-        return Tracking(Belief(jnp.zeros((0, SIZE), dtype), jnp.zeros(size, dtype), jnp.eye(size, dtype=dtype)))
+    def start(self, layer: LearnedLayer | None = None) -> Tracking:
+        """No contact, and the gain of the contact layer as it is known before the first frame.
+
+        Args:
+            layer: what was learned of the gain before, by `learned`; default: nothing.
+
+        Raises:
+            InverseError: if it was learned on another sheet or under other settings.
+        """
+        layer = LearnedLayer.unknown(self.field) if layer is None else layer
+        self.field.require_same(layer.field)
+        put = partial(jnp.asarray, dtype=self.filter.places.dtype)
+        return Tracking(Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(layer.covariance)))
+
+    def learned(self, now: Tracking, layer: LearnedLayer | None = None) -> LearnedLayer:
+        """What contacts have told of the gain of the contact layer up to now, to `start` with another time.
+
+        Args:
+            layer: with which these contacts were started.
+        """
+        before = 0 if layer is None else layer.contacts
+        return LearnedLayer.of_belief(self.field, now.belief.gain, now.belief.covariance, before + now.begun)
 
     def step(
         self,
@@ -81,8 +103,8 @@ class Tracker:
         """
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
-        seen = Seen(self._frame(dv), self._pads(pad_forces, pad_errors), seconds)
-        return self._with_shapes(self._stepped(now, seen, whole), seen.pads)
+        seen = Seen(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
+        return self._with_shapes(bounded(self._stepped(now, seen, whole)), seen.pads)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
@@ -109,7 +131,7 @@ class Tracker:
         if backlog is None:
             return now
         last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.seen
-        return self._with_shapes(self._looked(now, backlog), last.pads)
+        return self._with_shapes(bounded(self._looked(now, backlog)), last.pads)
 
     def _with_shapes(self, now: Tracking, pads: Pads) -> Tracking:
         """With what unknown shapes make the contacts err by."""
@@ -145,13 +167,15 @@ class Tracker:
         seconds = sum(seen.seconds for seen in waiting)
         return replace(after, belief=self.programs.predicted(after.belief, seconds)) if waiting else after
 
-    def _frame(self, dv: Float[ArrayLike, " readings"]) -> Float[np.ndarray, " readings"]:
+    def frame(self, dv: Float[ArrayLike, " readings"]) -> Float[np.ndarray, " readings"]:
+        """A frame as the programs take it; raises InverseError if it has another shape."""
         frame, readings = np.asarray(dv, self.filter.places.dtype), self.filter.finder.readings
         if frame.shape != (readings,):
             raise InverseError(f"dv has shape {frame.shape}; give one frame of {readings} readings")
         return frame
 
-    def _pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
+    def pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
+        """Forces on pads as the programs take them; raises InverseError if an array has another shape."""
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
             return Pads(jnp.zeros(count), jnp.full(count, jnp.inf, float))  # as those that are known: no weak type
@@ -173,6 +197,18 @@ class Tracker:
     def _is_far(self, update: Update) -> bool:
         size = len(self.filter.compress)
         return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
+
+
+def bounded(now: Tracking) -> Tracking:
+    """Without what was learned of the gain, if a mode is beyond `MOST_GAIN`; the contacts stay."""
+    gain = np.asarray(now.belief.gain)
+    if (np.abs(gain) <= MOST_GAIN).all():
+        return now
+    covariance = np.array(now.belief.covariance)
+    own = now.belief.contacts.size
+    covariance[own:] = covariance[:, own:] = 0
+    covariance[own:, own:] = np.eye(len(gain))
+    return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(0 * gain), jnp.asarray(covariance)))
 
 
 def prepare_tracker(
@@ -199,5 +235,5 @@ def prepare_tracker(
     require_known("prepare_tracker", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or TrackerSettings()
     sheet = sheet_of(model, untouched, sigma, channels)
-    tracker = prepare_filter(model, skin, settings, noise, sheet, channels)
-    return Tracker(tracker, settings, float(np.sum(np.asarray(model.areas))))
+    tracker, field = prepare_filter(model, skin, settings, noise, sheet, channels)
+    return Tracker(tracker, settings, float(np.sum(np.asarray(model.areas))), field)

@@ -28,7 +28,7 @@ class FakeTracker(Tracker):
     def __init__(self):
         self.seconds = []
 
-    def start(self):
+    def start(self, layer=None):
         return self._after(0, 0.0)
 
     def _after(self, count, x):

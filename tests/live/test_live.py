@@ -126,6 +126,7 @@ def calibration(monkeypatch, skin):
         curves=curves,
         locator=None,
         evaluation=None,
+        layer=None,
     )
 
 
@@ -332,8 +333,11 @@ class FakeTracker(Tracker):
     def __init__(self, untouched, noise):
         self.untouched, self.noise, self.steps, self.looks = untouched, noise, [], []
 
-    def start(self):
+    def start(self, layer=None):
         return stand_in(Tracking, tracks=(), begun=0)
+
+    def learned(self, now, layer=None):
+        return layer
 
     def look(self, now):
         self.looks.append(now.backlog)

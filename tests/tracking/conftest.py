@@ -29,13 +29,15 @@ def frame_of(model, blank):
     """Frames (readings,) V of loads (K, 6), from the full forward map."""
 
     @jax.jit
-    def change(loads):
+    def change(loads, gain):
         pressure = sum(load_pressure(load, model.centroids) for load in loads)
-        return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
+        return je.forward(model, model.background * (1 + gain * pressure / (20e3 + gain * pressure)))
 
     v0, noise = blank
     rng = np.random.default_rng(5)
-    return lambda loads: np.asarray(change(jnp.asarray(loads))) - v0 + noise * rng.normal(size=noise.size)
+    return lambda loads, gain=1.0: (
+        np.asarray(change(jnp.asarray(loads), gain)) - v0 + noise * rng.normal(size=noise.size)
+    )
 
 
 def load(x, y, force, width=0.012):

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxeit as je
-from jaxeit.tracking import Smoother, TimedTracks, Track, Tracker
+from jaxeit.tracking import LearnedLayer, Smoother, TimedTracks, Track, Tracker
 
 from ..calibration import Calibration
 from .load_windows import FIDELITY
@@ -31,7 +31,7 @@ class NotFollowed(ValueError):
 def prepare_calibrated_tracker(
     calibration: Calibration, untouched: Float[np.ndarray, " readings"], noise: Float[np.ndarray, " readings"] | None
 ) -> Tracker:
-    """A tracker of the calibrated skin.
+    """A tracker of the calibrated skin, whose model errs by as much as presses of the calibration show.
 
     Args:
         untouched: mean frame without contact, V.
@@ -48,7 +48,19 @@ def prepare_calibrated_tracker(
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
     sheet, _ = fit_untouched_sheet(model, untouched, channels)
     noise = np.where(channels, noise, 1.0)
-    return je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=sheet, channels=channels)
+    tracker = je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=sheet, channels=channels)
+    presses = probe_presses(calibration)
+    return tracker if presses is None else je.tracking.fit_model_error(tracker, *presses)
+
+
+def probe_presses(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Frames of presses of the calibration (n, readings) V, the forces on the pads and their errors (n, pads) N; None
+    for a calibration of an early version, which kept none."""
+    probes = calibration.probes
+    if probes is None:
+        return None
+    force, error, _ = calibration.pad_forces(probes.pressure)
+    return probes.dv, force, pad_errors(force, error)
 
 
 def pad_errors(force: Float[np.ndarray, "*n pads"], error: Float[np.ndarray, "*n pads"]) -> np.ndarray:
@@ -59,8 +71,8 @@ def pad_errors(force: Float[np.ndarray, "*n pads"], error: Float[np.ndarray, "*n
 class ContactTracks:
     """Follows contacts block by block, and gives back rows of the arrays `ABOUT`, one for each contact of a frame."""
 
-    def __init__(self, tracker: Tracker, *, smooth: bool = True):
-        self._tracker, self._now = tracker, tracker.start()
+    def __init__(self, tracker: Tracker, *, smooth: bool = True, layer: LearnedLayer | None = None):
+        self._tracker, self._layer, self._now = tracker, layer, tracker.start(layer)
         self._smoother = Smoother(tracker) if smooth else None
         self._last: int | None = None
         self._lives: dict[int, tuple[int, int]] = {}
@@ -77,6 +89,10 @@ class ContactTracks:
         return self._rows(
             [one for row in zip(time.tolist(), change, force, error, strict=True) for one in self._followed(*row)]
         )
+
+    def learned(self) -> LearnedLayer:
+        """What all contacts so far have told of the gain of the contact layer."""
+        return self._tracker.learned(self._now, self._layer)
 
     def end(self) -> Rows:
         """The rows that are left."""

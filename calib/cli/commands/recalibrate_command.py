@@ -24,6 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "percent by which a gain may have drifted, of each pad and of all together (standard deviations); default: 10"
     )
     parser.add_argument("--drift", type=above_zero, default=10.0, metavar="PERCENT", help=text)
+    text = "follow the contacts too, and keep what they tell of the contact layer's gain"
+    parser.add_argument("--learn-layer", action="store_true", help=text)
     text = "continue despite errors that `jaxeit check` finds, or if the session determines the gain of no pad"
     parser.add_argument("--force", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
@@ -34,7 +36,8 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    from ...calibration import KnownForces, LogCalibration, OrdinaryUse, load_calibration, recalibrate
+    from ...calibration import KnownForces, LogCalibration, OrdinaryUse, learn_layer, load_calibration, recalibrate
+    from ...calibration.layer import render_layer
     from ...calibration.recalibration.changes import render
     from ...fitting.gain_update import GainDrift
     from ...session import open_session
@@ -48,11 +51,15 @@ def run(args: argparse.Namespace) -> int:
     with open_session(args.session) as session:
         way = args.evidence or ("force" if "force" in session.streams else "use")
         moved = recalibrate(calibration, session, ways[way], ignore_errors=args.force)
+        if args.learn_layer:
+            moved = learn_layer(moved, session, ignore_errors=args.force)
         heading = title(session.name, session.simulated)
     moved.save(args.output)
     found = moved.recalibration
     assert found is not None
     print(found.to_json() if args.json else f"{heading}\n{render(found)}")
+    if moved.layer is not None and not args.json:
+        print(render_layer(moved.layer, moved.recon))
     return 0
 
 
@@ -62,6 +69,8 @@ def _recalibrate_log(args: argparse.Namespace, calibration: "LogCalibration", dr
     from ...calibration.logs.shift import render_shift
     from ...session import open_session
 
+    if args.learn_layer:
+        raise ValueError(f"{args.calibration}: the calibration of a log has no contact layer; leave --learn-layer")
     if args.evidence == "use":
         raise ValueError(f"{args.calibration}: the calibration of a log, which only known force can move; record force")
     with open_session(args.session) as session:

@@ -1,0 +1,124 @@
+"""The gain of the contact layer, learned from the contacts of a session and kept in the calibration."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxeit as je
+from jaxeit.tracking import LearnedLayer, Tracker
+
+from ..check.acceptance import accept
+from ..fitting.curves.play_operators import remembered
+from ..presses.table import Processing, resting_levels
+from ..session import Session, SessionError
+from .calibration import Calibration
+from .force_maps import USED, ForceEstimate, force_map
+from .frame_blocks import BLOCK, FrameBlock, FrameBlocks
+from .localisation.contact_tracks import ContactTracks, NotFollowed, prepare_calibrated_tracker, probe_presses
+from .localisation.quiet_frames import ENOUGH, QuietFrames
+
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+
+# Share of what was learned before that each new session forgets: skins age between sessions, and errors of the model
+# that last for a session are in no covariance.
+FORGOTTEN = 0.1
+
+
+def learn_layer(
+    calibration: Calibration,
+    session: Session,
+    *,
+    processing: Processing | None = None,
+    ignore_errors: bool = False,
+    progress: Progress = iter,
+) -> Calibration:
+    """The calibration with what the contacts of a session tell of the contact layer's gain.
+
+    Contacts are followed through the session as `apply` follows them, with the forces on the pads as data. What was
+    learned before is the start, less `FORGOTTEN` of it. `apply` and `live` then follow contacts with the result.
+
+    Args:
+        processing: how the session is corrected; default: as the sessions of the calibration.
+        ignore_errors: learn also from a session in which `check_session` finds an error.
+
+    Raises:
+        SessionError: if the session was recorded on another skin, lacks a stream, holds no contact, or no frame
+            without contact, which would tell the noise; or if the presses that the calibration kept are less probable
+            with what was learned.
+        RecordingError: if `check_session` finds an error in its skin, frames or pressures.
+    """
+    processing = processing or calibration.processing
+    levels = resting_levels(session, calibration.skin, processing)
+    accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
+    blocks = FrameBlocks(session, processing, levels)
+    before = None if calibration.layer is None else calibration.layer.aged(FORGOTTEN)
+    try:
+        tracker = quiet_tracker(calibration, blocks)
+    except NotFollowed as error:
+        raise SessionError(f"{session.name}: {error}; record a second without contact") from None
+    tracks = ContactTracks(tracker, smooth=False, layer=before)
+    for block, found in estimated(calibration, progress(blocks)):
+        tracks.add(block.time, block.change, found.force, found.standard_error)
+    learned = tracks.learned()
+    if learned.contacts == (0 if before is None else before.contacts):
+        raise SessionError(f"{session.name}: nothing touched the skin; press it in many places")
+    if not _is_better(calibration, tracker, learned, before):
+        what = (
+            "the presses of the calibration are less probable with what was learned of the contact layer than without"
+        )
+        raise SessionError(f"{session.name}: {what}; calibrate again, or leave the layer as it is (no --learn-layer)")
+    return replace(calibration, layer=learned)
+
+
+def _is_better(calibration: Calibration, tracker: Tracker, learned: LearnedLayer, before: LearnedLayer | None) -> bool:
+    """Whether presses of the calibration are more probable with what was learned; true if it kept none."""
+    presses = probe_presses(calibration)
+    if presses is None:
+        return True
+    with_it, without = (je.tracking.press_evidence(tracker, *presses, layer).sum() for layer in (learned, before))
+    return bool(with_it > without)
+
+
+def quiet_tracker(calibration: Calibration, blocks: FrameBlocks) -> Tracker:
+    """A tracker with the untouched sheet and the noise of the first frames without contact.
+
+    Raises:
+        NotFollowed: if there are none.
+    """
+    quiet = QuietFrames(calibration.recon.readings)
+    for block in blocks:
+        quiet.add(block.frames, block.change, block.loaded(calibration))
+        if quiet.count >= ENOUGH:
+            break
+    return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise)
+
+
+def estimated(calibration: Calibration, blocks: Iterable[FrameBlock]) -> Iterable[tuple[FrameBlock, ForceEstimate]]:
+    """Each block with the forces in its frames."""
+    before = np.zeros((1, len(calibration.skin.pads)))
+    for block in blocks:
+        yield block, _forces(calibration, block, before)
+        if calibration.curves.curve.path:
+            before = remembered(np.concatenate([before, calibration.own_pressures(block.pressed)]))
+
+
+def _forces(calibration: Calibration, block: FrameBlock, before: np.ndarray) -> ForceEstimate:
+    """Forces of a block; the last frame of a shorter one repeats, because each length compiles the program again."""
+    count = len(block.time)
+    rows = np.minimum(np.arange(BLOCK), count - 1)
+    found = force_map(calibration, block.change[rows], block.pressed[rows], before=before)
+    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
+    return cut._replace(map=replace(cut.map, areas=found.map.areas))
+
+
+def render_layer(layer: LearnedLayer, image: je.imaging.AbstractReconstructor) -> str:
+    """What is known of the contact layer, in one line; of the pixels of an image."""
+    mean, deviation = layer.at(np.asarray(image.centres, float)[np.asarray(image.areas) > 0])
+    known = np.median(deviation) / np.median(LearnedLayer.unknown(layer.field).at(np.asarray(image.centres, float))[1])
+    return (
+        f"contact layer: gain {np.exp(mean).min():.2f} to {np.exp(mean).max():.2f}, learned from {layer.contacts} "
+        f"contacts; its uncertainty is {100 * known:.0f} % of that before any contact (median over the sheet)"
+    )

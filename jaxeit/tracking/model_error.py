@@ -1,0 +1,111 @@
+"""How far the model of a skin errs, from frames in which one contact presses."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from ..imaging.noise import InverseError
+from .filter import Pads
+from .layer import LearnedLayer
+from .tracker import Tracker
+
+# Model errors that are tried: each is larger than the one before by this factor, up to the last.
+STEP, LAST = 2**0.5, 0.15
+# Share of the presses whose model error is no larger than that of the tracker.
+SHARE = 0.9
+
+
+def fit_model_error(
+    tracker: Tracker,
+    dv: Float[ArrayLike, "n readings"],
+    pad_forces: Float[ArrayLike, "n pads"] | None = None,
+    pad_errors: Float[ArrayLike, "n pads"] | None = None,
+) -> Tracker:
+    """The tracker with the model error that nine of ten frames of single presses stay below.
+
+    Mesh, contact layer and loads of a real skin are not those of the model. A tracker that takes the model for better
+    than it is explains what the model leaves of a press by further contacts. Here one contact is fitted to each frame
+    under each of some model errors, from that of the settings on, until the evidence of the frame falls (empirical
+    Bayes; MacKay 1992, Neural Computation 4, 415). Presses differ: near an electrode a model may err ten times as
+    much as elsewhere, and the tracker must not err there either.
+
+    Args:
+        dv: difference frames, (n, readings) V, in each of which one contact presses, as means over holds.
+        pad_forces, pad_errors: forces on the pads and their standard errors, (n, pads) N, as for `Tracker.step`.
+
+    Raises:
+        InverseError: if there is no frame, or an array has another shape.
+    """
+    seen = _seen(tracker, dv, pad_forces, pad_errors)
+    least = tracker.settings.loads.model_error
+    count = 1 + max(0, int(np.ceil(np.log(LAST / least) / np.log(STEP))))
+    tried = [_with_model_error(tracker, least * STEP**k) for k in range(count)]
+    found = [_most_probable(tried, *one) for one in seen]
+    return tried[int(np.quantile(found, SHARE, method="higher"))]
+
+
+def press_evidence(
+    tracker: Tracker,
+    dv: Float[ArrayLike, "n readings"],
+    pad_forces: Float[ArrayLike, "n pads"] | None = None,
+    pad_errors: Float[ArrayLike, "n pads"] | None = None,
+    layer: LearnedLayer | None = None,
+) -> Float[np.ndarray, " n"]:
+    """Log of the probability of each frame of a single press (n,), up to a constant of the frame.
+
+    What was learned of the contact layer is true if presses from which it was not learned are more probable with it.
+
+    Args:
+        dv, pad_forces, pad_errors: as for `fit_model_error`.
+        layer: as for `Tracker.start`.
+    """
+    seen = _seen(tracker, dv, pad_forces, pad_errors)
+    return np.array([_evidence(tracker, frame, pads, layer) for frame, pads in seen])
+
+
+def _seen(
+    tracker: Tracker, dv: ArrayLike, pad_forces: ArrayLike | None, pad_errors: ArrayLike | None
+) -> list[tuple[np.ndarray, Pads]]:
+    frames = np.asarray(dv, float)
+    if frames.ndim != 2 or not len(frames):
+        raise InverseError(f"dv has shape {frames.shape}; give one frame or more, (n, readings)")
+    forces, errors = ([None] * len(frames) if a is None else list(np.asarray(a)) for a in (pad_forces, pad_errors))
+    return [
+        (tracker.frame(frame), tracker.pads(force, error))
+        for frame, force, error in zip(frames, forces, errors, strict=True)
+    ]
+
+
+def _most_probable(tried: list[Tracker], frame: Float[np.ndarray, " readings"], pads: Pads) -> int:
+    """Which of the trackers makes a frame most probable; the evidence falls from there on."""
+    best = _evidence(tried[0], frame, pads)
+    for k, tracker in enumerate(tried[1:]):
+        evidence = _evidence(tracker, frame, pads)
+        if evidence < best:
+            return k
+        best = evidence
+    return len(tried) - 1
+
+
+def _with_model_error(tracker: Tracker, error: float) -> Tracker:
+    settings = replace(tracker.settings, loads=replace(tracker.settings.loads, model_error=error))
+    changed = eqx.tree_at(lambda f: f.model_error, tracker.filter, jnp.asarray(error, tracker.filter.model_error.dtype))
+    return Tracker(changed, settings, tracker.area, tracker.field)
+
+
+def _evidence(
+    tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads, layer: LearnedLayer | None = None
+) -> float:
+    """Log of the probability of a frame with one contact, up to a constant that all model errors share."""
+    programs, before = tracker.programs, tracker.start(layer).belief
+    place = programs.unexplained_place(before, frame, pads)
+    belief, attempt = tracker.events.with_contact(before, place), None
+    while attempt is None or not attempt.ended:
+        attempt = programs.attempted(belief, frame, pads, attempt)
+    left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + m^2 |y|^2 / n
+    share = 1 - float(tracker.filter.model_error) ** 2 * float(left @ left) / len(left)  # 1 / s^2
+    return float(attempt.evidence) + 0.5 * len(left) * float(np.log(share))

@@ -1,0 +1,189 @@
+"""The gain of the contact layer in a calibration: its file, where it is learned, and where it is used."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.calibration import layer as learning
+from calib.calibration.layer import FORGOTTEN, learn_layer, quiet_tracker, render_layer
+from calib.calibration.localisation.contact_tracks import NotFollowed
+from calib.cli import main
+from calib.live.follower import LiveFollower
+from calib.live.recalibrator import LiveRecalibrator
+from calib.session import SessionError, read_archive, write_archive
+from jaxeit.contacts.loads.settings import LoadSettings
+from jaxeit.tracking import GainField, LearnedLayer, Smoother, Tracker, Tracking
+
+from ..helpers import stand_in
+from .weeks import Skin
+
+PLACES = np.array([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15], [0.1, 0.05]])
+FORCE = np.full(5, 10.0)
+CONTACTS = 3  # that a tracker begins while a session lasts
+
+
+@pytest.fixture(scope="module")
+def later(model, pixels):
+    return Skin(model, pixels)
+
+
+@pytest.fixture(scope="module")
+def calibration(later):
+    return later.calibration()
+
+
+@pytest.fixture(scope="module")
+def layer():
+    """Learned from seven contacts."""
+    rng = np.random.default_rng(0)
+    corners = np.array([[0.0, 0.0], [0.2, 0.2]])
+    field = GainField.over(corners, rng.uniform(0, 0.2, (50, 2)), LoadSettings(gain_length=0.05), level=0.3)
+    half = np.eye(len(field.places)) - 0.2
+    return LearnedLayer(field, rng.normal(size=len(half)), half @ half.T / len(half), 7)
+
+
+class FakeTracker(Tracker):
+    """Three contacts begin with the first frame and tell the gain that is given; `started` holds the layers before."""
+
+    def __init__(self, tells):
+        self.tells, self.started, self.steps = tells, [], 0
+
+    def start(self, layer=None):
+        self.started.append(layer)
+        return stand_in(Tracking, tracks=(), begun=0, backlog=None)
+
+    def step(self, now, change, seconds, force, error, whole=True):
+        self.steps += 1
+        return stand_in(Tracking, tracks=(), begun=CONTACTS, backlog=None)
+
+    def learned(self, now, layer=None):
+        return self.tells._replace(contacts=now.begun + (0 if layer is None else layer.contacts))
+
+
+@pytest.fixture
+def tracker(layer, monkeypatch):
+    tracker = FakeTracker(layer)
+    monkeypatch.setattr(learning, "prepare_calibrated_tracker", lambda *_: tracker)
+    monkeypatch.setattr(Smoother, "__init__", lambda *_: None)
+    monkeypatch.setattr(Smoother, "add", lambda *_: [])
+    monkeypatch.setattr(Smoother, "end", lambda _: [])
+    return tracker
+
+
+@pytest.fixture(scope="module")
+def session(later, tmp_path_factory):
+    return later.record(tmp_path_factory.mktemp("use") / "use.h5", PLACES, FORCE, load_cell=FORCE)
+
+
+def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
+    replace(calibration, layer=layer).save(tmp_path / "c.h5")
+    found = calib.load_calibration(tmp_path / "c.h5").layer
+    for name in ("mean", "covariance", "contacts"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(layer, name))
+    points = np.random.default_rng(1).uniform(0, 0.2, (20, 2))
+    np.testing.assert_array_equal(found.at(points), layer.at(points))
+    calibration.save(tmp_path / "none.h5")
+    assert calib.load_calibration(tmp_path / "none.h5").layer is None
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("covariance", lambda a: a - 2 * np.eye(len(a)), "is no covariance"),
+        ("mean", lambda a: np.where(np.arange(len(a)) == 3, np.nan, a), "layer/mean holds a number that is not finite"),
+        ("places", lambda a: a[1:], "layer/places is float64 of shape"),
+        ("length", lambda a: 0 * a, "layer/length holds a number that is not finite, or zero or less"),
+        ("contacts", lambda a: a - 100, "layer/contacts is -93; nothing is learned from less than none"),
+    ],
+)
+def test_a_damaged_layer_is_refused(calibration, layer, tmp_path, name, change, message):
+    path, kind = tmp_path / "c.h5", "skin-calibration"
+    replace(calibration, layer=layer).save(path)
+    whole = read_archive(path, kind)
+    attrs = {k: v for k, v in whole.attrs.items() if k not in ("format", "format_version", "Conventions", "complete")}
+    attrs.pop("seal_sha256")
+    arrays = {k: (v, whole.units[k], whole.long_names[k]) for k, v in whole.arrays.items()}
+    value, *about = arrays[f"layer/{name}"]
+    arrays[f"layer/{name}"] = (change(value), *about)
+    path.unlink()
+    write_archive(path, kind, attrs, arrays)
+    with pytest.raises(SessionError, match=message):
+        calib.load_calibration(path)
+
+
+def test_learning_starts_from_what_was_learned_before_less_a_part(calibration, session, tracker, layer):
+    with calib.open_session(session) as use:
+        once = learn_layer(calibration, use)
+        twice = learn_layer(once, use)
+    first, second = tracker.started
+    assert first is None
+    np.testing.assert_allclose(second.mean, (1 - FORGOTTEN) * layer.mean)
+    assert (once.layer.contacts, twice.layer.contacts) == (CONTACTS, 2 * CONTACTS)
+    assert tracker.steps > 2 * 100
+
+
+def test_a_session_that_tells_nothing_is_refused(calibration, session, tracker, monkeypatch):
+    with calib.open_session(session) as use:
+        monkeypatch.setattr(FakeTracker, "step", lambda self, now, *_, **__: now)
+        with pytest.raises(SessionError, match=r"use\.h5: nothing touched the skin; press it in many places"):
+            learn_layer(calibration, use)
+
+        def unknown(*_):
+            raise NotFollowed("no frames without contact tell the noise")
+
+        monkeypatch.setattr(learning, "prepare_calibrated_tracker", unknown)
+        with pytest.raises(SessionError, match=r"use\.h5: no frames .* noise; record a second without contact"):
+            learn_layer(calibration, use)
+
+
+def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker, tmp_path, capsys):
+    old, new, out = (str(tmp_path / name) for name in ("old.h5", "new.h5", "out.h5"))
+    calibration.save(old)
+    assert main(["recalibrate", old, str(session), "-o", new, "--learn-layer"]) == 0
+    assert f"learned from {CONTACTS} contacts" in capsys.readouterr().out
+    assert main(["apply", new, str(session), "-o", out, "--track"]) == 0
+    assert tracker.started[-1].contacts == CONTACTS
+    assert main(["recalibrate", new, str(session), "-o", out, "--learn-layer", "--json"]) == 0
+    assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
+
+
+def test_calibrate_learns_from_all_its_sessions(tracker, bundled):
+    recipe = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft(), learn_layer=True)
+    stages = []
+    with calib.open_session(bundled[0]) as session:
+        found = calib.calibrate([session, session], recipe=recipe, progress=stages.append, ignore_errors=True)
+    assert found.layer.contacts == 2 * CONTACTS
+    assert stages[-1] == "learning the contact layer"
+
+
+def test_live_goes_on_with_the_layer_and_writes_it(calibration, tracker, layer, tmp_path):
+    known = replace(calibration, layer=layer)
+    follower = LiveFollower(known, lambda *_: tracker)
+    assert follower.learned() is layer
+    follower._tracker = tracker
+    follower.step(np.zeros(calibration.recon.readings), np.zeros(4), np.ones(4), 10**9)
+    assert tracker.started[-1] is layer
+    follower.restart()
+    assert follower.learned().contacts == layer.contacts + CONTACTS  # a new zero forgets contacts, and not the layer
+    LiveRecalibrator(known, tmp_path / "live.h5", layer=follower.learned).save()
+    assert calib.load_calibration(tmp_path / "live.h5").layer.contacts == layer.contacts + CONTACTS
+    LiveRecalibrator(calibration, tmp_path / "nothing.h5").save()
+    assert not (tmp_path / "nothing.h5").exists()
+
+
+def test_a_line_tells_how_much_is_known(calibration, layer):
+    line = render_layer(layer._replace(covariance=0.25 * np.eye(len(layer.mean))), calibration.recon)
+    assert "learned from 7 contacts; its uncertainty is 50 % of that before any contact" in line
+
+
+def test_frames_without_rest_are_not_followed(calibration, session):
+    with calib.open_session(session), pytest.raises(NotFollowed):
+        quiet_tracker(calibration, [])
+
+
+def test_the_documentation_names_the_option():
+    assert "--learn-layer" in Path("docs/commands.md").read_text()

@@ -1,0 +1,111 @@
+"""The gain of the contact layer: its prior against the kernel, and what is kept of it from one run to another."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxeit.contacts.loads.settings import LoadSettings
+from jaxeit.imaging import InverseError
+from jaxeit.tracking import GainField, LearnedLayer
+from jaxeit.tracking.tracker import MOST_GAIN, bounded
+
+from .conftest import SECONDS, load
+
+STRONGER = 1.3  # the true gain of the layer, everywhere
+FORCES = np.array([10.0, 0.0, 0.0, 0.0])  # N on the pads under a press at (0.05, 0.06) m
+PLACES = [(0.05, 0.06), (0.06, 0.05), (0.045, 0.045)]
+
+
+def test_a_gain_beyond_all_belief_is_forgotten_and_the_contacts_stay(tracker, frame_of):
+    now = tracker.start()
+    for _ in range(3):
+        now = tracker.step(now, frame_of([load(0.08, 0.08, 10.0)]), SECONDS)
+    assert bounded(now) is now
+    wrong = replace(now, belief=now.belief._replace(gain=now.belief.gain.at[5].set(-MOST_GAIN - 1)))
+    found = bounded(wrong).belief
+    np.testing.assert_array_equal(found.contacts, now.belief.contacts)
+    np.testing.assert_array_equal(found.covariance[:8, :8], now.belief.covariance[:8, :8])
+    np.testing.assert_array_equal(found.covariance[8:, 8:], np.eye(len(found.gain)))
+    assert not found.gain.any()
+    assert not found.covariance[:8, 8:].any()
+
+
+@pytest.fixture(scope="module")
+def layer(tracker, frame_of):
+    """Learned from three presses of known force on a layer that is stronger than was thought."""
+    now = tracker.start()
+    for x, y in PLACES:
+        for force in (0.0, 0.0, 10.0, 10.0, 10.0, 10.0, 0.0, 0.0):
+            frame = frame_of([load(x, y, max(force, 1e-6))], STRONGER)
+            now = tracker.step(now, frame, SECONDS, FORCES * force / 10 + 1e-9, np.full(4, 0.2))
+    return tracker.learned(now)
+
+
+def press(tracker, frame_of, layer, x, y):
+    """The contact of a press of 10 N that no pad tells of, after four frames."""
+    now = tracker.start(layer)
+    for force in (0.0, 10.0, 10.0, 10.0, 10.0):
+        now = tracker.step(now, frame_of([load(x, y, max(force, 1e-6))], STRONGER), SECONDS)
+    (track,) = now.tracks
+    return track
+
+
+def test_the_field_has_the_covariance_of_the_kernel():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.03, 0.17, (40, 2))
+    loads = LoadSettings()
+    field = GainField.over(np.array([[0.0, 0.0], [0.2, 0.2]]), points, loads, level=0.3)
+    modes = field.modes_at(points)
+    square = ((points[:, None] - points) ** 2).sum(-1)
+    expected = 0.3**2 + loads.gain**2 * np.exp(-square / (2 * loads.gain_length**2))
+    np.testing.assert_allclose(modes @ modes.T, expected, atol=0.04 * loads.gain**2)
+
+
+def test_nothing_learned_is_the_prior(tracker):
+    layer = LearnedLayer.unknown(tracker.field)
+    mean, deviation = layer.at(np.array([[0.1, 0.1], [0.05, 0.12]]))
+    np.testing.assert_array_equal(mean, 0)
+    np.testing.assert_allclose(deviation, np.hypot(tracker.settings.level, tracker.settings.loads.gain), rtol=0.02)
+    np.testing.assert_array_equal(tracker.start(layer).belief.covariance, tracker.start().belief.covariance)
+
+
+def test_presses_of_known_force_tell_the_gain_where_they_are(layer):
+    at = np.array([*PLACES, (0.15, 0.15)])
+    mean, deviation = layer.at(at)
+    assert layer.contacts == len(PLACES)
+    assert (np.abs(mean - np.log(STRONGER)) < 2.5 * deviation).all()
+    assert (np.abs(mean[:3] - np.log(STRONGER)) < 0.15).all()
+    assert deviation[:3].max() < 0.5 * deviation[3]
+
+
+def test_what_was_learned_tells_the_force_without_pads(tracker, frame_of, layer):
+    """The skin goes on working when no pad tells the force: at most half of the error without learning."""
+    errors = [np.log(press(tracker, frame_of, known, 0.052, 0.055).force / 10) for known in (None, layer)]
+    assert abs(errors[1]) < 0.5 * abs(errors[0])
+
+
+def test_learning_goes_on_where_it_ended(tracker, layer):
+    now = tracker.start(layer)
+    again = tracker.learned(now, layer)
+    np.testing.assert_allclose(again.mean, layer.mean, rtol=1e-6)
+    np.testing.assert_allclose(again.covariance, layer.covariance, atol=1e-7)
+    assert again.contacts == layer.contacts
+
+
+def test_ageing_leads_back_to_the_prior(layer):
+    half, gone = layer.aged(0.5), layer.aged(1.0)
+    np.testing.assert_allclose(half.mean, 0.5 * layer.mean)
+    np.testing.assert_array_equal(gone.covariance, np.eye(len(layer.mean)))
+    variances = [np.diag(one.covariance) for one in (layer, half, gone)]
+    assert (variances[0] <= variances[1] + 1e-12).all()
+    assert np.linalg.eigvalsh(half.covariance).min() > 0
+    with pytest.raises(InverseError, match="give 0 to 1"):
+        layer.aged(1.5)
+
+
+def test_a_layer_of_another_sheet_is_refused(tracker, layer):
+    moved = replace(layer.field, places=layer.field.places + 0.01)
+    for field in (moved, replace(layer.field, deviation=0.2)):
+        with pytest.raises(InverseError, match="learned on another sheet or under other settings"):
+            tracker.start(layer._replace(field=field))

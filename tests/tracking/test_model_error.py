@@ -1,0 +1,78 @@
+"""How far the model errs, fitted to presses: found where it is known, and what it does to a tracker."""
+
+import numpy as np
+import pytest
+
+from jaxeit.imaging import InverseError
+from jaxeit.tracking import fit_model_error
+from jaxeit.tracking.model_error import STEP
+
+from .conftest import SECONDS, load
+
+PLACES = np.random.default_rng(3).uniform(0.04, 0.16, (6, 2))
+RADIUS = 0.018  # of a ring, m
+WRONG = 0.05  # of the signal, by which a wrong model errs
+
+
+def wrong(frame, rng):
+    """A frame with independent errors that are a part of its signal."""
+    return frame + WRONG * np.sqrt(np.mean(frame**2)) * rng.normal(size=frame.size)
+
+
+@pytest.fixture(scope="module")
+def presses(frame_of):
+    return np.array([frame_of([load(x, y, 12.0)]) for x, y in PLACES])
+
+
+@pytest.fixture(scope="module")
+def humble(tracker, presses):
+    rng = np.random.default_rng(4)
+    return fit_model_error(tracker, np.array([wrong(frame, rng) for frame in presses]))
+
+
+def test_a_model_that_is_right_keeps_the_least_error(tracker, presses):
+    found = fit_model_error(tracker, presses).settings.loads.model_error
+    assert tracker.settings.loads.model_error <= found < 2.1 * tracker.settings.loads.model_error
+
+
+def test_the_error_that_was_made_is_found(tracker, humble, presses):
+    """In units of the whitened frame, whose largest direction holds more of the signal than of the error."""
+    unit = np.asarray(tracker.filter.compress)
+    rng = np.random.default_rng(5)
+    parts = [unit @ (wrong(frame, rng) - frame) for frame in presses], [unit @ frame for frame in presses]
+    truth = np.median([np.linalg.norm(error) / np.linalg.norm(signal) for error, signal in zip(*parts, strict=True)])
+    assert truth / STEP < humble.settings.loads.model_error < truth * STEP**2
+    assert float(humble.filter.model_error) == pytest.approx(humble.settings.loads.model_error)
+
+
+def test_a_tracker_takes_no_error_of_the_model_for_a_second_contact(tracker, frame_of):
+    """Each tip is a wide ring, which the model does not know."""
+    angle = 2 * np.pi * np.arange(8) / 8
+    rim = RADIUS * np.stack([np.cos(angle), np.sin(angle)], 1)
+
+    def pressed(x, y):
+        return frame_of([load(x + a, y + b, 2.0, width=0.006) for a, b in rim])
+
+    humble = fit_model_error(tracker, np.array([pressed(x, y) for x, y in PLACES]))
+    counts = []
+    for one in (tracker, humble):
+        now, seen = one.start(), []
+        for x, y in PLACES:
+            for pressing in [False] * 3 + [True] * 5 + [False] * 3:
+                now = one.step(now, pressed(x, y) * pressing, SECONDS)
+                seen.append(len(now.tracks))
+        counts.append(np.bincount(seen, minlength=3))
+    assert counts[0][2] >= 10
+    assert counts[1][2] == 0
+    assert counts[1][1] >= 5 * len(PLACES)
+
+
+def test_pads_are_data_of_the_fit_too(tracker, presses):
+    pads = np.zeros((len(presses), 4))
+    assert fit_model_error(tracker, presses, pads + 3.0, pads + 1e3).settings.loads.model_error < 0.011
+
+
+@pytest.mark.parametrize("dv", [np.zeros((0, 550)), np.zeros(550), np.zeros((2, 3))])
+def test_frames_of_another_shape_are_refused(tracker, dv):
+    with pytest.raises(InverseError, match="give one frame"):
+        fit_model_error(tracker, dv)
