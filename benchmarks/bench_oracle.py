@@ -9,6 +9,9 @@ division by that ratio.  Coverage is the share of presses within their 90 % inte
 
 `weeks`: gains of the pads have moved by 6 %, levels at rest by 40 Pa, and the image has become 20 % stronger; the
 calibration is moved by ten presses of known force, or by contacts of ordinary use.  Means over skins of other seeds.
+
+`tracks`: contacts followed by `apply --track` at places that the calibration has not seen: with the tracker's own model
+error, with that which the presses of the calibration show, and with a contact layer learned from 100 other presses.
 """
 
 import tempfile
@@ -21,11 +24,12 @@ import numpy as np
 
 import calib
 import jaxeit as je
-from calib.calibration import Calibration, KnownForces, OrdinaryUse
+from calib.calibration import Calibration, KnownForces, OrdinaryUse, learn_layer
+from calib.calibration.application import FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
 from calib.fitting import FitError
 from calib.fitting.validation import rmse
-from calib.session import Session
+from calib.session import Session, open_archive
 from tests.oracles.bench import Bench, Faults, simulate, write
 
 from .harness import Question, Run
@@ -147,7 +151,66 @@ def _ratio(found: Evaluation) -> np.ndarray:
     return found.total_force / found.force
 
 
-main = Question("oracle", __doc__, {"rows": measure, "weeks": weeks})
+# --- contacts followed
+
+FOLLOWED = {"as simulated": Faults(), "protrusions differ by 30 %": Faults(scatter=0.3)}
+OTHER_TIPS = Bench(places=50, levels=(10.0,))
+INSIDE = 4.605  # chi-square of two numbers, below which 90 % lie
+
+
+def tracks(run: Run) -> Iterator[Row]:
+    """Places of followed contacts, second ones that were none, and coverage, for each preparation of the tracker."""
+    bench, seeds = (SMOKE, (31,)) if run.smoke else (replace(FULL, levels=(8.0, 16.0), places=60), (31, 32))
+    rows = []
+    for seed in seeds:
+        for name, faults in run.sizes(list(FOLLOWED.items()), [("as simulated", Faults())]):
+            skin = replace(bench, skin_seed=seed)
+            with _recorded(skin, faults, seed=1) as session:
+                calibration = calib.calibrate([session], recipe=DRAFT)
+            ways = {"the tracker's own": replace(calibration, probes=None), "of the calibration's presses": calibration}
+            places = skin.places if run.smoke else 100
+            with _recorded(replace(skin, places=places, levels=(8.0,)), faults, seed=2) as session:
+                try:
+                    ways["the same, layer learned"] = learn_layer(calibration, session)
+                except calib.SessionError as error:
+                    print(error)
+            later = bench if run.smoke else OTHER_TIPS
+            with _recorded(replace(later, skin_seed=seed), faults, seed=3) as session:
+                rows += [{"skin": name, "model error": way} | _followed(c, session) for way, c in ways.items()]
+            print(*rows[-len(ways) :], sep="\n", flush=True)
+    yield {"tracks": [averaged(same) | {"skins": len(same)} for same in grouped(rows, "skin", "model error").values()]}
+
+
+def _followed(calibration: Calibration, session: Session) -> Row:
+    """How contacts were followed in the holds of single presses."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = calib.apply(calibration, session, Path(folder) / "maps.h5", track=True)
+        with open_archive(path, FORMAT) as file:
+            time, position, covariance = (
+                file.arrays[TRACKS + name].read() for name in ("time", "position", "position_covariance")
+            )
+    presses, errors, inside, extra = session.presses, [], [], 0
+    for begin, end, *place in zip(presses.t_hold0, presses.t_hold1, presses.x, presses.y, strict=True):
+        own = (time > begin) & (time < end)
+        if not own.any():
+            continue
+        away = position[own] - place
+        nearest = np.linalg.norm(away, axis=1)
+        extra += len(np.unique(time[own])) < own.sum()
+        errors.append(1e3 * nearest.mean())
+        square = np.einsum("ni,ni->n", away, np.linalg.solve(covariance[own], away[..., None])[..., 0])
+        inside.append((square < INSIDE).mean())
+    return {
+        "error_mm": float(np.mean(errors)),
+        "median_mm": float(np.median(errors)),
+        "p95_mm": float(np.quantile(errors, 0.95)),
+        "covered": float(np.mean(inside)),
+        "false_seconds": extra / len(errors),
+        "missed": 1 - len(errors) / len(presses.x),
+    }
+
+
+main = Question("oracle", __doc__, {"rows": measure, "weeks": weeks, "tracks": tracks})
 
 if __name__ == "__main__":
     main()
