@@ -12,6 +12,7 @@ import jaxeit as je
 
 from ..calibration.application import FORMAT, TRACKS
 from ..calibration.localisation.contact_tracks import ABOUT, Rows
+from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..session import open_archive, replacing
 from .figures import MM, draw_sheet, new_figure, png, require_matplotlib
 from .force_series import SERIES
@@ -20,11 +21,9 @@ from .html_parts import PAGE, STYLE, html_table, number_text, with_error
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-INSIDE = 2.1460  # standard deviations to the ellipse that holds 90 % of a normal distribution in the plane
 LARGER = 5  # times the ellipses are drawn larger, since they would hardly be seen
 ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
 MOST_POINTS = 2000  # of a contact's line
-ANGLES = np.linspace(0, 2 * np.pi, 61)
 CAPTION = (
     "Paths of the contacts, each with its number where it begins and a dot where it ends; an edge is a line. Ellipses "
     f"of 90 %, drawn {LARGER} times larger, where a contact presses with at least half of its largest force. Beside "
@@ -138,15 +137,10 @@ def _draw_path(axes: Any, number: int, one: Rows, colour: str) -> None:
     axes.annotate(str(number), place[0], xytext=(4, 4), textcoords="offset points", color=colour, fontsize=9)
     pressing = np.flatnonzero(one["force"] >= one["force"].max() / 2)
     for at in pressing[_thinned(len(pressing), ELLIPSES)]:
-        axes.plot(*_ellipse(place[at], one["position_covariance"][at] * MM**2).T, color=colour, lw=0.7, alpha=0.8)
+        ellipse = confidence_ellipse(one["position"][at], one["position_covariance"][at], LARGER * INSIDE_90) * MM
+        axes.plot(*ellipse.T, color=colour, lw=0.7, alpha=0.8)
         ends = place[at] + np.outer([-1, 1], one["half"][at] * MM)
         axes.plot(*ends.T, color=colour, lw=2.4, alpha=0.5)
-
-
-def _ellipse(place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    scale, axes = np.linalg.eigh(covariance)
-    circle = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
-    return np.asarray(place + LARGER * INSIDE * (circle * np.sqrt(np.maximum(scale, 0))) @ axes.T)
 
 
 def _draw_force(axes: Any, number: int, one: Rows, colour: str) -> None:
