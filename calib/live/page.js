@@ -31,6 +31,7 @@ function shape(name, attributes = {}, text = "") {  // of the drawing over the m
 const mm = metres => 1e3 * metres;
 const sum = values => values.reduce((total, value) => total + (value || 0), 0);
 function fixed(value, digits) { return value.toFixed(digits).replace("-", "−"); }
+function withError(value, error) { return `${fixed(value, 1)} ± ${fixed(error, error < 100 ? 1 : 0)}`; }
 function plain(value, digits = 2) { return String(Number(value.toPrecision(digits))); }
 function floats(text) { return new Float32Array(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer); }
 function readColours() {  // of the page, light or dark
@@ -179,9 +180,9 @@ function tableContacts(result) {
   $("found").hidden = result.contacts_age === null;
   if (result.contacts.length) $("contact-force").hidden = result.contacts[0].number === undefined;
   $("contacts").replaceChildren(...result.contacts.map((contact, k) => {
-    const place = [0, 1].map(i => `${mm(contact.position[i]).toFixed(1)} ± ${mm(contact.standard_error[i]).toFixed(1)}`);
+    const place = [0, 1].map(i => withError(mm(contact.position[i]), mm(contact.standard_error[i])));
     const followed = contact.number !== undefined;
-    const force = followed ? [`${contact.force.toFixed(1)} ± ${contact.force_error.toFixed(1)}`] : [];
+    const force = followed ? [withError(contact.force, contact.force_error)] : [];
     return rowOf(String(followed ? contact.number : k + 1), contact.sure ? "" : "not round: a guess", [...place, ...force], false);
   }));
 }
@@ -256,13 +257,16 @@ function plot(canvas, history, unit, now) {  // lines over the last minute, each
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, width, height);
   const known = Object.entries(history).map(([name, points]) => [name, points.filter(point => point[1] !== null)]);
-  const values = known.flatMap(([, points]) => points.flatMap(point => point.slice(1)));
+  const values = known.flatMap(([, points]) => points.map(point => point[1]));  // intervals may reach beyond the axes
   const low = Math.min(0, ...values), high = Math.max(low + MIN_SPAN[unit], ...values), pad = 0.06 * (high - low);
   const left = 44, right = width - 8, top = 6, bottom = height - 20;
   const u = t => right - (right - left) * (now - t) / HISTORY, v = f => bottom - (bottom - top) * (f - low) / (high + pad - low);
   drawAxes(pen, { left, right, bottom, u, v, low, high, now, unit });
-  known.forEach(([, points], k) => drawLine(pen, points, ink.series[k % SERIES], u, v));
-  nameLines(canvas.previousElementSibling, known.map(([name]) => name));
+  pen.save();
+  pen.beginPath(); pen.rect(left, top, right - left, bottom - top + 1); pen.clip();
+  known.forEach(([name, points], k) => drawLine(pen, points, ink.series[hue(name, k)], u, v));
+  pen.restore();
+  nameLines(canvas.previousElementSibling, known.map(([name, points], k) => [name, hue(name, k), points]), now);
   tellPlot(canvas, known);
 }
 function drawAxes(pen, { left, right, bottom, u, v, low, high, now, unit }) {
@@ -300,11 +304,13 @@ function runsOf(points) {  // no line crosses a time without results
   });
   return runs;
 }
-function nameLines(caption, names) {  // colours of the lines, behind the caption
+function hue(name, k) { return (Number(name.match(/^contact (\d+)$/)?.[1] ?? k)) % SERIES; }  // a contact keeps its colour
+function nameLines(caption, lines, now) {  // names of the lines that go on, with their colours, behind the caption
+  const alive = lines.length < 2 ? [] : lines.filter(([, , points]) => points.length && points.at(-1)[0] > now - MAX_GAP);
   const known = [...caption.querySelectorAll("span")].map(span => span.textContent);
-  if (known.join("\n") === names.join("\n") || (names.length < 2 && !known.length)) return;
+  if (known.join("\n") === alive.map(([name]) => name).join("\n")) return;
   caption.querySelectorAll("span").forEach(span => span.remove());
-  if (names.length > 1) caption.append(...names.map((name, k) => element("span", { class: `series-${k % SERIES}` }, name)));
+  caption.append(...alive.map(([name, colour]) => element("span", { class: `series-${colour}` }, name)));
 }
 function tellPlot(canvas, known) {  // what the picture shows, for those who do not see it
   const texts = known.filter(([, points]) => points.length).map(([name, points]) =>

@@ -31,7 +31,7 @@ def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
         "columns": recon.shape[1],
         "low": centres.min(0).tolist(),
         "high": centres.max(0).tolist(),
-        "areas": base64.b64encode(np.asarray(recon.areas).astype("<f4")).decode(),
+        "areas": base64.b64encode(np.asarray(recon.areas).astype("<f4").tobytes()).decode(),
         "bounds": [list(map(float, corner)) for corner in skin.domain.bounds],
         "rim": _rounded(skin.domain.boundary_point(rim)),
         "pads": [pad.name for pad in skin.pads],
@@ -48,7 +48,8 @@ def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
 
 def _rounded(points: np.ndarray) -> list[list[float]]:
     """Points to the nearest hundredth of a millimetre, which no screen shows."""
-    return np.round(np.asarray(points, float), 5).tolist()
+    rows: list[list[float]] = np.round(np.asarray(points, float), 5).tolist()
+    return rows
 
 
 def full_scales(calibration: Calibration) -> tuple[float, float | None]:
