@@ -1,17 +1,13 @@
 "use strict";
 const $ = id => document.getElementById(id);
-const HISTORY = 60;  // s that the histories show
-const HISTORY_STEP = 0.1;  // s between two points of a history
-const MAX_GAP = 0.5;  // s without results that a line crosses
 const PLOT_INTERVAL = 200;  // ms between two pictures of the histories
 const SAY_INTERVAL = 3000;  // ms between two texts for screen readers
 const TRAIL = 2;  // s of a contact's path that its trail shows
 const RANGES = [1, 1 / 3, 1 / 10];  // full colour, as shares of the calibrated range
 const SERIES = 6;  // colours of lines, in page.css
-const MIN_SPAN = { N: 1, ms: 2, count: 1 };  // of the axis of a history, so that noise does not fill it
 let scene = null, last = null, paused = false, ink = {};
 
-// --- texts, numbers and elements ------------------------------------------------------------------------------------
+// --- texts, numbers and elements ---------------------------------------------------------------------------------
 
 function setText(id, text) {  // unchanged text is left alone, so that nothing is read out twice
   if ($(id).textContent !== text) $(id).textContent = text;
@@ -41,13 +37,14 @@ function readColours() {  // of the page, light or dark
   ink.series = Array.from({ length: SERIES }, (_, k) => read(`series-${k}`));
 }
 
-// --- the sheet: a grid of colours, and over it outlines, electrodes and contacts in millimetres, y upwards -----------
+// --- the sheet: a grid of colours, and over it outlines, electrodes and contacts in millimetres, y upwards -------
 
 function pitch() {
   return [0, 1].map(k => (scene.high[k] - scene.low[k]) / ([scene.columns, scene.rows][k] - 1 || 1));
 }
 function path(points, closed = false) {
-  return points.map(([x, y], k) => `${k ? "L" : "M"}${mm(x).toFixed(2)} ${(-mm(y)).toFixed(2)}`).join("") + (closed ? "Z" : "");
+  const corners = points.map(([x, y]) => `${mm(x).toFixed(2)} ${(-mm(y)).toFixed(2)}`);
+  return `M${corners.join("L")}${closed ? "Z" : ""}`;
 }
 function viewBox() {  // the sheet and a margin for numbers of electrodes, mm
   const [low, high] = scene.bounds, margin = 0.05 * Math.max(high[0] - low[0], high[1] - low[1]);
@@ -71,13 +68,14 @@ function drawSkin() {  // what does not move
     drawn.append(shape("title", {}, scene.pads[k]));
     return drawn;
   });
-  const outlines = scene.electrode_outlines.map(outline => shape("path", { class: "electrode-outline", d: path(outline, true) }));
+  const outlines = scene.electrode_outlines.map(corners =>
+    shape("path", { class: "electrode-outline", d: path(corners, true) }));
   const electrodes = scene.electrodes.flatMap(([x, y], k) => [
     shape("path", { class: "electrode", d: `M${mm(x)} ${-mm(y)}h0` }),
     shape("text", { x: mm(x), y: -mm(y), dx: ".45em", dy: "-.35em", class: "number" }, String(k)),
   ]);
-  $("marks").replaceChildren(shape("path", { class: "rim", d: path(scene.rim, true) }), ...pads, ...outlines, ...electrodes,
-    shape("g", { id: "moving" }));
+  const rim = shape("path", { class: "rim", d: path(scene.rim, true) });
+  $("marks").replaceChildren(rim, ...pads, ...outlines, ...electrodes, shape("g", { id: "moving" }));
 }
 function colour(share) {  // uniform steps of lightness
   const s = Math.min(Math.max(share, 0), 1);
@@ -91,7 +89,7 @@ function fullColour() {
 }
 function drawMap(result) {  // force per area, or how much the sheet's conductivity has changed
   const force = $("which").value === "map", values = floats(result[force ? "map" : "image"]), areas = scene.cells;
-  if (!force && !scene.full_change) largestChange = values.reduce((most, v) => Math.max(most, Math.abs(v)), largestChange);
+  if (!force) largestChange = values.reduce((most, value) => Math.max(most, Math.abs(value)), largestChange);
   const full = fullColour(), image = new ImageData(scene.columns, scene.rows);
   for (let row = 0; row < scene.rows; row++) for (let column = 0; column < scene.columns; column++) {
     const cell = row * scene.columns + column, at = 4 * ((scene.rows - 1 - row) * scene.columns + column);
@@ -113,16 +111,17 @@ function tellScale(full, force) {
   $("bar").setAttribute("aria-label", `colour scale from 0 to ${quantity(full, force)}`);
   $("map").className = $("smooth").checked ? "smooth" : "";
 }
-function ellipseOf([[a, b], [, c]]) {  // half axes (m), and angle (rad) from x to the longer one, of the ellipse of 90 %
+function ellipseOf([[a, b], [, c]]) {  // of 90 %: its half axes (m), and the angle (rad) from x to the longer one
   const mean = (a + c) / 2, half = Math.hypot((a - c) / 2, b);
   const axis = variance => scene.radius * Math.sqrt(Math.max(variance, 0));
   return { longer: axis(mean + half), shorter: axis(mean - half), angle: Math.atan2(2 * b, a - c) / 2 };
 }
 function drawContact(contact) {
   const [x, y] = contact.position, { longer, shorter, angle } = ellipseOf(contact.covariance);
+  const kind = contact.sure ? "contact" : "contact guess";
+  const turn = `rotate(${-angle * 180 / Math.PI} ${mm(x)} ${-mm(y)})`;
   const parts = [
-    shape("ellipse", { class: contact.sure ? "contact" : "contact guess", cx: mm(x), cy: -mm(y), rx: mm(longer), ry: mm(shorter),
-      transform: `rotate(${-angle * 180 / Math.PI} ${mm(x)} ${-mm(y)})` }),
+    shape("ellipse", { class: kind, cx: mm(x), cy: -mm(y), rx: mm(longer), ry: mm(shorter), transform: turn }),
     shape("path", { class: "dot", d: `M${mm(x)} ${-mm(y)}h0` }),
   ];
   if (contact.number === undefined) return parts;
@@ -146,7 +145,8 @@ function keepTrails(result) {
   }
 }
 function drawMarks(result) {
-  const parts = [...trails.values()].map(trail => shape("path", { class: "trail", d: path(trail.map(row => row.slice(1))) }));
+  const places = [...trails.values()].map(trail => trail.map(([, x, y]) => [x, y]));
+  const parts = places.map(points => shape("path", { class: "trail", d: path(points) }));
   parts.push(...result.contacts.flatMap(drawContact));
   if (!result.contacts.some(contact => contact.number !== undefined)) result.centre.forEach((c, pad) => {
     if (c[0] === null) return;
@@ -154,10 +154,11 @@ function drawMarks(result) {
     parts.push(label(`${result.force[pad].toFixed(1)} N`, ...c));
   });
   $("moving").replaceChildren(...parts);
-  $("marks").setAttribute("aria-label", `sheet with ${scene.pads.length} pads and ${scene.electrodes.length} electrodes; ${spoken(result)}`);
+  const sheet = `sheet with ${scene.pads.length} pads and ${scene.electrodes.length} electrodes`;
+  $("marks").setAttribute("aria-label", `${sheet}; ${spoken(result)}`);
 }
 
-// --- tables ---------------------------------------------------------------------------------------------------------
+// --- tables ------------------------------------------------------------------------------------------------------
 
 function rowOf(name, note, cells, bad) {
   const row = element("tr"), head = element("th", { scope: "row" }, name);
@@ -165,7 +166,9 @@ function rowOf(name, note, cells, bad) {
   row.append(head, ...cells.map(text => element("td", {}, text)));
   return row;
 }
-function halfWidth(result, pad) { return scene.rows ? result.half_width[pad] : (result.high[pad] - result.low[pad]) / 2; }
+function halfWidth(result, pad) {  // of the interval of 90 %
+  return scene.rows ? result.half_width[pad] : (result.high[pad] - result.low[pad]) / 2;
+}
 function tablePads(result) {
   $("pads").replaceChildren(...scene.pads.map((name, pad) => {
     const force = result.force[pad], known = force !== null, centre = scene.rows ? result.centre[pad] : [null];
@@ -183,156 +186,39 @@ function tableContacts(result) {
     const place = [0, 1].map(i => withError(mm(contact.position[i]), mm(contact.standard_error[i])));
     const followed = contact.number !== undefined;
     const force = followed ? [withError(contact.force, contact.force_error)] : [];
-    return rowOf(String(followed ? contact.number : k + 1), contact.sure ? "" : "not round: a guess", [...place, ...force], false);
+    const name = String(followed ? contact.number : k + 1), note = contact.sure ? "" : "not round: a guess";
+    return rowOf(name, note, [...place, ...force], false);
   }));
 }
 let worst = 0;  // ms, of the recent results
 function tellPace(result) {
   worst = Math.max(0.99 * worst, result.latency_ms);
-  const counts = [`latency ${result.latency_ms.toFixed(1)} ms (recent worst ${worst.toFixed(1)})`, `frame ${result.number}`,
-    `${result.dropped} skipped`];
+  const latency = `latency ${result.latency_ms.toFixed(1)} ms (recent worst ${worst.toFixed(1)})`;
+  const counts = [latency, `frame ${result.number}`, `${result.dropped} skipped`];
   if (result.unsearched) counts.push(`contacts of ${result.unsearched} not fitted`);
   if (result.missing) counts.push(`${result.missing} ${scene.rows ? "readings" : "channels"} missing`);
   setText("pace", counts.join(", "));
 }
 
-// --- histories ------------------------------------------------------------------------------------------------------
-
-let lines = {}, stored = -Infinity;  // lines: of each history, name of a line: [time, value, low, high]
-let counted = null, latest = 0;  // frames that were lost until the last point; largest latency since then, ms
-function keepHistories(result, lost) {
-  const now = result.host_ns / 1e9;
-  latest = Math.max(latest, result.latency_ms);
-  if (now < stored) lines = {};  // another run
-  if (now < stored + HISTORY_STEP && now >= stored) return;
-  stored = now;
-  scene.pads.forEach((name, pad) => {
-    const force = result.force[pad], half = force === null ? 0 : halfWidth(result, pad);
-    keep("pads", name, scene.rows ? [now, force, force - half, force + half] : [now, force, result.low[pad], result.high[pad]]);
-  });
-  if (scene.rows && result.contacts_age !== null) keepContacts(result, now);
-  keep("latency", "latency", [now, latest]);
-  const gone = result.dropped + lost;
-  keep("losses", "frames", [now, counted === null ? 0 : Math.max(0, gone - counted)]);
-  keep("losses", scene.rows ? "readings of the frame" : "channels", [now, result.missing]);
-  [counted, latest] = [gone, 0];
-  for (const history of Object.values(lines)) for (const [name, points] of Object.entries(history)) {
-    while (points.length && points[0][0] < now - HISTORY) points.shift();
-    if (!points.length) delete history[name];
-  }
-}
-function keepContacts(result, now) {
-  const followed = result.contacts.filter(contact => contact.number !== undefined);
-  lines.contacts ||= {};
-  if (!followed.length && !Object.keys(lines.contacts).some(name => name !== "contacts")) keep("contacts", "contacts", [now, result.contacts.length]);
-  else delete lines.contacts.contacts;
-  for (const one of followed)
-    keep("contacts", `contact ${one.number}`, [now, one.force, one.force - 1.645 * one.force_error, one.force + 1.645 * one.force_error]);
-}
-function keep(history, name, point) { ((lines[history] ||= {})[name] ||= []).push(point); }
-function drawHistories() {
-  const forces = Object.keys(lines.contacts || {}).some(name => name !== "contacts");
-  $("contacts-history").hidden = !lines.contacts;
-  setCaption("contacts-history", forces ? "force of the contacts, N" : "number of contacts");
-  if (!scene.rows) plot($("curve"), lines.pads, "N", stored);
-  else plot($("pads-history").lastElementChild, lines.pads, "N", stored);
-  if (lines.contacts) plot($("contacts-history").lastElementChild, lines.contacts, forces ? "N" : "count", stored);
-  plot($("latency-history").lastElementChild, lines.latency, "ms", stored);
-  plot($("losses-history").lastElementChild, lines.losses, "count", stored);
-}
-function setCaption(id, text) {
-  const caption = $(id).querySelector("figcaption");
-  if (caption.firstChild?.nodeValue !== text) caption.replaceChildren(text);
-}
-function stepOf(span, unit) {  // between marks of an axis: 1, 2 or 5 times a power of ten, three to six of them
-  const power = 10 ** Math.floor(Math.log10(span / 3));
-  const step = [5, 2, 1].map(k => k * power).find(step => span / step >= 3) || power;
-  return unit === "count" ? Math.max(1, Math.round(step)) : step;
-}
-function plot(canvas, history, unit, now) {  // lines over the last minute, each with its name where it ends
-  const ratio = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight, pen = canvas.getContext("2d");
-  if (!width || !history) return;
-  if (canvas.width !== Math.round(ratio * width)) canvas.width = Math.round(ratio * width);
-  if (canvas.height !== Math.round(ratio * height)) canvas.height = Math.round(ratio * height);
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  pen.clearRect(0, 0, width, height);
-  const known = Object.entries(history).map(([name, points]) => [name, points.filter(point => point[1] !== null)]);
-  const values = known.flatMap(([, points]) => points.map(point => point[1]));  // intervals may reach beyond the axes
-  const low = Math.min(0, ...values), high = Math.max(low + MIN_SPAN[unit], ...values), pad = 0.06 * (high - low);
-  const left = 44, right = width - 8, top = 6, bottom = height - 20;
-  const u = t => right - (right - left) * (now - t) / HISTORY, v = f => bottom - (bottom - top) * (f - low) / (high + pad - low);
-  drawAxes(pen, { left, right, bottom, u, v, low, high, now, unit });
-  pen.save();
-  pen.beginPath(); pen.rect(left, top, right - left, bottom - top + 1); pen.clip();
-  known.forEach(([name, points], k) => drawLine(pen, points, ink.series[hue(name, k)], u, v));
-  pen.restore();
-  nameLines(canvas.previousElementSibling, known.map(([name, points], k) => [name, hue(name, k), points]), now);
-  tellPlot(canvas, known);
-}
-function drawAxes(pen, { left, right, bottom, u, v, low, high, now, unit }) {
-  pen.font = "12px system-ui, sans-serif";
-  pen.fillStyle = ink.quiet; pen.strokeStyle = ink.line; pen.lineWidth = 1;
-  const step = stepOf(high - low, unit);
-  pen.textAlign = "right";
-  for (let f = Math.ceil(low / step) * step; f <= high; f += step) {
-    pen.beginPath(); pen.moveTo(left, v(f)); pen.lineTo(right, v(f)); pen.stroke();
-    pen.fillText(String(Number(f.toPrecision(3))), left - 6, v(f) + 4);
-  }
-  for (let t = 0; t <= HISTORY; t += 20) {
-    pen.textAlign = t ? t === HISTORY ? "left" : "center" : "right";
-    pen.fillText(t ? `−${t} s` : "now", u(now - t), bottom + 15);
-  }
-}
-function drawLine(pen, points, hue, u, v) {
-  pen.fillStyle = pen.strokeStyle = hue;
-  pen.lineWidth = 1.6;
-  for (const run of runsOf(points)) {
-    if (run[0].length > 2) {
-      pen.globalAlpha = 0.2; trace(pen, [...run.map(p => [u(p[0]), v(p[3])]), ...run.map(p => [u(p[0]), v(p[2])]).reverse()]);
-      pen.fill(); pen.globalAlpha = 1;
-    }
-    trace(pen, run.map(p => [u(p[0]), v(p[1])]));
-    pen.stroke();
-  }
-}
-function trace(pen, places) { pen.beginPath(); places.forEach((place, k) => pen[k ? "lineTo" : "moveTo"](...place)); }
-function runsOf(points) {  // no line crosses a time without results
-  const runs = [];
-  points.forEach((point, k) => {
-    if (!k || point[0] - points[k - 1][0] > MAX_GAP) runs.push([]);
-    runs.at(-1).push(point);
-  });
-  return runs;
-}
-function hue(name, k) { return (Number(name.match(/^contact (\d+)$/)?.[1] ?? k)) % SERIES; }  // a contact keeps its colour
-function nameLines(caption, lines, now) {  // names of the lines that go on, with their colours, behind the caption
-  const alive = lines.length < 2 ? [] : lines.filter(([, , points]) => points.length && points.at(-1)[0] > now - MAX_GAP);
-  const known = [...caption.querySelectorAll("span")].map(span => span.textContent);
-  if (known.join("\n") === alive.map(([name]) => name).join("\n")) return;
-  caption.querySelectorAll("span").forEach(span => span.remove());
-  caption.append(...alive.map(([name, colour]) => element("span", { class: `series-${colour}` }, name)));
-}
-function tellPlot(canvas, known) {  // what the picture shows, for those who do not see it
-  const texts = known.filter(([, points]) => points.length).map(([name, points]) =>
-    `${name} ${plain(points.at(-1)[1])}, largest ${plain(points.reduce((most, point) => Math.max(most, point[1]), -Infinity))}`);
-  canvas.setAttribute("aria-label", `${canvas.previousElementSibling.firstChild.nodeValue}, last minute: ${texts.join("; ")}`);
-}
-
-// --- words for screen readers -----------------------------------------------------------------------------------------
+// --- words for screen readers ------------------------------------------------------------------------------------
 
 function spoken(result) {
   const total = `total ${sum(result.force).toFixed(0)} N`;
   const at = position => position.map(x => mm(x).toFixed(0)).join(", ");
-  const found = (result.contacts || []).map(contact => (contact.number === undefined ? "" : `${contact.number}: ${contact.force.toFixed(0)} N `) +
-    `at ${at(contact.position)} mm`);
-  const loaded = scene.pads.flatMap((name, pad) => result.force[pad] > 2 * halfWidth(result, pad) ? [`${name} ${result.force[pad].toFixed(0)} N`] : []);
+  const found = (result.contacts || []).map(contact => {
+    const about = contact.number === undefined ? "" : `${contact.number}: ${contact.force.toFixed(0)} N `;
+    return `${about}at ${at(contact.position)} mm`;
+  });
+  const isLoaded = pad => result.force[pad] > 2 * halfWidth(result, pad);
+  const told = scene.pads.map((name, pad) => isLoaded(pad) ? `${name} ${result.force[pad].toFixed(0)} N` : "");
+  const loaded = told.filter(Boolean);
   if (!found.length && !loaded.length) return "no contact";
   const count = found.length ? [`${found.length} ${found.length === 1 ? "contact" : "contacts"}`, ...found] : [];
   return [...count, ...loaded, total].join("; ");
 }
 function say() { if (last && !paused && $("say").checked) setText("said", spoken(last)); }
 
-// --- results and controls ---------------------------------------------------------------------------------------------
+// --- results and controls ----------------------------------------------------------------------------------------
 
 function show() {  // the newest result
   if (!last || paused) return;
@@ -355,7 +241,8 @@ function pause() {
   setText("state", paused ? "paused" : "running");
 }
 function offerRanges() {
-  const force = $("which").value === "map", chosen = $("range").value || "1", full = force ? scene.full_pressure : scene.full_change;
+  const force = $("which").value === "map", chosen = $("range").value || "1";
+  const full = force ? scene.full_pressure : scene.full_change;
   $("range").replaceChildren(...RANGES.map(share => element("option", { value: share },
     full ? quantity(share * full, force) : `${plain(100 * share)} % of the largest`)));
   $("range").value = chosen;

@@ -18,7 +18,8 @@ from .page_scene import page_scene
 from .results import Result
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-PAGE_FILES = {name: Path(__file__).with_name(f"page.{name}") for name in ("html", "css", "js")}
+PAGE_FILE = Path(__file__).with_name("page.html")
+PAGE_PARTS = ("page.css", "page.js", "history.js")
 MIN_RESULT_INTERVAL = 0.04  # s between two results for a viewer; the eye sees no more
 KEEP_ALIVE_INTERVAL = 1.0  # s between messages without results, which reveal closed connections
 REQUEST_TIMEOUT = 5.0  # s
@@ -38,9 +39,11 @@ OWN_FETCH_SITES = (None, "same-origin", "none")  # Sec-Fetch-Site of this page, 
 
 
 def whole_page() -> bytes:
-    """The page as one file, with its style and its program inside."""
-    parts = {name: path.read_text(encoding="utf-8") for name, path in PAGE_FILES.items()}
-    return parts["html"].replace("/* page.css */", parts["css"]).replace("/* page.js */", parts["js"]).encode()
+    """The page as one file: its style and its programs stand where it names them."""
+    text = PAGE_FILE.read_text(encoding="utf-8")
+    for name in PAGE_PARTS:
+        text = text.replace(f"/* {name} */", PAGE_FILE.with_name(name).read_text(encoding="utf-8"))
+    return text.encode()
 
 
 class Page(ThreadingHTTPServer):

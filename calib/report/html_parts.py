@@ -104,7 +104,7 @@ figure img { display: block; width: 100%; height: auto; background: #ffffff; bor
 .panels { display: grid; gap: .8rem 1.2rem; margin-bottom: .5rem;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, 17rem), 1fr)); }
 .panel { max-width: 30rem; display: flex; flex-direction: column; justify-content: flex-end; }
-.panels.few { grid-template-columns: repeat(auto-fill, minmax(min(100%, 26rem), 1fr)); }
+.panels.few { grid-template-columns: repeat(auto-fill, minmax(min(100%, 24rem), 1fr)); }
 .few > * { max-width: 42rem; }
 .panel figcaption { color: var(--text); min-height: 1.5em; }
 .panels svg { display: block; width: 100%; height: auto; }

@@ -42,7 +42,7 @@ class ExampleMaps:
         texts = [(place(true), place(found), place(half_axes(covariance))) for true, found, covariance in each]
         forces = zip(self.shown.force, self.force.sum(1), strict=True)
         return [
-            (str(k + 1), *text, number_text(float(force), 2), number_text(float(total), 2))
+            (f"press {k + 1}", *text, number_text(float(force), 2), number_text(float(total), 2))
             for k, (text, (force, total)) in enumerate(zip(texts, forces, strict=True))
         ]
 

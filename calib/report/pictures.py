@@ -33,8 +33,9 @@ from .press_panels import (
 
 # The image's estimator nearest to the paper's figure, and the one that the correction by location goes by.
 SHOWN_ESTIMATORS = ("quarter", "fitted")
+FEW = 2  # panels, which are larger
 CONTACT_COLUMNS = (
-    "press",
+    "shown",
     "true place, mm",
     "contact, mm",
     "half axes of the ellipse of 90 %, mm",
@@ -70,7 +71,8 @@ class Picture:
         """The section of the page."""
         if self.panels:
             parts = "".join(panel.html() for panel in self.panels)
-            shown = f"<div class='panels {self.name}' role='group' aria-label=\"{escape(self.alt)}\">{parts}</div>"
+            kind = f"{self.name} few" if len(self.panels) <= FEW else self.name
+            shown = f"<div class='panels {kind}' role='group' aria-label=\"{escape(self.alt)}\">{parts}</div>"
         else:
             data = base64.b64encode(self.data).decode()
             shown = f'<img alt="{escape(self.alt)}" src="data:image/png;base64,{data}">'

@@ -22,7 +22,7 @@ from .figures import (
 )
 from .map_figures import ExampleMaps, draw_contact
 from .pad_figures import curve_panel, loop_panel, pad_gain, pad_maps, residuals_by, symmetric_limit
-from .panels import Panel, chart_axes, panel, share_limits, sheet_axes
+from .panels import WIDER, Panel, chart_axes, panel, share_limits, sheet_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +83,7 @@ def localisation_panels(found: Evaluation, skin: je.Skin, *estimators: str, simu
     """True and estimated places, a panel for each estimator, with the numbers of the electrodes."""
     out = []
     for k, estimator in enumerate(estimators):
-        figure, axes, _ = sheet_axes(skin, simulated=simulated)
+        figure, axes, _ = sheet_axes(skin, simulated=simulated, width=WIDER)
         localisation_panel(axes, found, skin, estimator)
         number_electrodes(axes, skin)
         out.append(panel(figure, axes, f"places{k}"))
@@ -167,9 +167,10 @@ def _residual_panel(
     label: str,
 ) -> Panel:
     figure, axes = chart_axes(simulated=calibration.simulated)
+    shown = [calibration.evaluation, *evaluations.values()]
     residuals_by(axes, cause, calibration.evaluation, evaluations)
     axes.set_xlabel(label)
-    axes.set_xlim(left=0)
+    axes.set_xlim(left=0, right=1.05 * max(float(cause(one).max(initial=0)) for one in shown) or 1.0)
     if evaluations:
         axes.legend(fontsize=7.5, loc="best")
     axes.set_title(f"Force error {'by' if name == 'force' else 'over'} {name}")
@@ -206,7 +207,7 @@ def gain_panels(calibration: Calibration) -> list[Panel]:
     titles = "Gain by place", "Its standard error, and the places of the presses"
     out = []
     for k, (values, label) in enumerate(((gain, "gain"), (error, "standard error of the gain, %"))):
-        figure, axes, bar = sheet_axes(skin, bar=True, simulated=calibration.simulated)
+        figure, axes, bar = sheet_axes(skin, bar=True, simulated=calibration.simulated, width=WIDER)
         limits = axes.get_xlim(), axes.get_ylim()
         drawn = pad_maps(axes, skin, zip(x, y, values, strict=True), scales[k])
         for cells in drawn:

@@ -117,7 +117,7 @@ def test_the_page_is_one_file_that_a_screen_reader_understands():
     assert all(("aria-label" in p and p["role"] == "img") or p.get("aria-hidden") == "true" for p in pictures)
     assert any(attrs.get("aria-live") == "polite" for _, attrs, _ in tags.found)
     assert not any(k in attrs for _, attrs, _ in tags.found for k in ("src", "href"))
-    assert not any(mark in text for mark in ("/* page.css */", "/* page.js */"))
+    assert not any(mark in text for mark in ("/* page.css */", "/* page.js */", "/* history.js */"))
 
 
 def test_the_scene_has_the_proportions_of_the_skin(calibration):

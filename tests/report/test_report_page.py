@@ -101,7 +101,7 @@ def test_contacts_of_a_calibration_without_a_locator_are_centroids_of_images(cal
 def test_the_table_of_contacts_has_the_numbers_of_the_maps(shown):
     maps = ExampleMaps(shown)
     first = maps.rows()[0]
-    assert first[:2] == ("1", "50.0, 50.0")
+    assert first[:2] == ("press 1", "50.0, 50.0")
     assert first[4] == "9.00"
     assert first[5] == f"{maps.force[0].sum():.2f}"
 
