@@ -9,7 +9,6 @@ from ..calibration.calibration import Calibration
 from ..calibration.evaluation import CALIBRATED, METHODS, Evaluation
 from ..calibration.press_examples import PressExamples
 from ..fitting.fields import FIELDS, FittedField
-from .example_contacts import LARGER
 from .figures import ESTIMATOR_MEANING, sensitivity_maps
 from .html_parts import number_text
 
@@ -34,18 +33,18 @@ def about_localisation(evaluation: Evaluation, estimators: Sequence[str]) -> tup
     return alt, caption
 
 
-def about_maps(examples: PressExamples, estimator: str) -> tuple[str, str]:
-    """Alternative text and caption of images, force maps and contacts."""
-    count = len(examples.force)
-    meaning = ESTIMATOR_MEANING.get(estimator, "").split(" that")[0] if estimator != "fitted" else "fitted contact"
+def about_maps(examples: PressExamples, estimator: str, larger: int) -> tuple[str, str]:
+    """Alternative text and caption of images, force maps and contacts, whose ellipses are so many times larger."""
+    count, fitted = len(examples.force), estimator == "fitted"
+    meaning = "where the calibration finds it" if fitted else ESTIMATOR_MEANING.get(estimator, estimator)
+    by = "the noise of this frame and the errors of place of all presses" if fitted else "the errors of all presses"
     return (
         f"EIT images and force maps of {count} presses, over the outlines of sheet and pads, with the contacts found.",
         f"{count} presses of nearly the largest force: one that pads share, the others near the middles of pads. "
         "EIT image: with the force of the load cell. Force map: the image cut by the pads and scaled so that each "
         "pad's part sums to the force that its pressure tells; its total stands above it. The cross marks the true "
-        f"place. The ellipse is that of the contact ({meaning}): it holds the place with 90 %, by the noise of this "
-        f"frame and the errors of place of all presses, and is drawn {LARGER} times larger. These presses were "
-        "fitted, not held out.",
+        f"place. The ellipse holds the contact ({meaning}) with 90 %, by {by}"
+        f"{f', and is drawn {larger} times larger' if larger > 1 else ''}. These presses were fitted, not held out.",
     )
 
 

@@ -7,10 +7,11 @@ import numpy as np
 import jaxeit as je
 
 from ..calibration.calibration import Calibration
-from ..calibration.localisation.ellipses import placement_covariance
+from ..calibration.localisation.ellipses import INSIDE_90, placement_covariance
 from ..calibration.localisation.locators import CentroidLocator, ContactLocator
 
 LARGER = 5  # times that ellipses are drawn larger, since they would hardly be seen
+SMALL = 0.02  # half axis over the longer side of the sheet, below which ellipses are drawn larger
 IMAGE_ESTIMATOR = "quarter"  # where the calibration has no locator
 
 
@@ -28,6 +29,19 @@ class ExampleContacts:
     estimator: str
     position: np.ndarray
     covariance: np.ndarray
+
+    def magnification(self, skin: je.Skin) -> int:
+        """Times that the ellipses are drawn larger than they are: `LARGER` or 1, where they can be seen."""
+        known = self.covariance[np.isfinite(self.position).all(1)]
+        if not len(known) or not np.isfinite(known).all():
+            return 1
+        low, high = np.array(skin.domain.bounds)
+        return LARGER if half_axes(known).max() < SMALL * (high - low).max() else 1
+
+
+def half_axes(covariance: np.ndarray) -> np.ndarray:
+    """Half axes (..., 2) of the ellipse that holds 90 %, the longer first, in the root of the covariance's unit."""
+    return np.asarray(INSIDE_90 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
 
 
 def example_contacts(calibration: Calibration, image: np.ndarray) -> ExampleContacts:

@@ -7,7 +7,7 @@ import numpy as np
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import force_map
 from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
-from .example_contacts import LARGER, example_contacts
+from .example_contacts import example_contacts, half_axes
 from .figures import MM, RED, draw_sheet, label_y_once, new_figure
 from .html_parts import number_text
 
@@ -25,6 +25,7 @@ class ExampleMaps:
         self.image = np.asarray(recon(np.asarray(shown.dv, recon.dtype)))
         self.force = np.asarray(force_map(calibration, shown.dv, shown.pressure).map.force)
         self.contacts = example_contacts(calibration, self.image)
+        self.larger = self.contacts.magnification(calibration.skin)
 
     @property
     def density(self) -> np.ndarray:
@@ -47,11 +48,6 @@ class ExampleMaps:
         ]
 
 
-def half_axes(covariance: np.ndarray) -> np.ndarray:
-    """Half axes (2,) of the ellipse that holds 90 %, the longer first, in the root of the covariance's unit."""
-    return np.asarray(INSIDE_90 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[::-1], 0.0)))
-
-
 def maps_figure(maps: ExampleMaps) -> "Figure":
     """The image of each example above its force map with the contact; a cross marks the true place."""
     calibration, shown = maps.calibration, maps.shown
@@ -65,16 +61,16 @@ def maps_figure(maps: ExampleMaps) -> "Figure":
         below.set_title(f"map: {maps.force[k].sum():.3g} N", fontsize=9.5)
         for axes in (above, below):
             axes.plot(*(shown.position[k] * MM), "+", color=RED, ms=9)
-        draw_contact(below, maps.contacts.position[k], maps.contacts.covariance[k])
+        draw_contact(below, maps.contacts.position[k], maps.contacts.covariance[k], maps.larger)
     for row in panels:
         label_y_once(row)
     return figure
 
 
-def draw_contact(axes: Any, position: np.ndarray, covariance: np.ndarray) -> None:
-    """Draw the ellipse of 90 % of a contact (m, m^2), `LARGER` times as large; nothing where it is not known."""
+def draw_contact(axes: Any, position: np.ndarray, covariance: np.ndarray, larger: float) -> None:
+    """Draw the ellipse of 90 % of a contact (m, m^2), so many times larger; nothing where it is not known."""
     if np.isfinite(position).all() and np.isfinite(covariance).all():
-        points = confidence_ellipse(position, covariance, LARGER * INSIDE_90) * MM
+        points = confidence_ellipse(position, covariance, larger * INSIDE_90) * MM
         axes.plot(*points.T, color="#ffffff", lw=2.6, zorder=5)
         axes.plot(*points.T, color=RED, lw=1.4, zorder=6, gid="ellipse")
 

@@ -111,7 +111,7 @@ def _examples(calibration: Calibration) -> list[Picture]:
     if calibration.examples is None:
         return []
     maps = ExampleMaps(calibration)
-    about = about_maps(calibration.examples, maps.contacts.estimator)
+    about = about_maps(calibration.examples, maps.contacts.estimator, maps.larger)
     title = "Images, force maps and contacts of some presses"
     pictures = [Picture("maps", title, png(maps_figure(maps)), *about, map_panels(maps), maps.rows())]
     if calibration.skin.surface is not None:

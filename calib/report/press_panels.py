@@ -74,7 +74,7 @@ def _map_panel(
     figure.colorbar(drawn, cax=bar).set_label(label)
     axes.plot(*(maps.shown.position[k] * MM), "+", color=RED, ms=9)
     if contact:
-        draw_contact(axes, maps.contacts.position[k], maps.contacts.covariance[k])
+        draw_contact(axes, maps.contacts.position[k], maps.contacts.covariance[k], maps.larger)
     axes.set_title(title)
     return panel(figure, axes, name)
 
