@@ -75,8 +75,7 @@ STYLE = """
   :root { --text: #e8e8e8; --page: #16181b; --soft: #b3b3b3; --line: #444a50; --head: #22262b;
     --warn-text: #ffd9d4; --warn-page: #4a1512; --warn-line: #ff6f60;
     --red: #ff6f60; --green: #7fd18a; --blue: #7db7f5;
-    --mark-0: #ffb454; --mark-1: #cf9df2; --mark-2: #5fd0da; --mark-3: #c8a79b; }
-  figure img { filter: brightness(.92); } }
+    --mark-0: #ffb454; --mark-1: #cf9df2; --mark-2: #5fd0da; --mark-3: #c8a79b; } }
 body { margin: 0; background: var(--page); color: var(--text);
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; }
 main { max-width: 90rem; margin: 0 auto; padding: 1.5rem 1rem 3rem; }
@@ -99,8 +98,6 @@ td { overflow-wrap: break-word; }
 .provenance td { overflow-wrap: anywhere; font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .9em; }
 figure { margin: 0; }
 figure + .wide { margin-top: .8rem; }
-figure img { display: block; width: 100%; height: auto; background: #ffffff; border: 1px solid var(--line);
-  border-radius: 4px; margin-bottom: .5rem; }
 .panels { display: grid; gap: .8rem 1.2rem; margin-bottom: .5rem;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, 17rem), 1fr)); }
 .panel { max-width: 30rem; display: flex; flex-direction: column; justify-content: flex-end; }
@@ -126,7 +123,6 @@ li { overflow-wrap: anywhere; }
   main { max-width: none; padding: 0; }
   h2 { break-after: avoid; }
   figure, tr, .banner { break-inside: avoid; }
-  figure img { filter: none; }
   .panels { grid-template-columns: repeat(3, 1fr); }
   .wide { overflow: visible; } }
 """

@@ -81,7 +81,7 @@ def sheet_axes(
     up = across * min(ratio, TALLEST)
     across, top = up / ratio, TOP + MARK * simulated
     height = BOTTOM + up + top
-    figure = _figure(width, height, simulated)
+    figure = panel_figure(width, height, simulated)
     axes = figure.add_axes((LEFT / width, BOTTOM / height, across / width, up / height))
     draw_sheet(axes, skin)
     axes.set(xlim=(low[0] * MM, high[0] * MM), ylim=(low[1] * MM, high[1] * MM))
@@ -95,13 +95,14 @@ def chart_axes(*, simulated: bool = False, width: float = WIDTH, height: float =
     Raises:
         ReportError: matplotlib is not installed.
     """
-    figure = _figure(width, height, simulated)
+    figure = panel_figure(width, height, simulated)
     top = TOP + MARK * simulated
     box = (LEFT / width, BOTTOM / height, (width - LEFT - RIGHT) / width, (height - BOTTOM - top) / height)
     return figure, figure.add_axes(box)
 
 
-def _figure(width: float, height: float, simulated: bool) -> "Figure":
+def panel_figure(width: float, height: float, simulated: bool) -> "Figure":
+    """A figure without axes; with the word SIMULATED if it shows simulated data."""
     figure = bare_figure(width, height)
     if simulated:
         figure.text(LEFT / width, 1 - 0.02, "SIMULATED", color=RED, fontsize=8, fontweight="bold", va="top")

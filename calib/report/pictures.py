@@ -1,6 +1,5 @@
 """Pictures of the report of a calibration: panels on the page, and the paper's figures as PNG files beside it."""
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -16,7 +15,7 @@ from .captions import (
     about_maps,
     about_sensitivity,
 )
-from .curved_figure import curved_figure
+from .curved_figure import curved_figure, curved_panels
 from .figures import localisation_figure, png, sensitivity_figure
 from .html_parts import html_table
 from .map_figures import ExampleMaps, maps_figure
@@ -54,8 +53,8 @@ class Picture:
     | title  | heading of the section                                                 |
     | data   | the figure as a PNG file                                               |
     | alt    | what is shown, for those who do not see it                             |
-    | caption | what to look for                                                      |
-    | panels | what the page shows; without panels it shows the PNG file              |
+    | caption | what to look for                                                       |
+    | panels | what the page shows                                                    |
     | rows   | of a table of the contacts below                                       |
     """
 
@@ -64,18 +63,14 @@ class Picture:
     data: bytes
     alt: str
     caption: str
-    panels: Sequence[Panel] = ()
+    panels: Sequence[Panel]
     rows: Sequence[Sequence[str]] = field(default=())
 
     def html(self) -> str:
         """The section of the page."""
-        if self.panels:
-            parts = "".join(panel.html() for panel in self.panels)
-            kind = f"{self.name} few" if len(self.panels) <= FEW else self.name
-            shown = f"<div class='panels {kind}' role='group' aria-label=\"{escape(self.alt)}\">{parts}</div>"
-        else:
-            data = base64.b64encode(self.data).decode()
-            shown = f'<img alt="{escape(self.alt)}" src="data:image/png;base64,{data}">'
+        parts = "".join(panel.html() for panel in self.panels)
+        kind = f"{self.name} few" if len(self.panels) <= FEW else self.name
+        shown = f"<div class='panels {kind}' role='group' aria-label=\"{escape(self.alt)}\">{parts}</div>"
         table = html_table(CONTACT_COLUMNS, {"": self.rows}) if self.rows else ""
         caption = f"<figcaption>{escape(self.caption)}</figcaption>"
         return f"<h2>{escape(self.title)}</h2><figure>{shown}{caption}</figure>{table}"
@@ -117,7 +112,8 @@ def _examples(calibration: Calibration) -> list[Picture]:
     if calibration.skin.surface is not None:
         estimator = _estimators(calibration)[-1]
         curved = png(curved_figure(calibration, estimator))
-        pictures.append(Picture("curved", "On the curved sheet", curved, *about_curved(estimator)))
+        panels = curved_panels(calibration, estimator)
+        pictures.append(Picture("curved", "On the curved sheet", curved, *about_curved(estimator), panels))
     return pictures
 
 
