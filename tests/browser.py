@@ -5,6 +5,7 @@ descriptor 3 and writes to 4 (``--remote-debugging-pipe``), JSON ended by a zero
 """
 
 import base64
+import contextlib
 import fcntl
 import json
 import os
@@ -30,6 +31,7 @@ OPTIONS = (
     "--hide-scrollbars",
 )
 TIMEOUT = 60.0  # s for an answer
+PATIENCE = 10.0  # s for the browser to end by itself
 
 
 def browser_path() -> str | None:
@@ -102,8 +104,14 @@ class Browser:
         return self
 
     def __exit__(self, *error: object) -> None:
-        os.killpg(self._process, signal.SIGKILL)
-        os.waitpid(self._process, 0)
+        with contextlib.suppress(RuntimeError, TimeoutError, OSError):  # it has ended already
+            self.call("Browser.close")
+        until = time.monotonic() + PATIENCE
+        while not (ended := os.waitpid(self._process, os.WNOHANG)[0]) and time.monotonic() < until:
+            time.sleep(0.02)
+        if not ended:
+            os.killpg(self._process, signal.SIGKILL)
+            os.waitpid(self._process, 0)
         os.close(self._in)
         os.close(self._out)
         self._folder.cleanup()
