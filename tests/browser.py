@@ -180,9 +180,18 @@ class Tab:
             if not n.get("ignored") and "role" in n
         ]
 
-    def screenshot(self, *, whole: bool = True) -> bytes:
-        """The page as PNG: all of it, or what the window shows."""
-        return base64.b64decode(self.call("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
+    def box(self, of: str) -> list[float]:
+        """Left, top, width and height of an element (JavaScript) on the page, in CSS pixels."""
+        corner = "[b.x + scrollX, b.y + scrollY, b.width, b.height]"
+        found: list[float] = self.value(f"(b => {corner})({of}.getBoundingClientRect())")
+        return found
+
+    def screenshot(self, *, whole: bool = True, of: str | None = None) -> bytes:
+        """The page as PNG: all of it, what the window shows, or an element (JavaScript)."""
+        clip = (
+            {} if of is None else {"clip": dict(zip(("x", "y", "width", "height"), self.box(of), strict=True), scale=1)}
+        )
+        return base64.b64decode(self.call("Page.captureScreenshot", captureBeyondViewport=whole, **clip)["data"])
 
     def __enter__(self) -> "Tab":
         return self

@@ -192,7 +192,7 @@ def pixel(tab, row, column):
 
 
 def box(tab, of):
-    return np.array(tab.value(f"(b => [b.x, b.y, b.width, b.height])({of}.getBoundingClientRect())"))
+    return np.array(tab.box(of))
 
 
 @needs_browser

@@ -156,7 +156,7 @@ def page(shown, tmp_path_factory):
 
 
 def box(tab, of):
-    return np.array(tab.value(f"(b => [b.x, b.y, b.width, b.height])({of}.getBoundingClientRect())"))
+    return np.array(tab.box(of))
 
 
 @needs_browser
