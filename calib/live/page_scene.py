@@ -1,6 +1,7 @@
 """What the live page is told once: outlines, electrodes, the grid of the map, and the fixed scales of colour."""
 
 import base64
+from dataclasses import replace
 
 import numpy as np
 
@@ -56,6 +57,7 @@ def full_scales(calibration: Calibration) -> tuple[float, float | None]:
     """Force per area (Pa) and change of sheet conductivity (S) that have the full colour, whatever a frame shows.
 
     They are the largest in the maps and images of the calibration's presses of nearly the largest force, rounded up.
+    Each map sums to the force of the load cell, so that nothing needs to be located, which takes seconds to compile.
     Without such presses (a file of an early version): the largest calibrated force over a tenth of the smallest pad,
     and None.
     """
@@ -64,7 +66,10 @@ def full_scales(calibration: Calibration) -> tuple[float, float | None]:
         area = min(_area(pad.outline) for pad in calibration.skin.pads)
         return rounded_up(float(np.max(calibration.evaluation.force)) / (CONTACT_SHARE * area)), None
     areas = np.asarray(recon.areas)
-    force = np.asarray(force_map(calibration, shown.dv, shown.pressure).map.force)[:, areas > 0]
+    unlocated = replace(calibration, field=None, locator=None)
+    map_force = np.asarray(force_map(unlocated, shown.dv, shown.pressure).map.force)[:, areas > 0]
+    total = map_force.sum(1)
+    force = map_force * np.where(total > 0, shown.force / np.where(total > 0, total, 1), 0)[:, None]
     change = np.abs(np.asarray(recon(np.asarray(shown.dv, recon.dtype))))
     return rounded_up(float((force / areas[areas > 0]).max())), rounded_up(float(change.max()))
 

@@ -131,15 +131,17 @@ def test_the_scene_has_the_proportions_of_the_skin(calibration):
 
 
 def test_full_colours_are_those_of_presses_of_the_calibration(skin, monkeypatch):
-    """The largest force per area of the examples' maps, which sum to the forces of the pads, rounded up."""
+    """The largest force per area of the examples' maps, scaled to the load cell, and change of images, rounded up."""
     recon = stand_in(je.Reconstructor, areas=np.array([1e-4, 2e-4, 0.0]), dtype=np.dtype(float))
     monkeypatch.setattr(type(recon), "__call__", lambda self, dv: 1e-3 * np.asarray(dv), raising=False)
-    shown = PressExamples(np.array([[1.0, -2.3, 0.5]]), np.zeros((1, 4)), np.zeros((1, 2)), np.ones(1))
+    shown = PressExamples(np.array([[1.0, -2.3, 0.5]]), np.zeros((1, 4)), np.zeros((1, 2)), np.array([7.2]))
     monkeypatch.setattr(
         "calib.live.page_scene.force_map",
         lambda *_: stand_in(object, map=stand_in(object, force=jnp.array([[1.0, 2.6, 99.0]]))),
     )
-    assert full_scales(stand_in(Calibration, skin=skin, recon=recon, examples=shown)) == (15e3, pytest.approx(3e-3))
+    monkeypatch.setattr("calib.live.page_scene.replace", lambda found, **_: found)
+    calibration = stand_in(Calibration, skin=skin, recon=recon, examples=shown)
+    assert full_scales(calibration) == (30e3, pytest.approx(3e-3))  # 2.6 of 3.6 N, twice, on 2 cm2: 26 kPa
 
 
 @pytest.mark.parametrize(("value", "up"), [(1.0, 1.0), (1.01, 1.5), (9.9e-4, 1e-3), (8.0, 8.0), (13.3e3, 15e3), (0, 1)])
