@@ -265,6 +265,15 @@ def test_the_ellipse_goes_where_the_contact_goes(tab, page):
 
 
 @needs_browser
+def test_an_ellipse_larger_than_the_sheet_covers_nothing_else(tab, page):
+    shown(tab, page, result(2, covariance=np.eye(2)))  # 1 m
+    at = "(b => document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2).tagName)"
+    assert tab.value(f"{at}($('marks').getBoundingClientRect())") in ("ellipse", "path", "svg")
+    for other in ("$('bar')", "$('pads')", "$('pause')"):
+        assert tab.value(f"{at}({other}.getBoundingClientRect())") != "ellipse"
+
+
+@needs_browser
 def test_noise_does_not_fill_the_scale(tab, page):
     """The colours of a map depend on its values alone, not on what else the frame or the frames before showed."""
     full = 4000.0 * SIDE**2  # N on a pixel

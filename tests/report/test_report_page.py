@@ -192,6 +192,8 @@ def test_tables_are_rows_of_named_values_on_a_telephone(browser, page):
     with browser.open(page, 400) as tab:
         cell = "document.querySelector('.numbers tbody tr:nth-child(2) td')"
         assert tab.value(f"getComputedStyle({cell}, '::before').content") == '"presses"'
+        row, whole = (np.array(tab.box(of)) for of in (f"{cell}.parentElement", f"{cell}.closest('.wide')"))
+        assert row[2] == pytest.approx(whole[2], abs=1)
         roles = {part["role"] for part in tab.accessible()}
         assert {"table", "columnheader", "rowheader"} <= roles
         tab.resize(1280, 800)
