@@ -254,6 +254,7 @@ function begin(found) {
   setText("view-title", scene.rows ? "Force map" : "Force");
   for (const id of ["fourth", "maps", "sum", "sheet", "pads-history"]) $(id).hidden = !scene.rows;
   $("alone").hidden = Boolean(scene.rows);
+  if (!scene.rows) { setText("forces-title", "Force, N"); setText("first", "sensor"); }
   if (scene.rows) { scene.cells = floats(scene.areas); offerRanges(); layOut(); drawSkin(); }
   const results = new EventSource("/results");
   results.onmessage = receive;

@@ -32,7 +32,7 @@ def _axes(height: float, x: str, y: str) -> tuple["Figure", Any]:
 
 def residual_figure(found: LogEvaluation) -> "Figure":
     """Predicted minus recorded force over the predicted force, with the interval; samples out of range in red."""
-    figure, axes = _axes(2.8, "predicted force, N", "predicted - recorded, N")
+    figure, axes = _axes(3.2, "predicted force, N", "predicted - recorded, N")
     _scatter(axes, found, found.predicted, found.predicted - found.force)
     rows = _rows(found, found.known)
     rows = rows[np.argsort(found.predicted[rows])]
@@ -62,7 +62,7 @@ def _scatter(axes: Any, found: LogEvaluation, x: np.ndarray, y: np.ndarray) -> N
 
 def time_figure(found: LogEvaluation) -> "Figure":
     """Recorded and predicted force over time, with the interval."""
-    figure, axes = _axes(2.8, "time, s", "force, N")
+    figure, axes = _axes(3.0, "time, s", "force, N")
     rows = _rows(found, np.isfinite(found.predicted))
     axes.fill_between(
         found.time[rows], found.low[rows], found.high[rows], color=BLUE, alpha=0.2, linewidth=0, label="90 % interval"
