@@ -22,6 +22,7 @@ from jaxeit.tracking import Track
 
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of
+from ..calibration.localisation.ellipses import placement_covariance
 from ..calibration.localisation.locators import ContactLocator
 from ..fitting.curves.play_operators import remembered
 from ..fitting.fields import Places
@@ -215,19 +216,6 @@ def _touch_estimates(found: je.Contacts) -> TouchEstimates:
     )
 
 
-def placement_covariance(calibration: Calibration) -> np.ndarray:
-    """Mean square error (2, 2) m^2 of the fitted places of the calibration's presses.
-
-    It contains errors of the model, which the covariance of a fit, made from noise alone, does not.
-    """
-    found = calibration.evaluation
-    if calibration.locator is None or "fitted" not in found.estimated:
-        return np.zeros((2, 2))
-    error = np.asarray(found.estimated["fitted"] - found.position, float)
-    error = error[np.isfinite(error).all(1)]
-    return np.asarray(error.T @ error / max(len(error), 1))
-
-
 class Engine:
     """Turns frames into results with one calibration. Only the thread that created it may use it."""
 
@@ -256,7 +244,8 @@ class Engine:
         self._before = np.zeros((1, len(self._pad_weights)))
         self._waiting_frame: np.ndarray | None = None  # a touched frame whose contacts are not fitted yet
         self._places, self._touches, self._search_end = self._programs.nowhere, NO_TOUCHES, 0.0
-        self._placement_covariance = placement_covariance(calibration)
+        fits = calibration.locator is not None
+        self._placement_covariance = placement_covariance(calibration) if fits else np.zeros((2, 2))
         self._search_time = 0.0
         self.unsearched = 0
 

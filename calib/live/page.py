@@ -11,15 +11,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..calibration.calibration import Calibration
 from ..calibration.logs.calibration import LogCalibration
 from .loop import LiveControl
+from .page_scene import page_scene
 from .results import Result
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PAGE_FILE = Path(__file__).with_name("page.html")
+PAGE_PARTS = ("page.css", "page.js", "history.js")
 MIN_RESULT_INTERVAL = 0.04  # s between two results for a viewer; the eye sees no more
 KEEP_ALIVE_INTERVAL = 1.0  # s between messages without results, which reveal closed connections
 REQUEST_TIMEOUT = 5.0  # s
@@ -38,22 +38,12 @@ SECURITY_HEADERS = {
 OWN_FETCH_SITES = (None, "same-origin", "none")  # Sec-Fetch-Site of this page, of the user, and of programs
 
 
-def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
-    """Fixed contents of the page: pads, electrodes and grid, in m; of a sensor without EIT only its name."""
-    if isinstance(calibration, LogCalibration):
-        return {"skin": calibration.stream, "simulated": calibration.simulated, "pads": [calibration.stream]}
-    skin, recon = calibration.skin, calibration.recon
-    centres = np.asarray(recon.centres)
-    return {
-        "skin": skin.name,
-        "simulated": calibration.simulated,
-        "rows": recon.shape[0],
-        "columns": recon.shape[1],
-        "low": centres.min(0).tolist(),
-        "high": centres.max(0).tolist(),
-        "pads": [pad.name for pad in skin.pads],
-        "electrodes": np.asarray(skin.electrode_positions)[:, :2].tolist(),
-    }
+def whole_page() -> bytes:
+    """The page as one file: its style and its programs stand where it names them."""
+    text = PAGE_FILE.read_text(encoding="utf-8")
+    for name in PAGE_PARTS:
+        text = text.replace(f"/* {name} */", PAGE_FILE.with_name(name).read_text(encoding="utf-8"))
+    return text.encode()
 
 
 class Page(ThreadingHTTPServer):
@@ -140,7 +130,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_allowed():
             return
         if self.path == "/":
-            self._reply(PAGE_FILE.read_bytes(), "text/html; charset=utf-8")
+            self._reply(whole_page(), "text/html; charset=utf-8")
         elif self.path == "/scene":
             self._reply(self.server.scene, "application/json")
         elif self.path == "/results":

@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ..calibration.calibration import Calibration
+from ..calibration.localisation.ellipses import confidence_ellipse
 from ..calibration.logs.calibration import LogCalibration
 from .loop import LiveControl
 from .results import FrameResult, Result, TouchEstimates
@@ -23,7 +24,6 @@ SERIES: tuple[str, ...] = ("force", "standard_error")  # of each pad
 MIN_PICTURE_INTERVAL = 0.1  # s between two pictures, which take milliseconds to pack
 MAX_WAITING_RESULTS = 4096  # while the thread gets no processor time
 VIEWER_TIMEOUT = 2.0  # s for a viewer to answer, and to receive the last results
-ELLIPSE_ANGLES = np.linspace(0.0, 2.0 * np.pi, 49)
 MIN_COLOUR_RANGE = 1e-30  # upper end of a range of colours, which must not be empty
 MARK_COLOUR = (194, 47, 69)
 
@@ -123,8 +123,8 @@ class RerunView:
         self._stream.log("map/centres", self._centres(result, grid))
 
     def _contacts(self, touches: TouchEstimates, grid: "Grid") -> rr.LineStrips2D:
-        """Contacts as ellipses of two standard errors, with coordinates as labels."""
-        strips = [grid.pixels(ellipse(*at)) for at in zip(touches.position, touches.covariance, strict=True)]
+        """Contacts as ellipses of 90 %, with coordinates as labels."""
+        strips = [grid.pixels(confidence_ellipse(*at)) for at in zip(touches.position, touches.covariance, strict=True)]
         errors, names = np.sqrt(np.diagonal(touches.covariance, axis1=1, axis2=2)), _names(touches)
         labels = [
             f"{name}{1e3 * x:.1f}, {1e3 * y:.1f} mm ± {1e3 * dx:.1f}, {1e3 * dy:.1f}" + ("" if sure else ", a guess")
@@ -162,13 +162,6 @@ class Grid:
         """Points (n, 2) m in coordinates of a picture (n, 2), in pixels from its upper left corner."""
         column, row = ((points - self._low) / self._pitch + 0.5).T
         return np.stack([column, self.shape[0] - row], 1)
-
-
-def ellipse(position: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Points (49, 2) m on the ellipse of two standard errors."""
-    scale, axes = np.linalg.eigh(covariance)
-    unit = np.stack([np.cos(ELLIPSE_ANGLES), np.sin(ELLIPSE_ANGLES)], 1)
-    return np.asarray(position + 2.0 * (unit * np.sqrt(np.maximum(scale, 0.0))) @ axes.T)
 
 
 def _connect(stream: rr.RecordingStream, where: str) -> None:

@@ -9,7 +9,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.evaluation import CALIBRATED, METHODS, Evaluation
 from ..calibration.press_examples import PressExamples
 from ..fitting.fields import FIELDS, FittedField
-from .figures import sensitivity_maps
+from .figures import ESTIMATOR_MEANING, sensitivity_maps
 from .html_parts import number_text
 
 
@@ -23,7 +23,8 @@ def about_localisation(evaluation: Evaluation, estimators: Sequence[str]) -> tup
         f"mean error {', '.join(means)}."
     )
     caption = (
-        "True positions of the tip are black, estimated ones red; green circles are the electrodes, dark lines the "
+        "True positions of the tip are black (white on a dark page), estimated ones red; green circles are the "
+        "electrodes with their numbers, grey lines the "
         "outlines of the pads. Look for lines that all point one way: towards the centre they are the inward shift "
         f"of presses near the rim ({number_text(inward, 1)} mm on average by {estimators[0]}, positive is inward); "
         "all in parallel they are an offset between the stage and the sheet; swapped or mirrored regions are "
@@ -32,15 +33,18 @@ def about_localisation(evaluation: Evaluation, estimators: Sequence[str]) -> tup
     return alt, caption
 
 
-def about_maps(examples: PressExamples) -> tuple[str, str]:
-    """Alternative text and caption of images and force maps."""
-    count = len(examples.force)
+def about_maps(examples: PressExamples, estimator: str, larger: int) -> tuple[str, str]:
+    """Alternative text and caption of images, force maps and contacts, whose ellipses are so many times larger."""
+    count, fitted = len(examples.force), estimator == "fitted"
+    meaning = "where the calibration finds it" if fitted else ESTIMATOR_MEANING.get(estimator, estimator)
+    by = "the noise of this frame and the errors of place of all presses" if fitted else "the errors of all presses"
     return (
-        f"EIT images of {count} presses above their force maps, over the outlines of sheet and pads.",
+        f"EIT images and force maps of {count} presses, over the outlines of sheet and pads, with the contacts found.",
         f"{count} presses of nearly the largest force: one that pads share, the others near the middles of pads. "
-        "Above: the EIT image, with the force of the load cell. Below: the force map, the image cut by the pads and "
-        "scaled so that each pad's part sums to the force that its pressure tells; its total stands above it. The "
-        "cross marks the true place. These presses were fitted, not held out.",
+        "EIT image: with the force of the load cell. Force map: the image cut by the pads and scaled so that each "
+        "pad's part sums to the force that its pressure tells; its total stands above it. The cross marks the true "
+        f"place. The ellipse holds the contact ({meaning}) with 90 %, by {by}"
+        f"{f', and is drawn {larger} times larger' if larger > 1 else ''}. These presses were fitted, not held out.",
     )
 
 
@@ -81,7 +85,7 @@ def about_curves(calibration: Calibration, evaluations: Mapping[str, Evaluation]
         "the sheet; force errors against force and in the order of the presses."
     )
     caption = (
-        "Top: the curve of each pad over the pressures fitted, with the 95 % band of the curve itself (1.96 standard "
+        "First the curve of each pad over the pressures fitted, with the 95 % band of the curve itself (1.96 standard "
         "errors; single presses scatter more), and the means over the hold of presses that this pad carried to 90 % "
         "or more. The curve is fitted to whole presses, loading to release. Points in groups beside the curve are "
         f"places that respond differently. {_about_structure(calibration)}; a slope or bend over force asks for "
@@ -99,7 +103,8 @@ def about_loops(calibration: Calibration) -> tuple[str, str]:
     alt = f"Force against pressure along one press of each pad; mean of loading over unloading: {said}."
     law = "the law's own loop" if calibration.curves.curve.path else "one line for both ways, as this law has no memory"
     caption = (
-        "Of each pad the whole press of median stiffness among those at nearly its largest force. Black is the pad's "
+        "Of each pad the whole press of median stiffness among those at nearly its largest force. Blue is loading, red "
+        "unloading, black (white on a dark page) the pad's "
         f"fitted law times the gain at that place: {law}. Look for blue above red: at the same pressure the load is "
         "larger on the way in than on the way out, by the newtons in the titles on average; where that is more than "
         "the errors you can bear, calibrate with --curve hysteresis or auto. A loop that is open at the hold alone is "
@@ -109,7 +114,7 @@ def about_loops(calibration: Calibration) -> tuple[str, str]:
 
 
 def _about_structure(calibration: Calibration) -> str:
-    below = "Bottom: estimated minus true force of presses the fit had not seen, by place, by force and over time."
+    below = "Then estimated minus true force of presses the fit had not seen, by place, by force and over time."
     if calibration.field is None:
         return f"{below} Structure in the map asks for a correction by location"
     return (

@@ -1,5 +1,7 @@
 """Results on a curved sheet, in space: places, sensitivity and force maps, as seen from in front of the skin."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +11,7 @@ import jaxeit as je
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import force_map
 from .figures import GREEN, GREY, MM, RED, cell_edges, colour_reach, new_figure
+from .panels import HEIGHT, WIDTH, Panel, panel, panel_figure
 
 try:  # an extra, as in `figures`
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 
 VIEW = {"elev": 48, "azim": -72}  # degrees
 ZOOM = 1.0
+PROJECTION: dict[str, Any] = {"projection": "3d", "computed_zorder": False}
+LABELS = ("", "sensitivity / its mean", "force per area, kPa", "force per area, kPa")  # of the views' scales of colour
 EDGE_POINTS = 24  # along each side of a pad, so that its outline follows the surface
 
 
@@ -30,34 +35,63 @@ def curved_figure(calibration: Calibration, estimator: str) -> "Figure":
         calibration: of a skin whose sheet is curved, with examples.
         estimator: of the place; a name in ``calibration.evaluation.estimated``.
     """
-    found, skin, shown = calibration.evaluation, calibration.skin, calibration.examples
-    assert shown is not None
     figure = new_figure(9.6, 6.4, calibration.simulated)
-    panels = figure.subplots(2, 2, subplot_kw={"projection": "3d", "computed_zorder": False}).ravel()
-    _places(panels[0], skin, found.position, found.estimated[estimator])
-    ratio = found.total_force / found.force
-    values = ratio / ratio.mean()
+    panels = figure.subplots(2, 2, subplot_kw=PROJECTION).ravel()
+    views = _views(calibration, estimator)
+    drawn = [view(axes) for view, axes in zip(views, panels, strict=True)]
+    figure.colorbar(drawn[1], ax=panels[1], shrink=0.6, pad=0.02).set_label(LABELS[1])
+    figure.colorbar(drawn[3], ax=panels[2:], shrink=0.6, pad=0.02).set_label(LABELS[3])
+    for axes in panels:
+        _sheet(axes, calibration.skin)
+    return figure
+
+
+def curved_panels(calibration: Calibration, estimator: str) -> list[Panel]:
+    """The same four views as panels of the page."""
+    return [
+        _view_panel(calibration, view, label, f"view{k}")
+        for k, (view, label) in enumerate(zip(_views(calibration, estimator), LABELS, strict=True))
+    ]
+
+
+def _view_panel(calibration: Calibration, view: Callable[[Any], Any], label: str, name: str) -> Panel:
+    figure, beside = panel_figure(WIDTH, HEIGHT, calibration.simulated), 0.8
+    axes = figure.add_axes((0.0, 0.0, beside if label else 1.0, 0.95), **PROJECTION)
+    drawn = view(axes)
+    _sheet(axes, calibration.skin)
+    for cells in axes.collections:
+        cells.set_rasterized(True)
+    if label:
+        figure.colorbar(drawn, cax=figure.add_axes((beside, 0.15, 0.03, 0.7))).set_label(label)
+    return panel(figure, axes, name)
+
+
+def _views(calibration: Calibration, estimator: str) -> list[Callable[[Any], Any]]:
+    """Functions that draw one view each and return what has a scale of colour."""
+    found, skin, shown, recon = calibration.evaluation, calibration.skin, calibration.examples, calibration.recon
+    assert shown is not None
+    values = found.total_force / found.force / (found.total_force / found.force).mean()
     reach = colour_reach(values - 1)
-    drawn = _at_places(panels[1], skin, found.position, values, (1 - reach, 1 + reach))
-    figure.colorbar(drawn, ax=panels[1], shrink=0.6, pad=0.02).set_label("sensitivity / its mean")
     chosen = [0, len(shown.force) - 1]
-    maps, recon = force_map(calibration, shown.dv[chosen], shown.pressure[chosen]).map.force, calibration.recon
+    force = np.asarray(force_map(calibration, shown.dv[chosen], shown.pressure[chosen]).map.force)
     areas = np.asarray(recon.areas)
-    density = np.where(areas > 0, np.asarray(maps) / np.where(areas > 0, areas, 1), np.nan) / 1e3
+    density = np.where(areas > 0, force / np.where(areas > 0, areas, 1), np.nan) / 1e3
     high = float(np.nanmax(density)) or 1.0
     x0, x1, y0, y1 = np.asarray(recon.extent, float)
     rows, columns = recon.shape
     edges = np.linspace(x0, x1, columns + 1), np.linspace(y0, y1, rows + 1)
-    for axes, picture, force, place in zip(
-        panels[2:], density, np.asarray(maps).sum(1), shown.position[chosen], strict=True
-    ):
-        drawn = _cells(axes, skin, *edges, picture.reshape(rows, columns), (0.0, high), "viridis")
-        axes.plot(*_lifted(skin, place[None]), "+", color=RED, ms=9, zorder=4)
-        axes.set_title(f"force map, {force:.3g} N", fontsize=10)
-    figure.colorbar(drawn, ax=panels[2:], shrink=0.6, pad=0.02).set_label("force per area, kPa")
-    for axes in panels:
-        _sheet(axes, skin)
-    return figure
+
+    def force_view(k: int, axes: Any) -> Any:
+        axes.plot(*_lifted(skin, shown.position[chosen[k]][None]), "+", color=RED, ms=9, zorder=4)
+        axes.set_title(f"force map, {force[k].sum():.3g} N", fontsize=10)
+        return _cells(axes, skin, *edges, density[k].reshape(rows, columns), (0.0, high), "viridis")
+
+    return [
+        lambda axes: _places(axes, skin, found.position, found.estimated[estimator]),
+        lambda axes: _at_places(axes, skin, found.position, values, (1 - reach, 1 + reach)),
+        partial(force_view, 0),
+        partial(force_view, 1),
+    ]
 
 
 def _lifted(skin: je.Skin, chart: np.ndarray) -> np.ndarray:

@@ -1,8 +1,6 @@
 """The report of a calibration: one self-contained HTML page, and the paper's figures as files beside it."""
 
-import base64
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
@@ -15,32 +13,11 @@ from ..calibration.calibration import Calibration
 from ..calibration.evaluation import METHODS, THIRDS, Evaluation
 from ..fitting.selection import Candidate
 from ..session import replacing
-from .captions import (
-    about_curved,
-    about_curves,
-    about_gain,
-    about_localisation,
-    about_loops,
-    about_maps,
-    about_sensitivity,
-)
-from .curved_figure import curved_figure
-from .figures import (
-    ESTIMATOR_MEANING,
-    localisation_figure,
-    png,
-    require_matplotlib,
-    sensitivity_figure,
-)
+from .figures import ESTIMATOR_MEANING, require_matplotlib
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text, with_error
-from .map_figures import maps_figure
-from .pad_figures import curves_figure, gain_figure, has_loops, loops_figure
+from .pictures import Picture, calibration_pictures
 
 _NO_EVALUATIONS: Mapping[str, Evaluation] = MappingProxyType({})
-SHOWN_ESTIMATORS = (
-    "quarter",
-    "fitted",
-)  # the image's estimator nearest to the paper's figure, and what the field goes by
 
 
 def write_report(
@@ -66,13 +43,13 @@ def write_report(
     """
     require_matplotlib()
     page = Path(path)
-    figures = _figures(calibration, evaluations)
-    text = _page(calibration, evaluations, figures)
-    pictures = [page.with_name(f"{page.stem}_{figure.name}.png") for figure in figures]
-    for target, figure in zip(pictures, figures, strict=True):
-        _write(target, figure.data)
+    pictures = calibration_pictures(calibration, evaluations)
+    text = _page(calibration, evaluations, pictures)
+    files = [page.with_name(f"{page.stem}_{picture.name}.png") for picture in pictures]
+    for target, picture in zip(files, pictures, strict=True):
+        _write(target, picture.data)
     _write(page, text.encode())
-    return [page, *pictures]
+    return [page, *files]
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -80,51 +57,10 @@ def _write(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-# --- figures -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A PNG file with its title, alternative text and caption; `single`: whether the figure has one panel."""
-
-    name: str
-    title: str
-    data: bytes
-    alt: str
-    caption: str
-    single: bool = False
-
-
-def _figures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[_Picture]:
-    found, skin, simulated = calibration.evaluation, calibration.skin, calibration.simulated
-    estimators = [name for name in SHOWN_ESTIMATORS if name in found.estimated] or list(found.estimated)[:1]
-    localisation = localisation_figure(found, skin, *estimators, simulated=simulated)
-    sensitivity = sensitivity_figure(found, skin, simulated=simulated)
-    curves = curves_figure(calibration, evaluations)
-    about, single = about_localisation(found, estimators), len(estimators) == 1
-    pictures = [
-        _Picture("localisation", "Localisation", png(localisation), *about, single),
-        _Picture("sensitivity", "Sensitivity over the sheet", png(sensitivity), *about_sensitivity(found)),
-        _Picture("curves", "Curves and force errors", png(curves), *about_curves(calibration, evaluations)),
-    ]
-    if calibration.examples is not None:
-        maps = png(maps_figure(calibration))
-        pictures.insert(0, _Picture("maps", "Force maps of some presses", maps, *about_maps(calibration.examples)))
-        if skin.surface is not None:
-            curved = png(curved_figure(calibration, estimators[-1]))
-            pictures.insert(1, _Picture("curved", "On the curved sheet", curved, *about_curved(estimators[-1])))
-    if has_loops(calibration):
-        pictures.append(_Picture("loops", "Hysteresis", png(loops_figure(calibration)), *about_loops(calibration)))
-    if calibration.field is not None:
-        gain = png(gain_figure(calibration))
-        pictures.append(_Picture("gain", "Gain by location", gain, *about_gain(calibration.field)))
-    return pictures
-
-
 # --- the page ------------------------------------------------------------------------------------------------------
 
 
-def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figures: Iterable[_Picture]) -> str:
+def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], pictures: Iterable[Picture]) -> str:
     mark = "SIMULATED: " if calibration.simulated else ""
     title = escape(f"{mark}Calibration of the skin {calibration.skin.name}")
     parts = [
@@ -137,7 +73,7 @@ def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], figur
         _localisation(_all(calibration, evaluations), calibration.skin.name == PAPERS_SKIN),
         _left_out(calibration.evaluation),
         _choice(calibration),
-        *map(_figure, figures),
+        *(picture.html() for picture in pictures),
         _pads(calibration),
         _notes(calibration, evaluations),
         _provenance(calibration),
@@ -363,16 +299,6 @@ def _localisation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
         )
         out.append((name, with_error(mean, error, 1), *(number_text(value, 1) for value in rest)))
     return out
-
-
-def _figure(picture: _Picture) -> str:
-    data = base64.b64encode(picture.data).decode()
-    kind = " class='single'" if picture.single else ""
-    return (
-        f"<h2>{escape(picture.title)}</h2><figure{kind}>"
-        f'<img alt="{escape(picture.alt)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
-    )
 
 
 def _pads(calibration: Calibration) -> str:

@@ -26,6 +26,7 @@ except ImportError:
 MM = 1e3
 DPI = 125
 RED, GREEN, BLUE, GREY = "#c62828", "#2e7d32", "#1f5fa8", "#8a8a8a"
+OUTLINE = "#747474"  # of pads, on white, on black and on maps
 MARKS = ("#d9730d", "#7b3fa0", "#00838f", "#6d4c41")
 LAST_IN_FONT = "\u052f"  # the font that comes with matplotlib has Latin, Greek and Cyrillic letters
 
@@ -95,13 +96,14 @@ def localisation_figure(evaluation: Evaluation, skin: je.Skin, *estimators: str,
     figure = new_figure(*((6.6, 7.2) if len(estimators) == 1 else (9.6, 6.2)), simulated)
     panels = figure.subplots(1, len(estimators), sharex=True, sharey=True, squeeze=False)[0]
     for axes, estimator in zip(panels, estimators, strict=True):
-        _localisation_panel(axes, evaluation, skin, estimator)
+        localisation_panel(axes, evaluation, skin, estimator)
     label_y_once(panels)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
-def _localisation_panel(axes: Any, evaluation: Evaluation, skin: je.Skin, estimator: str) -> None:
+def localisation_panel(axes: Any, evaluation: Evaluation, skin: je.Skin, estimator: str) -> None:
+    """Draw true and estimated places of one estimator, with electrodes and pads."""
     draw_sheet(axes, skin)
     draw_electrodes(axes, skin)
     true, estimated = evaluation.position * MM, evaluation.estimated[estimator] * MM
@@ -140,7 +142,7 @@ def sensitivity_figure(evaluation: Evaluation, skin: je.Skin, *, simulated: bool
     for axes, (name, values) in zip(panels, maps.items(), strict=True):
         draw_sheet(axes, skin)
         drawn = value_map(axes, evaluation.position, values, 1 - reach, 1 + reach, "RdBu_r")
-        axes.set_title(_sensitivity_title(name, summary), fontsize=10)
+        axes.set_title(sensitivity_title(name, summary), fontsize=10)
     label_y_once(panels)
     bar = figure.colorbar(drawn, ax=panels, shrink=0.8, extend="both", pad=0.02)
     bar.set_label("sensitivity / its mean")
@@ -163,7 +165,8 @@ _SENSITIVITY_TITLE = {
 }
 
 
-def _sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
+def sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
+    """Name of a map of sensitivity, with its coefficient of variation."""
     label = _SENSITIVITY_TITLE[name]
     if f"cv_{name}_ddof1" not in summary:
         return f"{label}\nCV needs two presses or more"
@@ -176,11 +179,17 @@ def _sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
 
 def new_figure(width: float, height: float, simulated: bool) -> "Figure":
     """An empty figure of this size in inches; titled SIMULATED if it shows simulated data."""
-    require_matplotlib()
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = bare_figure(width, height, layout="constrained")
     if simulated:
         figure.suptitle("SIMULATED", color=RED, fontsize=11, fontweight="bold")
+    return figure
+
+
+def bare_figure(width: float, height: float, layout: Any = None) -> "Figure":
+    """An empty figure of this size in inches, without title and, by default, without layout."""
+    require_matplotlib()
+    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
+    FigureCanvasAgg(figure)
     return figure
 
 
@@ -202,7 +211,7 @@ def draw_sheet(axes: Any, skin: je.Skin) -> None:
     rim = np.union1d(np.linspace(0, skin.domain.perimeter, 181), skin.domain.corners)
     axes.plot(*(skin.domain.boundary_point(rim) * MM).T, color=GREY, lw=1.2, zorder=1)
     for pad in skin.pads:
-        axes.fill(*(pad.outline * MM).T, fill=False, edgecolor="#555555", lw=0.9, zorder=2)
+        axes.fill(*(pad.outline * MM).T, fill=False, edgecolor=OUTLINE, lw=0.9, zorder=2)
     axes.set_aspect("equal")
     axes.set_xlabel("x, mm")
     axes.set_ylabel("y, mm")

@@ -1,7 +1,6 @@
 """The report of a log's calibration: one self-contained HTML page. Residual statistics come first."""
 
-import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
@@ -11,9 +10,10 @@ import numpy as np
 from ..calibration.logs.calibration import LogCalibration
 from ..calibration.logs.evaluation import THIRDS, LogEvaluation
 from ..session import replacing
-from .figures import png, require_matplotlib
+from .figures import require_matplotlib
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text
-from .log_figures import place_figure, residual_figure, scatter_figure, time_figure
+from .log_figures import place_panels, residual_figure, scatter_figure, time_figure
+from .panels import inline_svg
 
 _NONE: Mapping[str, LogEvaluation] = MappingProxyType({})
 
@@ -48,7 +48,7 @@ def _page(calibration: LogCalibration, found: Mapping[str, LogEvaluation]) -> st
         f"<p>{escape(_lead(calibration))}</p>",
         _residuals(found),
         _coverage(found),
-        *(_figures(name, one) for name, one in found.items()),
+        *(_figures(number, name, one) for number, (name, one) in enumerate(found.items())),
         _gain(calibration),
         _health(calibration),
         _curve(calibration),
@@ -119,7 +119,7 @@ def _percent(share: float) -> str:
     return number_text(100 * share, 1) + (" %" if np.isfinite(share) else "")
 
 
-def _figures(name: str, found: LogEvaluation) -> str:
+def _figures(number: int, name: str, found: LogEvaluation) -> str:
     if not found.known.any():
         return ""
     pictures = (
@@ -131,15 +131,15 @@ def _figures(name: str, found: LogEvaluation) -> str:
         ("predicted and recorded force", scatter_figure(found), "On the line a prediction is right."),
         ("force over time", time_figure(found), "Recorded force, predicted force, and its 90 % interval."),
     )
-    return "".join(_picture(f"{name}: {what}", png(figure), about) for what, figure, about in pictures)
-
-
-def _picture(heading: str, data: bytes, caption: str) -> str:
-    text = base64.b64encode(data).decode()
-    return (
-        f"<h2>{escape(heading)}</h2><figure><img alt='{escape(heading)}' src='data:image/png;base64,{text}'>"
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    return "".join(
+        _picture(f"{name}: {what}", [inline_svg(figure, f"recording{number}-{k}", f"{name}: {what}")], about)
+        for k, (what, figure, about) in enumerate(pictures)
     )
+
+
+def _picture(heading: str, panels: Sequence[str], caption: str) -> str:
+    shown = f"<div class='panels few'>{''.join(panels)}</div>"
+    return f"<h2>{escape(heading)}</h2><figure>{shown}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def _gain(calibration: LogCalibration) -> str:
@@ -151,7 +151,7 @@ def _gain(calibration: LogCalibration) -> str:
         f"By the field {calibration.location_name}, over the box of the presses. The force is that of the curve times "
         "the gain; its geometric mean over the fitted places is 1."
     )
-    return _picture("Gain by place", png(place_figure(location.gain, location.box)), about)
+    return _picture("Gain by place", [one.html() for one in place_panels(location.gain, location.box)], about)
 
 
 def _health(calibration: LogCalibration) -> str:

@@ -1,20 +1,19 @@
 """Figures of a log's calibration: residuals and predictions over force, forces over time, and gain by place."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..calibration.logs.evaluation import LogEvaluation
 from ..fitting.fields import FittedField
-from .figures import BLUE, GREY, MM, RED, cell_edges, label_y_once
+from .figures import BLUE, GREY, MM, RED, bare_figure, cell_edges
 from .pad_figures import pad_gain, symmetric_limit
+from .panels import WIDER, WIDTH, Panel, chart_axes, panel
 
-try:  # an extra: without it everything but the figures works
+if TYPE_CHECKING:
     from matplotlib.figure import Figure
-except ImportError:
-    Figure = None  # type: ignore[assignment,misc]
 
-MAX_POINTS = 4000  # drawn, evenly spread; more only make the page larger
+MAX_POINTS = 2000  # drawn, evenly spread; more only make the page larger
 
 
 def _rows(found: LogEvaluation, rows: np.ndarray) -> np.ndarray:
@@ -24,8 +23,7 @@ def _rows(found: LogEvaluation, rows: np.ndarray) -> np.ndarray:
 
 
 def _axes(height: float, x: str, y: str) -> tuple["Figure", Any]:
-    figure = Figure(figsize=(8, height), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = chart_axes(width=WIDER, height=height)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.grid(alpha=0.3)
@@ -34,7 +32,7 @@ def _axes(height: float, x: str, y: str) -> tuple["Figure", Any]:
 
 def residual_figure(found: LogEvaluation) -> "Figure":
     """Predicted minus recorded force over the predicted force, with the interval; samples out of range in red."""
-    figure, axes = _axes(3.6, "predicted force, N", "predicted - recorded, N")
+    figure, axes = _axes(3.2, "predicted force, N", "predicted - recorded, N")
     _scatter(axes, found, found.predicted, found.predicted - found.force)
     rows = _rows(found, found.known)
     rows = rows[np.argsort(found.predicted[rows])]
@@ -46,7 +44,7 @@ def residual_figure(found: LogEvaluation) -> "Figure":
 
 def scatter_figure(found: LogEvaluation) -> "Figure":
     """Predicted over recorded force."""
-    figure, axes = _axes(4.5, "recorded force, N", "predicted force, N")
+    figure, axes = _axes(3.6, "recorded force, N", "predicted force, N")
     _scatter(axes, found, found.force, found.predicted)
     low, high = np.nanmin(found.force[found.known]), np.nanmax(found.force[found.known])
     axes.plot([low, high], [low, high], color="black", linewidth=0.8)
@@ -64,7 +62,7 @@ def _scatter(axes: Any, found: LogEvaluation, x: np.ndarray, y: np.ndarray) -> N
 
 def time_figure(found: LogEvaluation) -> "Figure":
     """Recorded and predicted force over time, with the interval."""
-    figure, axes = _axes(3.6, "time, s", "force, N")
+    figure, axes = _axes(3.0, "time, s", "force, N")
     rows = _rows(found, np.isfinite(found.predicted))
     axes.fill_between(
         found.time[rows], found.low[rows], found.high[rows], color=BLUE, alpha=0.2, linewidth=0, label="90 % interval"
@@ -76,21 +74,24 @@ def time_figure(found: LogEvaluation) -> "Figure":
     return figure
 
 
-def place_figure(gain: FittedField, box: np.ndarray) -> "Figure":
+def place_panels(gain: FittedField, box: np.ndarray) -> list[Panel]:
     """Gain and its standard error over the box (2, 2) m of the presses."""
     x, y, value, error = pad_gain(gain, 0, box)
     reach = symmetric_limit(value - 1)
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
     shown = (
         (value, (1 - reach, 1 + reach), "RdBu_r", "gain"),
         (error, (0.0, symmetric_limit(error)), "Purples", "standard error of the gain, %"),
     )
-    for axes, (cells, (low, high), colours, label) in zip(panels, shown, strict=True):
-        drawn = axes.pcolormesh(cell_edges(x) * MM, cell_edges(y) * MM, cells, vmin=low, vmax=high, cmap=colours)
-        figure.colorbar(drawn, ax=axes).set_label(label)
-        axes.set_aspect("equal")
-        axes.set_xlabel("x, mm")
-        axes.set_ylabel("y, mm")
-    label_y_once(panels)
-    return figure
+    return [_place_panel(cell_edges(x) * MM, cell_edges(y) * MM, *one) for one in shown]
+
+
+def _place_panel(
+    x: np.ndarray, y: np.ndarray, cells: np.ndarray, limits: tuple[float, float], colours: str, label: str
+) -> Panel:
+    figure = bare_figure(WIDTH, 0.8 * WIDTH, layout="constrained")
+    axes = figure.add_subplot()
+    drawn = axes.pcolormesh(x, y, cells, vmin=limits[0], vmax=limits[1], cmap=colours, rasterized=True)
+    figure.colorbar(drawn, ax=axes).set_label(label)
+    axes.set_aspect("equal")
+    axes.set(xlabel="x, mm", ylabel="y, mm", title=label)
+    return panel(figure, axes, label.split()[0])

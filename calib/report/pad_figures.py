@@ -59,10 +59,10 @@ def curves_figure(calibration: Calibration, evaluations: Mapping[str, Evaluation
     layout: Any = figure.get_layout_engine()
     layout.set(w_pad=0.09)
     _residual_map(bottom, panels["place"], calibration)
-    _residuals_by(panels["force"], lambda found: found.force, calibration.evaluation, evaluations)
+    residuals_by(panels["force"], lambda found: found.force, calibration.evaluation, evaluations)
     panels["force"].set(xlabel="true force, N", xlim=(0, None))
     panels["force"].set_title("Force error by force", fontsize=10)
-    _residuals_by(panels["order"], lambda found: np.arange(len(found.force)), calibration.evaluation, evaluations)
+    residuals_by(panels["order"], lambda found: np.arange(len(found.force)), calibration.evaluation, evaluations)
     panels["order"].set(xlabel="number of the press, in the order recorded")
     panels["order"].set_title("Force error over time", fontsize=10)
     if evaluations:
@@ -75,14 +75,15 @@ def _curve_panels(figure: Any, calibration: Calibration, rows: int, columns: int
     owner = dominant_pad(calibration.evaluation.pressure)
     for number, axes in enumerate(panels.flat):
         if number < len(calibration.skin.pads):
-            _curve_panel(axes, calibration, number, owner == number)
+            curve_panel(axes, calibration, number, owner == number)
         else:
             axes.set_visible(False)
     figure.supxlabel("pad pressure, kPa", fontsize=10)
     figure.supylabel("force, N", fontsize=10)
 
 
-def _curve_panel(axes: Any, calibration: Calibration, number: int, mine: np.ndarray) -> None:
+def curve_panel(axes: Any, calibration: Calibration, number: int, mine: np.ndarray) -> None:
+    """Draw a pad's curve with its 95 % band and its presses, ``mine`` (presses,) bool."""
     fitted, found = calibration.curves.pad(number), calibration.evaluation
     axes.plot(found.pressure[mine, number] / 1e3, found.force[mine], "o", ms=3, color="black", alpha=0.5)
     low, high = np.asarray(fitted.pressure_range, float)
@@ -113,7 +114,7 @@ def _residual_map(figure: Any, axes: Any, calibration: Calibration) -> None:
     axes.set_title("Force error by place", fontsize=10)
 
 
-def _residuals_by(
+def residuals_by(
     axes: Any, cause: Callable[[Evaluation], np.ndarray], own: Evaluation, evaluations: Mapping[str, Evaluation]
 ) -> None:
     """Force errors over a quantity that may explain them, (presses,) of each evaluation."""
@@ -151,7 +152,7 @@ def loops_figure(calibration: Calibration) -> "Figure":
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for number, axes in enumerate(panels.flat):
         if number < pads:
-            _loop_panel(axes, calibration, number)
+            loop_panel(axes, calibration, number)
         else:
             axes.set_visible(False)
     handles = {
@@ -171,7 +172,8 @@ def has_loops(calibration: Calibration) -> bool:
     return loops is not None and any(map(loops.unloads, range(len(calibration.skin.pads))))
 
 
-def _loop_panel(axes: Any, calibration: Calibration, number: int) -> None:
+def loop_panel(axes: Any, calibration: Calibration, number: int) -> None:
+    """Draw loading and unloading of a pad, with its fitted law."""
     loops, fitted = calibration.loops, calibration.curves.pad(number)
     assert loops is not None
     pressure, force, top = loops.of(number)
@@ -201,9 +203,9 @@ def gain_figure(calibration: Calibration) -> "Figure":
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     x, y, gain, error = zip(*(pad_gain(field, i, pad.outline) for i, pad in enumerate(skin.pads)), strict=True)
     reach = symmetric_limit(np.stack(gain) - 1)
-    _pad_maps(figure, panels[0], skin, zip(x, y, gain, strict=True), (1 - reach, 1 + reach, "RdBu_r"), "gain")
+    _gain_map(figure, panels[0], skin, zip(x, y, gain, strict=True), (1 - reach, 1 + reach, "RdBu_r"), "gain")
     shades = (0, symmetric_limit(np.stack(error)), "Purples")
-    _pad_maps(figure, panels[1], skin, zip(x, y, error, strict=True), shades, "standard error of the gain, %")
+    _gain_map(figure, panels[1], skin, zip(x, y, error, strict=True), shades, "standard error of the gain, %")
     place = calibration.evaluation.estimated.get("fitted", np.empty((0, 2))) * MM
     panels[1].plot(*place.T, ".", ms=2.5, color="black", zorder=3)
     panels[0].set_title("Gain by place", fontsize=10)
@@ -230,7 +232,21 @@ def symmetric_limit(deviation: np.ndarray) -> float:
     return max(float(np.abs(deviation).max()), 0.01)
 
 
-def _pad_maps(
+def pad_maps(
+    axes: Any, skin: je.Skin, cells: Iterable[Sequence[np.ndarray]], scale: tuple[float, float, str]
+) -> list[Any]:
+    """Draw values on each pad (x, y, values) as cells cut along its outline, with their scale (low, high, colours)."""
+    low, high, colours = scale
+    options = {"vmin": low, "vmax": high, "cmap": colours, "zorder": 0}
+    out = []
+    for pad, (x, y, values) in zip(skin.pads, cells, strict=True):
+        drawn = axes.pcolormesh(cell_edges(x) * MM, cell_edges(y) * MM, values, **options)
+        drawn.set_clip_path(Polygon(pad.outline * MM, transform=axes.transData))
+        out.append(drawn)
+    return out
+
+
+def _gain_map(
     figure: Any,
     axes: Any,
     skin: je.Skin,
@@ -238,12 +254,7 @@ def _pad_maps(
     scale: tuple[float, float, str],
     label: str,
 ) -> None:
-    """Values on each pad (x, y, values) as cells cut along its outline, with their scale (low, high, colours)."""
-    low, high, colours = scale
-    options = {"vmin": low, "vmax": high, "cmap": colours, "zorder": 0}
-    for pad, (x, y, values) in zip(skin.pads, cells, strict=True):
-        drawn = axes.pcolormesh(cell_edges(x) * MM, cell_edges(y) * MM, values, **options)
-        drawn.set_clip_path(Polygon(pad.outline * MM, transform=axes.transData))
-    figure.colorbar(drawn, ax=axes, shrink=0.85).set_label(label)
+    drawn = pad_maps(axes, skin, cells, scale)
+    figure.colorbar(drawn[-1], ax=axes, shrink=0.85).set_label(label)
     axes.use_sticky_edges = False
     draw_sheet(axes, skin)

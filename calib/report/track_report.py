@@ -1,10 +1,9 @@
 """The report of contacts that were followed through a recording: paths over the sheet, and forces over time."""
 
-import base64
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,19 +11,16 @@ import jaxeit as je
 
 from ..calibration.application import FORMAT, TRACKS
 from ..calibration.localisation.contact_tracks import ABOUT, Rows
+from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..session import open_archive, replacing
-from .figures import MM, draw_sheet, new_figure, png, require_matplotlib
+from .example_contacts import LARGER
+from .figures import MM, require_matplotlib
 from .force_series import SERIES
 from .html_parts import PAGE, STYLE, html_table, number_text, with_error
+from .panels import WIDER, Panel, chart_axes, panel, sheet_axes
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-INSIDE = 2.1460  # standard deviations to the ellipse that holds 90 % of a normal distribution in the plane
-LARGER = 5  # times the ellipses are drawn larger, since they would hardly be seen
 ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
 MOST_POINTS = 2000  # of a contact's line
-ANGLES = np.linspace(0, 2 * np.pi, 61)
 CAPTION = (
     "Paths of the contacts, each with its number where it begins and a dot where it ends; an edge is a line. Ellipses "
     f"of 90 %, drawn {LARGER} times larger, where a contact presses with at least half of its largest force. Beside "
@@ -64,10 +60,10 @@ def _page(rows: Rows, attrs: Mapping[str, Any], skin: je.Skin) -> str:
     if not rows or not len(rows["time"]):
         parts.append("<p>No contact was followed.</p>")
     else:
-        data = base64.b64encode(png(tracks_figure(rows, skin, simulated=simulated))).decode()
+        panels = "".join(panel.html() for panel in tracks_panels(rows, skin, simulated=simulated))
         alt = "Paths of contacts over the sheet, and their forces over time"
-        picture = f'<img alt="{alt}" src="data:image/png;base64,{data}">'
-        parts += [f"<figure>{picture}<figcaption>{escape(CAPTION)}</figcaption></figure>", _table(rows)]
+        shown = f"<div class='panels few' role='group' aria-label='{alt}'>{panels}</div>"
+        parts += [f"<figure>{shown}<figcaption>{escape(CAPTION)}</figcaption></figure>", _table(rows)]
     mark = "SIMULATED: " if simulated else ""
     return PAGE.format(title=escape(mark + title), style=STYLE, body="\n".join(parts))
 
@@ -97,37 +93,26 @@ def by_number(rows: Rows) -> dict[int, Rows]:
     return {number: {name: part[rows["number"] == number] for name, part in rows.items()} for number in numbers}
 
 
-def tracks_figure(rows: Rows, skin: je.Skin, *, true: Rows | None = None, simulated: bool = False) -> "Figure":
+def tracks_panels(rows: Rows, skin: je.Skin, *, simulated: bool = False) -> list[Panel]:
     """Paths of contacts over the sheet, with ellipses of 90 %, and their forces over time.
 
     Args:
         rows: of the contacts, by the names of `ABOUT`.
-        true: time (n,) ns, position (n, contacts, 2) m and force (n, contacts) N of true contacts, drawn dashed.
 
     Raises:
         ReportError: matplotlib is not installed.
     """
-    figure = new_figure(10.4, 5.4, simulated)
-    sheet, forces = figure.subplots(1, 2, width_ratios=[1, 1.25])
-    draw_sheet(sheet, skin)
-    sheet.set(xlim=sheet.get_xlim(), ylim=sheet.get_ylim())  # also where an ellipse is larger
-    if true is not None:
-        _draw_truth(sheet, forces, true)
+    over_sheet, sheet, _ = sheet_axes(skin, simulated=simulated, width=WIDER)
+    over_time, forces = chart_axes(simulated=simulated, width=WIDER, height=0.8 * WIDER)
+    limits = sheet.get_xlim(), sheet.get_ylim()
     for k, (number, one) in enumerate(by_number(rows).items()):
         _draw_path(sheet, number, one, SERIES[k % len(SERIES)])
         _draw_force(forces, number, one, SERIES[k % len(SERIES)])
-    forces.set_xlabel("time, s")
-    forces.set_ylabel("force, N")
+    sheet.set(xlim=limits[0], ylim=limits[1], title="Paths over the sheet")  # also where an ellipse is larger
+    forces.set(xlabel="time, s", ylabel="force, N", title="Forces over time")
     forces.set_ylim(bottom=0)
     forces.grid(alpha=0.25)
-    return figure
-
-
-def _draw_truth(sheet: Any, forces: Any, true: Rows) -> None:
-    for position, force in zip(true["position"].transpose(1, 0, 2), true["force"].T, strict=True):
-        there = np.where((force > 0)[:, None], position, np.nan) * MM
-        sheet.plot(*there.T, "--", color="black", lw=1.0, zorder=2)
-        forces.plot(true["time"] / 1e9, force, "--", color="black", lw=1.0, label="true")
+    return [panel(over_sheet, sheet, "paths"), panel(over_time, forces, "forces")]
 
 
 def _draw_path(axes: Any, number: int, one: Rows, colour: str) -> None:
@@ -138,15 +123,10 @@ def _draw_path(axes: Any, number: int, one: Rows, colour: str) -> None:
     axes.annotate(str(number), place[0], xytext=(4, 4), textcoords="offset points", color=colour, fontsize=9)
     pressing = np.flatnonzero(one["force"] >= one["force"].max() / 2)
     for at in pressing[_thinned(len(pressing), ELLIPSES)]:
-        axes.plot(*_ellipse(place[at], one["position_covariance"][at] * MM**2).T, color=colour, lw=0.7, alpha=0.8)
+        ellipse = confidence_ellipse(one["position"][at], one["position_covariance"][at], LARGER * INSIDE_90) * MM
+        axes.plot(*ellipse.T, color=colour, lw=0.7, alpha=0.8)
         ends = place[at] + np.outer([-1, 1], one["half"][at] * MM)
         axes.plot(*ends.T, color=colour, lw=2.4, alpha=0.5)
-
-
-def _ellipse(place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    scale, axes = np.linalg.eigh(covariance)
-    circle = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
-    return np.asarray(place + LARGER * INSIDE * (circle * np.sqrt(np.maximum(scale, 0))) @ axes.T)
 
 
 def _draw_force(axes: Any, number: int, one: Rows, colour: str) -> None:

@@ -22,6 +22,7 @@ import calib
 import jaxeit as je
 from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
+from calib.calibration.evaluation import Evaluation
 from calib.calibration.force_maps import ForceLaw, fused
 from calib.calibration.localisation.contact_tracks import PAD_SHARE, NotFollowed, prepare_calibrated_tracker
 from calib.cli import main
@@ -104,7 +105,8 @@ def calibration(monkeypatch, skin):
         frequency=0.0,
         reading_time=1e-5,
     )
-    pads = [stand_in(je.Pad, name="left"), stand_in(je.Pad, name='<b>"right"')]
+    corners = 0.1 * np.array([[0, 0], [1, 0], [1, 2], [0, 2]])
+    pads = [je.Pad("left", corners), je.Pad('<b>"right"', corners + np.array([0.1, 0.0]))]
     positions = np.array([[0.0, 0.0], [0.1, 0.1]])
     curves = stand_in(FittedCurve, curve=calib.PowerLaw())
     weights = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
@@ -116,6 +118,7 @@ def calibration(monkeypatch, skin):
             name="small",
             toml="",
             pads=pads,
+            electrodes=(),
             electrode_positions=positions,
             protocol=protocol,
         ),
@@ -125,7 +128,8 @@ def calibration(monkeypatch, skin):
         pads=stand_in(PadModel, curves=curves, field=None, gains=None, multiple=1.6),
         curves=curves,
         locator=None,
-        evaluation=None,
+        examples=None,
+        evaluation=stand_in(Evaluation, force=np.array([10.0]), estimated={}),
         layer=None,
     )
 

@@ -7,6 +7,7 @@ import pytest
 
 import calib
 import jaxeit as je
+from calib.calibration.localisation.ellipses import INSIDE_90
 from calib.cli import main
 from calib.live.loop import LiveControl
 from calib.live.results import FrameResult, TouchEstimates
@@ -107,7 +108,7 @@ def test_contacts_are_drawn_where_they_are_with_their_errors(view, calibration, 
     ((strip,),) = [values for _, values in found["/map/contacts", "LineStrips2D:strips"]]
     strip = np.array(strip)
     np.testing.assert_allclose(strip[:-1].mean(0), [2.5, 1.5], atol=1e-6)  # the middle of the third column, second row
-    np.testing.assert_allclose(np.ptp(strip, axis=0), [2 * 2 * 0.2, 2 * 2 * 0.1], rtol=1e-3)  # two standard errors
+    np.testing.assert_allclose(np.ptp(strip, axis=0), 2 * INSIDE_90 * np.array([0.2, 0.1]), rtol=1e-3)
     assert found["/map/contacts", "LineStrips2D:labels"][-1][1] == ["20.0, 10.0 mm ± 2.0, 1.0"]
     assert found["/map/centres", "Points2D:labels"][-1][1] == ["left 1.0 N"]
     np.testing.assert_allclose(found["/map/centres", "Points2D:positions"][-1][1], [[2.5, 1.5]])

@@ -169,7 +169,7 @@ def test_evaluate_and_apply_take_the_calibration_of_a_log(few, tmp_path, capsys)
     assert "second half, by the model of the first" in said
     assert "fitted to the whole recording" in said
     text = Path(page).read_text()
-    assert text.index("Residuals") < text.index("Coverage of the intervals") < text.index("data:image/png")
+    assert text.index("Residuals") < text.index("Coverage of the intervals") < text.index("<svg")
     assert main(["evaluate", c, few[1]]) == 0
     assert "outside the calibrated range" in capsys.readouterr().out
     assert main(["apply", c, few[1], "-o", out]) == 0
