@@ -18,6 +18,7 @@ from .captions import (
 from .curved_figure import curved_figure, curved_panels
 from .figures import localisation_figure, png, sensitivity_figure
 from .html_parts import html_table
+from .layer_figures import about_layer, layer_figure, layer_panels
 from .map_figures import ExampleMaps, maps_figure
 from .pad_figures import curves_figure, gain_figure, has_loops, loops_figure
 from .panels import Panel
@@ -93,6 +94,9 @@ def calibration_pictures(calibration: Calibration, evaluations: Mapping[str, Eva
     if calibration.field is not None:
         gain, about = png(gain_figure(calibration)), about_gain(calibration.field)
         pictures.append(Picture("gain", "Gain by location", gain, *about, gain_panels(calibration)))
+    if calibration.layer is not None:
+        maps, about = png(layer_figure(calibration)), about_layer(calibration.layer)
+        pictures.append(Picture("layer", "Contact layer", maps, *about, layer_panels(calibration)))
     return pictures
 
 

@@ -11,6 +11,7 @@ import jaxeit as je
 from calib.calibration import layer as learning
 from calib.calibration.layer import FORGOTTEN, learn_layer, quiet_tracker, render_layer
 from calib.calibration.localisation.contact_tracks import NotFollowed
+from calib.calibration.press_examples import PressExamples
 from calib.cli import main
 from calib.live.follower import LiveFollower
 from calib.live.recalibrator import LiveRecalibrator
@@ -64,10 +65,16 @@ class FakeTracker(Tracker):
         return self.tells._replace(contacts=now.begun + (0 if layer is None else layer.contacts))
 
 
+def better_with_contacts(tracker, dv, forces, errors, layer):
+    """Presses are the more probable the more contacts a layer was learned from."""
+    return np.full(len(dv), 0.0 if layer is None else float(layer.contacts))
+
+
 @pytest.fixture
 def tracker(layer, monkeypatch):
     tracker = FakeTracker(layer)
     monkeypatch.setattr(learning, "prepare_calibrated_tracker", lambda *_: tracker)
+    monkeypatch.setattr(je.tracking, "press_evidence", better_with_contacts)
     monkeypatch.setattr(Smoother, "__init__", lambda *_: None)
     monkeypatch.setattr(Smoother, "add", lambda *_: [])
     monkeypatch.setattr(Smoother, "end", lambda _: [])
@@ -138,6 +145,26 @@ def test_a_session_that_tells_nothing_is_refused(calibration, session, tracker, 
         monkeypatch.setattr(learning, "prepare_calibrated_tracker", unknown)
         with pytest.raises(SessionError, match=r"use\.h5: no frames .* noise; record a second without contact"):
             learn_layer(calibration, use)
+
+
+def test_a_layer_under_which_the_calibrations_presses_are_less_probable_is_refused(
+    calibration, session, tracker, monkeypatch
+):
+    readings = calibration.recon.readings
+    probes = PressExamples(np.zeros((2, readings)), np.full((2, 4), 500.0), np.full((2, 2), 0.05), np.full(2, 5.0))
+    asked = []
+
+    def evidence(tracker, dv, forces, errors, layer):
+        asked.append(layer)
+        return np.array([0.0, 0.0]) if layer is None else np.array([5.0, -6.0])
+
+    monkeypatch.setattr(je.tracking, "press_evidence", evidence)
+    with (
+        calib.open_session(session) as use,
+        pytest.raises(SessionError, match=r"use\.h5: the presses .* less probable"),
+    ):
+        learn_layer(replace(calibration, probes=probes), use)
+    assert [layer is None for layer in asked] == [False, True]
 
 
 def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker, tmp_path, capsys):

@@ -25,7 +25,10 @@ from calib.report.curved_figure import curved_figure
 from calib.report.document import write_report
 from calib.report.figures import ReportError, localisation_figure, png, sensitivity_figure
 from calib.report.force_series import ForceSeries, force_series_figure
+from calib.report.layer_figures import layer_maps
 from calib.report.pad_figures import curves_figure, gain_figure, loops_figure
+from jaxeit.contacts.loads.settings import LoadSettings
+from jaxeit.tracking import GainField, LearnedLayer
 
 HOSTILE = "\u65e5 $x^$ <script>alert(1)</script> & 'pad' \"\x00"  # the start is what fits into a figure
 SLOPE = 0.01  # N/Pa
@@ -465,6 +468,24 @@ def test_the_calibrated_force_has_a_third_map_where_it_is_not_the_papers(calibra
     s, expected = located.evaluation.summary(), located.evaluation.sensitivity("calibrated")
     assert f"Calibrated: estimated / true force\nCV {s['cv_calibrated_ddof1']:.3f}" in third.get_title()
     assert third.collections[0].get_array().ravel()[0] == pytest.approx(expected[:2].mean() / expected.mean())
+
+
+def test_a_layer_that_was_learned_has_two_maps(located, written, tmp_path):
+    """They are the field's own mean and deviation, and nothing is drawn off the sheet."""
+    corners = np.array([[0.0, 0.0], [0.2, 0.2]])
+    field = GainField.over(corners, np.random.default_rng(0).uniform(0, 0.2, (99, 2)), LoadSettings(), 0.3)
+    layer = LearnedLayer.unknown(field)._replace(mean=np.linspace(-1, 1, len(field.places)), contacts=12)
+    known = replace(located, layer=layer)
+    page, *files = write_report(known, tmp_path / "r.html")
+    assert "as told by 12 contacts" in page.read_text()
+    assert tmp_path / "r_layer.png" in files
+    assert not any("layer" in path.name for path in written)
+    gain, spread = layer_maps(layer, known.recon)
+    centres, there = np.asarray(known.recon.centres), np.asarray(known.recon.areas) > 0
+    modes = field.modes_at(centres)
+    np.testing.assert_allclose(gain.ravel()[there], np.exp(modes @ layer.mean)[there])
+    np.testing.assert_allclose(spread.ravel()[there], 100 * np.linalg.norm(modes, axis=1)[there])
+    assert np.isnan(gain.ravel()[~there]).all()
 
 
 def test_a_curved_sheet_is_drawn_in_space_and_a_flat_one_is_not(located, written, tmp_path):

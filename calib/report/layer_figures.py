@@ -1,0 +1,75 @@
+"""Maps of what was learned of the contact layer's gain."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import jaxeit as je
+from jaxeit.tracking import LearnedLayer
+
+from ..calibration import Calibration
+from .figures import MM, draw_sheet, label_y_once, new_figure
+from .html_parts import number_text
+from .pad_figures import symmetric_limit
+from .panels import Panel, panel, sheet_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TITLES = "Gain of the contact layer", "Its standard deviation"
+LABELS = "gain", "standard deviation of the gain, %"
+
+
+def layer_maps(layer: LearnedLayer, recon: je.imaging.AbstractReconstructor) -> tuple[np.ndarray, np.ndarray]:
+    """The gain of the layer in each pixel, (rows, columns), and its standard deviation, %; NaN off the sheet."""
+    mean, deviation = layer.at(np.asarray(recon.centres, float))
+    there = np.asarray(recon.areas) > 0
+    gain, spread = np.where(there, np.exp(mean), np.nan), np.where(there, 100 * deviation, np.nan)
+    return gain.reshape(recon.shape), spread.reshape(recon.shape)
+
+
+def layer_panels(calibration: Calibration) -> list[Panel]:
+    """The two maps, a panel each."""
+    out = []
+    for k in range(2):
+        figure, axes, bar = sheet_axes(calibration.skin, bar=True, simulated=calibration.simulated)
+        limits = axes.get_xlim(), axes.get_ylim()
+        figure.colorbar(_draw(axes, calibration, k), cax=bar).set_label(LABELS[k])
+        axes.set(xlim=limits[0], ylim=limits[1], title=TITLES[k])
+        out.append(panel(figure, axes, f"layer{k}"))
+    return out
+
+
+def layer_figure(calibration: Calibration) -> "Figure":
+    """Both maps side by side."""
+    figure = new_figure(9.6, 4.4, calibration.simulated)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for k, axes in enumerate(panels):
+        figure.colorbar(_draw(axes, calibration, k), ax=axes, shrink=0.85).set_label(LABELS[k])
+        draw_sheet(axes, calibration.skin)
+        axes.set_title(TITLES[k], fontsize=10)
+    label_y_once(panels)
+    return figure
+
+
+def about_layer(layer: LearnedLayer) -> tuple[str, str]:
+    """Alternative text and caption."""
+    alt = "Two maps of the sheet: the gain of the contact layer, and its standard deviation."
+    level = number_text(100 * layer.field.deviation, 0)
+    caption = (
+        f"How strongly the contact layer answers to pressure, as told by {layer.contacts} contacts whose forces the "
+        "pads knew; 1 is the layer of the model. Contacts are followed with it. Where nobody pressed, the standard "
+        f"deviation is that of a layer of which nothing is known, {level} % or more: press there."
+    )
+    return alt, caption
+
+
+def _draw(axes: Any, calibration: Calibration, which: int) -> Any:
+    assert calibration.layer is not None
+    values, recon = layer_maps(calibration.layer, calibration.recon)[which], calibration.recon
+    reach = symmetric_limit(np.nan_to_num(values - 1))
+    low, high, colours = (0.0, float(np.nanmax(values)), "Purples") if which else (1 - reach, 1 + reach, "RdBu_r")
+    extent = np.asarray(recon.extent, float) * MM
+    return axes.imshow(
+        values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high, interpolation="none", zorder=0
+    )
