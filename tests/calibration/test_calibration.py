@@ -318,8 +318,8 @@ KILLS = 100
 def test_100_kills_leave_the_old_result_or_a_complete_new_one(calibration, tmp_path, monkeypatch):
     """Of the calibration and of each file of its report; what a kill leaves beside them is hidden."""
     known, ready, drawn = {}, [], {}
-    draw = report._figures
-    monkeypatch.setattr(report, "_figures", lambda calibration, evaluations: drawn[calibration.notes])
+    draw = report.calibration_pictures
+    monkeypatch.setattr(report, "calibration_pictures", lambda calibration, evaluations: drawn[calibration.notes])
     for mark in ("old", "new"):
         (tmp_path / mark).mkdir()
         ready.append(tmp_path / f"{mark}.h5")
