@@ -9,12 +9,10 @@ jax.config.update("jax_enable_x64", True)
 
 
 def write_for_ever(ready, drawn, out, begun):
-    """`ready`: calibrations to load; `drawn`: their figures by their notes; `out`: a folder to write them to under one
+    """`ready`: calibrations to load; `drawn`: their pictures by their notes; `out`: a folder to write them to under one
     name; `begun` is set in between."""
     versions = [load_calibration(path) for path in ready]
-    report._figures = lambda calibration, evaluations: drawn[
-        calibration.notes
-    ]  # drawing takes long, and writes nothing
+    report.calibration_pictures = lambda calibration, _: drawn[calibration.notes]  # drawing takes long, writes nothing
     begun.set()
     while True:
         for calibration in versions:
