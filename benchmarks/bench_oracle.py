@@ -205,7 +205,7 @@ def _followed(calibration: Calibration, session: Session) -> Row:
         "median_mm": float(np.median(errors)),
         "p95_mm": float(np.quantile(errors, 0.95)),
         "covered": float(np.mean(inside)),
-        "false_seconds": extra / len(errors),
+        "false_seconds": float(extra) / len(errors),
         "missed": 1 - len(errors) / len(presses.x),
     }
 
