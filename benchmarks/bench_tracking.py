@@ -312,7 +312,7 @@ def learning(run: Run) -> Iterator[Row]:
 
 def coverage(run: Run) -> Iterator[Row]:
     """Single tips of several shapes, each followed while it presses and rests."""
-    seeds, count = run.sizes((1, 10), (1, 1))
+    seeds, count = run.sizes((3, 4), (1, 1))
     model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
     rows: list[Row] = []
     for seed in range(FIRST_SHAPES, FIRST_SHAPES + seeds):

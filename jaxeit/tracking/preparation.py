@@ -2,13 +2,16 @@
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
+from .._compile import verb
 from ..contacts.bump_responses import points_of
+from ..contacts.loads.preparation import field_modes
 from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
@@ -27,6 +30,10 @@ from .settings import TrackerSettings
 
 # Cells of the grid of neighbours, along the longer side.
 GRID = 20
+# Share of the variance of an unknown coat that its modes hold.
+COAT_VARIANCE = 0.99
+# Usual loads along each side of the sheet, of which an unknown coat changes the signal.
+COAT_PLACES = 5
 
 
 def prepare_filter(
@@ -45,14 +52,15 @@ def prepare_filter(
     kept = np.asarray(finder.compress, float) @ found.factor.T
     put = partial(jnp.asarray, dtype=model.dtype)
     whole = conductivity(model) if sigma is None else sigma
-    field, sheet = _loaded_sheet(model, skin, settings, whole, found.electrodes, kept @ found.factor)
+    coat = loads.coat_spread(sigma is not None)
+    field, sheet = _loaded_sheet(model, skin, settings, whole, coat, found.electrodes, kept @ found.factor)
     unit = jnp.eye(len(finder.whitening.channels), dtype=model.dtype)
     tracker = ContactFilter(
         finder=finder,
         compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
         sheet=sheet,
         places=put(field.places),
-        model_error=put(loads.model_error),
+        model_error=put(np.hypot(loads.model_error, _coat_share(sheet, settings) if coat else 0)),
         persistence=put(settings.persistence),
         rates=put(_rates(settings)),
         shape=put(loads.shape),
@@ -67,6 +75,7 @@ def _loaded_sheet(
     skin: Skin,
     settings: TrackerSettings,
     sigma: Float[Array, " elements"],
+    coat: float,
     pairs: np.ndarray,
     mixing: np.ndarray,
 ) -> tuple[GainField, LoadedSheet]:
@@ -83,8 +92,10 @@ def _loaded_sheet(
     centres = np.asarray(fine.centres, float)
     chart, middles = np.asarray(coarse.chart, float), np.asarray(coarse.centroids, float)
     field = GainField.over(np.stack([chart.min(0), chart.max(0)]), middles, loads, settings.level)
+    reanalysis = prepare_reanalysis(coarse, jnp.asarray(mean, coarse.dtype), pairs, mixing, light(0).dtype)
+    of_coat = light(_coat_modes(coarse, coat, loads.coat_length))
     sheet = LoadedSheet(
-        sheet=prepare_reanalysis(coarse, jnp.asarray(mean, coarse.dtype), pairs, mixing, light(0).dtype),
+        sheet=reanalysis,
         neighbours=_neighbours(coarse, centres, settings),
         sigma=light(mean),
         points=light(points),
@@ -94,9 +105,56 @@ def _loaded_sheet(
         pixel_response=light(response * background[:, None]),
         pixel_modes=light(field.modes_at(centres)),
         pad_area=light((masks.weights * masks.areas).T),
+        coat=of_coat,
+        by_coat=reanalysis.slopes_along(light(mean) * of_coat.T, reanalysis.potential),
         law=loads.law,
     )
     return field, sheet
+
+
+def _coat_share(sheet: LoadedSheet, settings: TrackerSettings) -> float:
+    """Part of a contact's signal by which an unknown coat makes it err, root mean square of usual loads all over the
+    sheet.
+
+    The filter takes it for an error of the model, like noise: it then holds to what is known of widths and of the gain
+    where it would otherwise explain the coat by them. What contacts err by even so is a consider covariance.
+    """
+    low, high = sheet.pixels.min(0), sheet.pixels.max(0)
+    along = (jnp.arange(COAT_PLACES, dtype=low.dtype) + 0.5) / COAT_PLACES
+    places = jnp.stack(jnp.meshgrid(*(low + (high - low) * along[:, None]).T), -1).reshape(-1, 2)
+    usual = jnp.log(jnp.asarray([settings.loads.width, settings.loads.force], low.dtype))
+    return float(jnp.sqrt(jnp.mean(_coat_shares(sheet, places, usual))))
+
+
+@verb
+def _coat_shares(sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[Array, "2"]) -> Float[Array, " n"]:
+    """Square of that part, of a load of a usual log width and force at each place."""
+    gain = jnp.zeros(sheet.modes.shape[1], places.dtype)
+
+    def share(place: Float[Array, "2"]) -> Float[Array, ""]:
+        contact = jnp.concatenate([place, usual, jnp.zeros_like(place)])[None]
+        near = sheet.near(contact)
+        seen = sheet.shown(contact, gain, jnp.zeros(0, jnp.int32), near).readings
+        return jnp.sum(sheet.coat_slopes(contact, gain, near) ** 2) / (seen @ seen)
+
+    found: Array = jax.lax.map(share, places)
+    return found
+
+
+def _coat_modes(model: Model, spread: float, length: float) -> Float[np.ndarray, "elements c"]:
+    """Modes of the log conductivity that is not known, of standard deviation ``spread``, on elements; none for zero.
+
+    They are the principal components of the field (Karhunen and Loeve), as many as hold `COAT_VARIANCE` of it.
+    """
+    areas = np.sqrt(np.asarray(model.areas, float))
+    if not spread:
+        return np.zeros((len(areas), 0))
+    modes = field_modes(np.asarray(model.centroids, float), length)
+    left, values, _ = np.linalg.svd(areas[:, None] * modes, full_matrices=False)
+    share = np.cumsum(values**2) / np.sum(values**2)
+    count = 1 + int(np.searchsorted(share, COAT_VARIANCE))
+    found: np.ndarray = spread * (left * values)[:, :count] / areas[:, None]
+    return found
 
 
 def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings) -> Neighbours:

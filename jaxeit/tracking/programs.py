@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compile import bind
+from .consider import consider_covariance
 from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, predicted, unexplained
-from .shapes import shape_covariance
 
 
 class Programs:
@@ -18,7 +18,7 @@ class Programs:
         self._predicted: Callable[..., Belief] = bind(predicted, tracker)
         self._attempted: Callable[..., Attempt] = bind(attempted, tracker)
         self._concluded: Callable[..., Update] = bind(concluded, tracker)
-        self._shape_covariance: Callable[..., Array] = bind(shape_covariance, tracker)
+        self._consider_covariance: Callable[..., Array] = bind(consider_covariance, tracker)
         self._unexplained: Callable[..., Array] = bind(unexplained, tracker)
         self._atoms, self._starts = np.asarray(tracker.finder.atoms), np.asarray(tracker.finder.starts)[:, :2]
         self._dtype = tracker.places.dtype
@@ -43,9 +43,9 @@ class Programs:
         """See `filter.concluded`."""
         return self._concluded(belief, dv, pads, attempt)
 
-    def shape_covariance(self, belief: Belief, pads: Pads) -> Float[np.ndarray, "K 6 6"]:
-        """See `shapes.shape_covariance`."""
-        return np.asarray(self._shape_covariance(belief, pads))
+    def consider_covariance(self, belief: Belief, pads: Pads) -> Float[np.ndarray, "K 6 6"]:
+        """See `consider.consider_covariance`."""
+        return np.asarray(self._consider_covariance(belief, pads))
 
     def unexplained_place(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads

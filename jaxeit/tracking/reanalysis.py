@@ -61,6 +61,19 @@ class Reanalysis(eqx.Module):
                 One may occur twice.
             change: of the conductivity of each element, S.
         """
+        place, inside, y, after = self._solved(elements, unknowns, change)
+        own, before = jnp.where(inside, change, 0), self.potential[unknowns]
+        untouched = self._products(self.slopes[elements], self.potential[self.dofs[elements]])
+        first, second = self.pairs.T
+        moved = -(before.T @ y)[first, second] + own @ untouched
+        products = self._products(self.slopes[elements], after[place])
+        return BeyondFirstOrder(moved @ self.mixing, inside, products - untouched)
+
+    def _solved(
+        self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
+    ) -> tuple[Int[Array, "e k"], Bool[Array, " e"], Float[Array, "m electrodes"], Float[Array, "n electrodes"]]:
+        """Which of the unknowns each element has (m: another one); whether it has no other; Y; and U with a row of
+        zeros more."""
         dofs, slopes, size = self.dofs[elements], self.slopes[elements], len(unknowns)
         place = jnp.full(len(self.green), size).at[unknowns].set(jnp.arange(size))[dofs]
         inside = jnp.all(place < size, 1)
@@ -70,11 +83,20 @@ class Reanalysis(eqx.Module):
         matrix = matrix[:size, :size]
         green, before = self.green[unknowns[:, None], unknowns], self.potential[unknowns]
         y = lapack.solve(jnp.eye(size, dtype=change.dtype) + matrix @ green, matrix @ before)
-        after = jnp.concatenate([before - green @ y, jnp.zeros_like(before[:1])])
-        untouched = self._products(slopes, self.potential[dofs])
-        first, second = self.pairs.T
-        moved = -(before.T @ y)[first, second] + own @ untouched
-        return BeyondFirstOrder(moved @ self.mixing, inside, self._products(slopes, after[place]) - untouched)
+        return place, inside, y, jnp.concatenate([before - green @ y, jnp.zeros_like(before[:1])])
+
+    def potential_after(
+        self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
+    ) -> Float[Array, "n electrodes"]:
+        """Potentials of unit currents into the electrodes after a change, as for `beyond`, on the whole sheet, ohm."""
+        _, _, y, _ = self._solved(elements, unknowns, change)
+        return self.potential - self.green[:, unknowns] @ y
+
+    def slopes_along(
+        self, directions: Float[Array, "d elements"], potential: Float[Array, "n electrodes"]
+    ) -> Float[Array, "d r"]:
+        """Derivatives of the readings along changes of all elements, S, where unit currents have these potentials."""
+        return -(directions @ self._products(self.slopes, potential[self.dofs])) @ self.mixing
 
     def _products(
         self, slopes: Float[Array, "e k s"], potential: Float[Array, "e k electrodes"]

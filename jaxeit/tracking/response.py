@@ -120,6 +120,8 @@ class LoadedSheet(eqx.Module):
     | pixel_response: readings per relative change of each, to first order     | (p, r)           | 1    |
     | pixel_modes: of the log gain of each                                     | (p, g)           | 1    |
     | pad_area: area of each pad in each pixel                                 | (p, pads)        | m^2  |
+    | coat: modes of the log conductivity that is not known, on the coarse mesh | (elements, c)   | 1    |
+    | by_coat: slopes of the readings of the untouched sheet in these          | (c, r)           | 1    |
     | law: factor of conductivity by pressure                                  |                  |      |
     """
 
@@ -133,7 +135,21 @@ class LoadedSheet(eqx.Module):
     pixel_response: Float[Array, "p r"]
     pixel_modes: Float[Array, "p g"]
     pad_area: Float[Array, "p pads"]
+    coat: Float[Array, "elements c"]
+    by_coat: Float[Array, "c r"]
     law: ContactPiezoresistance
+
+    def coat_slopes(self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Near) -> Float[Array, "c r"]:
+        """Slopes of what readings show of contacts in the modes of the coat.
+
+        A frame is a difference to the untouched sheet, so that these are the slopes of the loaded sheet less those of
+        the untouched one, both on the coarse mesh.
+        """
+        pressures = partial(_pressures, contacts.astype(self.points.dtype), shapes=False)
+        change, _ = self._changes(pressures, gain, jnp.zeros(0, jnp.int32), near)
+        after = self.sheet.potential_after(near.elements, near.unknowns, change)
+        loaded = self.sigma.at[near.elements].add(change)
+        return (self.sheet.slopes_along(loaded * self.coat.T, after) - self.by_coat).astype(contacts.dtype)
 
     def near(self, contacts: Float[Array, "K 6"]) -> Near:
         """What is near contacts."""

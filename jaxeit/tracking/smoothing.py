@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .consider import ConsiderErrors
 from .filter import SIZE, Belief, predicted
-from .shapes import ShapeErrors
 from .tracker import Tracker
 from .tracks import Track, Tracking, track_of
 
@@ -99,11 +99,11 @@ class _Frame:
     time: int
     states: dict[int, State]
     edges: dict[int, bool]
-    shapes: ShapeErrors
+    considered: ConsiderErrors
     seconds: float
 
     def timed(self, states: dict[int, State]) -> TimedTracks:
-        whole = {n: self.shapes.added(n, state.covariance) for n, state in states.items()}
+        whole = {n: self.considered.added(n, state.covariance) for n, state in states.items()}
         tracks = (track_of(n, states[n].mean, whole[n], edge) for n, edge in self.edges.items())
         return TimedTracks(self.time, tuple(tracks))
 
@@ -136,7 +136,7 @@ class Smoother:
             for k, number in enumerate(now.numbers)
         }
         edges = dict(zip(now.numbers, now.edges, strict=True))
-        self._frames.append(_Frame(time, states, edges, now.shapes, seconds))
+        self._frames.append(_Frame(time, states, edges, now.considered, seconds))
         if len(self._frames) > 2 * self._lag:
             yield from self._settled(self._lag)
 

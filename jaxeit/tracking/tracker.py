@@ -17,6 +17,7 @@ from ..imaging.background import sheet_of
 from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
+from .consider import ConsiderErrors
 from .events import Events
 from .filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
 from .layer import GainField, LearnedLayer
@@ -24,7 +25,6 @@ from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, wi
 from .preparation import prepare_filter
 from .programs import Programs
 from .settings import TrackerSettings
-from .shapes import ShapeErrors
 from .tracks import Backlog, Look, Seen, Tracking
 
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
@@ -104,7 +104,7 @@ class Tracker:
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         seen = Seen(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
-        return self._with_shapes(bounded(self._stepped(now, seen, whole)), seen.pads)
+        return self._with_considered(bounded(self._stepped(now, seen, whole)), seen.pads)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
@@ -131,15 +131,15 @@ class Tracker:
         if backlog is None:
             return now
         last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.seen
-        return self._with_shapes(bounded(self._looked(now, backlog)), last.pads)
+        return self._with_considered(bounded(self._looked(now, backlog)), last.pads)
 
-    def _with_shapes(self, now: Tracking, pads: Pads) -> Tracking:
-        """With what unknown shapes make the contacts err by."""
+    def _with_considered(self, now: Tracking, pads: Pads) -> Tracking:
+        """With what unknown shapes and an unknown coat make the contacts err by."""
         contacts = np.asarray(now.belief.contacts)
-        if not now.numbers or now.shapes.holds(now.numbers, contacts):
+        if not now.numbers or now.considered.holds(now.numbers, contacts):
             return now
-        covariance = self.programs.shape_covariance(now.belief, pads)
-        return replace(now, shapes=ShapeErrors(now.numbers, contacts[:, :SEEN], covariance))
+        covariance = self.programs.consider_covariance(now.belief, pads)
+        return replace(now, considered=ConsiderErrors(now.numbers, contacts[:, :SEEN], covariance))
 
     def _looked(self, now: Tracking, backlog: Backlog) -> Tracking:
         before, look, waiting = backlog.before, backlog.look, backlog.waiting

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .consider import ConsiderErrors
 from .events import Hypothesis
 from .filter import SIZE, Attempt, Belief, Pads
-from .shapes import ShapeErrors
 
 
 class Track(NamedTuple):
@@ -47,7 +47,7 @@ class Tracking:
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
     | misfit: chi-square of the last frame that was looked into, and frames since then |
-    | shapes: what unknown shapes of loads make the contacts err by         |
+    | considered: what unknown shapes and an unknown coat make the contacts err by |
     | backlog: frames that are not explained yet; the belief is that without events since then |
     """
 
@@ -58,7 +58,7 @@ class Tracking:
     begun: int = 0
     misfit: float = 0.0
     since: int = 0
-    shapes: ShapeErrors = field(default_factory=ShapeErrors)
+    considered: ConsiderErrors = field(default_factory=ConsiderErrors)
     backlog: "Backlog | None" = None
 
     @property
@@ -67,7 +67,7 @@ class Tracking:
         contacts, covariance = np.asarray(self.belief.contacts), np.asarray(self.belief.covariance)
         blocks = [covariance[own, own] for own in (slice(SIZE * k, SIZE * (k + 1)) for k in range(len(contacts)))]
         return tuple(
-            track_of(number, contacts[k], self.shapes.added(number, blocks[k]), edge)
+            track_of(number, contacts[k], self.considered.added(number, blocks[k]), edge)
             for k, (number, edge) in enumerate(zip(self.numbers, self.edges, strict=True))
         )
 

@@ -20,8 +20,8 @@ def blank(model):
 
 @pytest.fixture(scope="session")
 def tracker(model, skin, blank):
-    """Of the testbed at draft fidelity, for two contacts at most."""
-    return prepare_tracker(model, skin, SETTINGS, noise=blank[1])
+    """Of the testbed at draft fidelity, whose sheet is known, for two contacts at most."""
+    return prepare_tracker(model, skin, SETTINGS, noise=blank[1], sigma=model.background)
 
 
 @pytest.fixture(scope="module")

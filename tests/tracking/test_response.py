@@ -53,6 +53,19 @@ def test_with_all_unknowns_reanalysis_is_the_forward_map(model, whitened, sheet,
     np.testing.assert_allclose(found.readings + first_order @ change, exact, atol=1e-6)
 
 
+def test_slopes_along_a_coat_are_those_of_the_forward_map(model, whitened, sheet, touched):
+    change, elements = touched
+    after = sheet.potential_after(elements, _all_unknowns(sheet), change[elements])
+    along = model.background * jnp.sin(30 * model.centroids).T
+
+    def readings(sigma):
+        return whitened.compress @ whitened.whitening.sums(je.forward(model, sigma))
+
+    pressed = model.background + change
+    wanted = (readings(pressed + 1e-5 * along[0]) - readings(pressed - 1e-5 * along[0])) / 2e-5
+    np.testing.assert_allclose(sheet.slopes_along(along, after)[0], wanted, atol=1e-6 * float(jnp.linalg.norm(wanted)))
+
+
 def test_fewer_unknowns_err_less_than_noise(sheet, touched):
     change, elements = touched
     every = sheet.beyond(elements, _all_unknowns(sheet), change[elements]).readings

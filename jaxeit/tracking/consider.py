@@ -1,13 +1,14 @@
-"""What contacts err by because the shapes of their loads are not known.
+"""What contacts err by because the shapes of their loads, and maybe the coat of the sheet, are not known.
 
-The filter takes a load for Gaussian, or for even along an edge. A tip of another shape is the same in all frames, so
-that no frame lessens what it makes the contact err by; and a filter that learned shapes would take a second contact for
-the shape of the first. So the filter leaves shapes out, and what they may cause is added where a contact is handed out:
-a "consider" covariance (Schmidt 1966, Advances in Control Systems 3; Bierman 1977, ch. 8). With the slopes J of frames
-and pads in the numbers of the belief, S in the moments s of the shapes, and the covariance P of these numbers before
-any frame, contacts that rest for n frames come to err by
+The filter takes a load for Gaussian, or for even along an edge, and a sheet of which no untouched frame is at hand for
+even. A tip of another shape and the coat are the same in all frames, so that no frame lessens what they make the
+contact err by; and a filter that learned shapes would take a second contact for the shape of the first. So the filter
+leaves them out, and what they may cause is added where a contact is handed out: a "consider" covariance (Schmidt 1966,
+Advances in Control Systems 3; Bierman 1977, ch. 8). With the slopes J of frames and pads in the numbers of the belief,
+S in the moments of the shapes and in the modes of the coat, all in units of their standard deviations, and the
+covariance P of the numbers before any frame, contacts that rest for n frames come to err by
 
-    (n J^T J + P^-1)^-1 n J^T S s,      s ~ N(0, shape^2).
+    (n J^T J + P^-1)^-1 n J^T S s,      s ~ N(0, 1).
 """
 
 import math
@@ -30,8 +31,8 @@ CHANGED = np.array([0.002, 0.002, 0.1, 0.2, 0.002, 0.002])
 
 
 @verb
-def shape_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Float[Array, "K 6 6"]:
-    """Covariance of the first six numbers of each contact that unknown shapes of all loads cause.
+def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Float[Array, "K 6 6"]:
+    """Covariance of the first six numbers of each contact that unknown shapes of all loads and an unknown coat cause.
 
     Args:
         belief: of one contact or more.
@@ -48,20 +49,24 @@ def shape_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Floa
     of_loads, of_modes = jnp.split(every, [count * (SEEN + MOMENTS)])
     of_numbers, bent = jnp.split(of_loads.reshape(count, SEEN + MOMENTS, -1), [SEEN], 1)
     slopes = jnp.concatenate([of_numbers.reshape(count * SEEN, -1), of_modes])
-    bent = bent.reshape(count * MOMENTS, -1)
+    bent = tracker.shape * bent.reshape(count * MOMENTS, -1)
+    if tracker.sheet.coat.shape[1]:
+        by_coat = tracker.sheet.coat_slopes(contacts, belief.gain, near) / scale
+        # The forces on pads do not depend on the coat.
+        bent = jnp.concatenate([bent, jnp.pad(by_coat, ((0, 0), (0, len(error))))])
     usual = jnp.broadcast_to(tracker.spread, (count, len(tracker.spread)))
     halves = jnp.maximum(jnp.abs(contacts[:, 4:]), ROUND)
     of_gain = jnp.ones(len(modes), halves.dtype)
     before = jnp.concatenate([jnp.concatenate([usual, halves], 1).ravel(), of_gain])
     whitened = before[:, None] * slopes
     root = lapack.cholesky(whitened @ whitened.T + jnp.eye(len(before), dtype=before.dtype), lower=True)
-    moved = before[:, None] * lapack.cho_solve((root, True), whitened @ bent.T) * tracker.shape
-    own = moved[: contacts.size].reshape(count, SEEN, MOMENTS * count)
+    moved = before[:, None] * lapack.cho_solve((root, True), whitened @ bent.T)
+    own = moved[: contacts.size].reshape(count, SEEN, len(bent))
     return jnp.einsum("kim,kjm->kij", own, own)
 
 
-class ShapeErrors(NamedTuple):
-    """What unknown shapes make contacts err by.
+class ConsiderErrors(NamedTuple):
+    """What unknown shapes, and an unknown coat, make contacts err by.
 
     | meaning                                                                | shape     | unit  |
     |------------------------------------------------------------------------|-----------|-------|
@@ -79,7 +84,7 @@ class ShapeErrors(NamedTuple):
         return numbers == self.numbers and bool((np.abs(contacts[:, :SEEN] - self.contacts) < CHANGED).all())
 
     def added(self, number: int, covariance: Float[np.ndarray, "8 8"]) -> Float[np.ndarray, "8 8"]:
-        """The covariance of a contact, with what its unknown shape adds; nothing is added of one that is not known."""
+        """The covariance of a contact with what these errors add to it; nothing to that of another contact."""
         if number not in self.numbers:
             return covariance
         whole = np.array(covariance)
