@@ -363,6 +363,6 @@ def _clamped(polygons: np.ndarray, axis: int, low: np.ndarray, high: np.ndarray)
     crossing = np.clip((lines - start[..., axis][..., None]) / along, 0.0, 1.0)
     t = np.concatenate([np.zeros_like(crossing[..., :1]), np.sort(crossing, -1)], -1)
     points: np.ndarray = start[:, :, None] + t[..., None] * step[:, :, None]
-    points = points.reshape(len(points), -1, 2)
+    points = points.reshape(len(points), 3 * start.shape[1], 2)
     points[..., axis] = np.clip(points[..., axis], low[:, None], high[:, None])
     return points

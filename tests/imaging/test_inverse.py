@@ -234,3 +234,9 @@ def test_pixels_outside_a_disc_have_no_area():
 def _ring():
     angle = 2 * np.pi * np.arange(8) / 8
     return tuple(je.PointElectrode((0.08 * np.cos(a), 0.08 * np.sin(a))) for a in angle)
+
+
+def test_polygons_within_their_boxes_keep_their_areas():
+    triangle = np.array([[[0.2, 0.2], [0.8, 0.2], [0.2, 0.6]]])
+    np.testing.assert_allclose(overlap_areas(triangle, np.zeros((1, 2)), np.ones((1, 2))), [0.12])
+    assert overlap_areas(triangle[:0], np.zeros((0, 2)), np.ones((0, 2))).shape == (0,)
