@@ -1,6 +1,8 @@
 """How far the model of a skin errs, from frames in which one contact presses."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from .._compile import require_known
 from ..imaging.noise import InverseError
 from .filter import Pads
 from .layer import LearnedLayer
@@ -38,14 +41,15 @@ def fit_model_error(
         pad_forces, pad_errors: forces on the pads and their standard errors, (n, pads) N, as for `Tracker.step`.
 
     Raises:
-        InverseError: if there is no frame, or an array has another shape.
+        InverseError: if there is no frame, an array has another shape, or jit hides the values.
     """
+    require_known("fit_model_error", InverseError, dv, pad_forces, pad_errors)
     seen = _seen(tracker, dv, pad_forces, pad_errors)
     least = tracker.settings.loads.model_error
-    count = 1 + max(0, int(np.ceil(np.log(LAST / least) / np.log(STEP))))
-    tried = [_with_model_error(tracker, least * STEP**k) for k in range(count)]
-    found = [_most_probable(tried, *one) for one in seen]
-    return tried[int(np.quantile(found, SHARE, method="higher"))]
+    last = max(0, int(np.ceil(np.log(LAST / least) / np.log(STEP))))
+    tried = cache(lambda k: _with_model_error(tracker, least * STEP**k))  # most presses ask for the first few
+    found = [_most_probable(tried, last, *one) for one in seen]
+    return tried(int(np.quantile(found, SHARE, method="higher")))
 
 
 def press_evidence(
@@ -63,6 +67,7 @@ def press_evidence(
         dv, pad_forces, pad_errors: as for `fit_model_error`.
         layer: as for `Tracker.start`.
     """
+    require_known("press_evidence", InverseError, dv, pad_forces, pad_errors)
     seen = _seen(tracker, dv, pad_forces, pad_errors)
     return np.array([_evidence(tracker, frame, pads, layer) for frame, pads in seen])
 
@@ -80,15 +85,17 @@ def _seen(
     ]
 
 
-def _most_probable(tried: list[Tracker], frame: Float[np.ndarray, " readings"], pads: Pads) -> int:
-    """Which of the trackers makes a frame most probable; the evidence falls from there on."""
-    best = _evidence(tried[0], frame, pads)
-    for k, tracker in enumerate(tried[1:]):
-        evidence = _evidence(tracker, frame, pads)
+def _most_probable(
+    tried: Callable[[int], Tracker], last: int, frame: Float[np.ndarray, " readings"], pads: Pads
+) -> int:
+    """Which of the trackers 0 to ``last`` makes a frame most probable; the evidence falls from there on."""
+    best = _evidence(tried(0), frame, pads)
+    for k in range(last):
+        evidence = _evidence(tried(k + 1), frame, pads)
         if evidence < best:
             return k
         best = evidence
-    return len(tried) - 1
+    return last
 
 
 def _with_model_error(tracker: Tracker, error: float) -> Tracker:
@@ -102,10 +109,9 @@ def _evidence(
 ) -> float:
     """Log of the probability of a frame with one contact, up to a constant that all model errors share."""
     programs, before = tracker.programs, tracker.start(layer).belief
-    place = programs.unexplained_place(before, frame, pads)
-    belief, attempt = tracker.events.with_contact(before, place), None
+    left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + m^2 |y|^2 / n
+    belief, attempt = tracker.events.with_contact(before, programs.explaining_place(left)), None
     while attempt is None or not attempt.ended:
         attempt = programs.attempted(belief, frame, pads, attempt)
-    left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + m^2 |y|^2 / n
     share = 1 - float(tracker.filter.model_error) ** 2 * float(left @ left) / len(left)  # 1 / s^2
     return float(attempt.evidence) + 0.5 * len(left) * float(np.log(share))

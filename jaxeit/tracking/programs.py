@@ -51,7 +51,11 @@ class Programs:
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads
     ) -> Float[np.ndarray, "2"]:
         """Where a contact would explain most of what the contacts leave of a frame, m."""
-        place: np.ndarray = self._starts[int(np.argmax(self._atoms @ self.unexplained(belief, dv, pads)))]
+        return self.explaining_place(self.unexplained(belief, dv, pads))
+
+    def explaining_place(self, left: Float[np.ndarray, " r"]) -> Float[np.ndarray, "2"]:
+        """Where a contact would explain most of what is `unexplained`, m."""
+        place: np.ndarray = self._starts[int(np.argmax(self._atoms @ left))]
         return place
 
     def unexplained(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Float[np.ndarray, " r"]:

@@ -1,10 +1,11 @@
 """How far the model errs, fitted to presses: found where it is known, and what it does to a tracker."""
 
+import jax
 import numpy as np
 import pytest
 
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import fit_model_error
+from jaxeit.tracking import fit_model_error, press_evidence
 from jaxeit.tracking.model_error import STEP
 
 from .conftest import SECONDS, load
@@ -76,3 +77,9 @@ def test_pads_are_data_of_the_fit_too(tracker, presses):
 def test_frames_of_another_shape_are_refused(tracker, dv):
     with pytest.raises(InverseError, match="give one frame"):
         fit_model_error(tracker, dv)
+
+
+@pytest.mark.parametrize("function", [fit_model_error, press_evidence])
+def test_frames_that_jit_hides_are_refused(tracker, presses, function):
+    with pytest.raises(InverseError, match=f"{function.__name__} decides by looking at values"):
+        jax.jit(lambda dv: function(tracker, dv))(presses)
