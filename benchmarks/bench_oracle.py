@@ -27,6 +27,7 @@ import jaxeit as je
 from calib.calibration import Calibration, KnownForces, OrdinaryUse, learn_layer
 from calib.calibration.application import FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
+from calib.calibration.localisation.ellipses import INSIDE_90
 from calib.fitting import FitError
 from calib.fitting.validation import rmse
 from calib.session import Session, open_archive
@@ -155,7 +156,6 @@ def _ratio(found: Evaluation) -> np.ndarray:
 
 FOLLOWED = {"as simulated": Faults(), "protrusions differ by 30 %": Faults(scatter=0.3)}
 OTHER_TIPS = Bench(places=50, levels=(10.0,))
-INSIDE = 4.605  # chi-square of two numbers, below which 90 % lie
 
 
 def tracks(run: Run) -> Iterator[Row]:
@@ -199,7 +199,7 @@ def _followed(calibration: Calibration, session: Session) -> Row:
         extra += len(np.unique(time[own])) < own.sum()
         errors.append(1e3 * nearest.mean())
         square = np.einsum("ni,ni->n", away, np.linalg.solve(covariance[own], away[..., None])[..., 0])
-        inside.append((square < INSIDE).mean())
+        inside.append((square < INSIDE_90**2).mean())
     return {
         "error_mm": float(np.mean(errors)),
         "median_mm": float(np.median(errors)),

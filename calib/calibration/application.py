@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,16 +10,13 @@ from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from .calibration import Calibration
 from .force_maps import USED, ForceEstimate
-from .frame_blocks import FrameBlock, FrameBlocks
-from .layer import estimated, quiet_tracker
-from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed
+from .frame_blocks import FrameBlock, FrameBlocks, Progress, estimated
+from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, quiet_tracker
 from .localisation.load_windows import WindowedFrames, fit_windows
 from .recalibration.agreement import agreement_of_use
 
 FORMAT = "skin-forcemap"
 TRACKS = "tracks/"  # group of the arrays of contacts that were followed
-
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
 def apply(

@@ -1,17 +1,22 @@
-"""Frames of a session in blocks, corrected, with the pressures at their times."""
+"""Frames of a session in blocks, corrected, with the pressures at their times, and the forces in them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..fitting.curves.play_operators import remembered
 from ..presses.corrections import AbstractCorrection, correct
 from ..presses.streams import resample
 from ..presses.table import Processing
 from ..session import Session, SessionError, Stream
 from .calibration import Calibration
-from .force_maps import is_loaded, law_of
+from .force_maps import ForceEstimate, force_map, is_loaded, law_of
+
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 BLOCK = 512  # frames held in memory at once
 MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
@@ -72,3 +77,21 @@ def _around(stream: Stream, time: np.ndarray) -> slice:
             "overlap: check their clocks"
         )
     return slice(first, last)
+
+
+def estimated(calibration: Calibration, blocks: Iterable[FrameBlock]) -> Iterable[tuple[FrameBlock, ForceEstimate]]:
+    """Each block with the forces in its frames."""
+    before = np.zeros((1, len(calibration.skin.pads)))
+    for block in blocks:
+        yield block, _forces(calibration, block, before)
+        if calibration.curves.curve.path:
+            before = remembered(np.concatenate([before, calibration.own_pressures(block.pressed)]))
+
+
+def _forces(calibration: Calibration, block: FrameBlock, before: np.ndarray) -> ForceEstimate:
+    """Forces of a block; the last frame of a shorter one repeats, because each length compiles the program again."""
+    count = len(block.time)
+    rows = np.minimum(np.arange(BLOCK), count - 1)
+    found = force_map(calibration, block.change[rows], block.pressed[rows], before=before)
+    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
+    return cut._replace(map=replace(cut.map, areas=found.map.areas))

@@ -1,26 +1,19 @@
 """The gain of the contact layer, learned from the contacts of a session and kept in the calibration."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
 
-import jax
 import numpy as np
 
 import jaxeit as je
 from jaxeit.tracking import LearnedLayer, Tracker
 
 from ..check.acceptance import accept
-from ..fitting.curves.play_operators import remembered
 from ..presses.table import Processing, resting_levels
 from ..session import Session, SessionError
 from .calibration import Calibration
-from .force_maps import USED, ForceEstimate, force_map
-from .frame_blocks import BLOCK, FrameBlock, FrameBlocks
-from .localisation.contact_tracks import ContactTracks, NotFollowed, prepare_calibrated_tracker, probe_presses
-from .localisation.quiet_frames import ENOUGH, QuietFrames
-
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
+from .force_maps import USED
+from .frame_blocks import FrameBlocks, Progress, estimated
+from .localisation.contact_tracks import ContactTracks, NotFollowed, probe_presses, quiet_tracker
 
 # Share of what was learned before that each new session forgets: skins age between sessions, and errors of the model
 # that last for a session are in no covariance.
@@ -80,38 +73,6 @@ def _is_better(calibration: Calibration, tracker: Tracker, learned: LearnedLayer
         return True
     with_it, without = (je.tracking.press_evidence(tracker, *presses, layer).sum() for layer in (learned, before))
     return bool(with_it > without)
-
-
-def quiet_tracker(calibration: Calibration, blocks: FrameBlocks) -> Tracker:
-    """A tracker with the untouched sheet and the noise of the first frames without contact.
-
-    Raises:
-        NotFollowed: if there are none.
-    """
-    quiet = QuietFrames(calibration.recon.readings)
-    for block in blocks:
-        quiet.add(block.frames, block.change, block.loaded(calibration))
-        if quiet.count >= ENOUGH:
-            break
-    return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise)
-
-
-def estimated(calibration: Calibration, blocks: Iterable[FrameBlock]) -> Iterable[tuple[FrameBlock, ForceEstimate]]:
-    """Each block with the forces in its frames."""
-    before = np.zeros((1, len(calibration.skin.pads)))
-    for block in blocks:
-        yield block, _forces(calibration, block, before)
-        if calibration.curves.curve.path:
-            before = remembered(np.concatenate([before, calibration.own_pressures(block.pressed)]))
-
-
-def _forces(calibration: Calibration, block: FrameBlock, before: np.ndarray) -> ForceEstimate:
-    """Forces of a block; the last frame of a shorter one repeats, because each length compiles the program again."""
-    count = len(block.time)
-    rows = np.minimum(np.arange(BLOCK), count - 1)
-    found = force_map(calibration, block.change[rows], block.pressed[rows], before=before)
-    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
-    return cut._replace(map=replace(cut.map, areas=found.map.areas))
 
 
 def render_layer(layer: LearnedLayer, image: je.imaging.AbstractReconstructor) -> str:

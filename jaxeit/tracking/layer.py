@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..contacts.loads.preparation import field_bumps, field_nodes, field_norm
 from ..contacts.loads.settings import LoadSettings
 from ..imaging.noise import InverseError
 
@@ -39,14 +40,13 @@ class GainField(eqx.Module):
     ) -> "GainField":
         """The field of load settings over a sheet between two corners, m, of variance one at its points on average."""
         length = loads.gain_length
-        axes = [np.arange(low - length, high + 1.5 * length, length) for low, high in corners.T]
-        nodes = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-        norm = float(np.sqrt(np.mean((_bumps(points, nodes, length) ** 2).sum(-1))))
+        nodes = field_nodes(corners[0], corners[1], length)
+        norm = field_norm(field_bumps(points, nodes, length))
         return cls(np.concatenate([np.full((1, 2), np.inf), nodes]), length, level, loads.gain, norm)
 
     def modes_at(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n g"]:
         """Log gain of each mode at points (n, 2) m, per prior standard deviation of the mode."""
-        bumps = _bumps(points, self.places[1:], self.length)
+        bumps = field_bumps(points, self.places[1:], self.length)
         return np.concatenate([np.full((len(points), 1), self.level), self.deviation / self.norm * bumps], 1)
 
     def require_same(self, other: "GainField") -> None:
@@ -62,11 +62,6 @@ class GainField(eqx.Module):
             raise InverseError(
                 "the gain of the contact layer was learned on another sheet or under other settings; learn it again"
             )
-
-
-def _bumps(points: Float[np.ndarray, "n 2"], nodes: Float[np.ndarray, "b 2"], length: float) -> np.ndarray:
-    """Bumps whose sum of products is proportional to exp(-d^2 / 2 length^2)."""
-    return np.asarray(np.exp(-((points[:, None] - nodes) ** 2).sum(-1) / length**2))
 
 
 class LearnedLayer(NamedTuple):
@@ -106,7 +101,7 @@ class LearnedLayer(NamedTuple):
     def at(self, points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Mean and standard deviation of the log gain at points (n, 2) m."""
         modes = self.field.modes_at(points)
-        variance = np.einsum("ng,gh,nh->n", modes, self.covariance, modes)
+        variance = ((modes @ self.covariance) * modes).sum(1)
         return modes @ self.mean, np.sqrt(np.maximum(variance, 0))
 
     def aged(self, share: float) -> "LearnedLayer":

@@ -8,9 +8,9 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.calibration import layer as learning
-from calib.calibration.layer import FORGOTTEN, learn_layer, quiet_tracker, render_layer
-from calib.calibration.localisation.contact_tracks import NotFollowed
+from calib.calibration.layer import FORGOTTEN, learn_layer, render_layer
+from calib.calibration.localisation import contact_tracks
+from calib.calibration.localisation.contact_tracks import NotFollowed, quiet_tracker
 from calib.calibration.press_examples import PressExamples
 from calib.cli import main
 from calib.live.follower import LiveFollower
@@ -20,21 +20,10 @@ from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.tracking import GainField, LearnedLayer, Smoother, Tracker, Tracking
 
 from ..helpers import stand_in
-from .weeks import Skin
 
 PLACES = np.array([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15], [0.1, 0.05]])
 FORCE = np.full(5, 10.0)
 CONTACTS = 3  # that a tracker begins while a session lasts
-
-
-@pytest.fixture(scope="module")
-def later(model, pixels):
-    return Skin(model, pixels)
-
-
-@pytest.fixture(scope="module")
-def calibration(later):
-    return later.calibration()
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +62,7 @@ def better_with_contacts(tracker, dv, forces, errors, layer):
 @pytest.fixture
 def tracker(layer, monkeypatch):
     tracker = FakeTracker(layer)
-    monkeypatch.setattr(learning, "prepare_calibrated_tracker", lambda *_: tracker)
+    monkeypatch.setattr(contact_tracks, "prepare_calibrated_tracker", lambda *_: tracker)
     monkeypatch.setattr(je.tracking, "press_evidence", better_with_contacts)
     monkeypatch.setattr(Smoother, "__init__", lambda *_: None)
     monkeypatch.setattr(Smoother, "add", lambda *_: [])
@@ -142,7 +131,7 @@ def test_a_session_that_tells_nothing_is_refused(calibration, session, tracker, 
         def unknown(*_):
             raise NotFollowed("no frames without contact tell the noise")
 
-        monkeypatch.setattr(learning, "prepare_calibrated_tracker", unknown)
+        monkeypatch.setattr(contact_tracks, "prepare_calibrated_tracker", unknown)
         with pytest.raises(SessionError, match=r"use\.h5: no frames .* noise; record a second without contact"):
             learn_layer(calibration, use)
 

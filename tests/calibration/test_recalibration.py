@@ -24,7 +24,7 @@ from calib.live.engine import Engine, ReceivedFrame
 from calib.live.recalibrator import LiveRecalibrator
 from calib.session import read_archive
 
-from .weeks import SLOPE, S, Skin, rough_sensitivity
+from .weeks import SLOPE, S, rough_sensitivity
 
 LATER = "2026-11-23T09:00:00+00:00"
 GAINS = np.array([1.08, 0.95, 1.0, 1.04])
@@ -34,16 +34,6 @@ TEN = np.array(
      [0.13, 0.17], [0.16, 0.07]]
 )  # fmt: skip
 FORCE = np.array([8.0, 15.0, 12.0, 10.0, 18.0, 9.0, 14.0, 7.0, 16.0, 11.0])
-
-
-@pytest.fixture(scope="module")
-def later(model, pixels):
-    return Skin(model, pixels)
-
-
-@pytest.fixture(scope="module")
-def calibration(later):
-    return later.calibration()
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,10 @@ import jaxeit as je
 from jaxeit.tracking import LearnedLayer, Smoother, TimedTracks, Track, Tracker
 
 from ..calibration import Calibration
+from ..frame_blocks import FrameBlocks
 from .load_windows import FIDELITY
 from .press_images import fit_untouched_sheet
+from .quiet_frames import ENOUGH, QuietFrames
 
 MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
 # Part of a pad's force by which curve and shape of the load may err; its standard error is that of the pressure alone.
@@ -51,6 +53,20 @@ def prepare_calibrated_tracker(
     tracker = je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=sheet, channels=channels)
     presses = probe_presses(calibration)
     return tracker if presses is None else je.tracking.fit_model_error(tracker, *presses)
+
+
+def quiet_tracker(calibration: Calibration, blocks: FrameBlocks) -> Tracker:
+    """A tracker with the untouched sheet and the noise of the first frames without contact.
+
+    Raises:
+        NotFollowed: if there are none.
+    """
+    quiet = QuietFrames(calibration.recon.readings)
+    for block in blocks:
+        quiet.add(block.frames, block.change, block.loaded(calibration))
+        if quiet.count >= ENOUGH:
+            break
+    return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise)
 
 
 def probe_presses(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
