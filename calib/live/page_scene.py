@@ -63,7 +63,7 @@ def full_scales(calibration: Calibration) -> tuple[float, float | None]:
     """
     recon, shown = calibration.recon, calibration.examples
     if shown is None:
-        area = min(_area(pad.outline) for pad in calibration.skin.pads)
+        area = min(pad.area for pad in calibration.skin.pads)
         return rounded_up(float(np.max(calibration.evaluation.force)) / (CONTACT_SHARE * area)), None
     areas = np.asarray(recon.areas)
     unlocated = replace(calibration, field=None, locator=None)
@@ -72,11 +72,6 @@ def full_scales(calibration: Calibration) -> tuple[float, float | None]:
     force = map_force * np.where(total > 0, shown.force / np.where(total > 0, total, 1), 0)[:, None]
     change = np.abs(np.asarray(recon(np.asarray(shown.dv, recon.dtype))))
     return rounded_up(float((force / areas[areas > 0]).max())), rounded_up(float(change.max()))
-
-
-def _area(outline: np.ndarray) -> float:
-    x, y = outline.T
-    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
 
 
 def rounded_up(value: float) -> float:

@@ -234,6 +234,27 @@ def label_y_once(panels: Any) -> None:
         axes.set_ylabel("")
 
 
+def draw_pixels(
+    axes: Any,
+    image: je.imaging.AbstractReconstructor,
+    values: np.ndarray,
+    scale: tuple[float, float, str],
+    interpolation: str | None = "none",
+) -> Any:
+    """Draw values of an image's pixels, with their scale (low, high, colours)."""
+    low, high, colours = scale
+    return axes.imshow(
+        values.reshape(image.shape),
+        origin="lower",
+        extent=np.asarray(image.extent, float) * MM,
+        cmap=colours,
+        vmin=low,
+        vmax=high,
+        interpolation=interpolation,
+        zorder=0,
+    )
+
+
 def value_map(axes: Any, position: np.ndarray, values: np.ndarray, low: float, high: float, colours: str) -> Any:
     """Draw values at places as coloured cells if the places form a grid, otherwise as coloured marks."""
     options = {"vmin": low, "vmax": high, "cmap": colours}

@@ -1,6 +1,6 @@
 """Maps of what was learned of the contact layer's gain."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,7 +8,7 @@ import jaxeit as je
 from jaxeit.tracking import LearnedLayer
 
 from ..calibration import Calibration
-from .figures import MM, draw_sheet, label_y_once, new_figure
+from .figures import draw_pixels, draw_sheet, label_y_once, new_figure
 from .html_parts import number_text
 from .pad_figures import symmetric_limit
 from .panels import Panel, panel, sheet_axes
@@ -31,10 +31,11 @@ def layer_maps(layer: LearnedLayer, recon: je.imaging.AbstractReconstructor) -> 
 def layer_panels(calibration: Calibration) -> list[Panel]:
     """The two maps, a panel each."""
     out = []
-    for k in range(2):
+    for k, (values, scale) in enumerate(_drawn(calibration)):
         figure, axes, bar = sheet_axes(calibration.skin, bar=True, simulated=calibration.simulated)
         limits = axes.get_xlim(), axes.get_ylim()
-        figure.colorbar(_draw(axes, calibration, k), cax=bar).set_label(LABELS[k])
+        drawn = draw_pixels(axes, calibration.recon, values, scale)
+        figure.colorbar(drawn, cax=bar).set_label(LABELS[k])
         axes.set(xlim=limits[0], ylim=limits[1], title=TITLES[k])
         out.append(panel(figure, axes, f"layer{k}"))
     return out
@@ -44,8 +45,9 @@ def layer_figure(calibration: Calibration) -> "Figure":
     """Both maps side by side."""
     figure = new_figure(9.6, 4.4, calibration.simulated)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for k, axes in enumerate(panels):
-        figure.colorbar(_draw(axes, calibration, k), ax=axes, shrink=0.85).set_label(LABELS[k])
+    for k, (axes, (values, scale)) in enumerate(zip(panels, _drawn(calibration), strict=True)):
+        drawn = draw_pixels(axes, calibration.recon, values, scale)
+        figure.colorbar(drawn, ax=axes, shrink=0.85).set_label(LABELS[k])
         draw_sheet(axes, calibration.skin)
         axes.set_title(TITLES[k], fontsize=10)
     label_y_once(panels)
@@ -64,12 +66,9 @@ def about_layer(layer: LearnedLayer) -> tuple[str, str]:
     return alt, caption
 
 
-def _draw(axes: Any, calibration: Calibration, which: int) -> Any:
+def _drawn(calibration: Calibration) -> list[tuple[np.ndarray, tuple[float, float, str]]]:
+    """The maps with their scales of colour."""
     assert calibration.layer is not None
-    values, recon = layer_maps(calibration.layer, calibration.recon)[which], calibration.recon
-    reach = symmetric_limit(np.nan_to_num(values - 1))
-    low, high, colours = (0.0, float(np.nanmax(values)), "Purples") if which else (1 - reach, 1 + reach, "RdBu_r")
-    extent = np.asarray(recon.extent, float) * MM
-    return axes.imshow(
-        values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high, interpolation="none", zorder=0
-    )
+    gain, spread = layer_maps(calibration.layer, calibration.recon)
+    reach = symmetric_limit(np.nan_to_num(gain - 1))
+    return [(gain, (1 - reach, 1 + reach, "RdBu_r")), (spread, (0.0, float(np.nanmax(spread)), "Purples"))]

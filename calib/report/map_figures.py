@@ -8,7 +8,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.force_maps import force_map
 from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from .example_contacts import example_contacts, half_axes
-from .figures import MM, RED, draw_sheet, label_y_once, new_figure
+from .figures import MM, RED, draw_pixels, draw_sheet, label_y_once, new_figure
 from .html_parts import number_text
 
 if TYPE_CHECKING:
@@ -79,13 +79,9 @@ def _row(
     figure: Any, panels: Any, calibration: Calibration, values: np.ndarray, colours: str, label: str, *, symmetric: bool
 ) -> None:
     """One row of pictures (n, pixels) with a common colour scale."""
-    recon = calibration.recon
     high = float(np.nanmax(np.abs(values))) or 1.0
-    low = -high if symmetric else 0.0
-    extent = np.asarray(recon.extent, float) * MM
+    scale = (-high if symmetric else 0.0, high, colours)
     for axes, picture in zip(panels, values, strict=True):
-        drawn = axes.imshow(
-            picture.reshape(recon.shape), origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high
-        )
+        drawn = draw_pixels(axes, calibration.recon, picture, scale, interpolation=None)
         draw_sheet(axes, calibration.skin)
     figure.colorbar(drawn, ax=panels, shrink=0.8, pad=0.02).set_label(label)

@@ -15,6 +15,7 @@ from .figures import (
     MM,
     RED,
     colour_reach,
+    draw_pixels,
     localisation_panel,
     sensitivity_maps,
     sensitivity_title,
@@ -55,21 +56,10 @@ def _map_panel(
     *,
     contact: bool = False,
 ) -> Panel:
-    calibration, (low, high, colours) = maps.calibration, scale
+    calibration = maps.calibration
     figure, axes, bar = sheet_axes(calibration.skin, bar=True, simulated=calibration.simulated)
-    recon = calibration.recon
-    extent = np.asarray(recon.extent, float) * MM
     limits = axes.get_xlim(), axes.get_ylim()
-    drawn = axes.imshow(
-        values.reshape(recon.shape),
-        origin="lower",
-        extent=extent,
-        cmap=colours,
-        vmin=low,
-        vmax=high,
-        interpolation="none",
-        zorder=0,
-    )
+    drawn = draw_pixels(axes, calibration.recon, values, scale)
     axes.set(xlim=limits[0], ylim=limits[1])
     figure.colorbar(drawn, cax=bar).set_label(label)
     axes.plot(*(maps.shown.position[k] * MM), "+", color=RED, ms=9)
