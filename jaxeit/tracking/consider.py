@@ -1,12 +1,14 @@
-"""What contacts err by because the shapes of their loads, and maybe the coat of the sheet, are not known.
+"""What contacts err by because of what stays the same in all frames: shapes of loads, coat, errors of the model.
 
 The filter takes a load for Gaussian, or for even along an edge, and a sheet of which no untouched frame is at hand for
 even. A tip of another shape and the coat are the same in all frames, so that no frame lessens what they make the
-contact err by; and a filter that learned shapes would take a second contact for the shape of the first. So the filter
-leaves them out, and what they may cause is added where a contact is handed out: a "consider" covariance (Schmidt 1966,
-Advances in Control Systems 3; Bierman 1977, ch. 8). With the slopes J of frames and pads in the numbers of the belief,
-S in the moments of the shapes and in the modes of the coat, all in units of their standard deviations, and the
-covariance P of the numbers before any frame, contacts that rest for n frames come to err by
+contact err by; and a filter that learned shapes would take a second contact for the shape of the first. Errors of mesh
+and contact layer last as long as a press, and the filter forgets them after `TrackerSettings.persistence`, lest it take
+them for further contacts. What all of these may cause is added where a contact is handed out: a "consider" covariance
+(Schmidt 1966, Advances in Control Systems 3; Bierman 1977, ch. 8). With the slopes J of frames and pads in the numbers
+of the belief, S in the moments of the shapes, in the modes of the coat and in the errors of the model, all in units of
+their standard deviations, and the covariance P of the numbers before any frame, contacts that rest for n frames come to
+err by
 
     (n J^T J + P^-1)^-1 n J^T S s,      s ~ N(0, 1).
 """
@@ -32,7 +34,7 @@ CHANGED = np.array([0.002, 0.002, 0.1, 0.2, 0.002, 0.002])
 
 @verb
 def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Float[Array, "K 6 6"]:
-    """Covariance of the first six numbers of each contact that unknown shapes of all loads and an unknown coat cause.
+    """Covariance of the first six numbers of each contact that unknown shapes, coat and errors of the model cause.
 
     Args:
         belief: of one contact or more.
@@ -43,8 +45,8 @@ def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> F
     near = tracker.sheet.near(contacts)
     modes = active[contacts.size :] - belief.contacts.size
     shown = tracker.sheet.shown(contacts, belief.gain, modes, near, shapes=True)
-    share = tracker.model_error**2 * (shown.readings @ shown.readings) / len(shown.readings)
-    scale, error = jnp.sqrt((1 + share) / FRAMES), pads.error / math.sqrt(FRAMES)
+    square = (shown.readings @ shown.readings) / len(shown.readings)
+    scale, error = jnp.sqrt((1 + tracker.error_share * square) / FRAMES), pads.error / math.sqrt(FRAMES)
     every = jnp.concatenate([shown.reading_slopes / scale, shown.pad_slopes / error], 1)
     of_loads, of_modes = jnp.split(every, [count * (SEEN + MOMENTS)])
     of_numbers, bent = jnp.split(of_loads.reshape(count, SEEN + MOMENTS, -1), [SEEN], 1)
@@ -54,6 +56,8 @@ def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> F
         by_coat = tracker.sheet.coat_slopes(contacts, belief.gain, near) / scale
         # The forces on pads do not depend on the coat.
         bent = jnp.concatenate([bent, jnp.pad(by_coat, ((0, 0), (0, len(error))))])
+    unit = jnp.eye(len(shown.readings), every.shape[1], dtype=every.dtype)
+    bent = jnp.concatenate([bent, tracker.model_error * jnp.sqrt(square) / scale * unit])
     usual = jnp.broadcast_to(tracker.spread, (count, len(tracker.spread)))
     halves = jnp.maximum(jnp.abs(contacts[:, 4:]), ROUND)
     of_gain = jnp.ones(len(modes), halves.dtype)
@@ -66,7 +70,7 @@ def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> F
 
 
 class ConsiderErrors(NamedTuple):
-    """What unknown shapes, and an unknown coat, make contacts err by.
+    """What unknown shapes, an unknown coat and errors of the model make contacts err by.
 
     | meaning                                                                | shape     | unit  |
     |------------------------------------------------------------------------|-----------|-------|

@@ -115,8 +115,9 @@ class ContactFilter(eqx.Module):
     | compress: whitened readings of a frame that lacks none                   | (r, readings)    | 1/V  |
     | sheet: what contacts show                                                |                  |      |
     | places: where the modes of the gain lie; the first is the level          | (g, 2)           | m    |
-    | model_error: part of the signal by which mesh, sheet and load shape err  | ()               | 1    |
-    | persistence of that error                                                | ()               | s    |
+    | model_error: part of the signal by which mesh and contact layer err      | ()               | 1    |
+    | coat_error: part of the signal by which an unknown coat makes it err     | ()               | 1    |
+    | persistence of these errors                                              | ()               | s    |
     | shape: standard deviation of each moment of a load's shape               | ()               | 1    |
     | spread: of place (2), log width and log force before a contact is seen   | (4,)             | m, 1 |
     | rates: random walk of each number of a contact                           | (8,)             | per sqrt(s) |
@@ -127,11 +128,17 @@ class ContactFilter(eqx.Module):
     sheet: LoadedSheet
     places: Float[Array, "g 2"]
     model_error: Float[Array, ""]
+    coat_error: Float[Array, ""]
     persistence: Float[Array, ""]
     rates: Float[Array, "8"]
     shape: Float[Array, ""]
     spread: Float[Array, "4"]
     active_modes: int = eqx.field(static=True)
+
+    @property
+    def error_share(self) -> Float[Array, ""]:
+        """Share of the square of a signal that is an error of the model or caused by an unknown coat."""
+        return self.model_error**2 + self.coat_error**2
 
 
 @verb
@@ -224,7 +231,7 @@ def _seen(tracker: ContactFilter, dv: Float[Array, " readings"]) -> tuple[Frame,
     quick = Frame(y, none, none, tracker.finder.root)
     frame = jax.lax.cond(whole, lambda dv: quick, lambda dv: tracker.finder.compressed(dv)[0], dv)
     whole = whole | jnp.all(jnp.isfinite(dv) | ~tracker.finder.whitening.channels)
-    return frame, whole, tracker.model_error**2 * (frame.y @ frame.y) / len(frame.y)
+    return frame, whole, tracker.error_share * (frame.y @ frame.y) / len(frame.y)
 
 
 def _problem(

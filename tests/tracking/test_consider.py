@@ -127,11 +127,11 @@ def test_slopes_in_the_coat_are_those_of_the_forward_map(model, even_tracker, co
 
 def test_a_sheet_that_is_known_has_no_unknown_coat(model, skin, blank, tracker, even_tracker):
     """Nor has one of which the settings say so."""
-    assert 0.08 < float(even_tracker.filter.model_error) < 0.16
+    assert 0.08 < float(even_tracker.filter.coat_error) < 0.16
     settings = replace(SETTINGS, loads=replace(SETTINGS.loads, coat=0.0))
     for known in (tracker.filter, prepare_tracker(model, skin, settings, noise=blank[1]).filter):
         assert known.sheet.coat.shape[1] == 0
-        assert float(known.model_error) == SETTINGS.loads.model_error
+        assert float(known.coat_error) == 0
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,11 @@
 import jax
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, press_evidence
+from jaxeit.tracking.filter import SIZE
 from jaxeit.tracking.model_error import STEP
 
 from .conftest import SECONDS, load
@@ -66,6 +68,25 @@ def test_a_tracker_takes_no_error_of_the_model_for_a_second_contact(tracker, fra
     assert counts[0][2] >= 10
     assert counts[1][2] == 0
     assert counts[1][1] >= 5 * len(PLACES)
+
+
+def test_ellipses_hold_places_under_an_error_that_lasts_as_long_as_the_press(humble, presses):
+    """No frame lessens it, and the filter by itself forgets it."""
+    rng, by_filter, whole = np.random.default_rng(6), [], []
+    for frame, place in zip(np.tile(presses, (2, 1)), np.tile(PLACES, (2, 1)), strict=True):
+        seen, now = wrong(frame, rng), humble.start()
+        for _ in range(60):
+            now = humble.step(now, seen, 5 * SECONDS)
+        track = min(now.tracks, key=lambda t, p=place: np.linalg.norm(t.position - p))
+        own = SIZE * now.numbers.index(track.number) + np.arange(2)
+        away = track.position - place
+        for held, covariance in (
+            (by_filter, np.asarray(now.belief.covariance)[np.ix_(own, own)]),
+            (whole, track.covariance),
+        ):
+            held.append(away @ np.linalg.solve(covariance, away) < chi2.ppf(0.9, 2))
+    assert np.mean(by_filter) < 0.7
+    assert np.mean(whole) > 0.8
 
 
 def test_pads_are_data_of_the_fit_too(tracker, presses):

@@ -112,7 +112,7 @@ def test_an_update_is_the_conditional_normal_distribution(tracker, followed):
     np.testing.assert_allclose(found.contacts, belief.contacts, atol=1e-5)
     slopes, prior = np.zeros((len(y), len(belief.covariance))), np.asarray(belief.covariance)
     slopes[:, active] = np.asarray(shown.reading_slopes).T
-    variance = 1 + float(filter_.model_error) ** 2 * (y @ y) / len(y)
+    variance = 1 + float(filter_.error_share) * (y @ y) / len(y)
     gain = np.linalg.solve(slopes @ prior @ slopes.T + variance * np.eye(len(y)), slopes @ prior).T
     wanted = prior - gain @ slopes @ prior
     scale = np.sqrt(np.diag(wanted))
