@@ -90,3 +90,27 @@ def test_surfaces_that_cannot_be():
         je.Cylinder(0.0)
     with pytest.raises(ValueError, match="larger radius"):
         je.Sphere(0.01)(np.array([[0.1, 0.0]]))
+
+
+@pytest.mark.parametrize("surface", [je.geometry.Plane(), je.Cylinder(0.3, 0.14), je.Sphere(0.2, (0.1, 0.05))])
+def test_points_above_a_surface_are_found_on_the_sheet(surface):
+    """Normals by differences of the map, and the points above them."""
+    chart = np.vstack([np.random.default_rng(0).uniform(-0.1, 0.3, (20, 2)), [[0.1, 0.05]]])
+    at, step = surface(chart), 1e-6
+    along = [(surface(chart + step * e) - surface(chart - step * e)) / (2 * step) for e in np.eye(2)]
+    normal = np.cross(*along)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = np.linspace(-0.01, 0.02, len(chart))
+    found = surface.project(at + height[:, None] * normal)
+    np.testing.assert_allclose(found.chart, chart, atol=1e-12)
+    np.testing.assert_allclose(found.height, height, atol=1e-12)
+    np.testing.assert_allclose(found.normal, normal, atol=1e-8)
+
+
+def test_a_surface_of_ones_own_says_what_the_reverse_needs():
+    class Ramp(je.geometry.AbstractSurface):
+        def __call__(self, chart):
+            return np.column_stack([chart, chart[:, 0]])
+
+    with pytest.raises(je.geometry.SurfaceError, match="Ramp maps to space only; define its method project"):
+        Ramp().project(np.zeros((1, 3)))

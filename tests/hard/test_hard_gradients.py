@@ -75,6 +75,7 @@ HOST = {
     "triangulate": _GEOMETRY,
     "AbstractSurface": _GEOMETRY,
     "Cylinder": _GEOMETRY,
+    "Plane": _GEOMETRY,
     "Sphere": _GEOMETRY,
     "verb": "a decorator",
     "AbstractEstimator": "an abstract base of cases",
