@@ -12,6 +12,7 @@ from . import (
     record as record,
     report as report,
     session as session,
+    simulators as simulators,
 )
 from .batch.sessions import calibrate_many as calibrate_many
 from .bench import Bench as Bench, load_bench as load_bench, simulate as simulate

@@ -25,8 +25,8 @@ ORDER = [
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "__main__",
 ]  # fmt: skip
 BENCH = [
-    "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "export", "bench", "live",
-    "report", "batch", "cli",
+    "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "export", "bench",
+    "simulators", "live", "report", "batch", "cli",
 ]  # fmt: skip
 
 
