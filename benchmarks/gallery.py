@@ -83,6 +83,17 @@ def image_and_forces(axes: Any, names: Names) -> None:
     axes.set(xlabel="x, mm", ylabel="y, mm", title="kPa")
 
 
+def mujoco_ball_on_chest(axes: Any, names: Names) -> None:
+    """The force map of the last step, the way of the ball, and where contacts were found at every fourth step."""
+    recon, force = names["calibration"].recon, np.asarray(names["found"].map.force[-1])
+    pressure = (force / np.asarray(recon.areas)).reshape(recon.shape) / MM
+    axes.imshow(pressure, origin="lower", extent=MM * np.array(recon.extent), cmap="Blues")
+    axes.plot(*(MM * names["ball"].T), "-", color=GREY, linewidth=1)
+    axes.plot(*(MM * names["found"].position[::4].reshape(-1, 2).T), "x", color=ORANGE, markersize=4)
+    axes.set(xlabel="x, mm", ylabel="y, mm")
+    axes.set_title("force map; way of the ball, and as found", fontsize=8)
+
+
 def write_a_session(axes: Any, names: Names) -> None:
     axes.plot(np.arange(1000) / 100, names["pressures"], color=BLUE)
     axes.set(xlabel="s", ylabel="Pa")
@@ -127,6 +138,7 @@ DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "many_presses": many_presses,
     "mesh_of_my_own": mesh_of_my_own,
     "missing_readings": lambda axes, n: _bars(axes, n["changes"], "change of the image"),
+    "mujoco_ball_on_chest": mujoco_ball_on_chest,
     "my_own_effect": lambda axes, n: _line(axes, 1e3 * n["dry"], 1e3 * n["wet"], "dry, mV", "wet, mV", "."),
     "my_own_prior": lambda axes, n: _bars(axes, n["far"], "artefact beyond 50 mm, of the peak"),
     "noise_of_an_image": noise_of_an_image,

@@ -17,6 +17,9 @@ FINDS = {
     "many_presses": lambda names: names["error"] < 0.015,
     "mesh_of_my_own": lambda names: 0.001 < names["change"] < 0.02,
     "missing_readings": lambda names: names["changes"]["left out"] < 0.1 < names["changes"]["taken for zero"],
+    "mujoco_ball_on_chest": lambda names: (
+        names["rms"] < 0.8 and names["place"] < 0.003 and abs(names["finger"] - names["touched"][-1].force[1]) < 0.8
+    ),
     "my_own_effect": lambda names: jnp.abs(names["wet"] - names["dry"]).max() > 0,
     "my_own_prior": lambda names: names["far"]["Near"] < 0.5 * names["far"]["Noser"],
     "noise_of_an_image": lambda names: names["apart"] < 0.1,
@@ -70,6 +73,8 @@ def test_every_example_is_run_and_listed(root):
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in sorted(FINDS)]
 )
 def test_an_example_finds_what_it_says(root, name, capsys):
+    if name.startswith("mujoco"):
+        pytest.importorskip("mujoco")
     names = runpy.run_path(str(root / "examples" / f"{name}.py"))
     assert FINDS[name](names)
     assert capsys.readouterr().out.count("\n") >= 1
