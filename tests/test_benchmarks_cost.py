@@ -277,7 +277,8 @@ def test_a_part_measured_again_leaves_the_others(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["bench_fit", "bench_images", "bench_live", "bench_paper", "bench_scene", "paper_figures"]
+    "name",
+    ["bench_fit", "bench_images", "bench_live", "bench_paper", "bench_scene", "bench_simulator", "paper_figures"],
 )
 def test_smoke_of_those_without_a_test_of_their_own(name, root):
     """As a command; nothing is written."""
