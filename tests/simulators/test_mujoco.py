@@ -135,6 +135,7 @@ def test_a_sensor_of_another_kind_is_refused(skin):
         SensorReader(model, skin, sensor="touch", site="sheet")
 
 
+@pytest.mark.slow
 def test_the_programs_of_the_page(root):
     pytest.importorskip("mujoco.batch")  # MuJoCo 3.17 and later
     names = run(root / "docs" / "mujoco.md", {})
