@@ -14,8 +14,14 @@ from . import (
     session as session,
     simulators as simulators,
 )
+from .batch.random_frames import write_training_frames as write_training_frames
 from .batch.sessions import calibrate_many as calibrate_many
-from .bench import Bench as Bench, load_bench as load_bench, simulate as simulate
+from .bench import (
+    Bench as Bench,
+    load_bench as load_bench,
+    open_training_frames as open_training_frames,
+    simulate as simulate,
+)
 from .calibration import (
     Calibration as Calibration,
     Evaluation as Evaluation,

@@ -1,1 +1,1 @@
-"""Calibrate many sessions in parallel, by several processes or a cluster."""
+"""Calibrate many sessions, or simulate frames for training, by several processes or a cluster."""

@@ -7,21 +7,17 @@ one folder share the work.
 """
 
 import contextlib
-import hashlib
-import multiprocessing
 import os
 import pickle
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 import jaxeit as je
 
@@ -33,8 +29,9 @@ from ..report.figures import require_matplotlib
 from ..report.log_document import write_log_report
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
+from .digests import describe, digest
 from .logs import ensure_log_calibration
-from .workers import begin
+from .workers import ONE_AT_A_TIME, spawned_pool
 
 try:
     import fcntl
@@ -146,7 +143,7 @@ def _tasks(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
-    mark = _digest(recipe.to_toml(), _describe(skin), str(ignore_errors), je.__version__, jax.__version__)
+    mark = digest(recipe.to_toml(), describe(skin), str(ignore_errors), je.__version__, jax.__version__)
     shared: dict[str, Any] = {
         "report": report,
         "choices": pickle.dumps((skin, recipe, ignore_errors)),
@@ -167,25 +164,6 @@ def _tasks(
             raise SessionError(f"{session}: its result would take its place; choose another folder for the output")
         tasks.append(_Task(session, os.path.abspath(out / name), **shared))
     return tasks
-
-
-def _describe(value: Any) -> str:
-    """Describe an object completely, arrays bit by bit: equal texts mean equal objects, on every run."""
-    if isinstance(value, Mapping):
-        return _describe(sorted(value.items()))
-    if isinstance(value, (list, tuple)):
-        return f"[{','.join(map(_describe, value))}]"
-    if isinstance(value, (np.ndarray, jax.Array)):
-        array = np.asarray(value)
-        return f"{array.dtype}{array.shape}{array.tobytes().hex()}"
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = (f"{f.name}={_describe(getattr(value, f.name))}" for f in fields(value))
-        return f"{type(value).__qualname__}({','.join(parts)})"
-    return repr(value)
-
-
-def _digest(*texts: str) -> str:
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
 
 def render_outcomes(outcomes: Sequence[Outcome], out: str | os.PathLike[str]) -> str:
@@ -212,20 +190,16 @@ def _line(outcome: Outcome, width: int) -> str:
 # --- running -------------------------------------------------------------------------------------
 
 
-def _pool(jobs: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=begin)
-
-
 def _run_in_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
     """Run the tasks in pools of processes; a session whose worker died is tried once more in a process of its own."""
     left = list(tasks)
     while left:
         now, later = left[: jobs * _SESSIONS_PER_WORKER], left[jobs * _SESSIONS_PER_WORKER :]
-        with _pool(min(jobs, len(now))) as pool:
+        with spawned_pool(min(jobs, len(now))) as pool:
             broken = _run(pool, now, note)
         suspects = [task for task in broken if _lock_of(task.calibration).exists()] or broken[:1]
         for task in suspects:
-            with _pool(1) as alone:
+            with spawned_pool(1) as alone:
                 died = bool(_run(alone, [task], note))
             if died:
                 _lock_of(task.calibration).unlink(missing_ok=True)
@@ -269,13 +243,11 @@ def _error_text(error: Exception) -> str:
 
 # --- in the worker -------------------------------------------------------------------------------
 
-_ONE_AT_A_TIME = threading.Lock()  # compiled linear algebra called by two threads at once can hang
-
 
 def calibrate_one(task: _Task) -> Outcome:
     """Do one task, unless it is done already; does not raise for a session that cannot be calibrated."""
     start = time.perf_counter()
-    with _ONE_AT_A_TIME:
+    with ONE_AT_A_TIME:
         take_over(task.settings)
         try:
             with _exclusive(task.calibration):
@@ -288,7 +260,7 @@ def calibrate_one(task: _Task) -> Outcome:
 def _do_task(task: _Task) -> Outcome:
     """Do a task and return its outcome; a session without EIT is a log."""
     with open_session(task.session) as session:
-        mark = _digest(session.hash, task.mark)
+        mark = digest(session.hash, task.mark)
         if "eit" not in session.streams:
             return _do_log(task, session, mark)
         calibration, skipped = _ensure_calibration(task, session, mark)

@@ -4,7 +4,8 @@ import contextlib
 import os
 import signal
 import threading
-from multiprocessing import connection, parent_process
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import connection, get_context, parent_process
 
 ONE_THREAD = {
     "PJRT_NPROC": "1",
@@ -14,6 +15,14 @@ ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
 }
 """Environment of a worker: one thread of XLA and of every BLAS, as each core has a worker of its own."""
+
+ONE_AT_A_TIME = threading.Lock()
+"""Held by a worker that computes: compiled linear algebra called by two threads at once can hang."""
+
+
+def spawned_pool(jobs: int) -> ProcessPoolExecutor:
+    """A pool of spawned processes with one thread of computation each."""
+    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=begin)
 
 
 def begin() -> None:

@@ -7,18 +7,24 @@ discretisation error of the simulation (no inverse crime).
 from .bench import Bench, BenchError, Companion, Timing, load_bench, presets
 from .costs import PartCost, measure_costs, render_costs
 from .dataset import grid, simulate_contacts, write_data_set
+from .random_scenes import Footprint, RandomScenes
 from .simulation import SIMULATION, simulate
+from .training_frames import TrainingFrames, open_training_frames
 
 __all__ = [
     "SIMULATION",
     "Bench",
     "BenchError",
     "Companion",
+    "Footprint",
     "PartCost",
+    "RandomScenes",
     "Timing",
+    "TrainingFrames",
     "grid",
     "load_bench",
     "measure_costs",
+    "open_training_frames",
     "presets",
     "render_costs",
     "simulate",

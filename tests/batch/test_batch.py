@@ -17,6 +17,7 @@ import calib
 import calib.batch.sessions as batch
 import jaxeit as je
 from calib.batch import cluster
+from calib.batch.digests import describe
 from calib.calibration.logs.procedure import curves_of
 from calib.calibration.recipe_text import curve_choice
 from calib.cli import main
@@ -172,7 +173,7 @@ def test_the_command_of_a_cluster_without_dask_is_one_line(sessions, tmp_path, c
 
 def test_equal_options_are_told_alike_and_others_apart():
     told = [
-        batch._describe(options)
+        describe(options)
         for options in (
             {"a": calib.PowerLaw(900.0), "b": None},
             {"b": None, "a": calib.PowerLaw(900.0)},
@@ -269,7 +270,7 @@ def test_a_session_that_kills_its_worker_is_named_and_the_rest_complete(made, bu
     folder.mkdir()
     names = [str(shutil.copy(bundled[1], folder / f"{name}.h5")) for name in ("a", "kills", "c", "d")]
     ready = str(made[0] / "testbed_grid.h5")
-    monkeypatch.setattr(batch, "_pool", lambda jobs: deadly_pool(jobs, ready))
+    monkeypatch.setattr(batch, "spawned_pool", lambda jobs: deadly_pool(jobs, ready))
     outcomes = batch.calibrate_many(names, out, jobs=2)
     assert [bool(o.reason) for o in outcomes] == [False, True, False, False]
     assert "worker process died" in outcomes[1].reason

@@ -3,11 +3,12 @@
 import argparse
 import shlex
 import sys
-from contextlib import suppress
+import time
+from contextlib import ExitStack, suppress
 from itertools import chain
 from pathlib import Path
 
-from ..arguments import prepare_outputs, skin_of
+from ..arguments import count, prepare_outputs, skin_of
 from ..signals import interruption_status
 from ..terminal import announce_model, progress_bar
 
@@ -15,7 +16,7 @@ from ..terminal import announce_model, progress_bar
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A scene, or a skin for a data set, and what to do with it."""
     parser.add_argument("scene", metavar="SCENE.toml", help="a scene file, or a shipped scene by its name")
-    parser.add_argument("-o", "--output", metavar="SESSION.h5")
+    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="with --random-scenes, a folder")
     text = "print what the scene simulates and what each part costs, and simulate nothing"
     parser.add_argument("--explain", action="store_true", help=text)
     text = (
@@ -24,12 +25,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--serve", action="store_true", help=text)
     text = "write a data set (HDF5) of Gaussian contacts of 0 to 100 %% at N x N places of a skin, which SCENE names; "
     parser.add_argument("--data-set", nargs="?", type=int, const=41, metavar="N", help=text + "default N: 41")
+    _add_random_scenes(parser)
+
+
+def _add_random_scenes(parser: argparse.ArgumentParser) -> None:
+    about = (
+        "frames of random contacts on skins drawn anew, with pressures and true force maps; the same command resumes"
+    )
+    group = parser.add_argument_group("frames for training", about)
+    text = "write so many frames into the folder given by -o; the presses of the scene are not used"
+    group.add_argument("--random-scenes", type=count, metavar="FRAMES", help=text)
+    group.add_argument("--seed", type=int, metavar="N", help="of all that is drawn; default: that of the scene")
+    text = "accuracy of the finite-element model (default: standard); one of draft, standard, reference"
+    action = group.add_argument("--fidelity", metavar="NAME", help=text)
+    action.suggestions = ("draft", "standard", "reference")  # type: ignore[attr-defined]
+    group.add_argument("--pixels", type=count, metavar="N", help="pixels of the force map along x; default: 40")
+    many = group.add_mutually_exclusive_group()
+    many.add_argument("--jobs", type=count, metavar="N", help="number of processes; the bytes do not depend on it")
+    text = "as --jobs, on the workers of a Dask scheduler, which must see the same folder"
+    many.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, explain, or serve a scene."""
     if bool(args.output) == args.explain:
         raise ValueError("give either -o SESSION.h5 to simulate, or --explain")
+    _refuse_lone_options(args)
     from ...runtime import set_up
 
     set_up()
@@ -37,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.data_set:
         return _simulate_data_set(args)
+    if args.random_scenes:
+        return _simulate_random_scenes(args)
     bench = load_bench(args.scene)
     if args.explain:
         print(render_costs(bench, measure_costs(bench)))
@@ -99,4 +122,62 @@ def _simulate_data_set(args: argparse.Namespace) -> int:
     skin, progress = skin_of(str(args.scene)), progress_bar("contacts")
     places, steps = write_data_set(skin, args.output, columns=args.data_set, rows=args.data_set, progress=progress)
     print(f"{args.output}: {places} places, {steps} amplitudes, SIMULATED")
+    return 0
+
+
+_FOR_RANDOM_SCENES = ("seed", "fidelity", "pixels", "jobs", "scheduler")
+
+
+def _refuse_lone_options(args: argparse.Namespace) -> None:
+    given = [f"--{name}" for name in _FOR_RANDOM_SCENES if getattr(args, name) is not None]
+    if given and not args.random_scenes:
+        raise ValueError(
+            f"{', '.join(given)}: for frames for training; give --random-scenes FRAMES too, or leave it out"
+        )
+    if args.random_scenes and (args.data_set or args.explain or args.serve):
+        raise ValueError("--data-set, --explain and --serve make something else than --random-scenes; leave them out")
+
+
+def _simulate_random_scenes(args: argparse.Namespace) -> int:
+    """Write frames for training; an interruption leaves whole shards, from which the same command goes on."""
+    from tqdm import tqdm
+
+    import jaxeit as je
+
+    from ...batch.cluster import dask_executor
+    from ...batch.random_frames import write_training_frames
+    from ...bench import load_bench
+    from ...calibration.recipe_text import fidelity_choice
+
+    bench, start = load_bench(args.scene), time.monotonic()
+    with ExitStack() as stack:
+        executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
+        bar = stack.enter_context(tqdm(desc="frames", unit="", unit_scale=True, disable=None, leave=False))
+
+        def begin(frames: int, nbytes: int) -> None:
+            bar.reset(frames)
+            if frames:
+                text = f"{frames:,} frames to write, at most {nbytes / 1e6:,.1f} MB"
+                print(f"jaxeit: {text}", file=sys.stderr, flush=True)
+
+        try:
+            written = write_training_frames(
+                bench,
+                args.output,
+                args.random_scenes,
+                seed=args.seed,
+                fidelity=None if args.fidelity is None else fidelity_choice(args.fidelity, True),
+                pixels=None if args.pixels is None else je.Pixels(args.pixels),
+                executor=executor,
+                jobs=args.jobs or 1,
+                begin=begin,
+                tell=bar.update,
+            )
+        except KeyboardInterrupt as interrupt:
+            text = str(interrupt) or "interrupted"
+            print(f"jaxeit: {text}; the same command goes on from the shards in {args.output}", file=sys.stderr)
+            return interruption_status(interrupt)
+    rate = written.made / (time.monotonic() - start)
+    made = f", {written.made:,} of them now at {rate:,.0f} frames/s" if written.made else ", all of them there before"
+    print(f"{args.output}: {written.frames:,} frames, {written.nbytes / 1e6:,.1f} MB{made}, SIMULATED")
     return 0

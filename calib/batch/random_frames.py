@@ -1,0 +1,188 @@
+"""Write frames of random scenes for training, by several processes or a cluster.
+
+A shard is a function of the card and of its number, computed by one thread: equal cards give equal bytes, whatever the
+number of processes. A shard that lies in the folder whole is not made again.
+"""
+
+import contextlib
+import pickle
+import shutil
+from collections.abc import Callable, Mapping
+from concurrent.futures import BrokenExecutor, Executor, as_completed
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxeit as je
+
+from ..bench import Bench, BenchError, RandomScenes
+from ..bench.scene_frames import SceneFrames
+from ..bench.training_frames import VERSION, FrameSet, card_of, claim_folder, is_whole, shard_path, write_shard
+from ..runtime import settings, take_over
+from ..session import file_hash, replacing
+from .digests import describe, digest
+from .workers import ONE_AT_A_TIME, spawned_pool
+
+HASHES = "SHA256SUMS"
+
+
+@dataclass(frozen=True)
+class WrittenFrames:
+    """What `write_training_frames` has done.
+
+    | field                                                   | unit |
+    |---------------------------------------------------------|------|
+    | folder of the card and the shards                       |      |
+    | frames in the folder                                    |      |
+    | made: frames of them that were not there before         |      |
+    | nbytes: size of all shards                              | byte |
+    """
+
+    folder: Path
+    frames: int
+    made: int
+    nbytes: int
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A shard, and all that a worker needs to know; the frame set is pickled, as in `calib.batch.sessions`."""
+
+    folder: str
+    number: int
+    choices: bytes
+    mark: str
+    settings: Mapping[str, Any]
+
+
+def write_training_frames(
+    bench: Bench,
+    folder: str | Path,
+    frames: int,
+    *,
+    seed: int | None = None,
+    scenes: RandomScenes | None = None,
+    fidelity: je.Fidelity | None = None,
+    pixels: je.Pixels | None = None,
+    executor: Executor | None = None,
+    jobs: int = 1,
+    begin: Callable[[int, int], object] = lambda frames, nbytes: None,
+    tell: Callable[[int], object] = lambda frames: None,
+) -> WrittenFrames:
+    """Simulate frames of random contacts, with pressures, contacts and true force maps, and write them in shards.
+
+    Each shard of 1,024 frames is another skin of the scene: the seeds of all effects are drawn. Effects that the scene
+    does not list are not simulated. `calib.open_training_frames` reads the folder; ``card.json`` describes it. The same
+    arguments give the same bytes on the same machine, whatever the number of processes, and go on after an
+    interruption. Call this function below ``if __name__ == "__main__":``, because spawned processes import the main
+    module.
+
+    Args:
+        bench: a scene with its tip and rates, such as ``calib.load_bench("paper_bench")``; its presses are not used.
+        folder: new, empty, or with shards of the same arguments.
+        frames: number of frames.
+        seed: of all that is drawn; default: that of the bench.
+        scenes: distributions that contacts are drawn from; default `calib.bench.RandomScenes()`.
+        fidelity: of the simulation; default `jaxeit.Fidelity.standard()`.
+        pixels: of the force maps; default `jaxeit.Pixels()`, as those of a calibration.
+        executor: default: a pool of spawned processes with one thread of computation each. Another example is
+            `distributed.Client(address).get_executor(pure=False)`; its workers must see the same folder.
+        jobs: number of processes of the default pool.
+        begin: called before the work with the number of frames to make, and an upper bound of their bytes.
+        tell: called with the number of frames of each shard when it is written.
+
+    Raises:
+        BenchError: nothing can be simulated so; the folder holds something else; the disk has too little space; a
+            process died.
+    """
+    if jobs < 1:
+        raise BenchError(f"{jobs} jobs; give one or more")
+    made = FrameSet(
+        bench,
+        frames,
+        bench.seed if seed is None else seed,
+        fidelity or je.Fidelity.standard(),
+        _with_rows(pixels or je.Pixels(), bench.scene.skin),
+        scenes or RandomScenes(),
+    )
+    folder = Path(folder)
+    versions = {"jaxeit": metadata.version("jaxeit"), "jax": jax.__version__, "numpy": np.__version__}
+    mark = digest(describe(made), str(VERSION), *versions.values())
+    claim_folder(folder, card_of(made, mark, versions))
+    left = [number for number in range(made.shards) if not is_whole(shard_path(folder, number), mark)]
+    to_make = sum(map(made.rows, left))
+    _require_space(folder, to_make * made.frame_bytes)
+    begin(to_make, to_make * made.frame_bytes)
+    choices, chosen = pickle.dumps(made), settings()
+    tasks = {number: _Task(str(folder.absolute()), number, choices, mark, chosen) for number in left}
+    with contextlib.ExitStack() as stack:
+        if tasks and executor is None:
+            executor = stack.enter_context(spawned_pool(min(jobs, len(tasks))))
+        if executor is not None:
+            _run(executor, tasks, lambda number: tell(made.rows(number)))
+    paths = [shard_path(folder, number) for number in range(made.shards)]
+    _write_hashes(folder, paths)
+    return WrittenFrames(folder, frames, to_make, sum(path.stat().st_size for path in paths))
+
+
+def _with_rows(pixels: je.Pixels, skin: je.Skin) -> je.Pixels:
+    """Pixels whose number of rows does not depend on the mesh."""
+    (x0, y0), (x1, y1) = skin.domain.bounds
+    return je.Pixels(pixels.columns, pixels.rows or max(1, round(pixels.columns * (y1 - y0) / (x1 - x0))))
+
+
+def _require_space(folder: Path, nbytes: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if nbytes > free:
+        raise BenchError(
+            f"{folder}: the frames take up to {nbytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; write fewer "
+            "frames or pixels, or choose another disk"
+        )
+
+
+def _run(executor: Executor, tasks: Mapping[int, _Task], tell: Callable[[int], object]) -> None:
+    futures = {}
+    try:
+        futures = {executor.submit(make_shard, task): number for number, task in tasks.items()}
+        for future in as_completed(futures):
+            future.result()
+            tell(futures[future])
+    except BrokenExecutor as error:
+        raise BenchError(
+            "a worker process died, most likely for want of memory; the same command goes on, with fewer --jobs"
+        ) from error
+    finally:
+        for future in futures:
+            future.cancel()  # after an interruption, the shards that have not begun
+
+
+def _write_hashes(folder: Path, paths: list[Path]) -> None:
+    """Write the hashes of all shards as ``sha256sum --check`` reads them."""
+    lines = [f"{file_hash(path)}  {path.name}\n" for path in paths]
+    with replacing(folder / HASHES) as temporary:
+        temporary.write_text("".join(lines), encoding="ascii")
+
+
+# --- in the worker -------------------------------------------------------------------------------
+
+
+def make_shard(task: _Task) -> None:
+    """Simulate and write one shard."""
+    with ONE_AT_A_TIME:
+        take_over(task.settings)
+        made, simulator = _simulator(task.choices)
+        arrays = simulator.simulate(task.number, made.seed, made.rows(task.number))
+        path = shard_path(Path(task.folder), task.number)
+        write_shard(path, made, task.mark, task.number, arrays, simulator.pixels)
+
+
+@lru_cache(maxsize=1)
+def _simulator(choices: bytes) -> tuple[FrameSet, SceneFrames]:
+    """The frame set and its simulator, which serves all shards of this process."""
+    made: FrameSet = pickle.loads(choices)
+    return made, SceneFrames(made.bench, made.fidelity, made.pixels, made.scenes)

@@ -1,0 +1,275 @@
+"""Frames of random scenes on one drawn skin after another.
+
+A shard is a recording of one skin: the seeds of all effects are drawn, the untouched skin is recorded, and frames with
+independent contacts follow at the rate of the bench. Drift, noise and faults run through the whole shard, as in a
+recording. What remembers a load (creep, hysteresis, pads) sees a press of its own for each frame.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+import jaxeit as je
+from jaxeit import effects as fx
+
+from .bench import Bench, BenchError
+from .dataset import grid
+from .random_scenes import DrawnContacts, RandomScenes, Tips, arrange_tips, draw_contacts
+from .streams import history
+
+SHARD_FRAMES = 1024  # frames of one skin
+CHUNK_FRAMES = 128  # frames that are solved together, and of the untouched skin at the start
+HOLD_STEPS = 16  # samples of a hold; the load rises and falls in as many before it
+MAX_TIP_ERROR = 0.1  # of the force of a flat tip on the mesh
+LEAST_FORCE = 1e-7  # N: what is less on a pixel is zero, so that maps take less space
+
+
+class Press(NamedTuple):
+    """What touches the skin in one frame, or in some, along a first axis.
+
+    | field                                                | shape       | unit |
+    |------------------------------------------------------|-------------|------|
+    | load of each contact                                 | (contacts,) | N    |
+    | place of each tip                                    | (tips, 2)   | m    |
+    | contact of each tip, and its share of that load      | (tips,)     |      |
+    | hold: time since the load is constant                | ()          | s    |
+    | peak: highest load before the hold over that of it   | ()          | 1    |
+    | number of the frame                                  | ()          |      |
+    """
+
+    load: Float[Array, "*n contacts"]
+    place: Float[Array, "*n tips 2"]
+    contact: Int[Array, "*n tips"]
+    share: Float[Array, "*n tips"]
+    hold: Float[Array, "*n"]
+    peak: Float[Array, "*n"]
+    number: Int[Array, "*n"]
+
+
+class Air(NamedTuple):
+    """Temperature (K) and air pressure (Pa) above those at the start of a recording."""
+
+    temperature: Float[Array, ""]
+    pressure: Float[Array, ""]
+
+
+class Solved(NamedTuple):
+    """Frames before the electronics.
+
+    | field                                  | shape              | unit |
+    |----------------------------------------|--------------------|------|
+    | voltages                               | (frames, readings) | V    |
+    | pressures in the pads                  | (frames, pads)     | Pa   |
+    | force_map: force on each pixel         | (frames, pixels)   | N    |
+    """
+
+    voltages: Float[Array, "*n readings"]
+    pressures: Float[Array, "*n pads"]
+    force_map: Float[Array, "*n pixels"]
+
+
+class SceneFrames:
+    """Simulates shards of frames of random contacts on skins of one scene; made once per process.
+
+    Raises:
+        BenchError: if pressure changes no conductivity in the scene; if a flat tip is too small for the mesh.
+    """
+
+    def __init__(self, bench: Bench, fidelity: je.Fidelity, basis: je.Pixels, scenes: RandomScenes):
+        self.bench, self._scenes = bench, scenes
+        self._model = je.discretise(bench.scene, fidelity)
+        self._diameter = jnp.asarray(bench.tip_diameter, self._model.dtype)
+        _check_response(self._model)
+        _check_tips(bench, self._model)
+        self.pixels = basis.on(self._model)
+        self._response = je.pad_response(bench.scene.skin, self._model)
+        pads = bench.scene.skin.pads
+        self._masks = np.asarray(je.pad_masks(bench.scene.skin, self.pixels).weights) if pads else None
+
+    def simulate(self, number: int, seed: int, frames: int = SHARD_FRAMES) -> Mapping[str, np.ndarray]:
+        """The first ``frames`` of a shard by the names of `calib.bench.training_frames.ARRAYS`.
+
+        All that is drawn depends on the seed and on the number of the shard alone, the contacts on no effect.
+        """
+        touches, skins = (np.random.default_rng([seed, number, purpose]) for purpose in range(2))
+        key = jax.random.key(int(skins.integers(2**31)))
+        rise = skins.random() * self.bench.duration
+        model = self._drawn_skin(skins)
+        air = (rise * self.bench.temperature_rate, rise * self.bench.barometer_rate)
+        contacts = draw_contacts(self._scenes, self.bench.scene.skin.domain, SHARD_FRAMES, touches)
+        presses = self._presses(contacts, arrange_tips(contacts))
+        eit = _Recording(self.bench, model, fx.StreamKind.EIT, np.asarray(je.forward(model)), key)
+        idle = np.asarray(_idle_pads(model, jnp.zeros(len(self._response)), key), float)
+        pads = _Recording(self.bench, model, fx.StreamKind.PRESSURE, idle, key)
+        parts = []
+        for start in range(0, frames, CHUNK_FRAMES):
+            chunk = Press(*(jnp.asarray(values[start : start + CHUNK_FRAMES]) for values in presses))
+            found = solve_presses(
+                model, self.pixels, self._response, self._diameter, chunk, Air(*map(jnp.asarray, air)), key
+            )
+            parts.append((eit.record(found.voltages, air), pads.record(found.pressures, air), found.force_map))
+        voltages, pressures, maps = (np.concatenate([np.asarray(p) for p in part]) for part in zip(*parts, strict=True))
+        maps = np.where(maps < LEAST_FORCE, 0, maps).astype(float)
+        arrays = {
+            "frames": voltages - eit.untouched,
+            "untouched": eit.untouched,
+            "force_map": maps,
+            "contacts": contacts.number,
+            "contact_place": contacts.place,
+            "contact_force": contacts.force,
+            "contact_footprint": contacts.footprint,
+            "contact_size": contacts.size,
+            "contact_angle": contacts.angle,
+        }
+        if self._masks is not None:
+            on_pads = maps @ self._masks.T
+            arrays |= {"pressures": pressures - pads.untouched, "untouched_pressures": pads.untouched}
+            arrays["pad_forces"] = on_pads
+        single = ("untouched", "untouched_pressures")
+        return {name: values if name in single else values[:frames] for name, values in arrays.items()}
+
+    def _drawn_skin(self, rng: np.random.Generator) -> je.Model:
+        """The model of a skin of the scene whose effects have drawn seeds; equal in form to that of any other."""
+        effects = tuple(_reseeded(effect, rng) for effect in self.bench.scene.effects)
+        return dataclasses.replace(self._model, effects=_laid(effects, self._model.centroids))
+
+    def _presses(self, contacts: DrawnContacts, tips: Tips) -> tuple[np.ndarray, ...]:
+        """The fields of `Press` for all frames, on the host: a slice of them compiles nothing."""
+        dtype = self._model.dtype
+        place, share = tips.place.astype(dtype), tips.share.astype(dtype)
+        number = np.arange(SHARD_FRAMES, dtype=np.int32)
+        drawn = (contacts.force.astype(dtype), place, tips.contact.astype(np.int32), share)
+        return (*drawn, contacts.hold, contacts.peak, number)
+
+
+@je.verb
+def _laid(
+    effects: tuple[fx.AbstractEffect, ...], centroids: Float[Array, "elements 2"]
+) -> tuple[fx.AbstractEffect, ...]:
+    return fx.laid(effects, centroids)
+
+
+@je.verb
+def solve_presses(
+    model: je.Model,
+    pixels: je.model.BasisMap,
+    response: Float[Array, "pads elements"],
+    diameter: Float[Array, ""],
+    presses: Press,
+    air: Air,
+    key: Key[Array, ""],
+) -> Solved:
+    """Voltages, pressures in the pads, and force maps of some presses, before the electronics; ``key`` of chance."""
+    memory = fx.chosen(model.effects, fx.AbstractMemoryEffect)
+    pneumatic = fx.chosen(model.effects, fx.AbstractPneumaticEffect)
+    warmth = air.temperature.astype(model.dtype)
+
+    def one(press: Press) -> Solved:
+        own = jax.random.fold_in(key, press.number)
+        spread = jax.vmap(lambda place: je.model.load_spread(model, place, diameter))(press.place)
+        pressure = (press.load[press.contact] * press.share) @ spread
+        felt = pressure
+        if memory:
+            load = _held(memory, press.load, press, air, jax.random.fold_in(own, 0)).astype(model.dtype)
+            felt = (load[press.contact] * press.share) @ spread
+        voltages = je.forward(model, je.conductivity(model, felt, warmth))
+        pads = response @ pressure
+        pads = _held(pneumatic, pads, press, air, jax.random.fold_in(own, 1)).astype(model.dtype) if pneumatic else pads
+        return Solved(voltages, pads, pixels.restrict(pressure * model.areas))
+
+    found: Solved = jax.vmap(one)(presses)
+    return found
+
+
+def _held(
+    effects: tuple[fx.AbstractHistoryEffect, ...],
+    load: Float[Array, " channels"],
+    press: Press,
+    air: Air,
+    key: Key[Array, ""],
+) -> Float[Array, " channels"]:
+    """What effects with memory make of a load at the end of its hold."""
+    up, hold = jnp.arange(1, HOLD_STEPS // 2 + 1) / (HOLD_STEPS // 2), jnp.ones(HOLD_STEPS)
+    share = jnp.concatenate([up * press.peak, press.peak + up * (1 - press.peak), hold])
+    series = share[:, None] * load.astype(share.dtype)
+    whole = partial(jnp.full, len(share))
+    line = fx.Line(key, press.hold / HOLD_STEPS, whole(air.temperature), whole(air.pressure), jnp.zeros((0, 4), int))
+    after, _ = fx.history(effects, series, fx.history_start(effects, jnp.zeros_like(series[0])), line)
+    last: Array = after[-1]
+    return last
+
+
+@je.verb
+def _idle_pads(model: je.Model, pads: Float[Array, " pads"], key: Key[Array, ""]) -> Float[Array, " pads"]:
+    """Pressures in the pads of the untouched skin at the start of a recording, Pa."""
+    effects, nothing = fx.chosen(model.effects, fx.AbstractPneumaticEffect), jnp.zeros(1)
+    line = fx.Line(key, jnp.asarray(1.0), nothing, nothing, jnp.zeros((0, 4), int))
+    return fx.history(effects, pads[None], fx.history_start(effects, pads), line)[0][0]
+
+
+class _Recording:
+    """One stream of a shard through its electronics: first the untouched skin, whose mean is `untouched`."""
+
+    def __init__(
+        self, bench: Bench, model: je.Model, kind: fx.StreamKind, resting: Float[np.ndarray, " channels"], key: Any
+    ):
+        self._effects = fx.chosen(model.effects, fx.AbstractReadoutEffect, kind)
+        self._key = jax.random.fold_in(key, SHARD_FRAMES + (kind is fx.StreamKind.EIT))  # beyond those of frames
+        pattern = jnp.asarray(bench.scene.skin.protocol.pattern, jnp.int32)
+        self._pattern = pattern if kind is fx.StreamKind.EIT else pattern[:0]
+        self._interval, self._blocks = jnp.asarray(1 / bench.eit_rate), 0
+        resting = resting.astype(float)
+        self._state = fx.history_start(self._effects, jnp.asarray(resting))
+        self.untouched = self.record(np.tile(resting, (CHUNK_FRAMES, 1)), (0.0, 0.0)).mean(0)
+
+    def record(self, values: Any, air: tuple[float, float]) -> Float[np.ndarray, "rows channels"]:
+        """The next block of samples as it is recorded."""
+        rows: np.ndarray = np.asarray(values, float)
+        self._blocks += 1
+        if not self._effects or not rows.shape[1]:
+            return rows
+        temperature, pressure = (jnp.full(len(rows), rise) for rise in air)
+        key = jax.random.fold_in(self._key, self._blocks)
+        line = fx.Line(key, self._interval, temperature, pressure, self._pattern)
+        recorded, self._state = history(self._effects, jnp.asarray(rows), self._state, line)
+        rows = np.asarray(recorded)
+        return rows
+
+
+def _reseeded(effect: fx.AbstractEffect, rng: np.random.Generator) -> fx.AbstractEffect:
+    """The effect with a drawn seed, if it has one."""
+    if not any(field.name == "seed" for field in dataclasses.fields(effect)):
+        return effect
+    changes: Any = {"seed": jnp.asarray(int(rng.integers(2**31)))}
+    return dataclasses.replace(effect, **changes)
+
+
+def _check_response(model: je.Model) -> None:
+    sigma = je.conductivity(model, jnp.full_like(model.background, 1e4))
+    if not isinstance(sigma, je.model.CoatedSheet) and bool(jnp.all(sigma == je.conductivity(model))):
+        raise BenchError(
+            "the scene has no effect by which pressure changes the sheet, so that all frames would be equal; "
+            "list one, such as ContactPiezoresistance"
+        )
+
+
+def _check_tips(bench: Bench, model: je.Model) -> None:
+    """A flat tip presses on the elements whose centroids are under it, which must be enough of them."""
+    if fx.chosen(model.effects, fx.AbstractLoadEffect):
+        return
+    domain = bench.scene.skin.domain
+    places = grid(bench.scene.skin, 9, 9)
+    inner = places[domain.boundary_distance(places) > bench.tip_diameter]
+    for place in inner:
+        force = float(jnp.sum(je.model.load_spread(model, place, bench.tip_diameter) * model.areas))
+        if abs(force - 1) > MAX_TIP_ERROR:
+            raise BenchError(
+                f"a flat tip of {bench.tip_diameter:g} m bears {force:.0%} of its force at {place} m on this mesh; "
+                "take a finer fidelity or a larger tip, or list LoadSpreading"
+            )

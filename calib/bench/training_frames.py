@@ -1,0 +1,348 @@
+"""Files of frames for training: shards in HDF5, and a card that describes them.
+
+A folder holds ``card.json`` and one shard per drawn skin, ``shard-000000.h5``. The shards have named axes, so that h5py
+and xarray open them too.
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+import jaxeit as je
+
+from ..session import ArchiveWriter, SessionError, open_archive, replacing
+from .bench import Bench, BenchError
+from .random_scenes import MAX_CONTACTS, Footprint, RandomScenes
+from .scene_frames import SHARD_FRAMES
+
+FORMAT = "jaxeit-training-frames"
+VERSION = 1  # of the content: equal seeds give equal frames within a version
+SHARD_FORMAT = "skin-training-frames"
+CARD = "card.json"
+
+
+class About(NamedTuple):
+    """What an array is: its axes, its unit, what it means, and its type."""
+
+    dims: tuple[str, ...]
+    units: str
+    meaning: str
+    dtype: DTypeLike = "f4"
+
+
+FOOTPRINTS = ", ".join(f"{kind.value} {kind.name.lower()}" for kind in Footprint)
+ARRAYS = {
+    "frames": About(("frame", "reading"), "V", "change of the readings against the untouched skin"),
+    "untouched": About(("reading",), "V", "readings of the untouched skin of this shard, mean of 128 frames", "f8"),
+    "pressures": About(("frame", "pad"), "Pa", "change of the pressures in the pads against the untouched skin"),
+    "untouched_pressures": About(("pad",), "Pa", "pressures in the pads of the untouched skin", "f8"),
+    "pad_forces": About(("frame", "pad"), "N", "force on each pad: the pad's mask times the force map"),
+    "force_map": About(("frame", "pixel"), "N", "force on each pixel, the sum of all contacts"),
+    "contacts": About(("frame",), "1", "number of contacts; the further rows of a frame are 0", "u1"),
+    "contact_place": About(("frame", "contact", "axis"), "m", "middle of each contact"),
+    "contact_force": About(("frame", "contact"), "N", "force of each contact; what lies beside the sheet is lost"),
+    "contact_footprint": About(("frame", "contact"), "1", FOOTPRINTS, "u1"),
+    "contact_size": About(("frame", "contact"), "m", "radius of a disc or ring, half the length of an edge"),
+    "contact_angle": About(("frame", "contact"), "rad", "direction of an edge against x"),
+}
+"""Arrays of a shard by their names; a skin without pads has no arrays with an axis of pads."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameSet:
+    """Everything that the bytes of a set of frames depend on.
+
+    | field                                                        |
+    |--------------------------------------------------------------|
+    | bench: scene, tip, rates and ranges of temperature           |
+    | frames: their number                                         |
+    | seed of all that is drawn                                    |
+    | fidelity of the simulation                                   |
+    | pixels of the force maps, with their number of rows          |
+    | scenes: what contacts are drawn from                         |
+
+    Raises:
+        BenchError: for less than one frame, or a seed below 0.
+    """
+
+    bench: Bench
+    frames: int
+    seed: int
+    fidelity: je.Fidelity
+    pixels: je.Pixels
+    scenes: RandomScenes
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise BenchError(f"{self.frames} frames make no data set; give one or more")
+        if self.seed < 0:
+            raise BenchError(f"the seed is {self.seed}; give 0 or more")
+        if self.pixels.rows is None:
+            raise BenchError("pixels without their number of rows; give Pixels(columns, rows)")
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.frames // SHARD_FRAMES)
+
+    def rows(self, number: int) -> int:
+        """Number of frames in a shard; the last one may have fewer."""
+        return min(SHARD_FRAMES, self.frames - number * SHARD_FRAMES)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of all axes but that of the frames."""
+        skin = self.bench.scene.skin
+        pixels = self.pixels.columns * (self.pixels.rows or 0)
+        sizes = {"reading": skin.protocol.readings, "pixel": pixels, "contact": MAX_CONTACTS, "axis": 2}
+        return sizes | ({"pad": len(skin.pads)} if skin.pads else {})
+
+    @property
+    def arrays(self) -> dict[str, About]:
+        """The arrays of a shard."""
+        return {name: about for name, about in ARRAYS.items() if {*about.dims} <= {*self.sizes, "frame"}}
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one frame before compression."""
+        each = [a for a in self.arrays.values() if a.dims[0] == "frame"]
+        return sum(
+            np.dtype(a.dtype).itemsize * int(np.prod([self.sizes[d] for d in a.dims[1:]], dtype=int)) for a in each
+        )
+
+
+def shard_path(folder: Path, number: int) -> Path:
+    """Path of a shard."""
+    return folder / f"shard-{number:06d}.h5"
+
+
+def is_whole(path: Path, mark: str) -> bool:
+    """Whether a shard is complete and was made for the card with this mark."""
+    if not path.is_file():
+        return False
+    try:
+        with open_archive(path, SHARD_FORMAT) as shard:
+            return shard.attrs.get("mark") == mark
+    except SessionError:
+        return False
+
+
+def write_shard(
+    path: Path, made: FrameSet, mark: str, number: int, arrays: Mapping[str, np.ndarray], pixels: je.model.BasisMap
+) -> None:
+    """Write one shard, whole or not at all; equal arrays give equal bytes."""
+    skin = made.bench.scene.skin
+    attrs: dict[str, str | bool | int] = {
+        "title": f"frames of random contacts on {skin.name}",
+        "skin": skin.name,
+        "simulated": True,
+        "shard": number,
+        "seed": made.seed,
+        "mark": mark,
+        "image_rows": pixels.shape[0],
+        "image_columns": pixels.shape[1],
+        "coordinates": "x y",
+    }
+    first, rows = number * SHARD_FRAMES, made.rows(number)
+    with ArchiveWriter(path, SHARD_FORMAT, attrs) as writer:
+        writer.add("frame", np.arange(first, first + rows, dtype="i8"), "1", "number of the frame", ("frame",))
+        for name, size in made.sizes.items():
+            writer.add(name, np.arange(size, dtype="i4"), "1", f"number of the {name}", (name,))
+        for name, values in zip("xy", np.asarray(pixels.centres).T, strict=True):
+            writer.add(name, values, "m", f"centres of the pixels along {name}", ("pixel",))
+        writer.add("areas", np.asarray(pixels.areas), "m2", "areas of the pixels", ("pixel",))
+        for name, about in made.arrays.items():
+            writer.add(name, arrays[name].astype(about.dtype), about.units, about.meaning, about.dims)
+
+
+def card_of(made: FrameSet, mark: str, versions: Mapping[str, str]) -> str:
+    """The card: what the frames are, what they were drawn from, and how to draw them again; JSON."""
+    skin, sizes = made.bench.scene.skin, made.sizes
+    arrays = {
+        name: {
+            "meaning": about.meaning,
+            "axes": about.dims,
+            "shape": [made.frames if dim == "frame" else sizes[dim] for dim in about.dims],
+            "dtype": np.dtype(about.dtype).name,
+            "unit": about.units,
+        }
+        for name, about in made.arrays.items()
+    }
+    card = {
+        "format": FORMAT,
+        "version": VERSION,
+        "simulated": True,
+        "frames": made.frames,
+        "shards": made.shards,
+        "frames_per_shard": SHARD_FRAMES,
+        "seed": made.seed,
+        "skin": skin.name,
+        "skin_toml": skin.toml,
+        "scene_toml": made.bench.toml,
+        "effects": [type(effect).__name__ for effect in made.bench.scene.effects],
+        "tip_diameter_m": made.bench.tip_diameter,
+        "fidelity": str(made.fidelity),
+        "pixels": str(made.pixels),
+        "drawn_from": dataclasses.asdict(made.scenes),
+        "drawn_once_per_shard": "seeds of all effects, temperature and air pressure within those of the bench",
+        "arrays": arrays,
+        "mark": mark,
+        **versions,
+    }
+    return json.dumps(card, indent=2) + "\n"
+
+
+def claim_folder(folder: Path, card: str) -> None:
+    """Write the card into a folder without shards, or check that the card of the shards there is this one.
+
+    Raises:
+        BenchError: the folder holds frames of another card, or other files.
+    """
+    path = folder / CARD
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = {name for name in os.listdir(folder) if not name.startswith(".")}
+    except OSError as error:
+        raise BenchError(f"{folder}: no folder can be made there ({error.strerror}); choose another") from error
+    if names - {CARD} and CARD not in names:
+        raise BenchError(f"{folder}: holds other files and no {CARD}; give an empty or a new folder")
+    if CARD in names:
+        differ = _differences(path, card)
+        if differ and names != {CARD}:
+            raise BenchError(
+                f"{folder}: holds frames of another {differ}; give the same command again, or another folder"
+            )
+        if not differ:
+            return
+    with replacing(path) as temporary:
+        temporary.write_text(card, encoding="utf-8")
+
+
+def _differences(path: Path, card: str) -> str:
+    """Names of the entries by which a card differs from that of a folder, empty if it does not."""
+    old, new = _read_card(path), json.loads(card)
+    names = [name for name in new if old.get(name) != new[name]]
+    shown = [name for name in names if name not in ("mark", "arrays", "shards")]
+    return ", ".join(shown or names)
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    try:
+        card: dict[str, Any] = json.loads(je.toml.read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise BenchError(f"{path}: is no card of a data set ({error}); give another folder") from error
+    types = {"frames": int, "arrays": dict, "mark": str}
+    typed = isinstance(card, dict) and all(isinstance(card.get(name), kind) for name, kind in types.items())
+    if not typed or card.get("format") != FORMAT or card.get("version") != VERSION or card["frames"] < 1:
+        raise BenchError(f"{path}: is no card of {FORMAT} version {VERSION}; give another folder")
+    return card
+
+
+class TrainingFrames:
+    """Frames for training that `calib.write_training_frames` has written; from `open_training_frames`.
+
+    | attribute                                          |
+    |----------------------------------------------------|
+    | card: what the frames are, as a dictionary         |
+    | shards: numbers of the shards that are read        |
+
+    ``len`` is the number of frames. Each shard is another skin, so that `part` divides frames by skins: test a network
+    on skins that it has not seen.
+    """
+
+    def __init__(self, folder: Path, card: Mapping[str, Any], shards: range):
+        self.folder, self.card, self.shards = folder, card, shards
+
+    def __len__(self) -> int:
+        return sum(self._rows(number) for number in self.shards)
+
+    def _rows(self, number: int) -> int:
+        return min(SHARD_FRAMES, int(self.card["frames"]) - number * SHARD_FRAMES)
+
+    def part(self, start: float, stop: float) -> "TrainingFrames":
+        """The shards from a share to another: ``part(0, 0.9)`` for training, ``part(0.9, 1)`` for a test.
+
+        Raises:
+            BenchError: if no shard is among them.
+        """
+        first, last = (round(share * len(self.shards)) for share in (start, stop))
+        if not 0 <= first < last <= len(self.shards):
+            raise BenchError(
+                f"part({start:g}, {stop:g}) has none of {len(self.shards)} shards; give two shares from 0 to 1 further "
+                "apart, or write more frames"
+            )
+        return TrainingFrames(self.folder, self.card, self.shards[first:last])
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """One array of all shards in memory, such as ``frames["force_map"]``, (frames, pixels).
+
+        An array of the skins, such as ``untouched``, has one row for each shard.
+        """
+        parts = [self._read(number, [name])[name] for number in self.shards]
+        return np.concatenate(parts) if self._about(name)["axes"][0] == "frame" else np.stack(parts)
+
+    def batches(self, size: int, *names: str, seed: int | None = None) -> Iterator[tuple[np.ndarray, ...]]:
+        """Batches of ``size`` frames, each a tuple of the arrays named; one pass over all frames.
+
+        One shard is in memory at a time. With a seed, shards and the frames within each are in random order; the last
+        frames of a shard, too few for a batch, are left out of this pass.
+
+        Raises:
+            BenchError: for an unknown name, an array without an axis of frames, or a size that no shard has.
+        """
+        largest = self._rows(self.shards[0])
+        if not 1 <= size <= largest:
+            raise BenchError(f"batches of {size} frames; give 1 to {largest}, those of a shard")
+        for name in names:
+            if self._about(name)["axes"][0] != "frame":
+                raise BenchError(f"{name}: belongs to a shard and not to a frame; read it as frames[{name!r}]")
+        return self._batches(size, names, None if seed is None else np.random.default_rng(seed))
+
+    def _batches(
+        self, size: int, names: tuple[str, ...], rng: np.random.Generator | None
+    ) -> Iterator[tuple[np.ndarray, ...]]:
+        shards = list(self.shards) if rng is None else rng.permutation(self.shards).tolist()
+        for number in shards:
+            arrays, rows = self._read(number, names), self._rows(number)
+            order = np.arange(rows) if rng is None else rng.permutation(rows)
+            for start in range(0, rows - size + 1, size):
+                yield tuple(arrays[name][order[start : start + size]] for name in names)
+
+    def _about(self, name: str) -> dict[str, Any]:
+        if name not in self.card["arrays"]:
+            raise BenchError(f"{name}: no such array; there are {', '.join(self.card['arrays'])}")
+        about: dict[str, Any] = self.card["arrays"][name]
+        return about
+
+    def _read(self, number: int, names: Any) -> dict[str, np.ndarray]:
+        for name in names:
+            self._about(name)
+        path = shard_path(self.folder, number)
+        with open_archive(path, SHARD_FORMAT) as shard:
+            if shard.attrs.get("mark") != self.card["mark"]:
+                raise BenchError(f"{path}: belongs to another card; write the frames again in a new folder")
+            return {name: shard.arrays[name].read() for name in names}
+
+
+def open_training_frames(folder: str | os.PathLike[str]) -> TrainingFrames:
+    """Open frames that `calib.write_training_frames` has written; arrays are read on request.
+
+    Raises:
+        BenchError: the folder has no card, or shards are missing because the writing was interrupted.
+    """
+    where = Path(folder)
+    if not (where / CARD).is_file():
+        raise BenchError(f"{where}: has no {CARD}; write frames with jaxeit simulate SCENE --random-scenes N -o FOLDER")
+    card = _read_card(where / CARD)
+    shards = range(-(-card["frames"] // SHARD_FRAMES))
+    missing = sum(not shard_path(where, number).is_file() for number in shards)
+    if missing:
+        what = f"{missing} of {len(shards)} shards are missing"
+        raise BenchError(f"{where}: {what}; the command that began them goes on from here")
+    return TrainingFrames(where, card, shards)

@@ -1,0 +1,324 @@
+"""Frames for training: the same bytes however they are made, and physics that a second computation confirms."""
+
+import dataclasses
+import json
+from concurrent.futures import Executor, Future
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+import calib
+import jaxeit as je
+from calib.batch import random_frames
+from calib.bench import BenchError, Footprint, RandomScenes
+from calib.bench.random_scenes import MAX_CONTACTS, arrange_tips, draw_contacts
+from calib.bench.scene_frames import SHARD_FRAMES, SceneFrames
+from calib.cli import main
+
+from ..helpers import skin_of
+
+FRAMES = SHARD_FRAMES + 200
+WORDS = ["--fidelity", "draft", "--pixels", "20", "--seed", "5"]
+WIDTH = 0.01  # of the scene's load spreading
+SCENE = f"""
+format = "jaxeit-scene"
+version = 1
+title = "frames of random contacts"
+skin = "testbed"
+seed = 1
+
+[bench]
+sites = [[0.1, 0.1]]
+forces = [10.0]
+eit_rate = 50.0
+temperature_rate = 0.01
+
+[[effects]]
+type = "LoadSpreading"
+width = {WIDTH}
+
+[[effects]]
+type = "CoatingNonUniformity"
+
+[[effects]]
+type = "ContactPiezoresistance"
+
+[[effects]]
+type = "SheetTemperature"
+
+[[effects]]
+type = "PadEdgeDip"
+
+[[effects]]
+type = "SensorError"
+"""
+NOISE = """
+[[effects]]
+type = "Hysteresis"
+
+[[effects]]
+type = "BaselineDrift"
+stream = "eit"
+
+[[effects]]
+type = "Noise"
+stream = "eit"
+std = 1e-5
+"""
+
+
+class Here(Executor):
+    """Runs what it is given at once; is interrupted before a task of some number."""
+
+    def __init__(self, ends_at=None):
+        self.ends_at = ends_at
+
+    def submit(self, call, task):
+        if task.number == self.ends_at:
+            raise KeyboardInterrupt
+        future = Future()
+        future.set_result(call(task))
+        return future
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(scene, tmp_path_factory):
+    """Frames by the command, with two processes."""
+    path = tmp_path_factory.mktemp("frames") / "two"
+    assert main(["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(path), *WORDS, "--jobs", "2"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def frames(folder):
+    return calib.open_training_frames(folder)
+
+
+def _bytes(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_one_process_after_an_interruption_gives_the_same_bytes(scene, folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "one"
+    words = ["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(out), *WORDS]
+    pool = random_frames.spawned_pool
+    monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here(ends_at=0))
+    assert main(words) == 130
+    assert "the same command goes on from the shards" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["card.json"]
+    with pytest.raises(BenchError, match="2 of 2 shards are missing"):
+        calib.open_training_frames(out)
+    (out / "shard-000000.h5").write_bytes((folder / "shard-000000.h5").read_bytes()[:-1])  # not whole
+    monkeypatch.setattr(random_frames, "spawned_pool", pool)
+    assert main(words) == 0
+    assert f"{FRAMES:,} of them now" in capsys.readouterr().out
+    assert _bytes(out) == _bytes(folder)
+    assert main(words) == 0
+    assert "all of them there before" in capsys.readouterr().out
+
+
+def test_a_folder_of_something_else_is_refused(scene, folder, tmp_path, capsys):
+    before = _bytes(folder)
+    words = ["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(folder)]
+    assert main([*words, *WORDS[:-1], "6"]) == 2
+    assert "holds frames of another seed" in capsys.readouterr().err
+    scene.with_name("other.toml").write_text(SCENE.replace(f"width = {WIDTH}", "width = 0.011"))
+    assert main([*words[:1], str(scene.with_name("other.toml")), *words[2:], *WORDS]) == 2
+    assert "holds frames of another scene_toml" in capsys.readouterr().err
+    assert _bytes(folder) == before
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main([*words[:-1], str(tmp_path), *WORDS]) == 2
+    assert "holds other files" in capsys.readouterr().err
+
+
+def _on_rectangle(place, low, high):
+    """Share of a Gaussian of the scene's width within rectangles."""
+    z = [(edge - place) / WIDTH for edge in (low, high)]
+    return np.prod(ndtr(z[1]) - ndtr(z[0]), -1)
+
+
+def test_maps_pads_and_contacts_tell_of_one_load(frames, skin):
+    """By the distribution function of a Gaussian, for frames of tips alone."""
+    kinds, force, place = frames["contact_footprint"], frames["contact_force"], frames["contact_place"]
+    assert set(np.unique(frames["contacts"])) == {0, 1, 2, 3}
+    assert ((kinds > 0).sum(1) == frames["contacts"]).all()
+    assert ((force > 0) == (kinds > 0)).all()
+    tips = (kinds <= Footprint.TIP).all(1)
+    assert tips.sum() > 100
+    on_sheet = (force * _on_rectangle(place.astype(float), 0.0, 0.2)).sum(1)
+    total = frames["force_map"].sum(1)
+    error = (total[tips] - on_sheet[tips]) / np.maximum(on_sheet[tips], 0.5)
+    assert np.abs(error).max() < 0.04  # centroids of a coarse mesh, with edges as long as the Gaussian is wide
+    assert abs(error.mean()) < 0.005
+    corners = np.array([pad.outline for pad in skin.pads])
+    each = _on_rectangle(place[:, :, None].astype(float), corners.min(1), corners.max(1))
+    on_pads = np.einsum("fc,fcp->fp", force, each)
+    np.testing.assert_allclose(frames["pad_forces"][tips], on_pads[tips], atol=0.03 * force.max())
+    np.testing.assert_allclose(frames["pad_forces"].sum(1), total, rtol=1e-5, atol=1e-6)  # the pads cover the sheet
+    untouched = frames["contacts"] == 0
+    assert (frames["force_map"][untouched] == 0).all()
+
+
+def test_a_frame_is_what_the_scene_says(frames, scene):
+    """One frame of the second shard, from the model and the effects by hand."""
+    bench = calib.load_bench(scene)
+    drawn = np.random.default_rng([5, 1, 1])  # of the skin of that shard, in the order of its effects
+    drawn.integers(2**31)
+    warmth = drawn.random() * bench.duration * bench.temperature_rate
+    seeds = {name: int(drawn.integers(2**31)) for name in ("CoatingNonUniformity", "SensorError")}
+    effects = tuple(
+        dataclasses.replace(e, seed=jnp.asarray(seeds[type(e).__name__])) if type(e).__name__ in seeds else e
+        for e in bench.scene.effects
+    )
+    model = je.discretise(je.Scene(bench.scene.skin, effects), je.Fidelity.draft())
+    part = frames.part(0.5, 1)
+    number = int(np.flatnonzero((part["contact_footprint"] == Footprint.EDGE)[:, 0] & (part["contacts"] == 1))[0])
+    place, size, angle, force = (
+        part[f"contact_{name}"][number, 0].astype(float) for name in ("place", "size", "angle", "force")
+    )
+    along = size * (np.arange(12) - 5.5) / 6
+    tips = place + along[:, None] * [np.cos(angle), np.sin(angle)]
+    square = ((np.asarray(model.centroids)[None] - tips[:, None]) ** 2).sum(-1)
+    pressure = jnp.asarray(force / 12 * (np.exp(-0.5 * square / WIDTH**2) / (2 * np.pi * WIDTH**2)).sum(0))
+    change = je.forward(model, je.conductivity(model, pressure, warmth)) - je.forward(model)
+    np.testing.assert_allclose(part["frames"][number], change, atol=1e-6 * float(jnp.abs(change).max()))
+    np.testing.assert_allclose(part["untouched"][0], je.forward(model), rtol=1e-9)
+    pads = je.pad_response(bench.scene.skin, model) @ pressure
+    (sensor,) = je.effects.chosen(effects, je.effects.SensorError)
+    offset, span = je.effects.random.own_normal(sensor, sensor.seed, (2, 4), float)
+    np.testing.assert_allclose(part["pressures"][number], (1 + sensor.span * span) * pads, atol=1e-6 * pads.max())
+    np.testing.assert_allclose(part["untouched_pressures"][0], sensor.offset * offset, rtol=1e-9)
+
+
+def test_every_shard_is_another_skin_and_batches_hold_each_frame_once(frames):
+    assert len(frames) == FRAMES
+    first, second = frames["untouched"]
+    assert 0.01 < np.abs(first - second).max() / np.abs(first).max() < 1
+    places = np.concatenate([batch for (batch,) in frames.batches(100, "contact_place", seed=3)])
+    assert len(places) == 1000 + 200
+    rows = {row.tobytes() for row in frames["contact_place"].reshape(FRAMES, -1)}
+    assert {row.tobytes() for row in places.reshape(len(places), -1)} <= rows
+    x, y = next(frames.part(0.5, 1).batches(200, "frames", "force_map"))
+    assert (x == frames["frames"][SHARD_FRAMES:]).all()
+    assert y.shape == (200, 400)
+    with pytest.raises(BenchError, match="no such array; there are frames"):
+        frames["voltage"]
+    with pytest.raises(BenchError, match="belongs to a shard"):
+        frames.batches(10, "untouched")
+    with pytest.raises(BenchError, match="give 1 to 1024"):
+        frames.batches(2000, "frames")
+    with pytest.raises(BenchError, match="has none of 2 shards"):
+        frames.part(0.1, 0.2)
+
+
+def test_the_card_and_other_programs_read_the_shards(folder):
+    card = json.loads((folder / "card.json").read_text())
+    with h5py.File(folder / "shard-000001.h5") as shard:
+        for name, about in card["arrays"].items():
+            assert shard[name].dtype == about["dtype"]
+            assert shard[name].attrs["units"].decode() == about["unit"]
+            assert [axis[0].name[1:] for axis in shard[name].dims] == about["axes"]
+            rows = [200 if axis == "frame" else size for axis, size in zip(about["axes"], about["shape"], strict=True)]
+            assert list(shard[name].shape) == rows
+        assert shard["frame"][0] == SHARD_FRAMES
+    assert card["frames"] == FRAMES
+    assert "[[effects]]" in card["scene_toml"]
+
+
+def test_footprints_are_what_they_stand_for(skin):
+    contacts = draw_contacts(RandomScenes(), skin.domain, 4000, np.random.default_rng(0))
+    assert skin.domain.contains(contacts.place.reshape(-1, 2)).all()
+    np.testing.assert_allclose(np.bincount(contacts.number) / 4000, RandomScenes().counts, atol=0.03)
+    forces = contacts.force[contacts.number == MAX_CONTACTS]
+    assert abs(np.median(forces) / np.sqrt(0.5 * 30) - 1) < 0.1
+    tips = arrange_tips(contacts)
+    for frame in range(200):
+        assert abs(tips.share[frame].sum() - max(contacts.number[frame], 1)) < 1e-12
+        for number in range(contacts.number[frame]):
+            offset = (tips.place[frame] - contacts.place[frame, number])[tips.contact[frame] == number]
+            count = 12 // contacts.number[frame]
+            assert len(offset) == count
+            assert np.abs(offset.mean(0)).max() < 1e-12
+            share = {1: 0, 2: 0.5, 3: 1, 4: (1 - 1 / count**2) / 3}[int(contacts.footprint[frame, number])]
+            assert abs((offset**2).sum(1).mean() - share * contacts.size[frame, number] ** 2) < 1e-12
+
+
+def test_what_remembers_sees_a_press_of_its_own(scene):
+    """With hysteresis a load that has fallen is felt more, and with drift frames leave the untouched ones."""
+    path = scene.with_name("noise.toml")
+    path.write_text(SCENE + NOISE)
+    bench, made = calib.load_bench(path), {}
+    for name, peak in (("risen", (1.0, 1.0)), ("fallen", (2.0, 2.0))):
+        scenes = RandomScenes(counts=(0, 1, 0, 0), peak=peak)
+        made[name] = SceneFrames(bench, je.Fidelity.draft(), je.Pixels(20, 20), scenes).simulate(0, 1, 256)
+    np.testing.assert_array_equal(made["risen"]["force_map"], made["fallen"]["force_map"])
+    size = {name: np.abs(arrays["frames"]).max(1) for name, arrays in made.items()}
+    more = size["fallen"] / size["risen"]
+    strong = made["risen"]["force_map"].sum(1) > 5
+    fell = more[strong] > 1.01
+    assert 0.3 < fell.mean() < 0.7  # half of the frames
+    assert (more[strong] < 1.1).all()
+    np.testing.assert_allclose(made["risen"]["pressures"], made["fallen"]["pressures"])
+    assert all(np.isfinite(arrays["frames"]).all() for arrays in made.values())
+
+
+def test_what_cannot_be_simulated_is_refused(scene, tmp_path, capsys):
+    def write(bench, **options):
+        options = {"fidelity": je.Fidelity.draft(), "executor": Here()} | options
+        return calib.write_training_frames(bench, tmp_path / "out", 10, **options)
+
+    bench = calib.load_bench(scene)
+    with pytest.raises(BenchError, match="no effect by which pressure changes the sheet"):
+        write(calib.load_bench("ideal"))
+    law = je.effects.ContactPiezoresistance()
+    tip = dataclasses.replace(bench, scene=je.Scene(bench.scene.skin, (law,)), tip_diameter=0.005)
+    with pytest.raises(BenchError, match=r"of its force at .* on this mesh"):
+        SceneFrames(tip, je.Fidelity.draft(), je.Pixels(20, 20), RandomScenes())
+    for options, message in (
+        ({"seed": -1}, "the seed is -1"),
+        ({"jobs": 0}, "0 jobs"),
+        ({"pixels": je.Pixels(2000)}, "coefficients"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write(bench, **options)
+    for ranges, message in (({"force": (0.0, 3.0)}, "above zero"), ({"counts": (0.5, 0.1, 0.1, 0.1)}, "sum is 1")):
+        with pytest.raises(BenchError, match=message):
+            RandomScenes(**ranges)
+    for words, message in (
+        (["ideal", "--seed", "3", "-o", "s.h5"], "--seed: for frames for training"),
+        (["ideal", "--random-scenes", "3", "--serve", "-o", "s"], "leave them out"),
+        (["ideal", "--random-scenes", "3"], "give either -o"),
+    ):
+        assert main(["simulate", *words]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_too_little_disk_is_said_before_the_work(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(random_frames.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 10**6}))
+    with pytest.raises(BenchError, match=r"take up to \d+\.\d GB, and 0\.0 GB are free"):
+        calib.write_training_frames(calib.load_bench(scene), tmp_path / "out", 10**6)
+
+
+def test_a_skin_without_pads(tmp_path):
+    places = np.array([[0.02, 0.02], [0.08, 0.02], [0.08, 0.08], [0.02, 0.08]])
+    electrodes = [je.PointElectrode(tuple(place)) for place in places]
+    skin = skin_of(je.Rectangle(0.1, 0.1), electrodes, [[0, 1, 2, 3], [1, 2, 3, 0]])
+    scene = je.Scene(skin, (je.effects.LoadSpreading(), je.effects.ContactPiezoresistance()))
+    bench = calib.Bench(scene, np.zeros((1, 2)) + 0.05, np.array([5.0]))
+    options = {"fidelity": je.Fidelity.draft(), "pixels": je.Pixels(8), "executor": Here()}
+    calib.write_training_frames(bench, tmp_path / "out", 100, **options)
+    found = calib.open_training_frames(tmp_path / "out")
+    assert "pad_forces" not in found.card["arrays"]
+    assert found["frames"].shape == (100, 2)
+    assert jax.config.jax_enable_x64
