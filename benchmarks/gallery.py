@@ -130,6 +130,16 @@ def noise_of_an_image(axes: Any, names: Names) -> None:
     axes.set(xlabel="noise expected, uS", ylabel="noise measured, uS")
 
 
+def train_on_random_scenes(axes: Any, names: Names) -> None:
+    """True and learned shares of the force of one frame, side by side."""
+    truth, learned = (np.asarray(names[n]).reshape(-1, 20, 20) for n in ("truth", "learned"))
+    spread = np.where(names["unseen"]["contacts"] == 2, truth.max((1, 2)), np.inf)
+    frame = int(spread.argmin())
+    axes.imshow(np.hstack([truth[frame], learned[frame]]), origin="lower", cmap="viridis")
+    axes.axvline(19.5, color="white", linewidth=1)
+    axes.set(xticks=[], yticks=[], xlabel="true | learned share of the force")
+
+
 DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "bending": lambda axes, n: _bars(axes, {k: 100 * v for k, v in n["changes"].items()}, "change of the readings, %"),
     "forces_of_a_session": forces_of_a_session,
@@ -150,6 +160,7 @@ DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
         axes, {k: 100 * v[0] ** 2 for k, v in n["figures"].items()}, "area of the blob, % of the sheet"
     ),
     "tank": lambda axes, n: _image(axes, n["recon"](n["dv"]), n["recon"], true=n["middle"]),
+    "train_on_random_scenes": train_on_random_scenes,
     "two_fingers": two_fingers,
     "uneven_coating": lambda axes, n: _sheet(axes, n["model"], n["coating"]),
     "where_is_the_contact": where_is_the_contact,

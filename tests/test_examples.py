@@ -36,6 +36,7 @@ FINDS = {
         and names["figures"]["0.1"][0] < 0.8 * names["figures"]["strong, 10"][0]
     ),
     "tank": lambda names: jnp.linalg.norm(names["found"][:2] - names["middle"]) < 0.005,
+    "train_on_random_scenes": lambda names: names["errors"]["network"] < 0.3 < 0.35 < names["errors"]["fused image"],
     "two_fingers": lambda names: names["valleys"][20] > 0.9 and names["valleys"][80] < 0.1,
     "uneven_coating": lambda names: (
         names["errors"]["fitted to the frame without contact"] < names["errors"]["assumed even"]

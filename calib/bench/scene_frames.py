@@ -28,6 +28,10 @@ CHUNK_FRAMES = 128  # frames that are solved together, and of the untouched skin
 HOLD_STEPS = 16  # samples of a hold; the load rises and falls in as many before it
 MAX_TIP_ERROR = 0.1  # of the force of a flat tip on the mesh
 LEAST_FORCE = 1e-7  # N: what is less on a pixel is zero, so that maps take less space
+UNPRESSED = (
+    "the scene has no effect by which pressure changes the sheet, so that all frames would be equal; list one, such as "
+    "ContactPiezoresistance"
+)
 
 
 class Press(NamedTuple):
@@ -40,7 +44,9 @@ class Press(NamedTuple):
     | contact of each tip, and its share of that load      | (tips,)     |      |
     | hold: time since the load is constant                | ()          | s    |
     | peak: highest load before the hold over that of it   | ()          | 1    |
-    | number of the frame                                  | ()          |      |
+    | warmth: temperature above that at the start          | ()          | K    |
+    | air: pressure of the air above that at the start     | ()          | Pa   |
+    | number: 0 for the untouched skin, then of the frame  | ()          |      |
     """
 
     load: Float[Array, "*n contacts"]
@@ -49,14 +55,9 @@ class Press(NamedTuple):
     share: Float[Array, "*n tips"]
     hold: Float[Array, "*n"]
     peak: Float[Array, "*n"]
+    warmth: Float[Array, "*n"]
+    air: Float[Array, "*n"]
     number: Int[Array, "*n"]
-
-
-class Air(NamedTuple):
-    """Temperature (K) and air pressure (Pa) above those at the start of a recording."""
-
-    temperature: Float[Array, ""]
-    pressure: Float[Array, ""]
 
 
 class Solved(NamedTuple):
@@ -85,7 +86,8 @@ class SceneFrames:
         self.bench, self._scenes = bench, scenes
         self._model = je.discretise(bench.scene, fidelity)
         self._diameter = jnp.asarray(bench.tip_diameter, self._model.dtype)
-        _check_response(self._model)
+        if not fx.chosen(self._model.effects, fx.AbstractSheetEffect):
+            raise BenchError(UNPRESSED)
         _check_tips(bench, self._model)
         self.pixels = basis.on(self._model)
         self._response = je.pad_response(bench.scene.skin, self._model)
@@ -100,22 +102,25 @@ class SceneFrames:
         touches, skins = (np.random.default_rng([seed, number, purpose]) for purpose in range(2))
         key = jax.random.key(int(skins.integers(2**31)))
         rise = skins.random() * self.bench.duration
+        warmth, air = rise * self.bench.temperature_rate, rise * self.bench.barometer_rate
         model = self._drawn_skin(skins)
-        air = (rise * self.bench.temperature_rate, rise * self.bench.barometer_rate)
         contacts = draw_contacts(self._scenes, self.bench.scene.skin.domain, SHARD_FRAMES, touches)
-        presses = self._presses(contacts, arrange_tips(contacts))
-        eit = _Recording(self.bench, model, fx.StreamKind.EIT, np.asarray(je.forward(model)), key)
-        idle = np.asarray(_idle_pads(model, jnp.zeros(len(self._response)), key), float)
-        pads = _Recording(self.bench, model, fx.StreamKind.PRESSURE, idle, key)
+        presses = self._presses(contacts, arrange_tips(contacts), warmth, air)
+        recordings: list[_Recording] = []
         parts = []
         for start in range(0, frames, CHUNK_FRAMES):
-            chunk = Press(*(jnp.asarray(values[start : start + CHUNK_FRAMES]) for values in presses))
-            found = solve_presses(
-                model, self.pixels, self._response, self._diameter, chunk, Air(*map(jnp.asarray, air)), key
-            )
-            parts.append((eit.record(found.voltages, air), pads.record(found.pressures, air), found.force_map))
-        voltages, pressures, maps = (np.concatenate([np.asarray(p) for p in part]) for part in zip(*parts, strict=True))
-        maps = np.where(maps < LEAST_FORCE, 0, maps).astype(float)
+            chunk = Press(*(jnp.asarray(_with_first(values, start)) for values in presses))
+            solved = solve_presses(model, self.pixels, self._response, self._diameter, chunk, key)
+            voltages, pressures, maps = (np.asarray(values, float) for values in solved)
+            if not recordings:
+                _check_response(voltages, maps)
+                kinds = ((fx.StreamKind.EIT, voltages[0]), (fx.StreamKind.PRESSURE, pressures[0]))
+                recordings = [_Recording(self.bench, model, kind, resting, key) for kind, resting in kinds]
+            streams = zip(recordings, (voltages, pressures), strict=True)
+            parts.append([*(stream.record(values[1:], warmth, air) for stream, values in streams), maps[1:]])
+        eit, pads = recordings
+        voltages, pressures, maps = (np.concatenate(part) for part in zip(*parts, strict=True))
+        maps = np.where(maps < LEAST_FORCE, 0, maps)
         arrays = {
             "frames": voltages - eit.untouched,
             "untouched": eit.untouched,
@@ -139,13 +144,23 @@ class SceneFrames:
         effects = tuple(_reseeded(effect, rng) for effect in self.bench.scene.effects)
         return dataclasses.replace(self._model, effects=_laid(effects, self._model.centroids))
 
-    def _presses(self, contacts: DrawnContacts, tips: Tips) -> tuple[np.ndarray, ...]:
-        """The fields of `Press` for all frames, on the host: a slice of them compiles nothing."""
-        dtype = self._model.dtype
-        place, share = tips.place.astype(dtype), tips.share.astype(dtype)
-        number = np.arange(SHARD_FRAMES, dtype=np.int32)
-        drawn = (contacts.force.astype(dtype), place, tips.contact.astype(np.int32), share)
-        return (*drawn, contacts.hold, contacts.peak, number)
+    def _presses(self, contacts: DrawnContacts, tips: Tips, warmth: float, air: float) -> tuple[np.ndarray, ...]:
+        """The fields of `Press`, first of the untouched skin, on the host: a slice of them compiles nothing."""
+        dtype, even = self._model.dtype, np.ones(SHARD_FRAMES)
+        drawn = (
+            *(values.astype(dtype) for values in (contacts.force, tips.place)),
+            tips.contact.astype(np.int32),
+            tips.share.astype(dtype),
+            *(contacts.hold, contacts.peak, warmth * even, air * even, np.arange(1, SHARD_FRAMES + 1, dtype=np.int32)),
+        )
+        untouched = [np.zeros_like(values[:1]) for values in drawn]
+        untouched[Press._fields.index("hold")] += 1
+        return tuple(np.concatenate(pair) for pair in zip(untouched, drawn, strict=True))
+
+
+def _with_first(values: np.ndarray, start: int) -> np.ndarray:
+    """The first row, and those of a chunk of frames, of a field of `Press`."""
+    return np.concatenate([values[:1], values[start + 1 : start + 1 + CHUNK_FRAMES]])
 
 
 @je.verb
@@ -162,13 +177,11 @@ def solve_presses(
     response: Float[Array, "pads elements"],
     diameter: Float[Array, ""],
     presses: Press,
-    air: Air,
     key: Key[Array, ""],
 ) -> Solved:
     """Voltages, pressures in the pads, and force maps of some presses, before the electronics; ``key`` of chance."""
     memory = fx.chosen(model.effects, fx.AbstractMemoryEffect)
     pneumatic = fx.chosen(model.effects, fx.AbstractPneumaticEffect)
-    warmth = air.temperature.astype(model.dtype)
 
     def one(press: Press) -> Solved:
         own = jax.random.fold_in(key, press.number)
@@ -176,11 +189,11 @@ def solve_presses(
         pressure = (press.load[press.contact] * press.share) @ spread
         felt = pressure
         if memory:
-            load = _held(memory, press.load, press, air, jax.random.fold_in(own, 0)).astype(model.dtype)
+            load = _held(memory, press.load, press, jax.random.fold_in(own, 0)).astype(model.dtype)
             felt = (load[press.contact] * press.share) @ spread
-        voltages = je.forward(model, je.conductivity(model, felt, warmth))
+        voltages = je.forward(model, je.conductivity(model, felt, press.warmth.astype(model.dtype)))
         pads = response @ pressure
-        pads = _held(pneumatic, pads, press, air, jax.random.fold_in(own, 1)).astype(model.dtype) if pneumatic else pads
+        pads = _held(pneumatic, pads, press, jax.random.fold_in(own, 1)).astype(model.dtype) if pneumatic else pads
         return Solved(voltages, pads, pixels.restrict(pressure * model.areas))
 
     found: Solved = jax.vmap(one)(presses)
@@ -191,7 +204,6 @@ def _held(
     effects: tuple[fx.AbstractHistoryEffect, ...],
     load: Float[Array, " channels"],
     press: Press,
-    air: Air,
     key: Key[Array, ""],
 ) -> Float[Array, " channels"]:
     """What effects with memory make of a load at the end of its hold."""
@@ -199,42 +211,39 @@ def _held(
     share = jnp.concatenate([up * press.peak, press.peak + up * (1 - press.peak), hold])
     series = share[:, None] * load.astype(share.dtype)
     whole = partial(jnp.full, len(share))
-    line = fx.Line(key, press.hold / HOLD_STEPS, whole(air.temperature), whole(air.pressure), jnp.zeros((0, 4), int))
+    line = fx.Line(key, press.hold / HOLD_STEPS, whole(press.warmth), whole(press.air), jnp.zeros((0, 4), int))
     after, _ = fx.history(effects, series, fx.history_start(effects, jnp.zeros_like(series[0])), line)
     last: Array = after[-1]
     return last
-
-
-@je.verb
-def _idle_pads(model: je.Model, pads: Float[Array, " pads"], key: Key[Array, ""]) -> Float[Array, " pads"]:
-    """Pressures in the pads of the untouched skin at the start of a recording, Pa."""
-    effects, nothing = fx.chosen(model.effects, fx.AbstractPneumaticEffect), jnp.zeros(1)
-    line = fx.Line(key, jnp.asarray(1.0), nothing, nothing, jnp.zeros((0, 4), int))
-    return fx.history(effects, pads[None], fx.history_start(effects, pads), line)[0][0]
 
 
 class _Recording:
     """One stream of a shard through its electronics: first the untouched skin, whose mean is `untouched`."""
 
     def __init__(
-        self, bench: Bench, model: je.Model, kind: fx.StreamKind, resting: Float[np.ndarray, " channels"], key: Any
+        self,
+        bench: Bench,
+        model: je.Model,
+        kind: fx.StreamKind,
+        resting: Float[np.ndarray, " channels"],
+        key: Key[Array, ""],
     ):
         self._effects = fx.chosen(model.effects, fx.AbstractReadoutEffect, kind)
-        self._key = jax.random.fold_in(key, SHARD_FRAMES + (kind is fx.StreamKind.EIT))  # beyond those of frames
+        self._key = jax.random.fold_in(key, SHARD_FRAMES + 1 + (kind is fx.StreamKind.EIT))  # beyond those of frames
         pattern = jnp.asarray(bench.scene.skin.protocol.pattern, jnp.int32)
         self._pattern = pattern if kind is fx.StreamKind.EIT else pattern[:0]
         self._interval, self._blocks = jnp.asarray(1 / bench.eit_rate), 0
-        resting = resting.astype(float)
         self._state = fx.history_start(self._effects, jnp.asarray(resting))
-        self.untouched = self.record(np.tile(resting, (CHUNK_FRAMES, 1)), (0.0, 0.0)).mean(0)
+        self.untouched = self.record(np.tile(resting, (CHUNK_FRAMES, 1)), 0.0, 0.0).mean(0)
 
-    def record(self, values: Any, air: tuple[float, float]) -> Float[np.ndarray, "rows channels"]:
-        """The next block of samples as it is recorded."""
-        rows: np.ndarray = np.asarray(values, float)
+    def record(
+        self, rows: Float[np.ndarray, "rows channels"], warmth: float, air: float
+    ) -> Float[np.ndarray, "rows channels"]:
+        """The next block of samples as it is recorded, at this temperature (K) and pressure (Pa) of the air."""
         self._blocks += 1
         if not self._effects or not rows.shape[1]:
             return rows
-        temperature, pressure = (jnp.full(len(rows), rise) for rise in air)
+        temperature, pressure = (jnp.full(len(rows), rise) for rise in (warmth, air))
         key = jax.random.fold_in(self._key, self._blocks)
         line = fx.Line(key, self._interval, temperature, pressure, self._pattern)
         recorded, self._state = history(self._effects, jnp.asarray(rows), self._state, line)
@@ -250,13 +259,9 @@ def _reseeded(effect: fx.AbstractEffect, rng: np.random.Generator) -> fx.Abstrac
     return dataclasses.replace(effect, **changes)
 
 
-def _check_response(model: je.Model) -> None:
-    sigma = je.conductivity(model, jnp.full_like(model.background, 1e4))
-    if not isinstance(sigma, je.model.CoatedSheet) and bool(jnp.all(sigma == je.conductivity(model))):
-        raise BenchError(
-            "the scene has no effect by which pressure changes the sheet, so that all frames would be equal; "
-            "list one, such as ContactPiezoresistance"
-        )
+def _check_response(voltages: Float[np.ndarray, "n readings"], maps: Float[np.ndarray, "n pixels"]) -> None:
+    if maps.any() and not np.ptp(voltages, axis=0).any():
+        raise BenchError(UNPRESSED)
 
 
 def _check_tips(bench: Bench, model: je.Model) -> None:

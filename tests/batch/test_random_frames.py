@@ -281,6 +281,9 @@ def test_what_cannot_be_simulated_is_refused(scene, tmp_path, capsys):
     bench = calib.load_bench(scene)
     with pytest.raises(BenchError, match="no effect by which pressure changes the sheet"):
         write(calib.load_bench("ideal"))
+    dead = je.Scene(bench.scene.skin, (je.effects.LoadSpreading(), je.effects.CoatingNonUniformity()))
+    with pytest.raises(BenchError, match="no effect by which pressure changes the sheet"):
+        write(dataclasses.replace(bench, scene=dead))
     law = je.effects.ContactPiezoresistance()
     tip = dataclasses.replace(bench, scene=je.Scene(bench.scene.skin, (law,)), tip_diameter=0.005)
     with pytest.raises(BenchError, match=r"of its force at .* on this mesh"):
