@@ -17,9 +17,11 @@ from calib.batch import random_frames
 from calib.bench import BenchError, Footprint, RandomScenes
 from calib.bench.random_scenes import MAX_CONTACTS, arrange_tips, draw_contacts
 from calib.bench.scene_frames import SHARD_FRAMES, SceneFrames
+from calib.bench.training_frames import ARRAYS
 from calib.cli import main
 
 from ..helpers import skin_of
+from ..test_docs import run
 
 FRAMES = SHARD_FRAMES + 200
 WORDS = ["--fidelity", "draft", "--pixels", "20", "--seed", "5"]
@@ -220,6 +222,19 @@ def test_every_shard_is_another_skin_and_batches_hold_each_frame_once(frames):
         frames.batches(2000, "frames")
     with pytest.raises(BenchError, match="has none of 2 shards"):
         frames.part(0.1, 0.2)
+
+
+def test_the_page_is_true(folder, root, monkeypatch):
+    (folder.parent / "frames").symlink_to(folder)
+    monkeypatch.chdir(folder.parent)
+    page = root / "docs" / "training-frames.md"
+    assert run(page, {})["places"].shape == (200, 3, 2)
+    text = page.read_text()
+    for name, about in ARRAYS.items():
+        row = next(line for line in text.splitlines() if line.startswith(f"| `{name}` |"))
+        meaning = about.meaning.split(",")[0].split(";")[0]
+        assert f"| {', '.join(about.dims)} |" in row
+        assert meaning in row
 
 
 def test_the_card_and_other_programs_read_the_shards(folder):
