@@ -132,7 +132,9 @@ class ArchiveWriter(FileWriter):
         array, kind = _storable(self.path, name, np.asarray(values))
         group, leaf = self._place(name, dims)
         attrs = {"units": units, "long_name": long_name, **kind}
-        self._name_axes(make_array(group, leaf, array, attrs), name)
+        dataset = make_array(group, leaf, array, attrs)
+        self._name_axes(dataset, name)
+        dataset.flush()  # else its place in the file depends on who else holds it, such as a profiler
         self._check_disk()
 
     def add_rows(

@@ -18,6 +18,7 @@ import pytest
 from h5py import h5d, h5p, h5s, h5t
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+import calib.session.archive as archive
 from calib.session import (
     ArchiveWriter,
     ClockTable,
@@ -759,6 +760,22 @@ def test_results_come_back(tmp_path: Path) -> None:
         assert found.dtype == np.asarray(values).dtype
         np.testing.assert_array_equal(found, values)
         assert (archive.units[name], archive.long_names[name]) == (units, long_name)
+
+
+def test_bytes_do_not_depend_on_who_else_holds_an_array(tmp_path, monkeypatch):
+    """A profiler, such as that of a Dask worker, keeps the frames of a thread, and with them what they name."""
+    arrays = {"k": (np.arange(3), "1", "")} | {f"x{n}": (np.ones(3), "1", "") for n in range(5)}
+    write_archive(tmp_path / "a.h5", "x", {}, arrays, dict.fromkeys(arrays, ("k",)))
+    held, make = [], archive.make_array
+
+    def hold(*what):
+        held.append(make(*what))
+        return held[-1]
+
+    monkeypatch.setattr(archive, "make_array", hold)
+    write_archive(tmp_path / "b.h5", "x", {}, arrays, dict.fromkeys(arrays, ("k",)))
+    assert len(held) == 6
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
 def test_rows_may_be_written_and_read_in_pieces(tmp_path: Path) -> None:
