@@ -97,7 +97,10 @@ class SceneFrames:
     def simulate(self, number: int, seed: int, frames: int = SHARD_FRAMES) -> Mapping[str, np.ndarray]:
         """The first ``frames`` of a shard by the names of `calib.bench.training_frames.ARRAYS`.
 
-        All that is drawn depends on the seed and on the number of the shard alone, the contacts on no effect.
+        All that is drawn depends on the seed and on the number of the shard alone; contacts do not depend on effects.
+
+        Raises:
+            BenchError: if the frames do not depend on the pressure, or a number is not finite.
         """
         touches, skins = (np.random.default_rng([seed, number, purpose]) for purpose in range(2))
         key = jax.random.key(int(skins.integers(2**31)))
@@ -106,6 +109,28 @@ class SceneFrames:
         model = self._drawn_skin(skins)
         contacts = draw_contacts(self._scenes, self.bench.scene.skin.domain, SHARD_FRAMES, touches)
         presses = self._presses(contacts, arrange_tips(contacts), warmth, air)
+        recorded = self._recorded(model, presses, frames, key, (warmth, air))
+        if bad := [name for name, values in recorded.items() if not np.isfinite(values).all()]:
+            raise BenchError(f"shard {number}: {', '.join(bad)} are not finite; check the parameters of the effects")
+        drawn = {
+            "contacts": contacts.number,
+            "contact_place": contacts.place,
+            "contact_force": contacts.force,
+            "contact_footprint": contacts.footprint,
+            "contact_size": contacts.size,
+            "contact_angle": contacts.angle,
+        }
+        return recorded | {name: values[:frames] for name, values in drawn.items()}
+
+    def _recorded(
+        self,
+        model: je.Model,
+        presses: tuple[np.ndarray, ...],
+        frames: int,
+        key: Key[Array, ""],
+        air: tuple[float, float],
+    ) -> dict[str, np.ndarray]:
+        """What a skin reads under presses, as it is recorded, and the forces on it."""
         recordings: list[_Recording] = []
         parts = []
         for start in range(0, frames, CHUNK_FRAMES):
@@ -117,27 +142,15 @@ class SceneFrames:
                 kinds = ((fx.StreamKind.EIT, voltages[0]), (fx.StreamKind.PRESSURE, pressures[0]))
                 recordings = [_Recording(self.bench, model, kind, resting, key) for kind, resting in kinds]
             streams = zip(recordings, (voltages, pressures), strict=True)
-            parts.append([*(stream.record(values[1:], warmth, air) for stream, values in streams), maps[1:]])
+            parts.append([*(stream.record(values[1:], *air) for stream, values in streams), maps[1:]])
         eit, pads = recordings
-        voltages, pressures, maps = (np.concatenate(part) for part in zip(*parts, strict=True))
+        voltages, pressures, maps = (np.concatenate(part)[:frames] for part in zip(*parts, strict=True))
         maps = np.where(maps < LEAST_FORCE, 0, maps)
-        arrays = {
-            "frames": voltages - eit.untouched,
-            "untouched": eit.untouched,
-            "force_map": maps,
-            "contacts": contacts.number,
-            "contact_place": contacts.place,
-            "contact_force": contacts.force,
-            "contact_footprint": contacts.footprint,
-            "contact_size": contacts.size,
-            "contact_angle": contacts.angle,
-        }
-        if self._masks is not None:
-            on_pads = maps @ self._masks.T
-            arrays |= {"pressures": pressures - pads.untouched, "untouched_pressures": pads.untouched}
-            arrays["pad_forces"] = on_pads
-        single = ("untouched", "untouched_pressures")
-        return {name: values if name in single else values[:frames] for name, values in arrays.items()}
+        found = {"frames": voltages - eit.untouched, "untouched": eit.untouched, "force_map": maps}
+        if self._masks is None:
+            return found
+        felt = {"pressures": pressures - pads.untouched, "untouched_pressures": pads.untouched}
+        return found | felt | {"pad_forces": maps @ self._masks.T}
 
     def _drawn_skin(self, rng: np.random.Generator) -> je.Model:
         """The model of a skin of the scene whose effects have drawn seeds; equal in form to that of any other."""
