@@ -116,8 +116,8 @@ def write_training_frames(
     claim_folder(folder, card_of(made, mark, versions))
     left = [number for number in range(made.shards) if not is_whole(shard_path(folder, number), mark)]
     to_make = sum(map(made.rows, left))
-    _require_space(folder, to_make * made.frame_bytes)
-    begin(to_make, to_make * made.frame_bytes)
+    _require_space(folder, made.nbytes(left))
+    begin(to_make, made.nbytes(left))
     choices, chosen = pickle.dumps(made), settings()
     tasks = {number: _Task(str(folder.absolute()), number, choices, mark, chosen) for number in left}
     with contextlib.ExitStack() as stack:

@@ -1,7 +1,8 @@
 """A simulated bench: an indenter presses a skin at many places, and all streams are recorded as on a real bench.
 
 The simulation uses another mesh than `calib.calibrate`, so that the calibration cannot compensate for the
-discretisation error of the simulation (no inverse crime).
+discretisation error of the simulation (no inverse crime). For training, frames of random contacts take the place of the
+presses (`RandomScenes`).
 """
 
 from .bench import Bench, BenchError, Companion, Timing, load_bench, presets

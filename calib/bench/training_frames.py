@@ -7,7 +7,7 @@ and xarray open them too.
 import dataclasses
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 import jaxeit as je
+from jaxeit.budget import require
 
 from ..session import ArchiveWriter, SessionError, open_archive, replacing
 from .bench import Bench, BenchError
@@ -25,6 +26,7 @@ FORMAT = "jaxeit-training-frames"
 VERSION = 1  # of the content: equal seeds give equal frames within a version
 SHARD_FORMAT = "skin-training-frames"
 CARD = "card.json"
+FIXED_BYTES = 1 << 16  # of a shard: headers
 
 
 class About(NamedTuple):
@@ -68,7 +70,7 @@ class FrameSet:
     | scenes: what contacts are drawn from                         |
 
     Raises:
-        BenchError: for less than one frame, or a seed below 0.
+        BenchError: for less than one frame, or a seed below 0 or beyond 2^63 - 1.
     """
 
     bench: Bench
@@ -81,8 +83,8 @@ class FrameSet:
     def __post_init__(self) -> None:
         if self.frames < 1:
             raise BenchError(f"{self.frames} frames make no data set; give one or more")
-        if self.seed < 0:
-            raise BenchError(f"the seed is {self.seed}; give 0 or more")
+        if not 0 <= self.seed < 2**63:
+            raise BenchError(f"the seed is {self.seed}; give 0 to 2^63 - 1")
         if self.pixels.rows is None:
             raise BenchError("pixels without their number of rows; give Pixels(columns, rows)")
 
@@ -108,13 +110,13 @@ class FrameSet:
         """The arrays of a shard."""
         return {name: about for name, about in ARRAYS.items() if {*about.dims} <= {*self.sizes, "frame"}}
 
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of one frame before compression."""
+    def nbytes(self, numbers: Collection[int]) -> int:
+        """Upper bound of the bytes of some shards."""
         each = [a for a in self.arrays.values() if a.dims[0] == "frame"]
-        return sum(
-            np.dtype(a.dtype).itemsize * int(np.prod([self.sizes[d] for d in a.dims[1:]], dtype=int)) for a in each
-        )
+        counts = [int(np.prod([self.sizes[d] for d in a.dims[1:]], dtype=int)) for a in each]
+        frame = sum(np.dtype(a.dtype).itemsize * count for a, count in zip(each, counts, strict=True))
+        fixed = FIXED_BYTES + 8 * (sum(self.sizes.values()) + 3 * self.sizes["pixel"] + self.sizes["reading"])
+        return sum(self.rows(number) * frame + fixed for number in numbers)
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -283,9 +285,16 @@ class TrainingFrames:
         """One array of all shards in memory, such as ``frames["force_map"]``, (frames, pixels).
 
         An array of the skins, such as ``untouched``, has one row for each shard.
+
+        Raises:
+            BenchError: for an unknown name, or an array beyond the budget of one in memory; see `batches`.
         """
+        about = self._about(name)
+        rows = len(self) if about["axes"][0] == "frame" else len(self.shards)
+        nbytes = rows * int(np.prod(about["shape"][1:], dtype=int)) * np.dtype(about["dtype"]).itemsize
+        require("array_bytes", nbytes, f"{self.folder}: {name}", BenchError)
         parts = [self._read(number, [name])[name] for number in self.shards]
-        return np.concatenate(parts) if self._about(name)["axes"][0] == "frame" else np.stack(parts)
+        return np.concatenate(parts) if about["axes"][0] == "frame" else np.stack(parts)
 
     def batches(self, size: int, *names: str, seed: int | None = None) -> Iterator[tuple[np.ndarray, ...]]:
         """Batches of ``size`` frames, each a tuple of the arrays named; one pass over all frames.

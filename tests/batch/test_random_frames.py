@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from concurrent.futures import Executor, Future
 
 import h5py
@@ -110,7 +111,10 @@ def test_one_process_after_an_interruption_gives_the_same_bytes(scene, folder, t
     (out / "shard-000000.h5").write_bytes((folder / "shard-000000.h5").read_bytes()[:-1])  # not whole
     monkeypatch.setattr(random_frames, "spawned_pool", pool)
     assert main(words) == 0
-    assert f"{FRAMES:,} of them now" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert f"{FRAMES:,} of them now" in told.out
+    bound = float(re.search(r"at most ([\d.]+) MB", told.err)[1])
+    assert 0.2 * bound < sum(path.stat().st_size for path in out.glob("*.h5")) / 1e6 < bound
     assert _bytes(out) == _bytes(folder)
     assert main(words) == 0
     assert "all of them there before" in capsys.readouterr().out
@@ -189,7 +193,7 @@ def test_a_frame_is_what_the_scene_says(frames, scene):
     np.testing.assert_allclose(part["untouched_pressures"][0], sensor.offset * offset, rtol=1e-9)
 
 
-def test_every_shard_is_another_skin_and_batches_hold_each_frame_once(frames):
+def test_every_shard_is_another_skin_and_batches_hold_each_frame_once(frames, monkeypatch):
     assert len(frames) == FRAMES
     first, second = frames["untouched"]
     assert 0.01 < np.abs(first - second).max() / np.abs(first).max() < 1
@@ -208,6 +212,9 @@ def test_every_shard_is_another_skin_and_batches_hold_each_frame_once(frames):
         frames.batches(2000, "frames")
     with pytest.raises(BenchError, match="has none of 2 shards"):
         frames.part(0.1, 0.2)
+    monkeypatch.setenv("JAXEIT_BUDGET", "1e-4")
+    with pytest.raises(BenchError, match=r"force_map: .* bytes at once"):
+        frames["force_map"]
 
 
 def test_the_page_is_true(folder, root, monkeypatch):
@@ -318,6 +325,7 @@ def test_what_cannot_be_simulated_is_refused(scene, tmp_path, capsys):
         SceneFrames(tip, je.Fidelity.draft(), je.Pixels(20, 20), RandomScenes())
     for options, message in (
         ({"seed": -1}, "the seed is -1"),
+        ({"seed": 2**63}, "give 0 to 2"),
         ({"jobs": 0}, "0 jobs"),
         ({"pixels": je.Pixels(2000)}, "coefficients"),
     ):

@@ -41,7 +41,9 @@ def _add_random_scenes(parser: argparse.ArgumentParser) -> None:
     action.suggestions = ("draft", "standard", "reference")  # type: ignore[attr-defined]
     group.add_argument("--pixels", type=count, metavar="N", help="pixels of the force map along x; default: 40")
     many = group.add_mutually_exclusive_group()
-    many.add_argument("--jobs", type=count, metavar="N", help="number of processes; the bytes do not depend on it")
+    many.add_argument(
+        "--jobs", type=count, metavar="N", help="number of processes, on which the bytes do not depend; default: 1"
+    )
     text = "as --jobs, on the workers of a Dask scheduler, which must see the same folder"
     many.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
