@@ -131,13 +131,20 @@ def noise_of_an_image(axes: Any, names: Names) -> None:
 
 
 def train_on_random_scenes(axes: Any, names: Names) -> None:
-    """True and learned shares of the force, side by side: of two contacts, the frame with the median error."""
-    truth, learned = (np.asarray(names[n]).reshape(-1, 20, 20) for n in ("truth", "learned"))
+    """Shares of the force, true, by the network and by the fused image, of two contacts: a good frame and a bad one."""
+    maps = [np.asarray(names[n]).reshape(-1, 20, 20) for n in ("truth", "learned", "fused")]
     two = np.flatnonzero(names["unseen"]["contacts"] == 2)
-    frame = two[np.argsort(np.abs(truth - learned)[two].sum((1, 2)))[len(two) // 2]]
-    axes.imshow(np.hstack([truth[frame], learned[frame]]), origin="lower", cmap="viridis")
-    axes.axvline(19.5, color="white", linewidth=1)
-    axes.set(xticks=[], yticks=[], xlabel="true | learned share of the force")
+    order = two[np.argsort(np.abs(maps[0] - maps[1])[two].sum((1, 2)))]
+    rows = [
+        np.hstack([one[frame] / one[frame].max() for one in maps])
+        for frame in (order[-len(two) // 4], order[len(two) // 4])
+    ]
+    axes.imshow(np.vstack(rows), origin="lower", cmap="Blues")
+    axes.hlines(19.5, -0.5, 59.5, color=GREY, linewidth=1)
+    axes.vlines([19.5, 39.5], -0.5, 39.5, color=GREY, linewidth=1)
+    axes.set(xticks=[9.5, 29.5, 49.5], xticklabels=["true", "network", "fused image"], yticks=[])
+    axes.tick_params(length=0)
+    axes.set_title("where the force is, on a skin not seen before", fontsize=8)
 
 
 DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
