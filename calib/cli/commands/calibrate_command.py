@@ -54,6 +54,7 @@ def _calibrate_together(args: argparse.Namespace) -> int:
     from jaxeit.skin import parse_skin
 
     from ...calibration.evaluation import render_table
+    from ...calibration.layer import render_layer
     from ...calibration.procedure import STAGES, calibrate, evaluate
     from ...session import open_session
 
@@ -81,6 +82,8 @@ def _calibrate_together(args: argparse.Namespace) -> int:
     print(render_table(calibration.evaluation, title(names, calibration.simulated)))
     for note in calibration.notes:
         print(f"  note: {note}")
+    if calibration.layer is not None:
+        print(f"  {render_layer(calibration.layer, calibration.recon)}")
     for name, found in tried.items():
         print("\n" + render_table(found, title(name, tests[name].simulated)))
     print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
