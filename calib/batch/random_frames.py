@@ -9,7 +9,7 @@ import pickle
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -112,9 +112,10 @@ def write_training_frames(
     )
     folder = Path(folder)
     versions = {"jaxeit": metadata.version("jaxeit"), "jax": jax.__version__, "numpy": np.__version__}
-    mark = digest(describe(made), str(VERSION), *versions.values())
+    # A folder may get more frames, so that the number of frames is no part of the mark.
+    mark = digest(describe(replace(made, frames=1)), str(VERSION), *versions.values())
     claim_folder(folder, card_of(made, mark, versions))
-    left = [number for number in range(made.shards) if not is_whole(shard_path(folder, number), mark)]
+    left = [n for n in range(made.shards) if not is_whole(shard_path(folder, n), mark, made.rows(n))]
     to_make = sum(map(made.rows, left))
     _require_space(folder, made.nbytes(left))
     begin(to_make, made.nbytes(left))

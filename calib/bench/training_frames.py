@@ -26,6 +26,7 @@ FORMAT = "jaxeit-training-frames"
 VERSION = 1  # of the content: equal seeds give equal frames within a version
 SHARD_FORMAT = "skin-training-frames"
 CARD = "card.json"
+COUNTS = ("frames", "shards", "arrays")  # entries of a card that change where frames are added
 FIXED_BYTES = 1 << 16  # of a shard: headers
 
 
@@ -124,13 +125,13 @@ def shard_path(folder: Path, number: int) -> Path:
     return folder / f"shard-{number:06d}.h5"
 
 
-def is_whole(path: Path, mark: str) -> bool:
-    """Whether a shard is complete and was made for the card with this mark."""
+def is_whole(path: Path, mark: str, rows: int) -> bool:
+    """Whether a shard has all its frames and was made for a card with this mark."""
     if not path.is_file():
         return False
     try:
         with open_archive(path, SHARD_FORMAT) as shard:
-            return shard.attrs.get("mark") == mark
+            return shard.attrs.get("mark") == mark and shard.arrays["frame"].shape == (rows,)
     except SessionError:
         return False
 
@@ -201,10 +202,10 @@ def card_of(made: FrameSet, mark: str, versions: Mapping[str, str]) -> str:
 
 
 def claim_folder(folder: Path, card: str) -> None:
-    """Write the card into a folder without shards, or check that the card of the shards there is this one.
+    """Write the card into a folder without shards, or of shards that belong to it; it may have more frames than these.
 
     Raises:
-        BenchError: the folder holds frames of another card, or other files.
+        BenchError: the folder holds frames of another card, more frames, or other files.
     """
     path = folder / CARD
     try:
@@ -217,21 +218,19 @@ def claim_folder(folder: Path, card: str) -> None:
     if CARD in names:
         differ = _differences(path, card)
         if differ and names != {CARD}:
-            raise BenchError(
-                f"{folder}: holds frames of another {differ}; give the same command again, or another folder"
-            )
-        if not differ:
-            return
+            raise BenchError(f"{folder}: holds frames that differ in {differ}; give that command, or another folder")
+        there, wanted = (one["frames"] for one in (_read_card(path), json.loads(card)))
+        if there > wanted and names != {CARD}:
+            raise BenchError(f"{folder}: holds {there:,} frames; give as many or more, or another folder")
     with replacing(path) as temporary:
         temporary.write_text(card, encoding="utf-8")
 
 
 def _differences(path: Path, card: str) -> str:
-    """Names of the entries by which a card differs from that of a folder, empty if it does not."""
-    old, new = _read_card(path), json.loads(card)
+    """Names of the entries by which a card differs from that of a folder, besides the number of frames."""
+    old, new = ({k: v for k, v in one.items() if k not in COUNTS} for one in (_read_card(path), json.loads(card)))
     names = [name for name in new if old.get(name) != new[name]]
-    shown = [name for name in names if name not in ("mark", "arrays", "shards")]
-    return ", ".join(shown or names)
+    return ", ".join([name for name in names if name != "mark"] or names)
 
 
 def _read_card(path: Path) -> dict[str, Any]:
@@ -336,6 +335,8 @@ class TrainingFrames:
         with open_archive(path, SHARD_FORMAT) as shard:
             if shard.attrs.get("mark") != self.card["mark"]:
                 raise BenchError(f"{path}: belongs to another card; write the frames again in a new folder")
+            if shard.arrays["frame"].shape != (self._rows(number),):
+                raise BenchError(f"{path}: frames are missing; give the command that writes them again")
             return {name: shard.arrays[name].read() for name in names}
 
 

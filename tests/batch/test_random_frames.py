@@ -99,15 +99,26 @@ def _bytes(folder):
 
 
 def test_one_process_after_an_interruption_gives_the_same_bytes(scene, folder, tmp_path, monkeypatch, capsys):
+    """After one of the first frames, and after one of frames that were to be added."""
     out = tmp_path / "one"
     words = ["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(out), *WORDS]
+    few = [*words[:3], "128", *words[4:]]
     pool = random_frames.spawned_pool
     monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here(ends_at=0))
-    assert main(words) == 130
+    assert main(few) == 130
     assert "the same command goes on from the shards" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["card.json"]
-    with pytest.raises(BenchError, match="2 of 2 shards are missing"):
+    with pytest.raises(BenchError, match="1 of 1 shards are missing"):
         calib.open_training_frames(out)
+    monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here())
+    assert main(few) == 0
+    assert len(calib.open_training_frames(out)["contacts"]) == 128
+    monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here(ends_at=0))
+    assert main([*words[:3], "129", *words[4:]]) == 130
+    with pytest.raises(BenchError, match=r"shard-000000\.h5: frames are missing; give the command"):
+        calib.open_training_frames(out)["contacts"]
+    assert main(few) == 2
+    assert "holds 129 frames; give as many or more" in capsys.readouterr().err
     (out / "shard-000000.h5").write_bytes((folder / "shard-000000.h5").read_bytes()[:-1])  # not whole
     monkeypatch.setattr(random_frames, "spawned_pool", pool)
     assert main(words) == 0
@@ -124,10 +135,10 @@ def test_a_folder_of_something_else_is_refused(scene, folder, tmp_path, capsys):
     before = _bytes(folder)
     words = ["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(folder)]
     assert main([*words, *WORDS[:-1], "6"]) == 2
-    assert "holds frames of another seed" in capsys.readouterr().err
+    assert "holds frames that differ in seed" in capsys.readouterr().err
     scene.with_name("other.toml").write_text(SCENE.replace(f"width = {WIDTH}", "width = 0.011"))
     assert main([*words[:1], str(scene.with_name("other.toml")), *words[2:], *WORDS]) == 2
-    assert "holds frames of another scene_toml" in capsys.readouterr().err
+    assert "holds frames that differ in scene_toml" in capsys.readouterr().err
     assert _bytes(folder) == before
     (tmp_path / "notes.txt").write_text("mine")
     assert main([*words[:-1], str(tmp_path), *WORDS]) == 2
