@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import calib
 import jaxeit as je
+from calib.cli import main
 from calib.simulators import SimulatorError
 from tests.test_docs import run
 
@@ -159,3 +161,42 @@ def test_names_that_the_model_does_not_have(skin):
 def test_nothing_of_mujoco_is_imported_unless_asked_for():
     code = "import sys, calib, calib.simulators; sys.exit('mujoco' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+BALL = """<mujoco><option timestep="0.005"/><worldbody>
+  <geom name="board" type="box" size=".1 .1 .01"/><site name="sheet" pos="-.1 -.1 .01"/>
+  <body pos="-.04 .03 .0395"><freejoint/><geom type="sphere" size=".03" mass="1.2" condim="6"/></body>
+</worldbody></mujoco>"""
+
+
+def test_the_command_records_what_the_skin_of_a_robot_reads(skin, tmp_path, capsys):
+    """A session that begins untouched, and whose load is the weight of the ball."""
+    (tmp_path / "robot.xml").write_text(BALL)
+    (tmp_path / "scene.toml").write_text(
+        'format = "jaxeit-scene"\nversion = 1\ntitle = "a ball"\nskin = "testbed"\nseed = 1\n'
+        "[bench]\nblank = 0.5\neit_rate = 50.0\ncolumns = 2\nrows = 2\nmargin = 0.05\nforces = [10.0]\n"
+        '[[effects]]\ntype = "LoadSpreading"\nwidth = 0.01\n[[effects]]\ntype = "ContactPiezoresistance"\n'
+    )
+    out, words = tmp_path / "session.h5", ["--geom", "board", "--site", "sheet", "--fidelity", "draft"]
+    command = ["simulate", str(tmp_path / "scene.toml"), "-o", str(out), "--mujoco", str(tmp_path / "robot.xml")]
+    assert main([*command, *words, "--seconds", "1"]) == 0
+    with calib.open_session(out) as session:
+        frames, pads, load = session.stream("eit").read(), session.stream("pressure").read(), session.truth["load"]
+        assert session.simulated
+        assert len(frames) == len(pads) == len(load) == 75
+        assert session.skin_toml == skin.toml
+    assert not load[:25].any()
+    np.testing.assert_array_equal(frames[1:25], frames[:24])
+    np.testing.assert_allclose(load[-10:], 1.2 * GRAVITY, rtol=0.02)
+    assert np.abs(frames[-1] - frames[0]).max() > 1e-4 * np.abs(frames[0]).max()
+    assert [pad.name for pad in skin.pads][pads[-1].argmax()] == "upper left"
+    (tmp_path / "broken.xml").write_text(BALL.replace("sphere", "spere"))
+    for wrong, said in (
+        ([*words, "--seconds", "0"], "0 s are no recording"),
+        (["--geom", "board"], "give --geom NAME"),
+        ([*words, "--mujoco", str(tmp_path / "broken.xml")], "MuJoCo cannot read the model"),
+        ([*words, "--jobs", "2"], "--jobs: an option of --random-scenes"),
+        ([*words, "--random-scenes", "5"], "make different things"),
+    ):
+        assert main([*command, *wrong]) == 2
+        assert said in capsys.readouterr().err

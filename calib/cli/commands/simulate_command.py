@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "write a data set (HDF5) of Gaussian contacts of 0 to 100 %% at N x N places of a skin, which SCENE names; "
     parser.add_argument("--data-set", nargs="?", type=int, const=41, metavar="N", help=text + "default N: 41")
     _add_random_scenes(parser)
+    _add_robot(parser)
 
 
 def _add_random_scenes(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +49,17 @@ def _add_random_scenes(parser: argparse.ArgumentParser) -> None:
     many.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
 
+def _add_robot(parser: argparse.ArgumentParser) -> None:
+    about = "what a skin on a robot reads while MuJoCo simulates the robot, left to itself; needs jaxeit[mujoco]"
+    group = parser.add_argument_group("a simulated robot", about)
+    text = "the robot; the scene gives skin, effects and rates, and its presses are not used"
+    group.add_argument("--mujoco", metavar="MODEL.xml", help=text)
+    group.add_argument("--geom", nargs="+", metavar="NAME", help="geoms of the robot that the skin covers")
+    text = "site of the robot at which the skin lies, with the axes of its surface"
+    group.add_argument("--site", metavar="NAME", help=text)
+    group.add_argument("--seconds", type=float, metavar="S", help="of the robot's time; default: 10")
+
+
 def run(args: argparse.Namespace) -> int:
     """Simulate, explain, or serve a scene."""
     if bool(args.output) == args.explain:
@@ -62,6 +74,8 @@ def run(args: argparse.Namespace) -> int:
         return _simulate_data_set(args)
     if args.random_scenes:
         return _simulate_random_scenes(args)
+    if args.mujoco:
+        return _simulate_robot(args)
     bench = load_bench(args.scene)
     if args.explain:
         print(render_costs(bench, measure_costs(bench)))
@@ -127,17 +141,51 @@ def _simulate_data_set(args: argparse.Namespace) -> int:
     return 0
 
 
-_FOR_RANDOM_SCENES = ("seed", "fidelity", "pixels", "jobs", "scheduler")
+_OPTIONS_OF = {
+    "--random-scenes FRAMES": ("seed", "fidelity", "pixels", "jobs", "scheduler"),
+    "--mujoco MODEL.xml": ("geom", "site", "seconds", "fidelity"),
+}
+_OTHERS = ("data_set", "random_scenes", "mujoco", "explain", "serve")
 
 
 def _refuse_lone_options(args: argparse.Namespace) -> None:
-    given = [f"--{name}" for name in _FOR_RANDOM_SCENES if getattr(args, name) is not None]
-    if given and not args.random_scenes:
-        raise ValueError(
-            f"{', '.join(given)}: for frames for training; give --random-scenes FRAMES too, or leave it out"
-        )
-    if args.random_scenes and (args.data_set or args.explain or args.serve):
-        raise ValueError("--data-set, --explain and --serve make something else than --random-scenes; leave them out")
+    """What makes one thing does not go with what makes another, nor its options without it."""
+    wanted = [_flag(name) for name in _OTHERS if getattr(args, name)]
+    if len(wanted) > 1 and {"--random-scenes", "--mujoco"} & {*wanted}:
+        raise ValueError(f"{' and '.join(wanted)} make different things; give one of them")
+    of = {main: names for main, names in _OPTIONS_OF.items() if main.split()[0] not in wanted}
+    own = {name for main, names in _OPTIONS_OF.items() if main not in of for name in names}
+    for main, names in of.items():
+        given = [_flag(name) for name in names if getattr(args, name) is not None and name not in own]
+        if given:
+            raise ValueError(f"{', '.join(given)}: an option of {main}; give it too, or leave this out")
+    if args.mujoco and not (args.geom and args.site):
+        raise ValueError("--mujoco: give --geom NAME, which the skin covers, and --site NAME, where the skin lies")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _simulate_robot(args: argparse.Namespace) -> int:
+    from ...bench import load_bench
+    from ...calibration.recipe_text import fidelity_choice
+    from ...simulators.rollout import load_robot, record_rollout
+
+    prepare_outputs(args.output)
+    bench, seconds = load_bench(args.scene), 10.0 if args.seconds is None else args.seconds
+    record_rollout(
+        args.output,
+        bench,
+        load_robot(args.mujoco),
+        seconds,
+        geoms=args.geom,
+        site=args.site,
+        fidelity=None if args.fidelity is None else fidelity_choice(args.fidelity, True),
+        progress=progress_bar("frames"),
+    )
+    print(f"{args.output}: {seconds:g} s of {args.mujoco}, SIMULATED")
+    return 0
 
 
 def _simulate_random_scenes(args: argparse.Namespace) -> int:
