@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+import jaxeit as je
+
 from ..check.acceptance import accept
 from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session
@@ -13,6 +15,7 @@ from .force_maps import USED, ForceEstimate
 from .frame_blocks import FrameBlock, FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, quiet_tracker
 from .localisation.load_windows import WindowedFrames, fit_windows
+from .places_in_space import normals_in_space, pad_centres, points_in_space
 from .recalibration.agreement import agreement_of_use
 
 FORMAT = "skin-forcemap"
@@ -97,6 +100,7 @@ def _add_coordinates(writer: ArchiveWriter, calibration: Calibration) -> dict[st
         "pixel": (len(centres), "number of the pixel, row by row"),
         "pad": (len(pads), "number of the pad: " + ", ".join(f"{i} {pad.name}" for i, pad in enumerate(pads))),
         "axis": (2, "0: x, 1: y"),
+        "space": (3, "0: x, 1: y, 2: z"),
         "contact": (contacts, "number of the contact in its frame"),
     }
     for name, (size, meaning) in about.items():
@@ -105,8 +109,23 @@ def _add_coordinates(writer: ArchiveWriter, calibration: Calibration) -> dict[st
     writer.add("centres", centres, "m", "centres of the pixels", ("pixel", "axis"))
     for name, values in zip("xy", centres.T, strict=True):
         writer.add(name, values, "m", f"centres of the pixels along {name}", ("pixel",))
-    writer.add("areas", np.asarray(calibration.recon.areas), "m2", "areas of the pixels", ("pixel",))
+    areas = np.asarray(calibration.recon.areas)
+    writer.add("areas", areas, "m2", "areas of the pixels", ("pixel",))
+    _add_places(writer, calibration.skin, centres, areas > 0)
     return {name: size for name, (size, _) in about.items()}
+
+
+def _add_places(writer: ArchiveWriter, skin: je.Skin, centres: np.ndarray, covered: np.ndarray) -> None:
+    """Write where the skin lies in space, for programs that do not know its surface."""
+    surface, pads = skin.surface, pad_centres(skin)
+    places = points_in_space(surface, centres, covered)
+    writer.add("points", places, "m", "centres of the pixels in space; NaN: off the sheet", ("pixel", "space"))
+    if not len(pads):
+        return
+    writer.add("pad_names", np.array([pad.name for pad in skin.pads]), "1", "names of the pads", ("pad",))
+    writer.add("pad_points", points_in_space(surface, pads), "m", "centres of the pads in space", ("pad", "space"))
+    normals = normals_in_space(surface, pads)
+    writer.add("pad_normals", normals, "1", "normals of the sheet there, away from its inside", ("pad", "space"))
 
 
 def _append(writer: ArchiveWriter, rows: Mapping[str, np.ndarray], names: Iterable[str], group: str = "") -> None:

@@ -1,6 +1,7 @@
-"""Calibrations for other programs: a C header for firmware."""
+"""Calibrations, force maps and sessions for other programs: a C header for firmware, bags of ROS 2."""
 
 from .c_header import HeaderSizes, export_c
 from .errors import ExportError
+from .mcap import BagSummary, export_mcap
 
-__all__ = ["ExportError", "HeaderSizes", "export_c"]
+__all__ = ["BagSummary", "ExportError", "HeaderSizes", "export_c", "export_mcap"]

@@ -224,14 +224,21 @@ def check_version(root: Node) -> None:
 
 
 def _nanoseconds(root: Node, text: str) -> int:
-    """Convert an ISO time with zone to ns since 1970."""
+    """`epoch_nanoseconds` of the time that a file names."""
+    try:
+        return epoch_nanoseconds(text)
+    except ValueError as error:
+        raise root.error(str(error), "write an ISO time with zone, as 2025-01-31T12:00:00Z") from None
+
+
+def epoch_nanoseconds(text: str) -> int:
+    """Convert an ISO time with zone to ns since 1970; raises ValueError."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
         moment = None
     if moment is None or moment.tzinfo is None:
-        what = f"time_epoch_utc is {printable(text)!r}"
-        raise root.error(what, "write an ISO time with zone, as 2025-01-31T12:00:00Z")
+        raise ValueError(f"time_epoch_utc is {printable(text)!r}")
     since = moment - datetime.fromisoformat("1970-01-01T00:00:00Z")
     return ((since.days * 86400 + since.seconds) * 10**6 + since.microseconds) * 1000
 

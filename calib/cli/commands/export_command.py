@@ -3,10 +3,11 @@
 import argparse
 
 from ..arguments import prepare_outputs
+from ..terminal import progress_bar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What to write, the calibration, and the file to write."""
+    """What to write, from which file, and where to."""
     kinds = parser.add_subparsers(title="formats", required=True, metavar="FORMAT", dest="format")
     text = "one C99 header without allocation: a frame to image, force map and pad forces in float32"
     header = kinds.add_parser("c", help=text, description=text[0].upper() + text[1:] + ".")
@@ -16,18 +17,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     header.add_argument("--prefix", default="skin", help=text)
     text = "leave out a correction by location, which a header cannot hold: its gain is then 1"
     header.add_argument("--without-location", action="store_true", help=text)
+    header.set_defaults(export=_write_header)
+    text = "a force map or a session as a bag of ROS 2 (MCAP) for ros2 bag play and Foxglove, with jaxeit[tables]"
+    bag = kinds.add_parser("mcap", help=text, description=text[0].upper() + text[1:] + ".")
+    bag.add_argument("source", metavar="FORCEMAP.h5", help="a force map of jaxeit apply, or a session")
+    text = "a folder of rosbag2, or one file if the name ends in .mcap"
+    bag.add_argument("-o", "--output", required=True, metavar="BAG", help=text)
+    bag.add_argument("--prefix", default="/skin", help="first part of the topics (default: %(default)s)")
+    text = "frame of coordinates in which the skin lies (default: %(default)s)"
+    bag.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
+    bag.set_defaults(export=_write_bag)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the header, and print what it takes."""
+    """Write the file, and print what it holds."""
     from ...runtime import set_up
 
     set_up()
+    print(f"{args.output}: {args.export(args)}")
+    return 0
+
+
+def _write_header(args: argparse.Namespace) -> object:
     from ...calibration import load_calibration
     from ...export import export_c
 
     prepare_outputs(args.output)
     calibration = load_calibration(args.calibration)
-    sizes = export_c(calibration, args.output, prefix=args.prefix, without_location=args.without_location)
-    print(f"{args.output}: {sizes}")
-    return 0
+    return export_c(calibration, args.output, prefix=args.prefix, without_location=args.without_location)
+
+
+def _write_bag(args: argparse.Namespace) -> object:
+    from ...export import export_mcap
+
+    progress = progress_bar("blocks")
+    return export_mcap(args.source, args.output, prefix=args.prefix, frame_id=args.frame_id, progress=progress)

@@ -1,0 +1,241 @@
+"""Force maps and sessions as bags of ROS 2 in MCAP files, for `ros2 bag play` and Foxglove."""
+
+import heapq
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..calibration.application import FORMAT as FORCE_MAP
+from ..session import ArchiveReader, Session, Stream, open_archive, open_session
+from ..session.archive import archive_format
+from ..session.errors import printable, problem
+from ..session.reader import epoch_nanoseconds
+from ..session.tables import FORMAT as SESSION
+from . import mcap_messages as ros
+from .mcap_writer import Bag, require_frame, require_stamps, topic_names, topic_prefix, writing_bag
+
+BLOCK = 256
+"""Frames of a force map that are read at once."""
+
+BLOCK_BYTES = 4 << 20
+"""Bytes of a stream of a session that are read at once."""
+
+PAD_COLUMNS = {
+    "pad_force": "force_N",
+    "pad_force_se": "standard_error_N",
+    "pad_force_half": "half_90_percent_N",
+    "pad_valid": "pressure_valid",
+    "shape_valid": "shape_valid",
+}
+"""Arrays of a force map with a row of pads for each frame, and what the raw message calls them."""
+
+PICTURES = ("force", "force_se")
+POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "force", "force_se", "pressure")])
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class BagSummary:
+    """What a bag holds.
+
+    | meaning                                             | unit |
+    |-----------------------------------------------------|------|
+    | topics: type and number of the messages, by topic   |      |
+    | seconds from the first message to the last          | s    |
+    """
+
+    topics: dict[str, tuple[str, int]]
+    seconds: float
+
+    def __str__(self) -> str:
+        count = sum(number for _, number in self.topics.values())
+        lines = [f"{len(self.topics)} topics, {count:,} messages, {self.seconds:.2f} s"]
+        return "\n".join([*lines, *(f"  {name}  {kind}  {number:,}" for name, (kind, number) in self.topics.items())])
+
+
+def export_mcap(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    prefix: str = "/skin",
+    frame_id: str = "skin",
+    progress: Progress = iter,
+) -> BagSummary:
+    """Write a force map of `calib.apply`, or a session, as a bag of ROS 2; it appears only when complete.
+
+    ``docs/ros.md`` lists the topics. Missing values are NaN in the file and stay NaN in the messages.
+
+    Args:
+        output: a name that ends in ``.mcap`` is one MCAP file; another is a folder of rosbag2, with its metadata.
+        prefix: the topics' first part.
+        frame_id: the frame of coordinates in which the skin lies.
+        progress: wraps what is written piece by piece, as `tqdm.tqdm` does.
+
+    Raises:
+        SessionError: for another kind of file, a file without frames, times that ROS cannot state, or an output that
+            exists.
+        ValueError: for a prefix or a frame that ROS does not take.
+        ImportError: without the library `rosbags`, of the extra ``tables``.
+    """
+    source, output = Path(source), Path(output)
+    prefix, frame_id = topic_prefix(prefix), require_frame(frame_id)
+    kind = archive_format(source)
+    if kind == FORCE_MAP:
+        with open_archive(source, FORCE_MAP) as archive, writing_bag(output) as bag:
+            times = _ForceMapBag(bag, archive, prefix, frame_id).write(progress)
+            return _summary(bag, times)
+    if kind == SESSION:
+        with open_session(source) as session, writing_bag(output) as bag:
+            return _summary(bag, _write_session(bag, session, prefix, progress))
+    what = f"is {printable(kind)!r}" if kind else "has no format"
+    raise problem(source, "file", what, "name a force map of `jaxeit apply`, or a session")
+
+
+def _summary(bag: Bag, times: tuple[int, int]) -> BagSummary:
+    topics = {name: (bag.kind(name), count) for name, count in bag.counts.items()}
+    return BagSummary(topics, (times[1] - times[0]) / 1e9)
+
+
+class _ForceMapBag:
+    """The topics of a force map. Its arrays are checked before the first message is written."""
+
+    def __init__(self, bag: Bag, archive: ArchiveReader, prefix: str, frame: str):
+        self._bag, self._archive, self._frame = bag, archive, frame
+        self._rows, self._columns = (self._whole(name) for name in ("image_rows", "image_columns"))
+        pixels, frames = self._rows * self._columns, self._frames()
+        self._require({"areas": (pixels,), "points": (pixels, 3)})
+        pads = self._pads()
+        self._require(dict.fromkeys(PICTURES, (frames, pixels)))
+        self._require(dict.fromkeys(PAD_COLUMNS, (frames, len(pads))))
+        areas, points = archive.arrays["areas"].read(), archive.arrays["points"].read()
+        self._on = areas > 0
+        self._areas, self._cloud = areas[self._on], np.zeros(int(self._on.sum()), POINT)
+        for name, values in zip("xyz", points[self._on].T, strict=True):
+            self._cloud[name] = values
+        self._topics = {name: f"{prefix}/{name}" for name in ("force_map", "taxels", "pad_forces")}
+        self._wrenches = [f"{prefix}/pads/{pad}/wrench" for pad in pads]
+        self._frame_names = [f"{frame}_{pad}" for pad in pads]
+
+    def _whole(self, name: str) -> int:
+        value = self._archive.attrs.get(name)
+        if not isinstance(value, int) or value < 1:
+            raise problem(self._archive.path, name, f"is {printable(value)!r}", "write the force map again")
+        return value
+
+    def _frames(self) -> int:
+        self._require({"time": None})
+        shape = self._archive.arrays["time"].shape
+        if len(shape) != 1 or not shape[0]:
+            raise problem(self._archive.path, "time", "holds no frame", "apply the calibration to a longer session")
+        return int(shape[0])
+
+    def _pads(self) -> list[str]:
+        """Parts of topics of the pads."""
+        self._require({"pad_names": None})
+        count = self._archive.arrays["pad_names"].shape[0]
+        self._require({"pad_points": (count, 3), "pad_normals": (count, 3)})
+        return topic_names(self._archive.arrays["pad_names"].read().tolist(), "pad")
+
+    def _require(self, shapes: dict[str, tuple[int, ...] | None]) -> None:
+        """Refuse a file without these arrays, or with arrays of other shapes."""
+        todo = "write the force map again with `jaxeit apply`"
+        for name, shape in shapes.items():
+            if name not in self._archive.arrays:
+                raise problem(self._archive.path, name, "missing", todo)
+            if shape is not None and self._archive.arrays[name].shape != shape:
+                what = f"has the shape {self._archive.arrays[name].shape}, not {shape}"
+                raise problem(self._archive.path, name, what, todo)
+
+    def write(self, progress: Progress) -> tuple[int, int]:
+        """Write all messages; returns the times of the first and the last, ns since 1970."""
+        arrays, path = self._archive.arrays, self._archive.path
+        epoch = _epoch(self._archive)
+        first, last = (epoch + int(arrays["time"].read(*rows)[0]) for rows in ((0, 1), (self._frames() - 1, None)))
+        require_stamps(path, first, last)
+        self._declare()
+        points, normals = arrays["pad_points"].read(), arrays["pad_normals"].read()
+        head = ros.header(self._bag, first, self._frame)
+        message = ros.frames(self._bag, head, self._frame_names, points, normals)
+        self._bag.write("/tf_static", first, message)
+        for start in progress(range(0, self._frames(), BLOCK)):
+            block = {name: arrays[name].read(start, start + BLOCK) for name in (*PICTURES, *PAD_COLUMNS)}
+            for row, since in enumerate(arrays["time"].read(start, start + BLOCK).tolist()):
+                time = epoch + since
+                require_stamps(path, min(first, time), max(last, time))
+                self._write_frame(time, {name: values[row] for name, values in block.items()})
+        return first, last
+
+    def _declare(self) -> None:
+        self._bag.topic("/tf_static", ros.FRAMES, latched=True)
+        kinds = {"force_map": ros.IMAGE, "taxels": ros.POINTS, "pad_forces": ros.NUMBERS}
+        for name, kind in kinds.items():
+            self._bag.topic(self._topics[name], kind)
+        for name in self._wrenches:
+            self._bag.topic(name, ros.WRENCH)
+
+    def _write_frame(self, time: int, values: dict[str, np.ndarray]) -> None:
+        bag, head = self._bag, ros.header(self._bag, time, self._frame)
+        # Rows of the file go along +y, rows of a picture downwards: +y is up on the screen.
+        picture = values["force"].reshape(self._rows, self._columns)[::-1]
+        bag.write(self._topics["force_map"], time, ros.image(bag, head, picture))
+        cloud = self._cloud
+        for name in PICTURES:
+            cloud[name] = values[name][self._on]
+        cloud["pressure"] = values["force"][self._on] / self._areas
+        bag.write(self._topics["taxels"], time, ros.point_cloud(bag, head, cloud))
+        table = np.stack([values[name].astype(np.float64) for name in PAD_COLUMNS], 1)
+        axes = (ros.Axis("pad", len(table)), ros.Axis(" ".join(PAD_COLUMNS.values()), len(PAD_COLUMNS)))
+        bag.write(self._topics["pad_forces"], time, ros.numbers(bag, table, *axes))
+        for topic, frame, force in zip(self._wrenches, self._frame_names, table[:, 0].tolist(), strict=True):
+            bag.write(topic, time, ros.wrench(bag, ros.header(bag, time, frame), force))
+
+
+def _epoch(archive: ArchiveReader) -> int:
+    """Zero of the times of an archive, ns since 1970."""
+    try:
+        return epoch_nanoseconds(str(archive.attrs.get("time_epoch_utc", "")))
+    except ValueError as error:
+        raise problem(archive.path, "file", str(error), "write the force map again with `jaxeit apply`") from None
+
+
+def _write_session(bag: Bag, session: Session, prefix: str, progress: Progress) -> tuple[int, int]:
+    """Write the streams of a session in the order of time; returns the first and the last time, ns since 1970."""
+    streams = [stream for stream in session.streams.values() if len(stream)]
+    if not streams:
+        raise problem(session.path, "/streams", "hold no sample", "record a longer session")
+    first = session.epoch_ns + min(int(stream.time[0]) for stream in streams)
+    last = session.epoch_ns + max(int(stream.time[-1]) for stream in streams)
+    require_stamps(session.path, first, last)
+    parts = []
+    for stream, name in zip(streams, topic_names([stream.name for stream in streams], "stream"), strict=True):
+        topic = bag.topic(f"{prefix}/{name}", ros.NUMBERS)
+        parts.append(_samples(bag, stream, topic))
+        status = stream.status()
+        if status is not None and status.any():
+            flagged = bag.topic(f"{prefix}/{name}/status", ros.FLAGS)
+            parts.append(_flagged(bag, stream, flagged, status))
+    for time, topic, message in progress(heapq.merge(*parts, key=lambda part: part[0])):
+        bag.write(topic, session.epoch_ns + time, message())
+    return first, last
+
+
+Message = tuple[int, str, Callable[[], Any]]
+
+
+def _samples(bag: Bag, stream: Stream, topic: str) -> Iterator[Message]:
+    """Times, ns since the session's epoch, and messages of all samples of a stream."""
+    axis = ros.Axis(f"{stream.variable} [{stream.unit}]", stream.channels)
+    for start, stop, values in stream.blocks(BLOCK_BYTES):
+        for time, row in zip(stream.time[start:stop].tolist(), values, strict=True):
+            yield time, topic, partial(ros.numbers, bag, row, axis)
+
+
+def _flagged(bag: Bag, stream: Stream, topic: str, status: np.ndarray) -> Iterator[Message]:
+    """Times and flags of the samples that have flags."""
+    for row in np.flatnonzero(status).tolist():
+        yield int(stream.time[row]), topic, partial(ros.flags, bag, int(status[row]))
