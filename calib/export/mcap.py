@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.application import FORMAT as FORCE_MAP
+from ..calibration.application import FORMAT as FORCE_MAP, TRACKS
 from ..session import ArchiveReader, Session, Stream, open_archive, open_session
 from ..session.archive import archive_format
 from ..session.errors import printable, problem
@@ -33,6 +33,21 @@ PAD_COLUMNS = {
     "shape_valid": "shape_valid",
 }
 """Arrays of a force map with a row of pads for each frame, and what the raw message calls them."""
+
+PLACE_COLUMNS = {"contact_position": ("x_m y_m", (2,)), "contact_force": ("force_N", ())}
+"""The same for contacts that a correction by location finds in each frame alone, with the shape of an entry."""
+
+TRACK_COLUMNS = {
+    "number": ("number", ()),
+    "position": ("x_m y_m", (2,)),
+    "position_covariance": ("xx_m2 xy_m2 yx_m2 yy_m2", (2, 2)),
+    "width": ("width_m", ()),
+    "force": ("force_N", ()),
+    "force_se": ("standard_error_N", ()),
+    "half": ("half_x_m half_y_m", (2,)),
+    "velocity": ("velocity_x_m_s velocity_y_m_s", (2,)),
+}
+"""The same for contacts that were followed (`apply --track`)."""
 
 PICTURES = ("force", "force_se")
 POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "force", "force_se", "pressure")])
@@ -112,12 +127,16 @@ class _ForceMapBag:
         pads = self._pads()
         self._require(dict.fromkeys(PICTURES, (frames, pixels)))
         self._require(dict.fromkeys(PAD_COLUMNS, (frames, len(pads))))
+        self._contacts = self._contact_arrays(frames)
+        self._tracks = self._track_times()
         areas, points = archive.arrays["areas"].read(), archive.arrays["points"].read()
         self._on = areas > 0
         self._areas, self._cloud = areas[self._on], np.zeros(int(self._on.sum()), POINT)
         for name, values in zip("xyz", points[self._on].T, strict=True):
             self._cloud[name] = values
-        self._topics = {name: f"{prefix}/{name}" for name in ("force_map", "taxels", "pad_forces")}
+        self._topics = {
+            name: f"{prefix}/{name}" for name in ("force_map", "taxels", "pad_forces", "contacts", "tracks")
+        }
         self._wrenches = [f"{prefix}/pads/{pad}/wrench" for pad in pads]
         self._frame_names = [f"{frame}_{pad}" for pad in pads]
 
@@ -141,6 +160,25 @@ class _ForceMapBag:
         self._require({"pad_points": (count, 3), "pad_normals": (count, 3)})
         return topic_names(self._archive.arrays["pad_names"].read().tolist(), "pad")
 
+    def _contact_arrays(self, frames: int) -> list[str]:
+        """Arrays of the contacts that were found in each frame alone; none if they were not looked for."""
+        names = [name for name in PLACE_COLUMNS if name in self._archive.arrays]
+        if names:
+            self._require(dict.fromkeys(PLACE_COLUMNS))
+            count = (*self._archive.arrays["contact_force"].shape, 0)[1]
+            self._require({name: (frames, count, *tail) for name, (_, tail) in PLACE_COLUMNS.items()})
+        return names
+
+    def _track_times(self) -> np.ndarray | None:
+        """Times of the rows of contacts that were followed, ns; None if they were not."""
+        if TRACKS + "time" not in self._archive.arrays:
+            return None
+        times = self._archive.arrays[TRACKS + "time"].read()
+        self._require({TRACKS + name: (len(times), *tail) for name, (_, tail) in TRACK_COLUMNS.items()})
+        if times.ndim != 1 or (np.diff(times) < 0).any():
+            raise problem(self._archive.path, TRACKS + "time", "is not in order", "write the force map again")
+        return times
+
     def _require(self, shapes: dict[str, tuple[int, ...] | None]) -> None:
         """Refuse a file without these arrays, or with arrays of other shapes."""
         todo = "write the force map again with `jaxeit apply`"
@@ -163,16 +201,21 @@ class _ForceMapBag:
         message = ros.frames(self._bag, head, self._frame_names, points, normals)
         self._bag.write("/tf_static", first, message)
         for start in progress(range(0, self._frames(), BLOCK)):
-            block = {name: arrays[name].read(start, start + BLOCK) for name in (*PICTURES, *PAD_COLUMNS)}
+            block = {
+                name: arrays[name].read(start, start + BLOCK) for name in (*PICTURES, *PAD_COLUMNS, *self._contacts)
+            }
             for row, since in enumerate(arrays["time"].read(start, start + BLOCK).tolist()):
                 time = epoch + since
                 require_stamps(path, min(first, time), max(last, time))
                 self._write_frame(time, {name: values[row] for name, values in block.items()})
+                self._write_tracks(time, since)
         return first, last
 
     def _declare(self) -> None:
         self._bag.topic("/tf_static", ros.FRAMES, latched=True)
         kinds = {"force_map": ros.IMAGE, "taxels": ros.POINTS, "pad_forces": ros.NUMBERS}
+        kinds |= {"contacts": ros.NUMBERS} if self._contacts else {}
+        kinds |= {} if self._tracks is None else {"tracks": ros.NUMBERS}
         for name, kind in kinds.items():
             self._bag.topic(self._topics[name], kind)
         for name in self._wrenches:
@@ -188,11 +231,32 @@ class _ForceMapBag:
             cloud[name] = values[name][self._on]
         cloud["pressure"] = values["force"][self._on] / self._areas
         bag.write(self._topics["taxels"], time, ros.point_cloud(bag, head, cloud))
-        table = np.stack([values[name].astype(np.float64) for name in PAD_COLUMNS], 1)
-        axes = (ros.Axis("pad", len(table)), ros.Axis(" ".join(PAD_COLUMNS.values()), len(PAD_COLUMNS)))
-        bag.write(self._topics["pad_forces"], time, ros.numbers(bag, table, *axes))
+        table = _table([values[name] for name in PAD_COLUMNS])
+        self._write_table("pad_forces", time, table, "pad", PAD_COLUMNS.values())
+        if self._contacts:
+            found = _table([values[name] for name in PLACE_COLUMNS])
+            self._write_table("contacts", time, found, "contact", [label for label, _ in PLACE_COLUMNS.values()])
         for topic, frame, force in zip(self._wrenches, self._frame_names, table[:, 0].tolist(), strict=True):
             bag.write(topic, time, ros.wrench(bag, ros.header(bag, time, frame), force))
+
+    def _write_tracks(self, time: int, since: int) -> None:
+        """Write the contacts of a frame that were followed; a table without rows says that there is none."""
+        if self._tracks is None:
+            return
+        first, stop = (int(np.searchsorted(self._tracks, since, side)) for side in ("left", "right"))
+        table = _table([self._archive.arrays[TRACKS + name].read(first, stop) for name in TRACK_COLUMNS])
+        self._write_table("tracks", time, table, "contact", [label for label, _ in TRACK_COLUMNS.values()])
+
+    def _write_table(self, name: str, time: int, table: np.ndarray, rows: str, columns: Iterable[str]) -> None:
+        axes = (ros.Axis(rows, len(table)), ros.Axis(" ".join(columns), table.shape[1]))
+        self._bag.write(self._topics[name], time, ros.numbers(self._bag, table, *axes))
+
+
+def _table(columns: list[np.ndarray]) -> np.ndarray:
+    """Arrays (rows, ...) side by side as float64 (rows, columns)."""
+    rows = len(columns[0])
+    parts = [column.astype(np.float64).reshape(rows, int(np.prod(column.shape[1:]))) for column in columns]
+    return np.concatenate(parts, 1)
 
 
 def _epoch(archive: ArchiveReader) -> int:

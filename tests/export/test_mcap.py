@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import calib
+from calib.calibration.localisation.contact_tracks import ABOUT
 from calib.calibration.places_in_space import normals_in_space, pad_centres, points_in_space
 from calib.cli import main
 from calib.export.mcap_messages import turn_to
@@ -25,6 +26,8 @@ TOPICS = {
     "/skin/force_map": ("sensor_msgs/msg/Image", FRAMES),
     "/skin/taxels": ("sensor_msgs/msg/PointCloud2", FRAMES),
     "/skin/pad_forces": ("std_msgs/msg/Float64MultiArray", FRAMES),
+    "/skin/contacts": ("std_msgs/msg/Float64MultiArray", FRAMES),
+    "/skin/tracks": ("std_msgs/msg/Float64MultiArray", FRAMES),
     "/skin/pads/left_arm/wrench": ("geometry_msgs/msg/WrenchStamped", FRAMES),
     "/skin/pads/pad_2_right/wrench": ("geometry_msgs/msg/WrenchStamped", FRAMES),
 }
@@ -41,6 +44,9 @@ def arrays():
     force[3, :6] = np.nan
     pads = {name: rng.normal(size=(FRAMES, 2)) for name in ("pad_force", "pad_force_se", "pad_force_half")}
     pads["pad_force"][3, 0] = np.nan
+    times, followed = np.arange(FRAMES) * 55_555_555 + 7, [1, 1, 2, 4]  # frames of the rows of contacts
+    tracks = {f"tracks/{name}": rng.normal(size=(4, *about.shape)) for name, about in ABOUT.items()}
+    tracks |= {"tracks/time": times[followed], "tracks/number": np.array([1, 2, 1, 3])}
     return {
         "pixel": np.arange(pixels),
         "space": np.arange(3),
@@ -50,12 +56,15 @@ def arrays():
         "pad_names": np.array(PADS),
         "pad_points": points_in_space(surface, middles),
         "pad_normals": normals_in_space(surface, middles),
-        "time": np.arange(FRAMES) * 55_555_555 + 7,
+        "time": times,
         "force": force,
         "force_se": np.abs(force),
         **pads,
         "pad_valid": np.ones((FRAMES, 2), "u1"),
         "shape_valid": np.eye(FRAMES, 2).astype("u1"),
+        "contact_position": np.where(np.arange(FRAMES)[:, None, None] < 2, np.nan, rng.normal(size=(FRAMES, 1, 2))),
+        "contact_force": rng.normal(size=(FRAMES, 1)),
+        **tracks,
     }
 
 
@@ -106,6 +115,13 @@ def cloud_of(message):
     return np.frombuffer(bytes(message.data), kind)
 
 
+def tracks_of(message):
+    contacts, columns = message.layout.dim
+    names = columns.label.split()
+    assert (names[0], names[8], names[12], len(names)) == ("number", "force_N", "velocity_x_m_s", columns.size)
+    return np.reshape(message.data, (contacts.size, columns.size))
+
+
 @pytest.mark.parametrize("read", [by_rosbags, by_mcap])
 def test_a_force_map_is_read_back(bag, arrays, read):
     if read is by_mcap:
@@ -141,6 +157,14 @@ def test_a_force_map_is_read_back(bag, arrays, read):
         ]
         names = ("pad_force", "pad_force_se", "pad_force_half", "pad_valid", "shape_valid")
         np.testing.assert_array_equal(np.reshape(table.data, (2, 5)), np.stack([arrays[n][frame] for n in names], 1))
+    for frame, (_, table) in enumerate(found["/skin/contacts"]):
+        assert [(one.label, one.size) for one in table.layout.dim] == [("contact", 1), ("x_m y_m force_N", 3)]
+        np.testing.assert_array_equal(table.data[:2], arrays["contact_position"][frame, 0])
+        np.testing.assert_array_equal(table.data[2:], arrays["contact_force"][frame])
+    rows = [tracks_of(message) for _, message in found["/skin/tracks"]]
+    assert [len(one) for one in rows] == [0, 2, 1, 0, 1]
+    for name, column in {"number": 0, "position": slice(1, 3), "force": 8, "velocity": slice(12, 14)}.items():
+        np.testing.assert_array_equal(np.concatenate(rows)[:, column], arrays[f"tracks/{name}"])
     frames = {one.child_frame_id: one for one in found["/tf_static"][0][1].transforms}
     for pad, name in enumerate(("left_arm", "pad_2_right")):
         messages = [message for _, message in found[f"/skin/pads/{name}/wrench"]]
