@@ -274,10 +274,16 @@ def test_apply_writes_the_force_of_every_frame(calibration, grid, folder):
     with h5netcdf.File(out, "r") as file:  # as xarray opens it
         axes = {name: file.variables[name].dimensions for name in ("force", "pad_force", "centres", "x")}
         time, epoch = file.variables["time"].attrs["units"], file.attrs["time_epoch_utc"]
+        axes |= {name: file.variables[name].dimensions for name in ("points", "pad_names", "pad_normals")}
     named = {"force": ("time", "pixel"), "pad_force": ("time", "pad"), "centres": ("pixel", "axis"), "x": ("pixel",)}
+    named |= {"points": ("pixel", "space"), "pad_names": ("pad",), "pad_normals": ("pad", "space")}
     assert axes == named
     assert np.bytes_(time).decode() == f"nanoseconds since {np.bytes_(epoch).decode()}"
     archive = calib.session.read_archive(out, "skin-forcemap")
+    np.testing.assert_array_equal(archive.arrays["points"][:, :2], archive.arrays["centres"])
+    assert archive.arrays["pad_names"].tolist() == [pad.name for pad in calibration.skin.pads]
+    bag = calib.export_mcap(out, folder / "bag")
+    assert bag.topics["/skin/pads/upper_left/wrench"] == ("geometry_msgs/msg/WrenchStamped", frames)
     force, pads = archive.arrays["force"], archive.arrays["pad_force"]
     assert force.shape == (frames, 400)
     np.testing.assert_allclose(force.sum(1), pads.sum(1), atol=1e-4)

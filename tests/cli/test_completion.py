@@ -38,6 +38,7 @@ def script(tmp_path_factory):
         (["calibrate", "--curve", ""], {*CURVES.shipped, "auto"}),
         (["calibrate", "--hyperparameter", "l"], {"l-curve"}),
         (["import", "par"], {"parquet"}),
+        (["export", "m"], {"mcap"}),
         (["completion", ""], {"bash", "zsh", "tcsh"}),
         (["check", "ses"], {"session.h5"}),
         (["calibrate", "session.h5", "-o", "ses"], {"session.h5"}),
