@@ -346,8 +346,8 @@ def test_what_cannot_be_simulated_is_refused(scene, tmp_path, capsys):
         with pytest.raises(BenchError, match=message):
             RandomScenes(**ranges)
     for words, message in (
-        (["ideal", "--seed", "3", "-o", "s.h5"], "--seed: for frames for training"),
-        (["ideal", "--random-scenes", "3", "--serve", "-o", "s"], "leave them out"),
+        (["ideal", "--seed", "3", "-o", "s.h5"], "--seed: an option of --random-scenes FRAMES"),
+        (["ideal", "--random-scenes", "3", "--serve", "-o", "s"], "make different things"),
         (["ideal", "--random-scenes", "3"], "give either -o"),
     ):
         assert main(["simulate", *words]) == 2

@@ -89,7 +89,9 @@ def judged(answer: Answer, known: Collection[str] = (), about: str = "") -> Verd
 
 
 def same(found: Any, honest: Any, tolerance: float = TOLERANCE) -> bool:
-    """Whether two arrays are equal to a tolerance, where the found one has a number."""
+    """Whether two arrays are equal to a tolerance, where the found one has a number; texts are equal or not."""
+    if np.asarray(honest).dtype.kind not in "biuf":
+        return np.array_equal(found, honest)
     found, honest = np.asarray(found, float), np.asarray(honest, float)
     if found.shape != honest.shape:
         return False
