@@ -136,27 +136,30 @@ def _replace(path: Path, write: Callable[[BinaryIO], object]) -> None:
 # --- the file ------------------------------------------------------------------------------------
 
 
+def simulated_facts(bench: Bench, title: str, session_id: str | None = None) -> SessionFacts:
+    """Facts of a session that is simulated by the scene of a bench; its id is a new one unless given."""
+    skin, protocol = bench.scene.skin, bench.scene.skin.protocol
+    return SessionFacts(
+        title=title,
+        skin_name=skin.name,
+        skin_toml=skin.toml,
+        pattern=protocol.pattern,
+        current=protocol.current,
+        frequency=protocol.frequency,
+        offset=np.arange(protocol.readings) * protocol.reading_time,
+        epoch=bench.epoch,
+        simulated=True,
+        scene=bench.toml,
+        seed=bench.seed,
+        session_id=session_id,
+        license="Apache-2.0",
+    )
+
+
 def _write(made: SimulatedStreams, store: _BlockStore, path: Path) -> None:
     bench = made.bench
-    skin, protocol = bench.scene.skin, bench.scene.skin.protocol
-    writer = SessionWriter(
-        path,
-        SessionFacts(
-            title=bench.title,
-            skin_name=skin.name,
-            skin_toml=skin.toml,
-            pattern=protocol.pattern,
-            current=protocol.current,
-            frequency=protocol.frequency,
-            offset=np.arange(protocol.readings) * protocol.reading_time,
-            epoch=bench.epoch,
-            simulated=True,
-            scene=bench.toml,
-            seed=bench.seed,
-            session_id=str(uuid5(NAMESPACE_OID, f"{bench.toml}{bench.seed}")),
-            license="Apache-2.0",
-        ),
-    )
+    session_id = str(uuid5(NAMESPACE_OID, f"{bench.toml}{bench.seed}"))
+    writer = SessionWriter(path, simulated_facts(bench, bench.title, session_id))
     about = {
         "eit": ("voltage", "V", bench.eit_step or 2 * float(np.abs(made.eit.resting).max()) / np.iinfo("i2").max),
         "pressure": ("pressure", "Pa", bench.pressure_step),

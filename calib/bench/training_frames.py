@@ -96,7 +96,7 @@ class FrameSet:
 
     def rows(self, number: int) -> int:
         """Number of frames in a shard; the last one may have fewer."""
-        return min(SHARD_FRAMES, self.frames - number * SHARD_FRAMES)
+        return _rows(self.frames, number)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -118,6 +118,11 @@ class FrameSet:
         frame = sum(np.dtype(a.dtype).itemsize * count for a, count in zip(each, counts, strict=True))
         fixed = FIXED_BYTES + 8 * (sum(self.sizes.values()) + 3 * self.sizes["pixel"] + self.sizes["reading"])
         return sum(self.rows(number) * frame + fixed for number in numbers)
+
+
+def _rows(frames: int, number: int) -> int:
+    """Number of frames in a shard of a set of so many."""
+    return min(SHARD_FRAMES, frames - number * SHARD_FRAMES)
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -216,20 +221,19 @@ def claim_folder(folder: Path, card: str) -> None:
     if names - {CARD} and CARD not in names:
         raise BenchError(f"{folder}: holds other files and no {CARD}; give an empty or a new folder")
     if CARD in names:
-        differ = _differences(path, card)
+        old, new = _read_card(path), json.loads(card)
+        differ = _differences(old, new)
         if differ and names != {CARD}:
             raise BenchError(f"{folder}: holds frames that differ in {differ}; give that command, or another folder")
-        there, wanted = (one["frames"] for one in (_read_card(path), json.loads(card)))
-        if there > wanted and names != {CARD}:
-            raise BenchError(f"{folder}: holds {there:,} frames; give as many or more, or another folder")
+        if old["frames"] > new["frames"] and names != {CARD}:
+            raise BenchError(f"{folder}: holds {old['frames']:,} frames; give as many or more, or another folder")
     with replacing(path) as temporary:
         temporary.write_text(card, encoding="utf-8")
 
 
-def _differences(path: Path, card: str) -> str:
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """Names of the entries by which a card differs from that of a folder, besides the number of frames."""
-    old, new = ({k: v for k, v in one.items() if k not in COUNTS} for one in (_read_card(path), json.loads(card)))
-    names = [name for name in new if old.get(name) != new[name]]
+    names = [name for name in new if name not in COUNTS and old.get(name) != new[name]]
     return ", ".join([name for name in names if name != "mark"] or names)
 
 
@@ -264,7 +268,7 @@ class TrainingFrames:
         return sum(self._rows(number) for number in self.shards)
 
     def _rows(self, number: int) -> int:
-        return min(SHARD_FRAMES, int(self.card["frames"]) - number * SHARD_FRAMES)
+        return _rows(int(self.card["frames"]), number)
 
     def part(self, start: float, stop: float) -> "TrainingFrames":
         """The shards from a share to another: ``part(0, 0.9)`` for training, ``part(0.9, 1)`` for a test.

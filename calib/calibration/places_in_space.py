@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 import jaxeit as je
 from jaxeit.geometry import AbstractSurface, Plane
+from jaxeit.geometry.shapes import cross
 
 _STEP = 1e-5
 """m, of the differences that give tangents: on a radius of 10 mm the direction errs by 1e-7."""
@@ -46,5 +47,5 @@ def _centroid(corners: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "2"]
     """Centroid of a polygon: the mean of the triangles that its sides form with the first corner, by their areas."""
     sides = corners - corners[0]
     after = np.roll(sides, -1, 0)
-    doubled = sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0]
+    doubled = cross(sides, after)
     return np.asarray(corners[0] + doubled @ (sides + after) / (3 * doubled.sum()))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.application import FORMAT as FORCE_MAP, TRACKS
+from ..calibration.frame_blocks import Progress
 from ..session import ArchiveReader, Session, Stream, open_archive, open_session
 from ..session.archive import archive_format
 from ..session.errors import printable, problem
@@ -51,7 +52,6 @@ TRACK_COLUMNS = {
 
 PICTURES = ("force", "force_se")
 POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "force", "force_se", "pressure")])
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import jaxeit as je
 from .contacts import DIAMETER, REACH, SLOTS, ContactPoints, PlacedContacts, SimulatorError, place_contacts
 
 try:
-    import mujoco
+    import mujoco as mujoco  # for other modules too, which need not say again what is missing
 except ImportError:
     raise ImportError("calib.simulators.mujoco needs MuJoCo; pip install 'jaxeit[mujoco]'") from None
 

@@ -1,18 +1,17 @@
 """What the skin of a robot reads while MuJoCo simulates the robot, as a session file."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-import mujoco
 import numpy as np
 
 import jaxeit as je
 
 from ..bench import Bench
-from ..session import SessionFacts, SessionWriter, StreamFacts
-from .contacts import ContactPoints, SimulatorError
-from .mujoco import ContactReader
+from ..bench.simulation import Progress, simulated_facts
+from ..session import SessionWriter, StreamFacts
+from .contacts import ContactPoints, SimulatorError, place_contacts
+from .mujoco import ContactReader, mujoco
 from .skin import prepare_skin, step
 
 SHORTEST_REST = 0.5  # s without contact that a session begins with, from which its zero is told
@@ -39,7 +38,7 @@ def record_rollout(
     geoms: Sequence[str],
     site: str,
     fidelity: je.Fidelity | None = None,
-    progress: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    progress: Progress = iter,
 ) -> Path:
     """Simulate a robot that is left to itself, and write what its skin reads as a session.
 
@@ -70,10 +69,12 @@ def record_rollout(
     now, state = je.bind(step, skin), skin.start(bench.seed)
     rest, frames = round(max(bench.blank, SHORTEST_REST) / interval), round(seconds / interval)
     loads, left_out = np.zeros(rest + frames), np.zeros(rest + frames, int)
-    with _writer(Path(path), bench) as writer:
+    facts = simulated_facts(bench, "what the skin of a simulated robot reads")
+    with SessionWriter(path, facts) as writer:
         for name, about in _streams(bench.scene.skin, 1 / interval).items():
             writer.add_stream(name, about)
-        for number, (contacts, missing) in enumerate(progress(_Contacts(robot, reader, rest, frames, steps))):
+        touched = _Contacts(robot, bench.scene.skin, reader, rest, frames, steps)
+        for number, (contacts, missing) in enumerate(progress(touched)):
             state, readings = now(state, contacts)
             time = [round(number * interval * 1e9)]
             writer.append("eit", time, np.asarray(readings.frame)[None])
@@ -86,21 +87,21 @@ def record_rollout(
 class _Contacts:
     """Contacts frame by frame, first none; with a length, so that progress can be displayed."""
 
-    def __init__(self, robot: mujoco.MjModel, reader: ContactReader, rest: int, frames: int, steps: int):
-        self._robot, self._reader, self._rest, self._frames, self._steps = robot, reader, rest, frames, steps
+    def __init__(self, robot: mujoco.MjModel, skin: je.Skin, reader: ContactReader, rest: int, frames: int, steps: int):
+        self._robot, self._skin, self._reader = robot, skin, reader
+        self._rest, self._frames, self._steps = rest, frames, steps
 
     def __len__(self) -> int:
         return self._rest + self._frames
 
     def __iter__(self) -> Iterator[tuple[ContactPoints, int]]:
+        nothing = np.zeros((0, 3))
+        untouched = place_contacts(self._skin, nothing, nothing).contacts
+        for _ in range(self._rest):
+            yield untouched, 0
         data = mujoco.MjData(self._robot)
         if self._robot.nkey:
             mujoco.mj_resetDataKeyframe(self._robot, data, 0)
-        mujoco.mj_forward(self._robot, data)
-        nothing = self._reader(data).contacts
-        nothing = nothing._replace(force=np.zeros_like(nothing.force))
-        for _ in range(self._rest):
-            yield nothing, 0
         for _ in range(self._frames):
             mujoco.mj_step(self._robot, data, self._steps)
             placed = self._reader(data)
@@ -111,23 +112,3 @@ def _streams(skin: je.Skin, rate: float) -> dict[str, StreamFacts]:
     eit = StreamFacts("voltage", units="V", channels=skin.protocol.readings, rate_hz=rate, transport="simulated")
     pressure = StreamFacts("pressure", units="Pa", channels=len(skin.pads), rate_hz=rate, transport="simulated")
     return {"eit": eit, "pressure": pressure}
-
-
-def _writer(path: Path, bench: Bench) -> SessionWriter:
-    skin = bench.scene.skin
-    protocol = skin.protocol
-    facts = SessionFacts(
-        title="what the skin of a simulated robot reads",
-        skin_name=skin.name,
-        skin_toml=skin.toml,
-        pattern=protocol.pattern,
-        current=protocol.current,
-        frequency=protocol.frequency,
-        offset=np.arange(protocol.readings) * protocol.reading_time,
-        epoch=bench.epoch,
-        simulated=True,
-        scene=bench.toml,
-        seed=bench.seed,
-        license="Apache-2.0",
-    )
-    return SessionWriter(path, facts)

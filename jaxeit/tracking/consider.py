@@ -56,16 +56,17 @@ def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> F
         by_coat = tracker.sheet.coat_slopes(contacts, belief.gain, near) / scale
         # The forces on pads do not depend on the coat.
         bent = jnp.concatenate([bent, jnp.pad(by_coat, ((0, 0), (0, len(error))))])
-    unit = jnp.eye(len(shown.readings), every.shape[1], dtype=every.dtype)
-    bent = jnp.concatenate([bent, tracker.model_error * jnp.sqrt(square) / scale * unit])
     usual = jnp.broadcast_to(tracker.spread, (count, len(tracker.spread)))
     halves = jnp.maximum(jnp.abs(contacts[:, 4:]), ROUND)
     of_gain = jnp.ones(len(modes), halves.dtype)
     before = jnp.concatenate([jnp.concatenate([usual, halves], 1).ravel(), of_gain])
     whitened = before[:, None] * slopes
     root = lapack.cholesky(whitened @ whitened.T + jnp.eye(len(before), dtype=before.dtype), lower=True)
-    moved = before[:, None] * lapack.cho_solve((root, True), whitened @ bent.T)
-    own = moved[: contacts.size].reshape(count, SEEN, len(bent))
+    # The model errs in each reading by itself.
+    by_model = tracker.model_error * jnp.sqrt(square) / scale * whitened[:, : len(shown.readings)]
+    towards = jnp.concatenate([whitened @ bent.T, by_model], 1)
+    moved = before[:, None] * lapack.cho_solve((root, True), towards)
+    own = moved[: contacts.size].reshape(count, SEEN, -1)
     return jnp.einsum("kim,kjm->kij", own, own)
 
 

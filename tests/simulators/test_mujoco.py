@@ -163,6 +163,14 @@ def test_nothing_of_mujoco_is_imported_unless_asked_for():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_where_mujoco_is_missing_the_command_says_how_to_install_it():
+    words = ["simulate", "paper_bench", "-o", "s.h5", "--mujoco", "m.xml", "--geom", "g", "--site", "s"]
+    code = f"import sys; sys.modules['mujoco'] = None; from calib.cli import main; sys.exit(main({words}))"
+    found = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert found.returncode == 2
+    assert "pip install 'jaxeit[mujoco]'" in found.stderr
+
+
 BALL = """<mujoco><option timestep="0.005"/><worldbody>
   <geom name="board" type="box" size=".1 .1 .01"/><site name="sheet" pos="-.1 -.1 .01"/>
   <body pos="-.04 .03 .0395"><freejoint/><geom type="sphere" size=".03" mass="1.2" condim="6"/></body>

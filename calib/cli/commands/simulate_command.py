@@ -7,10 +7,14 @@ import time
 from contextlib import ExitStack, suppress
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..arguments import count, prepare_outputs, skin_of
 from ..signals import interruption_status
 from ..terminal import announce_model, progress_bar
+
+if TYPE_CHECKING:
+    from jaxeit import Fidelity
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -153,10 +157,9 @@ def _refuse_lone_options(args: argparse.Namespace) -> None:
     wanted = [_flag(name) for name in _OTHERS if getattr(args, name)]
     if len(wanted) > 1 and {"--random-scenes", "--mujoco"} & {*wanted}:
         raise ValueError(f"{' and '.join(wanted)} make different things; give one of them")
-    of = {main: names for main, names in _OPTIONS_OF.items() if main.split()[0] not in wanted}
-    own = {name for main, names in _OPTIONS_OF.items() if main not in of for name in names}
-    for main, names in of.items():
-        given = [_flag(name) for name in names if getattr(args, name) is not None and name not in own]
+    allowed = {name for main, names in _OPTIONS_OF.items() if main.split()[0] in wanted for name in names}
+    for main, names in _OPTIONS_OF.items():
+        given = [_flag(name) for name in names if name not in allowed and getattr(args, name) is not None]
         if given:
             raise ValueError(f"{', '.join(given)}: an option of {main}; give it too, or leave this out")
     if args.mujoco and not (args.geom and args.site):
@@ -167,9 +170,15 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def _fidelity_of(args: argparse.Namespace) -> "Fidelity | None":
+    """What --fidelity asks for; None: the default of what is made."""
+    from ...calibration.recipe_text import fidelity_choice
+
+    return None if args.fidelity is None else fidelity_choice(args.fidelity, True)
+
+
 def _simulate_robot(args: argparse.Namespace) -> int:
     from ...bench import load_bench
-    from ...calibration.recipe_text import fidelity_choice
     from ...simulators.rollout import load_robot, record_rollout
 
     prepare_outputs(args.output)
@@ -181,7 +190,7 @@ def _simulate_robot(args: argparse.Namespace) -> int:
         seconds,
         geoms=args.geom,
         site=args.site,
-        fidelity=None if args.fidelity is None else fidelity_choice(args.fidelity, True),
+        fidelity=_fidelity_of(args),
         progress=progress_bar("frames"),
     )
     print(f"{args.output}: {seconds:g} s of {args.mujoco}, SIMULATED")
@@ -197,7 +206,6 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
     from ...batch.cluster import dask_executor
     from ...batch.random_frames import write_training_frames
     from ...bench import load_bench
-    from ...calibration.recipe_text import fidelity_choice
 
     bench, start = load_bench(args.scene), time.monotonic()
     with ExitStack() as stack:
@@ -216,7 +224,7 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
                 args.output,
                 args.random_scenes,
                 seed=args.seed,
-                fidelity=None if args.fidelity is None else fidelity_choice(args.fidelity, True),
+                fidelity=_fidelity_of(args),
                 pixels=None if args.pixels is None else je.Pixels(args.pixels),
                 executor=executor,
                 jobs=args.jobs or 1,
