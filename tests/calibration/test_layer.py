@@ -8,6 +8,7 @@ import pytest
 
 import calib
 import jaxeit as je
+from calib.calibration import procedure
 from calib.calibration.layer import FORGOTTEN, learn_layer, render_layer
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import NotFollowed, quiet_tracker
@@ -167,10 +168,16 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker
     assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
 
 
-def test_calibrate_learns_from_all_its_sessions(tracker, bundled, tmp_path, capsys):
+def test_calibrate_learns_from_all_its_sessions(tracker, bundled, tmp_path, monkeypatch, capsys):
+    recipe = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft(), learn_layer=True)
+    stages = []
+    with calib.open_session(bundled[0]) as session:
+        found = calib.calibrate([session, session], recipe=recipe, progress=stages.append, ignore_errors=True)
+    assert found.layer.contacts == 2 * CONTACTS
+    assert stages[-1] == "learning the contact layer"
+    monkeypatch.setattr(procedure, "calibrate", lambda *_, **__: found)
     out = str(tmp_path / "calibration.h5")
-    options = ["--learn-layer", "--pixels", "20", "--fidelity", "draft", "--force"]
-    assert main(["calibrate", *2 * [str(bundled[0])], "-o", out, *options]) == 0
+    assert main(["calibrate", *2 * [str(bundled[0])], "-o", out, "--learn-layer"]) == 0
     assert f"learned from {2 * CONTACTS} contacts" in capsys.readouterr().out
     assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
 
