@@ -50,7 +50,7 @@ def simulate_contacts(
     devices = Mesh(np.array(jax.devices()), ("contacts",))
     piece = CONTACTS_PER_DEVICE * devices.size
     at, size = np.repeat(np.arange(len(places)), len(amplitudes)), np.tile(amplitudes, len(places))
-    out = np.empty((len(at), len(model.pattern)), model.dtype)
+    out = np.empty((len(at), model.readings), model.dtype)
     split, whole = NamedSharding(devices, P("contacts")), NamedSharding(devices, P())
     model, spread = jax.device_put((model, jnp.asarray(width, model.dtype)), whole)
     sigma = je.conductivity(model)

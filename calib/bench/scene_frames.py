@@ -84,6 +84,7 @@ class SceneFrames:
 
     def __init__(self, bench: Bench, fidelity: je.Fidelity, basis: je.Pixels, scenes: RandomScenes):
         self.bench, self._scenes = bench, scenes
+        bench.scene.skin.protocol.rows("a bench")
         self._model = je.discretise(bench.scene, fidelity)
         self._diameter = jnp.asarray(bench.tip_diameter, self._model.dtype)
         if not fx.chosen(self._model.effects, fx.AbstractSheetEffect):

@@ -365,6 +365,7 @@ class SimulatedStreams:
 
 def simulated_streams(bench: Bench, fidelity: je.Fidelity) -> SimulatedStreams:
     """Discretise the scene, apply the effects of the stage to its motion, and set up the streams."""
+    bench.scene.skin.protocol.rows("a bench")
     model = je.discretise(bench.scene, fidelity)
     laid = fx.laid(model.effects, model.centroids)
     model = eqx.tree_at(lambda m: m.effects, model, laid, is_leaf=lambda x: x is model.effects)

@@ -103,6 +103,7 @@ def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:
 
 def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:
     where, pattern, own = "/device/eit_protocol", session.pattern, skin.protocol
+    rows = own.rows("a session")
     if pattern is None:
         if "eit" in session.streams:
             remedy = "write the pattern of the scan: no reading has a meaning without it"
@@ -111,9 +112,9 @@ def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:
     if pattern.max() >= len(skin.electrodes):
         what = f"the pattern names electrode {pattern.max()}; the skin has 0 to {len(skin.electrodes) - 1}"
         yield Finding(Severity.ERROR, where, what, "electrodes are counted from 0")
-    elif pattern.shape != own.pattern.shape or (pattern != own.pattern).any():
+    elif pattern.shape != rows.shape or (pattern != rows).any():
         remedy = "calibrate with the skin that was recorded (--skin FILE), or correct its protocol"
-        yield Finding(Severity.ERROR, where, _pattern_difference(pattern, own.pattern), remedy)
+        yield Finding(Severity.ERROR, where, _pattern_difference(pattern, rows), remedy)
     if session.current is not None and not np.isclose(session.current, own.current, rtol=0.01):
         what = f"the drive current is {session.current:g} A, but {own.current:g} A in the skin's file"
         yield Finding(Severity.WARNING, where, what, "correct the wrong one of the two")

@@ -156,7 +156,8 @@ def require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) ->
     pattern = session.pattern
     if pattern is None:
         raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
-    if pattern.shape != skin.protocol.pattern.shape or (pattern != skin.protocol.pattern).any():
+    own = skin.protocol.rows("calibration of a skin")
+    if pattern.shape != own.shape or (pattern != own).any():
         raise _error(
             session,
             "/device/eit_protocol/pattern",

@@ -124,6 +124,7 @@ def prepare_skin(
             )
     if not fx.chosen(scene.effects, fx.AbstractLoadEffect):
         raise SimulatorError("no effect spreads the load, and contacts are points; add jaxeit.effects.LoadSpreading")
+    scene.skin.protocol.rows("a skin on a simulated robot")
     model = je.discretise(scene, fidelity)
     laid = fx.laid(model.effects, model.centroids)
     model = eqx.tree_at(lambda m: m.effects, model, laid, is_leaf=lambda x: x is model.effects)

@@ -45,7 +45,7 @@ def refine_contacts(
     """
     require_known("refine_contacts", InverseError, model, dv, contacts, noise, sigma, channels)
     found = whitened_readings(model, noise, channels)
-    readings, dv, used = model.pattern.shape[0], np.asarray(dv, float), np.asarray(found.whitening.channels)
+    readings, dv, used = model.readings, np.asarray(dv, float), np.asarray(found.whitening.channels)
     if dv.shape != (readings,) or contacts.present.ndim != 1:
         raise InverseError(f"dv has shape {dv.shape}; refine one frame of {readings} readings at a time")
     if not np.isfinite(dv[used]).all():

@@ -55,10 +55,12 @@ RowsType = TypeVar("RowsType", bound=Rows)
 class PairRows(NamedTuple):
     """Rows of P as four pair sums each; see `Whitening`.
 
-    | meaning                                   | shape  | unit |
-    |-------------------------------------------|--------|------|
-    | pairs: the four pair sums of each reading | (n, 4) |      |
-    | signs: current times the sign of each     | (4,)   | A    |
+    | meaning                                   | shape          | unit |
+    |-------------------------------------------|----------------|------|
+    | pairs: the four pair sums of each reading | (n, 4)         |      |
+    | signs: current times the sign of each     | (4,) or (n, 4) | A    |
+
+    Readings of a protocol with a mixing have more than four.
     """
 
     pairs: Any
@@ -66,11 +68,13 @@ class PairRows(NamedTuple):
 
     def times(self, matrix: Any) -> Any:
         """See `Rows`."""
+        if self.signs.ndim > 1:
+            return (self.signs[:, None] @ matrix[self.pairs])[:, 0]
         return self.signs @ matrix[self.pairs]
 
     def between(self, rows: Any) -> Any:
         """See `Rows`."""
-        return rows[:, self.pairs] @ self.signs
+        return (rows[:, self.pairs] * self.signs).sum(-1) if self.signs.ndim > 1 else rows[:, self.pairs] @ self.signs
 
     def add_to(self, library: ArrayLibrary, sums: Any, values: Any) -> Any:
         """See `Rows`."""
@@ -215,7 +219,8 @@ def _gathered(
     there = jnp.arange(GATHERED_READINGS) < jnp.sum(missing)
     if whitening.weight.ndim == 1:
         weight = jnp.where(there, whitening.weight[place], 0)
-        return Missing(PairRows(whitening.pairs[place], whitening.signs), weight, jnp.zeros_like(weight))
+        signs = whitening.signs if whitening.shares is None else whitening.signs[place]
+        return Missing(PairRows(whitening.pairs[place], signs), weight, jnp.zeros_like(weight))
     weights = jnp.where(there[:, None], whitening.weight[place], 0)
     block = jnp.where(there[:, None] & there, weights[:, place], jnp.diag((~there).astype(known.dtype)))
     return correlated(JAX, whitening.pair_sums(weights), block, weights @ known)

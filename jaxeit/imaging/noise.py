@@ -30,6 +30,7 @@ from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
 from ..model.discretisation import Model
+from ..model.mixing import Mixing, matrix_of_rows, padded_rows
 
 
 class InverseError(ValueError):
@@ -43,23 +44,25 @@ class Whitening(eqx.Module):
     |----------------------------------------------------------------------|--------------------|-------|
     | pairs: the four pair sums z0 - z1 - z2 + z3 of each reading          | (readings, 4)      |       |
     | lines, sign: the readings that each pair sum occurs in; sign 0: none | (k, c)             |       |
+    | shares of ``pairs`` in each reading, and (readings, n) pairs, where the protocol has a mixing |     | |
     | current                                                              | ()                 | A     |
     | weight: inverse of the noise, as variances or as a covariance matrix | (readings,) or     | 1/V^2 |
     |   (0 where a channel is not used)                                    | (readings, readings) |     |
     | channels: readings that are used                                     | (readings,)        |       |
     """
 
-    pairs: Int[Array, "readings 4"]
+    pairs: Int[Array, "readings n"]
     lines: Int[Array, "k c"]
     sign: Float[Array, "k c"]
     current: Float[Array, ""]
     weight: Float[Array, "..."]
     channels: Bool[Array, " readings"]
+    shares: Float[Array, "readings n"] | None = None
 
     @property
-    def signs(self) -> Float[Array, "4"]:
-        """Current times the sign of each of the four pair sums of a reading, A."""
-        return self.current * jnp.asarray(SIGNS, self.sign.dtype)
+    def signs(self) -> Float[Array, "4"] | Float[Array, "readings n"]:
+        """Current times the sign of each of the four pair sums of a reading, or times their shares, A."""
+        return self.current * (jnp.asarray(SIGNS, self.sign.dtype) if self.shares is None else self.shares)
 
     def sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
         """``t = P^T W dv``; channels that are not used may hold anything."""
@@ -79,6 +82,8 @@ class Whitening(eqx.Module):
 
     def readings(self, z: Float[Array, "k ..."]) -> Float[Array, "readings ..."]:
         """``P z``."""
+        if self.shares is not None:
+            return self.current * Mixing(self.pairs, self.shares)(z)
         first, second, third, fourth = (z[column] for column in self.pairs.T)
         return self.current * (first - second - third + fourth)
 
@@ -92,11 +97,23 @@ def pairs_of(pattern: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(np.divmod(keys, count), 1), number.reshape(4, -1).T
 
 
-def whitened(pattern: np.ndarray, current: Any, weight: Any, channels: np.ndarray, dtype: np.dtype) -> "Whitened":
-    """The pair sums of a protocol, from its pattern (readings, 4); in NumPy unless JAX traces current or weight."""
+def whitened(
+    pattern: np.ndarray,
+    current: Any,
+    weight: Any,
+    channels: np.ndarray,
+    dtype: np.dtype,
+    mixing: sp.csr_array | None = None,
+) -> "Whitened":
+    """The pair sums of a protocol, from its pattern (rows, 4); in NumPy unless JAX traces current or weight."""
     electrodes, pairs = pairs_of(pattern)
     require("array_bytes", 8 * len(electrodes) ** 2, "prepare: covariance of the pairs of electrodes")
-    lines, sign = lines_of(pairs, len(electrodes))
+    p, shares = matrix_of(pairs, len(electrodes)), None
+    if mixing is None:
+        lines, sign = lines_of(pairs, len(electrodes))
+    else:
+        p = mixing @ p
+        (pairs, shares), (lines, sign) = padded_rows(p), padded_rows(p.T.tocsr())
     arrays = {
         "pairs": pairs.astype(np.int32),
         "lines": lines.astype(np.int32),
@@ -105,7 +122,9 @@ def whitened(pattern: np.ndarray, current: Any, weight: Any, channels: np.ndarra
         "weight": weight.astype(dtype),
         "channels": channels.copy(),  # JAX may keep the array that it is given, and the caller's is not ours to keep
     }
-    factors = _factors(matrix_of(pairs, len(electrodes)), current, weight, channels)
+    if shares is not None:
+        arrays["shares"] = shares.astype(dtype)
+    factors = _factors(p, current, weight, channels)
     return Whitened(Whitening(**_on_device(arrays)), electrodes, *factors)
 
 
@@ -215,18 +234,20 @@ def whitened_readings(model: Model, noise: Any, channels: Any) -> Whitened:
             f"{type(between[0]).__name__} acts between sheet and readings, which are then not the differences of "
             "potentials that reconstruction takes them for; reconstruct with a scene without it"
         )
-    if is_traced(model.pattern):
+    if is_traced(model.pattern, model.mixing):
         raise InverseError(
             "jit, grad or vmap hides the protocol of the model, which decides the shapes of a reconstruction; use the "
             "model from outside the transformed function, and pass only what changes as an argument"
         )
-    readings = model.pattern.shape[0]
+    readings = model.readings
     used = require_some(np.ones(readings, bool) if channels is None else known_flags(channels, readings))
     weight = noise_weight(noise, readings, used)
     if not is_traced(weight) and not np.abs(weight).max() < np.finfo(model.dtype).max:
         raise InverseError(f"one over the noise squared is beyond {model.dtype}; is the noise in V?")
     current = model.current if is_traced(model.current) else float(model.current)
-    return whitened(np.asarray(model.pattern), current, weight, used, model.dtype)
+    rows = len(model.pattern)
+    mixing = None if model.mixing is None else matrix_of_rows(model.mixing, rows)
+    return whitened(np.asarray(model.pattern), current, weight, used, model.dtype, mixing)
 
 
 def known_flags(channels: Any, readings: int) -> np.ndarray:

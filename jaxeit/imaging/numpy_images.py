@@ -26,7 +26,8 @@ class NumpyImages:
         self._factor = self._exact_factor.astype(dtype, copy=False)
         self._used, self._weight = np.asarray(whitening.channels), np.asarray(whitening.weight)
         self._pairs = np.asarray(whitening.pairs, np.intp)
-        self._signs = np.asarray(whitening.signs, self._predict.dtype)
+        signs = np.asarray(whitening.signs, self._predict.dtype)
+        self._signs = np.broadcast_to(signs, self._pairs.shape)
         self._correlated = self._weight.ndim == 2
         ones = np.ones_like(self._weight, shape=len(self._pairs))
         sums = self._pair_sums(ones if self._correlated else self._weight)
@@ -35,8 +36,8 @@ class NumpyImages:
 
     def _pair_sums(self, weight: np.ndarray) -> csr_array:
         """``P^T`` times these weights, (k, readings); zero for channels that are not used."""
-        place = self._pairs[self._used].ravel(), np.repeat(np.flatnonzero(self._used), 4)
-        shares = np.outer(weight, self._signs)[self._used].ravel()
+        place = self._pairs[self._used].ravel(), np.repeat(np.flatnonzero(self._used), self._pairs.shape[1])
+        shares = (weight[:, None] * self._signs)[self._used].ravel()
         return csr_array((shares, place), (len(self._predict), len(self._pairs)))
 
     def __call__(self, dv: Float[np.ndarray, "... readings"]) -> Float[np.ndarray, "... basis"]:
@@ -82,14 +83,14 @@ class NumpyImages:
     def _missing(self, known: np.ndarray, missing: np.ndarray) -> Missing[Any]:
         if not self._correlated:
             weight = self._weight[missing]
-            return Missing(PairRows(self._pairs[missing], self._signs), weight, np.zeros_like(weight))
+            return Missing(PairRows(self._pairs[missing], self._signs[missing]), weight, np.zeros_like(weight))
         rows, weights = self._exact_sums[:, missing].T, self._weight[missing]
         return correlated(NUMPY, rows, weights[:, missing], weights @ known)
 
     def _image_of(self, left: np.ndarray, values: np.ndarray) -> np.ndarray:
         """The image of the few readings that are left: they are added to a reconstructor without readings."""
         predict, factor = self._without_readings
-        added = Missing(PairRows(self._pairs[left], self._signs), self._weight[left], values)
+        added = Missing(PairRows(self._pairs[left], self._signs[left]), self._weight[left], values)
         sums = completed_sums(NUMPY, added, predict, np.zeros_like(predict, shape=len(predict)))
         image: np.ndarray = factor.dot(sums)
         return image

@@ -90,7 +90,7 @@ def prepare(
     values are not checked (a value out of range gives an image that is not finite), and the provenance calls them
     traced. The protocol and ``channels`` decide shapes and must be known: use the model from outside the transformed
     function. To pass a large model as an argument, put the known protocol back inside:
-    ``eqx.tree_at(lambda m: m.pattern, argument, model.pattern)``.
+    ``eqx.tree_at(lambda m: m.pattern, argument, model.pattern)``, and ``mixing`` where the model has one.
 
     Args:
         prior: default `Noser`.

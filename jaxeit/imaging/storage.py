@@ -66,8 +66,17 @@ class StorageError(ValueError):
 
 
 def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.ndarray]:
-    """The arrays of a reconstructor under the names of `NUMBERS`; of an iterative one, all but its method and prior."""
+    """The arrays of a reconstructor under the names of `NUMBERS`; of an iterative one, all but its method and prior.
+
+    Raises:
+        StorageError: for a protocol of matrices (`Protocol.from_matrices`).
+    """
     require_known("to_numbers", StorageError, recon)
+    if recon.whitening.shares is not None:
+        raise StorageError(
+            "a reconstructor for a protocol of matrices (Protocol.from_matrices) has no form in a file; make it with "
+            "prepare where it is used"
+        )
     parts = (recon, recon.whitening, recon.picture)
     if isinstance(recon, Reconstructor):
         return {name: _part(parts, name) for name in LINEAR_NUMBERS}

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from .._compile import is_traced
 from ..budget import require
-from ..effects import AbstractCoatEffect, AbstractEffect, chosen
+from ..effects import AbstractCoatEffect, AbstractEffect, AbstractTerminalEffect, chosen
 from ..geometry.shapes import Domain
 from ..linalg import AbstractLinearSolver, default_solver
 from ..linalg.base import on_device
@@ -26,6 +26,7 @@ from ..skin.description import Skin
 from ..skin.electrodes import touched
 from .fidelity import Fidelity, require_dtype
 from .metal_sheet import Coat, lay_coat
+from .mixing import Mixing, padded_rows
 from .scene import Scene
 from .system import System, system_arrays, system_of
 from .unknowns import number_unknowns
@@ -47,7 +48,8 @@ class Model(eqx.Module):
     | areas                                               | (elements,)     | m^2               |
     | background: sheet conductivity, before effects      | (elements,)     | S                 |
     | contact: contact conductance of each electrode      | (electrodes,)   | S/m^2 or S/m      |
-    | pattern: drive+, drive-, sense+, sense-             | (readings, 4)   |                   |
+    | pattern: drive+, drive-, sense+, sense-             | (rows, 4)       |                   |
+    | mixing: readings as sums of rows; None: each is one |                 |                   |
     | current                                             | ()              | A                 |
     | effects of the scene                                |                 |                   |
     | coat: the second sheet, if an effect asks for one   |                 |                   |
@@ -60,12 +62,18 @@ class Model(eqx.Module):
     areas: Float[Array, " elements"]
     background: Float[Array, " elements"]
     contact: Float[Array, " electrodes"]
-    pattern: Int[Array, "readings 4"]
+    pattern: Int[Array, "rows 4"]
     current: Float[Array, ""]
     effects: tuple[AbstractEffect, ...]
     system: System
     solver: AbstractLinearSolver
     coat: Coat | None
+    mixing: Mixing | None = None
+
+    @property
+    def readings(self) -> int:
+        """Number of readings in one frame."""
+        return self.pattern.shape[0] if self.mixing is None else self.mixing.readings
 
     @property
     def electrodes(self) -> int:
@@ -88,7 +96,7 @@ class Model(eqx.Module):
         rows = [
             ("mesh", f"{nodes:,} nodes, {elements:,} triangles" + ("" if len(edges) <= MAX_LINES else "; not drawn")),
             ("sheet", f"{1e4 * float(self.areas.sum()):.4g} cm^2, {'flat' if self.nodes.shape[1] == 2 else 'curved'}"),
-            ("scan", f"{self.electrodes} electrodes, {len(self.pattern)} readings, {1e3 * float(self.current):.3g} mA"),
+            ("scan", f"{self.electrodes} electrodes, {self.readings} readings, {1e3 * float(self.current):.3g} mA"),
             ("effects", ", ".join(type(effect).__name__ for effect in self.effects) or "none"),
             ("precision, solver", f"{self.dtype}, {type(self.solver).__name__}"),
         ]
@@ -110,12 +118,15 @@ def discretise(
 
     Raises:
         FidelityError: float64 asked for while JAX is in 32-bit mode.
+        ProtocolError: an effect on the circuit of a reading, and a protocol of matrices, whose readings have none.
         ElectrodeError, MeshError: the electrodes do not fit the sheet, each other or the mesh.
         BudgetError: the mesh or the fields would be larger than `Budget` allows.
     """
     fidelity = Fidelity.standard() if fidelity is None else fidelity
     require_dtype(fidelity.dtype)
     skin = scene.skin
+    if at_terminals := chosen(scene.effects, AbstractTerminalEffect):
+        skin.protocol.rows(f"the effect {type(at_terminals[0]).__name__}")
     sheet, metal = _spaces(scene, fidelity, mesh)
     values = _model_arrays(skin, sheet.mesh)
     electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
@@ -133,7 +144,9 @@ def discretise(
         index = unknowns.index[: len(sheet.points)]
         coat = lay_coat(metal, sheet, pattern, index, arrays["under"][index], unknowns.electrode, solver, put)
     effects = jax.tree.map(put, scene.effects)
-    return Model(**jax.tree.map(put, values), effects=effects, system=system, solver=solver, coat=coat)
+    mixing = skin.protocol.mixing
+    mixed = None if mixing is None else Mixing(*map(put, padded_rows(mixing)))
+    return Model(**jax.tree.map(put, values), effects=effects, system=system, solver=solver, coat=coat, mixing=mixed)
 
 
 def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:

@@ -217,7 +217,8 @@ def _checked_values(model: Model, name: str, values: Float[Array, " elements"]) 
 def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
     """Voltages of the protocol from the transfer matrix in ohm."""
     source, sink, plus, minus = model.pattern.T
-    return model.current * (z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
+    found = model.current * (z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
+    return found if model.mixing is None else model.mixing(found)
 
 
 class DerivativeError(ValueError):

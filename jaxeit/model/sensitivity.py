@@ -72,7 +72,7 @@ def scaled_jacobian(
     source, sink, plus, minus = model.pattern.T
     out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
     found: Array = model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])
-    return found
+    return found if model.mixing is None else model.mixing(found)
 
 
 @verb

@@ -67,7 +67,7 @@ def covariance_of_region(
     sigma: Float[Array, " elements"] | None,
 ) -> Callable[[Float[Array, "... basis"]], Float[Array, "... readings readings"]]:
     """`signal_covariance` as a function of the region, so that many regions share one Jacobian."""
-    readings = model.pattern.shape[0]
+    readings = model.readings
     std = jnp.ones(readings) if noise is None else _standard_deviations(noise, readings)
     strength = jnp.asarray(hyperparameter, model.dtype)
     return partial(_signal, jacobian(model, sigma, image), std.astype(model.dtype), prior, strength, image)

@@ -181,6 +181,7 @@ def prepare_event_scan(
         raise ProtocolError(
             f"the skin {skin.name!r} has no pads, and their pressure directs the scan; give a skin with pads"
         )
+    skin.protocol.rows("an event-driven scan")
     begins, ends = settings.limits(len(skin.pads))
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels(20)).on(model)
     centres = _grid(skin.domain, settings.radius)

@@ -7,7 +7,6 @@ the information of the best set of equal size (Nemhauser, Wolsey and Fisher 1978
 """
 
 from abc import abstractmethod
-from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -177,7 +176,7 @@ def shortened(protocol: Protocol, rows: Integer[ArrayLike, " count"] | Bool[Arra
     """
     rows = np.asarray(rows)
     rows = np.flatnonzero(rows) if rows.dtype == bool else np.unique(rows)
-    return replace(protocol, pattern=protocol.pattern[rows])
+    return protocol.only(rows)
 
 
 def scan_time(protocol: Protocol, switch: float = 0.0) -> float:
@@ -186,8 +185,11 @@ def scan_time(protocol: Protocol, switch: float = 0.0) -> float:
     Args:
         protocol: the scan.
         switch: cost of a change of the driven pair, in readings.
+
+    Raises:
+        ProtocolError: for a protocol of matrices, whose drives are no pairs.
     """
-    drive = drives(protocol.pattern)
+    drive = drives(protocol.rows("scan_time"))
     changes = int(np.sum(drive != np.roll(drive, 1)))
     return (protocol.readings + switch * changes) * protocol.reading_time
 

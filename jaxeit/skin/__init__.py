@@ -14,6 +14,7 @@ from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, El
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
 from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
+from .rims import rim_electrodes
 from .rings import RingPatch
 
 __all__ = [
@@ -37,5 +38,6 @@ __all__ = [
     "load_skin",
     "parse_skin",
     "reciprocal_rows",
+    "rim_electrodes",
     "shipped_skins",
 ]
