@@ -157,7 +157,7 @@ def _matrix(name: str, values: Any, electrodes: int | None = None) -> np.ndarray
         )
     if np.iscomplexobj(values) or not np.isfinite(values).all():
         raise ProtocolError(f"{name} has entries that are no finite real numbers")
-    return values.astype(float)
+    return np.asarray(values, float)
 
 
 class _Terms:

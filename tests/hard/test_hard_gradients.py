@@ -62,6 +62,7 @@ HOST = {
     "read_effects": _DESCRIBES,
     "read_text": _DESCRIBES,
     "reciprocal_rows": _DESCRIBES,
+    "rim_electrodes": _DESCRIBES,
     "refine_contacts": _PREPARES,
     "limit_blas_threads": _DESCRIBES,
     "reuse_memory": _DESCRIBES,
