@@ -13,6 +13,7 @@ from . import (
     report as report,
     session as session,
     simulators as simulators,
+    tanks as tanks,
 )
 from .batch.random_frames import write_training_frames as write_training_frames
 from .batch.sessions import calibrate_many as calibrate_many

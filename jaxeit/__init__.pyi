@@ -12,6 +12,7 @@ from . import (
     meshing as meshing,
     metrics as metrics,
     model as model,
+    plot as plot,
     registry as registry,
     scan as scan,
     skin as skin,

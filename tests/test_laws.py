@@ -22,11 +22,11 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "budget", "files", "notebook", "_compile", "toml",
     "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
-    "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "__main__",
+    "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "plot", "__main__",
 ]  # fmt: skip
 BENCH = [
     "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "export", "bench",
-    "simulators", "live", "report", "batch", "cli",
+    "simulators", "live", "report", "batch", "tanks", "cli",
 ]  # fmt: skip
 
 

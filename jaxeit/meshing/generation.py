@@ -19,7 +19,7 @@ from ..geometry.shapes import Domain, Rectangle
 from .footprints import AbstractFootprint, Feature, cycle, neighbours, require_placed
 from .sizes import SizeField, divide_rim, fill, narrow_places, thin
 from .smoothing import Problem, missing_edges, relax
-from .triangles import Mesh, MeshError, place
+from .triangles import CROWDED, Mesh, MeshError, place
 
 START_SPACING = 0.72
 """Least distance between the initial nodes, over the wanted edge length."""
@@ -68,7 +68,7 @@ def triangulate(
     free = free[problem.open_to(free)]
     points, triangles = relax(problem, thin(free, problem.fixed, START_SPACING * size(free)))
     _require_followed(problem, triangles)
-    return Mesh(points, triangles).check()
+    return Mesh(points, triangles).check(advice=CROWDED)
 
 
 def expected_nodes(

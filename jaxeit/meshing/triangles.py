@@ -12,6 +12,10 @@ from scipy.spatial import cKDTree
 
 from .smoothing import corner_angles, directed_edges, doubled_areas, edge_keys
 
+OWN_MESH = "move its nodes apart, or accept such triangles with min_angle=, an argument of discretise and of Mesh.check"
+
+CROWDED = "use a shorter edge_length or more segments there, or move what is crowded apart"
+
 Surface = Callable[[np.ndarray], np.ndarray]
 
 
@@ -79,12 +83,12 @@ class Mesh:
         """Smallest angle of each triangle on the surface, (m,) degrees."""
         return np.asarray(corner_angles(self.nodes[self.triangles]).min(1))
 
-    def check(self, min_angle: float = 20.0) -> "Mesh":
+    def check(self, min_angle: float = 20.0, advice: str = OWN_MESH) -> "Mesh":
         """This mesh; raises MeshError with its worst fault, the place of the fault, and what to do.
 
         Tests for values that are not finite, indices out of range, nodes that coincide or belong
         to no triangle, flipped triangles, edges of more than two triangles, separate pieces, and
-        angles below ``min_angle`` degrees.
+        angles below ``min_angle`` degrees; ``advice`` says what to do about these.
         """
         _require_finite(self)
         _require_indices(self)
@@ -92,7 +96,7 @@ class Mesh:
         _require_orientation(self)
         _require_manifold(self)
         _require_connected(self)
-        _require_angles(self, min_angle)
+        _require_angles(self, min_angle, advice)
         return self
 
     def lift(self, surface: Surface) -> "Mesh":
@@ -237,13 +241,12 @@ def _require_connected(mesh: Mesh) -> None:
         )
 
 
-def _require_angles(mesh: Mesh, min_angle: float) -> None:
+def _require_angles(mesh: Mesh, min_angle: float, advice: str) -> None:
     angles = mesh.min_angles
     worst = int(np.argmin(angles))
     if not angles[worst] >= min_angle:
         raise MeshError(
             f"mesh: triangle {worst} at {place(mesh.centroids[worst])} has an angle of "
             f"{angles[worst]:.1f} degrees ({int((angles < min_angle).sum())} triangles are below "
-            f"{min_angle:g}); use a shorter edge_length or more segments there, or move what is "
-            "crowded apart"
+            f"{min_angle:g}); {advice}"
         )

@@ -20,7 +20,7 @@ from ..linalg.base import on_device
 from ..meshing.elements import Space, function_space
 from ..meshing.footprints import AbstractFootprint
 from ..meshing.generation import expected_nodes, triangulate
-from ..meshing.triangles import Mesh
+from ..meshing.triangles import CROWDED, Mesh
 from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
 from ..skin.electrodes import touched
@@ -109,11 +109,14 @@ def discretise(
     *,
     mesh: Mesh | None = None,
     ground: int | None = None,
+    min_angle: float = 20.0,
 ) -> Model:
     """Build the model of ``scene`` at ``fidelity`` (default: `Fidelity.standard`).
 
     Args:
         mesh: use this mesh instead of making one, for a metal coat too; it must follow the electrodes.
+        min_angle: smallest angle that a triangle of ``mesh`` may have, degrees. Readings are less accurate
+            where triangles are flat.
         ground: the mesh node held at zero volts; readings do not depend on it.
 
     Raises:
@@ -127,7 +130,7 @@ def discretise(
     skin = scene.skin
     if at_terminals := chosen(scene.effects, AbstractTerminalEffect):
         skin.protocol.rows(f"the effect {type(at_terminals[0]).__name__}")
-    sheet, metal = _spaces(scene, fidelity, mesh)
+    sheet, metal = _spaces(scene, fidelity, None if mesh is None else mesh.check(min_angle))
     values = _model_arrays(skin, sheet.mesh)
     electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
     unknowns = number_unknowns(sheet, electrodes, ground)
@@ -184,7 +187,7 @@ def _spaces(scene: Scene, fidelity: Fidelity, mesh: Mesh | None) -> tuple[Space,
     """The function spaces of the sheet and of its metal coat, if an effect asks for one."""
     coated = bool(chosen(scene.effects, AbstractCoatEffect))
     coarse = COAT_EDGES * _edge_length(scene.skin, fidelity)
-    sheet = make_mesh(scene, fidelity) if mesh is None else mesh.check()
+    sheet = make_mesh(scene, fidelity) if mesh is None else mesh
     if not coated:
         return function_space(sheet, fidelity.order), None
     metal = _mesh(scene.skin, [], coarse, fidelity.growth) if mesh is None else sheet
@@ -198,7 +201,7 @@ def _edge_length(skin: Skin, fidelity: Fidelity) -> float:
 
 def _mesh(skin: Skin, footprints: Sequence[AbstractFootprint], edge_length: float, growth: float) -> Mesh:
     mesh = _flat_mesh(skin.domain, footprints, edge_length, growth)
-    return mesh if skin.surface is None else mesh.lift(skin.surface).check()
+    return mesh if skin.surface is None else mesh.lift(skin.surface).check(advice=CROWDED)
 
 
 def _flat_mesh(domain: Domain, footprints: Sequence[AbstractFootprint], edge_length: float, growth: float) -> Mesh:

@@ -69,6 +69,7 @@ HOST = {
     "rounding": "what it estimates has no direction",
     "save_reconstructor": _DESCRIBES,
     "scan_time": _DESCRIBES,
+    **dict.fromkeys(("show_contacts", "show_image", "show_mesh", "show_sensitivity", "show_skin"), "draws a picture"),
     "shipped_skins": _DESCRIBES,
     "shortened": _DESCRIBES,
     "structured": _GEOMETRY,

@@ -1,0 +1,18 @@
+"""Tanks of others: files of EIDORS, the Kuopio challenge, PyEIDORS, Sciospec and NumPy, and images of their frames."""
+
+from .formats import load_eidors, load_ktc, load_npz, load_pyeidors, load_sciospec, load_tank
+from .images import TankImage, difference_image
+from .recording import Tank, TankError
+
+__all__ = [
+    "Tank",
+    "TankError",
+    "TankImage",
+    "difference_image",
+    "load_eidors",
+    "load_ktc",
+    "load_npz",
+    "load_pyeidors",
+    "load_sciospec",
+    "load_tank",
+]

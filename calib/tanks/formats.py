@@ -1,0 +1,118 @@
+"""Open the file of a tank by its format, or by its name and content."""
+
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxeit as je
+from jaxeit.files import open_regular
+from jaxeit.geometry import Domain
+from jaxeit.skin import AbstractElectrode
+
+from .matlab import eidors_tank, is_ktc, ktc_tank, read_matlab
+from .recording import Tank, TankError, tank_of
+from .texts import pyeidors_tank, sciospec_tank
+
+Rim = Sequence[AbstractElectrode]
+
+
+def load_tank(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+    """A tank and its frames, from any file that this room reads.
+
+    Args:
+        path: .mat (EIDORS or the Kuopio challenge), .csv (PyEIDORS), .eit (Sciospec), .npz, or a folder of .eit files.
+        domain: shape of the tank, where the file has none (all but .mat), such as ``je.Disc(0.03)``.
+        rim: its electrodes; default: `je.skin.rim_electrodes`, electrode 0 at +x, counter-clockwise.
+
+    Raises:
+        TankError, OSError: naming the file and what is wrong with it.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
+    kind = path.suffix.lower()
+    if kind == ".mat":
+        variables = read_matlab(path)
+        return ktc_tank(path, variables) if is_ktc(variables) else eidors_tank(path, variables)
+    if kind == ".eit":
+        return load_sciospec([path], domain, rim)
+    readers = {".csv": load_pyeidors, ".npz": load_npz}
+    if kind not in readers:
+        raise TankError(f"{path.name}: is no file of a tank by its name; give .mat, .csv, .eit or .npz")
+    return readers[kind](path, domain, rim)
+
+
+def load_eidors(path: str | Path) -> Tank:
+    """A MATLAB file with a forward model of EIDORS (``fmdl``, ``img`` or ``imdl``) and frames (``vh``, ``vi``).
+
+    The model is taken with its mesh, electrodes (points, or complete ones along the outer rim), contact impedances and
+    stimulation. Every variable that is an array or a data structure of as many readings is a frame.
+
+    Raises:
+        TankError: for a volume, electrodes inside the mesh, or a file of MATLAB's format 7.3.
+    """
+    path = Path(path)
+    return eidors_tank(path, read_matlab(path))
+
+
+def load_ktc(path: str | Path) -> Tank:
+    """A frame of the Kuopio Tomography Challenge 2023, after the ``ref.mat`` beside it; currents of each drive its own.
+
+    Raises:
+        TankError: for a file without Inj, Mpat and Uel.
+    """
+    path = Path(path)
+    return ktc_tank(path, read_matlab(path))
+
+
+def load_pyeidors(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+    """A CSV table of PyEIDORS: one row a reading, real and imaginary part of each frame, adjacent rotating order.
+
+    Arguments as for `load_tank`.
+    """
+    return pyeidors_tank(Path(path), domain, rim)
+
+
+def load_sciospec(paths: Sequence[str | Path], domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+    """Text files of Sciospec's software, a frame each; readings are of neighbouring channels that do not drive.
+
+    Arguments as for `load_tank`.
+    """
+    return sciospec_tank([Path(path) for path in paths], domain, rim)
+
+
+def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+    """NumPy arrays: ``frames`` (frames, readings) V, with ``pattern`` (readings, 4) and ``amplitude`` A, or with
+    ``current`` (electrodes, drives) A and ``measurement`` (electrodes, senses) as for `Protocol.from_matrices`.
+
+    Arguments as for `load_tank`.
+    """
+    path = Path(path)
+    arrays = _npz(path)
+    if "frames" not in arrays or not (
+        {"pattern", "amplitude"} <= set(arrays) or {"current", "measurement"} <= set(arrays)
+    ):
+        raise TankError(
+            f"{path.name}: holds {sorted(arrays)}; frames, and pattern and amplitude or current and measurement"
+        )
+    if "pattern" in arrays:
+        protocol = je.Protocol(arrays["pattern"], float(arrays["amplitude"]))
+        electrodes = int(protocol.pattern.max()) + 1 if rim is None else len(rim)
+    else:
+        protocol = je.Protocol.from_matrices(arrays["current"], arrays["measurement"])
+        electrodes = len(arrays["current"])
+    frames = np.atleast_2d(arrays["frames"])
+    quadrature = frames.imag if np.iscomplexobj(frames) else None
+    names = tuple(f"frame {k}" for k in range(len(frames)))
+    return Tank(tank_of(path.stem, protocol, electrodes, domain, rim), frames.real.astype(float), names, quadrature)
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    try:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise TankError(f"{path.name}: cannot be read as a NumPy archive: {error}") from None

@@ -1,0 +1,81 @@
+"""Difference images of tanks, relative to the even content that the reference frame shows."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import jaxeit as je
+from jaxeit.imaging import AbstractIterativeMethod, AbstractLinearMethod, IterativeReconstructor
+from jaxeit.model import AbstractBasis
+
+from .recording import Tank, TankError
+
+LEAST_CORRELATION = 0.5
+"""Correlation of the reference with the model below which order, polarity or geometry cannot be right."""
+
+
+class TankImage(NamedTuple):
+    """A difference image.
+
+    | meaning                                                                  | shape          | unit |
+    |--------------------------------------------------------------------------|----------------|------|
+    | change of conductivity over that of the reference                        | (basis,)       | 1    |
+    | recon: the reconstructor, whose ``shape``, ``extent`` belong to the image |               |      |
+    | background: conductivity of the reference, if its content is even        | ()             | S    |
+    | correlation of the reference with the model of even content              | ()             | 1    |
+    """
+
+    change: Float[Array, " basis"]
+    recon: je.Reconstructor | IterativeReconstructor
+    background: float
+    correlation: float
+
+
+def difference_image(
+    tank: Tank,
+    frame: int = -1,
+    reference: int = 0,
+    *,
+    prior: je.AbstractPrior | None = None,
+    method: AbstractLinearMethod | AbstractIterativeMethod | None = None,
+    basis: AbstractBasis | None = None,
+    hyperparameter: float = 0.1,
+    fidelity: je.Fidelity | None = None,
+) -> TankImage:
+    """The change from one frame to another.
+
+    One conductivity is fitted to the reference, by which the size of current and tank, and a gain, have no part in the
+    image. Readings that are NaN in either frame are left out.
+
+    Args:
+        frame, reference: numbers of the frames.
+        prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x.
+        fidelity: as for `Tank.model`.
+
+    Raises:
+        TankError: if there is one frame, or the reference does not look like the model.
+    """
+    count = len(tank.frames)
+    first, last = (number % count for number in (reference, frame) if -count <= number < count) if count > 1 else (0, 0)
+    if first == last:
+        raise TankError(
+            f"{tank.skin.name}: frame {frame} less frame {reference}, of {count}; give two different frames"
+        )
+    model = tank.model(fidelity)
+    before, after = tank.frames[first], tank.frames[last]
+    even = np.asarray(je.forward(model))
+    used = np.isfinite(before) & np.isfinite(after)
+    if used.sum() < 3:
+        raise TankError(f"{tank.skin.name}: the frames share {int(used.sum())} finite readings; more are needed")
+    correlation = float(np.corrcoef(even[used], before[used])[0, 1])
+    if not correlation > LEAST_CORRELATION:
+        raise TankError(
+            f"{tank.skin.name}: the correlation of frame {first} with a model of even content is {correlation:.2f}; "
+            "check the order and the polarity of readings, and the place and direction of electrodes"
+        )
+    scale = float(even[used] @ before[used] / (before[used] @ before[used]))
+    recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=hyperparameter)
+    change = recon(jnp.asarray(scale * (after - before), model.dtype)) * tank.skin.sheet_resistance
+    return TankImage(change, recon, scale / tank.skin.sheet_resistance, correlation)

@@ -1,0 +1,198 @@
+"""MATLAB files: models and frames of EIDORS, and frames of the Kuopio Tomography Challenge.
+
+The fields are those that EIDORS documents for a forward model: ``nodes``, ``elems``, ``electrode(i).nodes`` and
+``.z_contact``, ``stimulation(k).stim_pattern`` (electrodes, A) and ``.meas_pattern`` (readings, electrodes).
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError, mat_struct
+
+import jaxeit as je
+from jaxeit.files import open_regular
+from jaxeit.geometry import Polygon
+
+from .recording import Tank, TankError
+
+REFERENCES = ("vh", "v_h", "homg", "ref", "reference", "Uelref")
+"""Names under which a frame is the reference, and comes first."""
+
+KTC_RADIUS, KTC_CONTACT = 0.115, 1e-4  # m; ohm m at 1 S: no contact impedance is published
+
+
+def read_matlab(path: Path) -> dict[str, Any]:
+    """The variables of a MATLAB file before version 7.3, structures as objects with fields."""
+    try:
+        with open_regular(path) as file:
+            found = loadmat(file, squeeze_me=True, struct_as_record=False)
+    except NotImplementedError:
+        raise TankError(f"{path.name}: is of MATLAB's format 7.3; save it with save(..., '-v7')") from None
+    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError) as error:
+        raise TankError(f"{path.name}: cannot be read as a MATLAB file: {error}") from None
+    return {name: value for name, value in found.items() if not name.startswith("__")}
+
+
+# --- EIDORS
+
+
+def eidors_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
+    """A forward model of EIDORS, on its own mesh, and every variable that holds a frame of it."""
+    model = next((found for value in variables.values() for found in _forward_models(value)), None)
+    if model is None:
+        raise TankError(f"{path.name}: no variable has a forward model (nodes, elems); save fwd_model, img or imdl")
+    where = f"{path.name}: fwd_model"
+    mesh, number = _mesh(where, model)
+    rim = _Rim(mesh)
+    electrodes = tuple(
+        rim.electrode(f"{where}.electrode({k + 1})", one, number)
+        for k, one in enumerate(_each(where, model, "electrode"))
+    )
+    stimulation = _each(where, model, "stimulation")
+    current = [_pattern(f"{where}.stimulation({k + 1})", s, "stim_pattern") for k, s in enumerate(stimulation)]
+    measured = [_pattern(f"{where}.stimulation({k + 1})", s, "meas_pattern") for k, s in enumerate(stimulation)]
+    sizes = {len(column.ravel()) for column in current} | {matrix.shape[1] for matrix in measured}
+    if sizes != {len(electrodes)}:
+        raise TankError(f"{where}.stimulation: patterns are for {sorted(sizes)} electrodes, not {len(electrodes)}")
+    protocol = je.Protocol.from_matrices(
+        np.stack([column.ravel() for column in current], 1), [matrix.T for matrix in measured]
+    )
+    skin = je.Skin(path.stem, rim.domain, 1.0, electrodes, protocol)
+    frames = {
+        name if columns.shape[1] == 1 else f"{name}({k + 1})": column
+        for name, value in variables.items()
+        if (columns := _frames_of(value, protocol.readings)) is not None
+        for k, column in enumerate(columns.T)
+    }
+    names = tuple(sorted(frames, key=lambda name: name.split("(")[0] not in REFERENCES))
+    values = np.array([frames[name] for name in names]).reshape(len(names), protocol.readings)
+    parts = np.ascontiguousarray(values.real), values.imag if np.iscomplexobj(values) else None
+    return Tank(skin, parts[0].astype(float), names, parts[1], mesh)
+
+
+def _forward_models(value: Any) -> Iterator[mat_struct]:
+    for one in np.ravel(value) if isinstance(value, np.ndarray) and value.dtype == object else [value]:
+        if isinstance(one, mat_struct):
+            if hasattr(one, "nodes") and hasattr(one, "elems"):
+                yield one
+            elif hasattr(one, "fwd_model"):
+                yield from _forward_models(one.fwd_model)
+
+
+def _each(where: str, model: mat_struct, name: str) -> list[mat_struct]:
+    found = [one for one in np.ravel(np.array(getattr(model, name, []), object)) if isinstance(one, mat_struct)]
+    if not found:
+        raise TankError(f"{where}.{name}: missing; a tank needs its electrodes and its stimulation")
+    return found
+
+
+def _pattern(where: str, struct: mat_struct, name: str) -> np.ndarray:
+    value = getattr(struct, name, None)
+    if value is None or isinstance(value, str):  # a word stands for a pattern that EIDORS makes when it solves
+        raise TankError(f"{where}.{name}: is {value!r}; give a matrix, as mk_stim_patterns does")
+    return np.atleast_2d(value.toarray() if sp.issparse(value) else np.asarray(value, float))
+
+
+def _mesh(where: str, model: mat_struct) -> tuple[je.meshing.Mesh, np.ndarray]:
+    """The mesh, all triangles counter-clockwise, and the new number of each node, -1 for one without triangles."""
+    nodes, elems = np.asarray(model.nodes, float), np.atleast_2d(np.asarray(model.elems)).astype(int) - 1
+    flat = nodes.ndim == 2 and nodes.shape[1] >= 2 and (nodes[:, 2:] == nodes[:1, 2:]).all()
+    if not flat or elems.shape[1] != 3:
+        raise TankError(f"{where}: elements have {elems.shape[1]} nodes; a sheet is a plane mesh of triangles")
+    if elems.min() < 0 or elems.max() >= len(nodes):
+        raise TankError(f"{where}.elems: names nodes outside 1 to {len(nodes)}")
+    corners = nodes[elems, :2]
+    (u, v) = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    flipped = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0
+    elems[flipped] = elems[flipped][:, [0, 2, 1]]
+    used, triangles = np.unique(elems, return_inverse=True)
+    number = np.full(len(nodes), -1)
+    number[used] = np.arange(len(used))
+    return je.meshing.Mesh(nodes[used, :2], triangles.reshape(-1, 3)), number
+
+
+class _Rim:
+    """The outer boundary of a mesh as a polygon, one corner a node."""
+
+    def __init__(self, mesh: je.meshing.Mesh) -> None:
+        self._nodes = mesh.nodes
+        after = {int(a): int(b) for a, b in mesh.boundary_edges}
+        loops = []
+        while after:
+            loop = [next(iter(after))]
+            while (following := after.pop(loop[-1], None)) is not None and following != loop[0]:
+                loop.append(following)
+            loops.append(loop)
+        self._loop = max(loops, key=lambda loop: float(np.ptp(mesh.nodes[loop], axis=0).prod()))
+        self.domain = Polygon(mesh.nodes[self._loop])
+        sides = np.linalg.norm(np.diff(mesh.nodes[[*self._loop, self._loop[0]]], axis=0), axis=1)
+        self._along = np.concatenate([[0.0], np.cumsum(sides)])
+
+    def electrode(self, where: str, struct: mat_struct, number: np.ndarray) -> je.BoundaryPatch | je.PointElectrode:
+        """One node: a point; neighbours along the rim: the complete electrode model, z_contact in ohm m."""
+        nodes = number[np.ravel(np.asarray(getattr(struct, "nodes", []))).astype(int) - 1]
+        if not len(nodes) or (nodes < 0).any():
+            raise TankError(f"{where}: names no node of the mesh")
+        if len(nodes) == 1:
+            x, y = self._nodes[nodes[0]]
+            return je.PointElectrode((float(x), float(y)))
+        on = np.isin(self._loop, nodes)
+        sides = np.flatnonzero(on & np.roll(on, -1))
+        first = sides[~np.isin((sides - 1) % len(on), sides)]
+        if on.sum() != len(set(nodes.tolist())) or len(first) != 1 or len(sides) != on.sum() - 1:
+            raise TankError(f"{where}: its nodes are no single stretch of the outer rim, on which electrodes lie here")
+        start, perimeter = self._along[first[0]], self._along[-1]
+        stop = self._along[(first[0] + len(sides)) % len(on)]
+        contact = float(np.real(np.ravel(getattr(struct, "z_contact", 0.01))[0]))
+        return je.BoundaryPatch(float(start), float(stop if stop > start else stop + perimeter), contact)
+
+
+def _frames_of(value: Any, readings: int) -> np.ndarray | None:
+    """The frames of a variable as columns, if it is an array or a data structure of so many readings."""
+    value = getattr(value, "meas", value)
+    if isinstance(value, mat_struct) or np.asarray(value).dtype.kind not in "fiuc":
+        return None
+    columns = np.asarray(value)
+    columns = columns[:, None] if columns.ndim == 1 else columns
+    return columns if columns.ndim == 2 and len(columns) == readings else None
+
+
+# --- the Kuopio Tomography Challenge 2023
+
+
+class _KtcFrame(NamedTuple):
+    current: np.ndarray
+    measurement: np.ndarray
+    readings: np.ndarray
+
+
+def is_ktc(variables: Mapping[str, Any]) -> bool:
+    """Whether these are the variables of a frame of the challenge."""
+    return "Mpat" in variables and bool({"Uel", "Uelref"} & set(variables)) and "elfaces" not in variables
+
+
+def _ktc_frame(path: Path, variables: Mapping[str, Any]) -> _KtcFrame:
+    current = variables.get("Inj", variables.get("Injref"))
+    readings = variables.get("Uel", variables.get("Uelref"))
+    if current is None or readings is None or "Mpat" not in variables:
+        raise TankError(f"{path.name}: has no Inj, Mpat and Uel, as frames of the Kuopio challenge have")
+    return _KtcFrame(1e-3 * np.asarray(current, float), np.asarray(variables["Mpat"], float), np.ravel(readings))
+
+
+def ktc_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
+    """A frame of the challenge, after the ``ref.mat`` beside it where there is one; currents of the file are in mA."""
+    frame = _ktc_frame(path, variables)
+    frames, names = [frame.readings], [path.stem]
+    water = path.with_name("ref.mat")
+    if "Uelref" not in variables and water.is_file():
+        reference = _ktc_frame(water, read_matlab(water))
+        frames, names = [reference.readings, *frames], ["ref", *names]
+    count = len(frame.current)
+    disc = je.Disc(KTC_RADIUS)
+    rim = je.skin.rim_electrodes(disc, count, contact=KTC_CONTACT, start=np.pi / 2)
+    protocol = je.Protocol.from_matrices(frame.current, frame.measurement)
+    return Tank(je.Skin(path.stem, disc, 1.0, rim, protocol), np.array(frames), tuple(names))

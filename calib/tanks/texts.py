@@ -1,0 +1,114 @@
+"""Text files of tanks: CSV of PyEIDORS, and the .eit files that the software of Sciospec writes."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+import jaxeit as je
+from jaxeit.files import open_regular
+from jaxeit.geometry import Domain
+from jaxeit.skin import AbstractElectrode
+
+from .recording import Tank, TankError, tank_of
+
+CURRENT_IN_NAME = re.compile(r"_([\d.]+)(uA|mA)(?:_([\d.]+)Hz)?")
+AMPERE = {"uA": 1e-6, "mA": 1e-3}
+
+
+def text_of(path: Path) -> str:
+    """The text of a file."""
+    with open_regular(path) as file:
+        return file.read().decode("utf-8", "replace")
+
+
+def _numbers(where: str, line: str) -> list[float]:
+    try:
+        return [float(word) for word in line.replace(",", " ").split()]
+    except ValueError:
+        raise TankError(f"{where}: {line.strip()[:60]!r} has a word that is no number") from None
+
+
+def pyeidors_tank(path: Path, domain: Domain | None, rim: Sequence[AbstractElectrode] | None) -> Tank:
+    """A table with one row a reading, two columns a frame (real and imaginary part), of opposite polarity to ours.
+
+    Adjacent drive and measurement in rotating order; current and frequency are in the name of the file.
+    """
+    lines = [line for line in text_of(path).splitlines() if line.strip()]
+    rows = [_numbers(f"{path.name}: line {k + 1}", line) for k, line in enumerate(lines)]
+    electrodes = (3 + np.sqrt(9 + 4 * len(rows))) / 2
+    if not rows or electrodes != int(electrodes) or electrodes < 4:
+        raise TankError(f"{path.name}: has {len(rows)} lines, which is no n (n - 3) for n electrodes of adjacent pairs")
+    widths = {len(row) for row in rows}
+    if len(widths) != 1 or widths.pop() % 2:
+        raise TankError(f"{path.name}: lines have {sorted({len(row) for row in rows})} columns; two are needed a frame")
+    named = CURRENT_IN_NAME.search(path.name)
+    current = float(named[1]) * AMPERE[named[2]] if named else 1e-3
+    frequency = float(named[3]) if named and named[3] else 0.0
+    protocol = je.Protocol(je.skin.adjacent(int(electrodes)), current, frequency)
+    table = -np.array(rows).T
+    names = tuple(f"frame {k}" for k in range(len(table) // 2))
+    skin = tank_of(path.stem, protocol, int(electrodes), domain, rim)
+    return Tank(skin, table[::2], names, table[1::2])
+
+
+def sciospec_tank(paths: Sequence[Path], domain: Domain | None, rim: Sequence[AbstractElectrode] | None) -> Tank:
+    """One frame a file, in the order of the names: the potential of each channel for each injection.
+
+    The readings are differences of neighbouring channels that do not drive. Of several frequencies the first is taken.
+    """
+    frames: list[np.ndarray] = []
+    names: list[str] = []
+    first: tuple[np.ndarray, float, float] | None = None
+    for path in sorted(paths):
+        drives, potentials, current, frequency = _sciospec_frame(path)
+        if first is not None and not np.array_equal(first[0], drives):
+            raise TankError(f"{path.name}: has other injections than {names[0]}; load the files of one setup")
+        first = first or (drives, current, frequency)
+        frames.append(potentials)
+        names.append(path.stem)
+    if first is None:
+        raise TankError("no .eit file was given")
+    drives, current, frequency = first
+    electrodes = frames[0].shape[1]
+    ring = np.stack([np.arange(electrodes), (np.arange(electrodes) + 1) % electrodes], 1)
+    rows = [[*drive, *pair] for drive in drives.tolist() for pair in ring.tolist() if not set(drive) & set(pair)]
+    pattern = np.array(rows)
+    drive = np.repeat(
+        np.arange(len(drives)), [sum(not set(d) & set(p) for p in ring.tolist()) for d in drives.tolist()]
+    )
+    stack = np.array(frames)
+    readings = stack[:, drive, pattern[:, 2]] - stack[:, drive, pattern[:, 3]]
+    skin = tank_of(
+        paths[0].parent.name or "sciospec", je.Protocol(pattern, current, frequency), electrodes, domain, rim
+    )
+    return Tank(skin, np.ascontiguousarray(readings.real), tuple(names), np.ascontiguousarray(readings.imag))
+
+
+def _sciospec_frame(path: Path) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Injections (n, 2) from 0, potentials (n, channels) V, current in A, frequency in Hz.
+
+    The first line tells the number of header lines; of these the fifth is the least frequency, the eighth the number of
+    frequencies, the ninth the current. Then each injection has a line of two electrodes, counted from 1, and a line a
+    frequency of real and imaginary parts by turns.
+    """
+    lines = text_of(path).splitlines()
+    where = path.name
+    try:
+        header, frequency, count, current = int(lines[0]), float(lines[4]), int(float(lines[7])), float(lines[8])
+    except (ValueError, IndexError):
+        raise TankError(f"{where}: does not begin like a text file of Sciospec's software") from None
+    body = [line for line in lines[header:] if line.strip()]
+    step = 1 + count
+    if count < 1 or not body or len(body) % step or not current > 0:
+        raise TankError(f"{where}: {len(body)} lines after its header are no injections of {count} frequencies")
+    drives = [_numbers(where, line) for line in body[::step]]
+    values = [_numbers(where, line) for line in body[1::step]]
+    if {len(drive) for drive in drives} != {2} or len({len(v) for v in values}) != 1 or len(values[0]) % 2:
+        raise TankError(f"{where}: an injection is two electrodes, and a line of potentials has two numbers a channel")
+    table = np.array(values)
+    pairs = np.array(drives).astype(int) - 1
+    if pairs.min() < 0 or pairs.max() >= table.shape[1] // 2:
+        raise TankError(f"{where}: injects at electrode {pairs.max() + 1}, and has {table.shape[1] // 2} channels")
+    return pairs, table[:, ::2] + 1j * table[:, 1::2], current, frequency

@@ -1,0 +1,179 @@
+"""Pictures with matplotlib, one call each: sheet and electrodes, mesh, image, sensitivity, contacts.
+
+Every function draws on ``axes``, or on a new figure of `matplotlib.pyplot`, and returns the Axes; save the picture by
+``axes.figure.savefig("picture.png")``. Lengths are drawn in mm. Install ``jaxeit[plot]``.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .contacts import Contacts
+from .model import Model, jacobian
+from .model.bases import AbstractPictured
+from .skin import BoundaryPatch, Skin
+
+try:  # an extra: without it the rest of jaxeit works
+    from matplotlib import pyplot
+    from matplotlib.patches import Ellipse
+    from matplotlib.tri import Triangulation
+except ImportError:
+    pyplot = None  # type: ignore[assignment]
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+else:
+    Axes = Any
+
+MM = 1e3
+GREY, BLUE, ORANGE = "#8a8a8a", "#1f5fa8", "#d9730d"
+ELLIPSE_90 = 2.1460  # radius over standard deviation of an ellipse that holds 90 %: sqrt(-2 log 0.1)
+NUMBER_OFFSET = 0.05  # of the sheet's size: from an electrode to its number
+
+
+class PlotError(ValueError):
+    """A picture that cannot be drawn."""
+
+
+def show_skin(skin: Skin, axes: Axes | None = None, *, numbers: bool = True) -> Axes:
+    """The sheet's outline, its pads and its electrodes with their numbers, counted from 0.
+
+    Raises:
+        PlotError: without matplotlib.
+    """
+    axes = _axes(axes)
+    domain = skin.domain
+    around = np.unique(np.append(domain.corners, np.linspace(0, domain.perimeter, 257)))
+    axes.plot(*_mm(domain.boundary_point(around)), color="black", linewidth=1)
+    for pad in skin.pads:
+        axes.fill(*_mm(pad.outline), color=BLUE, alpha=0.15, linewidth=0)
+        axes.text(*_mm(np.mean(pad.outline, 0)), pad.name, ha="center", va="center", color=BLUE, fontsize=8)
+    middle, size = np.mean(domain.bounds, 0), np.ptp(domain.bounds, 0).max()
+    for number, electrode in enumerate(skin.electrodes):
+        place = electrode.centre(domain)
+        if isinstance(electrode, BoundaryPatch):
+            arc = domain.boundary_point(np.linspace(electrode.start, electrode.stop, 33))
+            axes.plot(*_mm(arc), color=ORANGE, linewidth=4, solid_capstyle="butt")
+        else:
+            axes.plot(*_mm(place), "o", color=ORANGE, markersize=4)
+        if numbers:
+            out = (place - middle) / max(float(np.linalg.norm(place - middle)), 1e-9 * size)
+            at = place + NUMBER_OFFSET * size * out
+            axes.text(*_mm(at), str(number), ha="center", va="center", fontsize=8, clip_on=False)
+    if numbers:
+        axes.margins(0.1)  # numbers stand outside the rim
+    return _labelled(axes)
+
+
+def show_mesh(model: Model, axes: Axes | None = None) -> Axes:
+    """The triangles of a model, in the sheet's flat coordinates.
+
+    Raises:
+        PlotError: without matplotlib.
+    """
+    axes = _axes(axes)
+    axes.triplot(_triangles(model), color=GREY, linewidth=0.4)
+    return _labelled(axes)
+
+
+def show_image(
+    where: AbstractPictured | Model,
+    values: Float[Array, " n"] | Float[np.ndarray, " n"],
+    axes: Axes | None = None,
+    *,
+    label: str = "",
+) -> Axes:
+    """An image with a colour bar; blue below zero, white at zero, red above, or shades of one colour for one sign.
+
+    Args:
+        where: the reconstructor or the basis of the image; the model, for a value per element.
+        values: one per coefficient or element.
+        label: of the colour bar.
+
+    Raises:
+        PlotError: if the values do not fit ``where``, or without matplotlib.
+    """
+    axes, drawn = _axes(axes), np.asarray(values, float)
+    expected = len(where.areas)
+    if drawn.shape != (expected,):
+        raise PlotError(f"the image has shape {drawn.shape}; {type(where).__name__} has {expected} values")
+    if not isinstance(where, Model) and not where.shape:
+        raise PlotError("the basis has no picture; give the model in place of it, for a value per element")
+    finite = drawn[np.isfinite(drawn)]
+    top = float(np.abs(finite).max()) if finite.size and np.abs(finite).max() > 0 else 1.0
+    signed = finite.size == 0 or finite.min() < 0
+    look: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -top} if signed else {"cmap": "viridis", "vmin": finite.min()}
+    if isinstance(where, Model):
+        shown = axes.tripcolor(_triangles(where), drawn, vmax=top, **look)
+    else:
+        picture = np.where(np.asarray(where.areas) > 0, drawn, np.nan).reshape(where.shape)
+        shown = axes.imshow(picture, origin="lower", extent=MM * np.array(where.extent), vmax=top, **look)
+    axes.figure.colorbar(shown, ax=axes, label=label)
+    return _labelled(axes)
+
+
+def show_sensitivity(model: Model, reading: int | None = None, axes: Axes | None = None) -> Axes:
+    """How much readings change with the conductivity of each place, in V/S per square metre.
+
+    Args:
+        reading: the number of one, drawn with its sign; default: the root of the sum of squares over all, on a
+            logarithmic scale of powers of ten.
+
+    Raises:
+        PlotError: if there is no such reading, or without matplotlib.
+    """
+    if reading is not None and not 0 <= reading < model.readings:
+        raise PlotError(f"reading {reading}: the protocol has readings 0 to {model.readings - 1}")
+    slopes = jacobian(model) / model.areas
+    if reading is not None:
+        axes = show_image(model, slopes[reading], axes, label=f"reading {reading}, V/S/m$^2$")
+        return axes
+    decades = jnp.log10(jnp.sqrt(jnp.sum(slopes**2, 0)))
+    axes = _axes(axes)
+    shown = axes.tripcolor(_triangles(model), np.asarray(decades), cmap="viridis")
+    axes.figure.colorbar(shown, ax=axes, label="log10 of V/S/m$^2$")
+    return _labelled(axes)
+
+
+def show_contacts(contacts: Contacts, axes: Axes | None = None) -> Axes:
+    """The contacts of one frame: number, centre, width as a dashed circle, and the ellipse that holds it with 90 %.
+
+    Raises:
+        PlotError: for several frames, or without matplotlib.
+    """
+    if contacts.present.ndim != 1:
+        raise PlotError(f"contacts of {contacts.present.shape[:-1]} frames; give those of one")
+    axes = _axes(axes)
+    for number in np.flatnonzero(np.asarray(contacts.present)):
+        place = _mm(np.asarray(contacts.position[number]))
+        axes.plot(*place, "x", color="black")
+        axes.annotate(str(number), place, (4, 4), textcoords="offset points", fontsize=8)
+        spread = 2 * MM * float(contacts.width[number])
+        axes.add_patch(Ellipse(place, spread, spread, fill=False, color=GREY, linestyle="--"))
+        variance, along = np.linalg.eigh(np.asarray(contacts.covariance[number, :2, :2], float))
+        width, height = 2 * MM * ELLIPSE_90 * np.sqrt(np.maximum(variance, 0))
+        angle = float(np.degrees(np.arctan2(along[1, 0], along[0, 0])))
+        axes.add_patch(Ellipse(place, width, height, angle=angle, fill=False, color=ORANGE))
+    return _labelled(axes)
+
+
+def _axes(axes: Axes | None) -> Axes:
+    if pyplot is None:
+        raise PlotError("pictures need matplotlib, which is not installed; install jaxeit[plot]")
+    return pyplot.subplots(layout="constrained")[1] if axes is None else axes
+
+
+def _mm(points: np.ndarray) -> Any:
+    """Coordinates in mm, as two arrays or two numbers."""
+    return MM * np.asarray(points).T
+
+
+def _triangles(model: Model) -> Any:
+    return Triangulation(*_mm(np.asarray(model.chart)), np.asarray(model.triangles))
+
+
+def _labelled(axes: Axes) -> Axes:
+    axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    return axes
