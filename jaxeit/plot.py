@@ -48,8 +48,9 @@ def show_skin(skin: Skin, axes: Axes | None = None, *, numbers: bool = True) -> 
     around = np.unique(np.append(domain.corners, np.linspace(0, domain.perimeter, 257)))
     axes.plot(*_mm(domain.boundary_point(around)), color="black", linewidth=1)
     for pad in skin.pads:
-        axes.fill(*_mm(pad.outline), color=BLUE, alpha=0.15, linewidth=0)
-        axes.text(*_mm(np.mean(pad.outline, 0)), pad.name, ha="center", va="center", color=BLUE, fontsize=8)
+        axes.fill(*_mm(pad.outline), color=BLUE, alpha=0.15)
+        x, y = _mm(np.min(pad.outline, 0))
+        axes.text(x, y, f" {pad.name}", ha="left", va="bottom", color=BLUE, fontsize=8)
     middle, size = np.mean(domain.bounds, 0), np.ptp(domain.bounds, 0).max()
     for number, electrode in enumerate(skin.electrodes):
         place = electrode.centre(domain)
@@ -58,12 +59,15 @@ def show_skin(skin: Skin, axes: Axes | None = None, *, numbers: bool = True) -> 
             axes.plot(*_mm(arc), color=ORANGE, linewidth=4, solid_capstyle="butt")
         else:
             axes.plot(*_mm(place), "o", color=ORANGE, markersize=4)
-        if numbers:
-            out = (place - middle) / max(float(np.linalg.norm(place - middle)), 1e-9 * size)
-            at = place + NUMBER_OFFSET * size * out
-            axes.text(*_mm(at), str(number), ha="center", va="center", fontsize=8, clip_on=False)
-    if numbers:
-        axes.margins(0.1)  # numbers stand outside the rim
+        if numbers:  # outside at the rim, else above and to the right
+            at_rim = domain.boundary_distance(place[None])[0] < 1e-3 * size
+            out = (place - middle) / np.linalg.norm(place - middle) if at_rim else np.array([0.6, 0.6])
+            x, y = _mm(place + NUMBER_OFFSET * size * out)
+            axes.text(x, y, str(number), ha="center", va="center", fontsize=8)
+    low, high = (
+        MM * (np.array(end) + sign * 2 * NUMBER_OFFSET * size) for sign, end in zip((-1, 1), domain.bounds, strict=True)
+    )
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     return _labelled(axes)
 
 
@@ -109,7 +113,8 @@ def show_image(
         shown = axes.tripcolor(_triangles(where), drawn, vmax=top, **look)
     else:
         picture = np.where(np.asarray(where.areas) > 0, drawn, np.nan).reshape(where.shape)
-        shown = axes.imshow(picture, origin="lower", extent=MM * np.array(where.extent), vmax=top, **look)
+        x0, x1, y0, y1 = (MM * end for end in where.extent)
+        shown = axes.imshow(picture, origin="lower", extent=(x0, x1, y0, y1), vmax=top, **look)
     axes.figure.colorbar(shown, ax=axes, label=label)
     return _labelled(axes)
 
@@ -171,7 +176,8 @@ def _mm(points: np.ndarray) -> Any:
 
 
 def _triangles(model: Model) -> Any:
-    return Triangulation(*_mm(np.asarray(model.chart)), np.asarray(model.triangles))
+    x, y = _mm(np.asarray(model.chart))
+    return Triangulation(x, y, np.asarray(model.triangles))
 
 
 def _labelled(axes: Axes) -> Axes:

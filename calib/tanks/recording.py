@@ -65,7 +65,7 @@ def tank_of(
     """
     if domain is None:
         raise TankError(
-            f"{name}: the file does not tell the shape of the tank; give domain=, such as je.Disc(0.1) in m"
+            f"{name}: the file does not tell the shape of the tank; give domain=, such as je.Disc(0.1), or --radius"
         )
     rim = je.skin.rim_electrodes(domain, electrodes) if rim is None else rim
     if len(rim) != electrodes:

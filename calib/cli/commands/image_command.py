@@ -1,0 +1,81 @@
+"""`jaxeit image`."""
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
+
+if TYPE_CHECKING:
+    from ...tanks import Tank
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """A file of a tank, its geometry where the file has none, and the picture to write."""
+    text = (
+        "MATLAB file of EIDORS or the Kuopio challenge, CSV of PyEIDORS, .eit of Sciospec or a folder of them, or NPZ"
+    )
+    parser.add_argument("tank", metavar="FILE", help=text)
+    parser.add_argument("-o", "--output", required=True, metavar="PICTURE.png", help="PNG, PDF or SVG by its name")
+    parser.add_argument("--frame", type=int, default=-1, metavar="N", help="frame to image, from 0; default: the last")
+    parser.add_argument("--reference", type=int, default=0, metavar="N", help="frame it is compared with; default: 0")
+    text = "radius in m of a round tank; needed where the file does not describe its tank (all but .mat)"
+    parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
+    parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
+    parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
+    parser.add_argument("--prior", default="noser", help="default: noser")
+    parser.add_argument("--hyperparameter", type=above_zero, default=0.1, metavar="L", help="weight of the prior; 0.1")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the difference image of two frames, and print what was found."""
+    from ...runtime import set_up
+
+    set_up()
+    require_matplotlib_for("jaxeit image")
+    prepare_outputs(args.output)
+    from matplotlib.figure import Figure
+
+    import jaxeit as je
+
+    from ...session import replacing
+    from ...tanks import difference_image
+
+    kind = Path(args.output).suffix.lower()[1:]
+    if kind not in ("png", "pdf", "svg"):
+        raise ValueError(f"{args.output}: give a name that ends in .png, .pdf or .svg")
+    prior = je.imaging.PRIORS.make(args.prior)
+    tank = _tank(args)
+    found = difference_image(tank, args.frame, args.reference, prior=prior, hyperparameter=args.hyperparameter)
+    figure = Figure(layout="constrained")  # without a window, on any machine
+    axes = figure.subplots()
+    je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
+    je.plot.show_skin(tank.skin, axes)
+    axes.set_title(f"{tank.names[args.frame]} less {tank.names[args.reference]}", fontsize=9)
+    with replacing(Path(args.output)) as new:
+        figure.savefig(new, format=kind, dpi=150)
+    low, high = float(found.change.min()), float(found.change.max())
+    count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
+    print(f"{count} electrodes, {readings} readings, frames: {', '.join(tank.names)}")
+    print(f"reference: {found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}")
+    print(f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity")
+    return 0
+
+
+def _tank(args: argparse.Namespace) -> "Tank":
+    """The tank of the file, its electrodes where the options say."""
+    import jaxeit as je
+
+    from ...tanks import load_tank
+
+    tank = load_tank(args.tank, None if args.radius is None else je.Disc(args.radius))
+    if not (args.start or args.clockwise):
+        return tank
+    if args.radius is None:
+        raise ValueError("--start and --clockwise place the electrodes of a round tank: give --radius")
+    count = len(tank.skin.electrodes)
+    start, clockwise = math.radians(args.start), args.clockwise
+    rim = je.skin.rim_electrodes(tank.skin.domain, count, start=start, clockwise=clockwise)
+    return replace(tank, skin=replace(tank.skin, electrodes=rim))
