@@ -103,7 +103,7 @@ def show_image(
     expected = len(where.areas)
     if drawn.shape != (expected,):
         raise PlotError(f"the image has shape {drawn.shape}; {type(where).__name__} has {expected} values")
-    if not isinstance(where, Model) and not where.shape:
+    if not isinstance(where, Model) and len(where.shape) != 2:
         raise PlotError("the basis has no picture; give the model in place of it, for a value per element")
     finite = drawn[np.isfinite(drawn)]
     top = float(np.abs(finite).max()) if finite.size and np.abs(finite).max() > 0 else 1.0
@@ -135,9 +135,10 @@ def show_sensitivity(model: Model, reading: int | None = None, axes: Axes | None
     if reading is not None:
         axes = show_image(model, slopes[reading], axes, label=f"reading {reading}, V/S/m$^2$")
         return axes
-    decades = jnp.log10(jnp.sqrt(jnp.sum(slopes**2, 0)))
+    size = np.asarray(jnp.sqrt(jnp.sum(slopes**2, 0)))
+    decades = np.log10(np.where(size > 0, size, np.nan))  # zero, and left blank, under a perfect contact
     axes = _axes(axes)
-    shown = axes.tripcolor(_triangles(model), np.asarray(decades), cmap="viridis")
+    shown = axes.tripcolor(_triangles(model), decades, cmap="viridis")
     axes.figure.colorbar(shown, ax=axes, label="log10 of V/S/m$^2$")
     return _labelled(axes)
 

@@ -1,0 +1,244 @@
+"""Files of tanks, written here as other programs write them; the programs of docs/tanks.md on them."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+import calib
+import jaxeit as je
+from calib.cli import main
+from calib.tanks import TankError, difference_image, load_tank
+
+from ..helpers import REAL_DATA, skin_of
+from ..test_docs import blocks, run
+
+pytest.importorskip("matplotlib")
+COUNT, RADIUS, CURRENT = 16, 0.03, 5.5e-5
+PLACE = np.array([0.012, 0.008])  # of a conductive rod
+RING = np.eye(COUNT) - np.roll(np.eye(COUNT), 1, 0)
+CSV = "tank_55uA_1000Hz.csv"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A tank with adjacent readings before and after a rod was put in, and potentials for any currents."""
+    disc = je.Disc(RADIUS)
+    rim = je.skin.rim_electrodes(disc, COUNT, contact=2e-3)
+    skin = skin_of(disc, rim, je.skin.adjacent(COUNT), current=CURRENT)
+    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.06))
+    rod = jnp.linalg.norm(model.centroids - PLACE, axis=1) < 0.004
+    frames = [je.forward(model, jnp.where(rod, gain, 1.0) * model.background) for gain in (1.0, 5.0)]
+    return SimpleNamespace(skin=skin, model=model, frames=np.array(frames))
+
+
+def _write_csv(path, frames):
+    """Real and imaginary part by turns, of the polarity of PyEIDORS."""
+    np.savetxt(path, np.stack([-frames[0], 0.1 * frames[0], -frames[1], 0.1 * frames[1]], 1), delimiter=",")
+    return path
+
+
+def _struct(name, values):
+    """A structure array of MATLAB."""
+    out = np.empty((1, len(values)), dtype=[(key, object) for key in values[0]])
+    for number, value in enumerate(values):
+        out[0, number] = tuple(value[key] for key in values[0])
+    return {name: out}
+
+
+def _forward_model(bench, change=None):
+    """A model as EIDORS has it: counted from 1, some triangles clockwise, a node without triangles."""
+    model = bench.model
+    nodes = np.concatenate([[[9.0, 9.0]], np.asarray(model.nodes)])
+    elems = np.asarray(model.triangles) + 2
+    elems[::3] = elems[::3][:, ::-1]
+    electrodes = []
+    for number, electrode in enumerate(bench.skin.electrodes):
+        ends = je.Disc(RADIUS).boundary_coordinate(nodes[1:])
+        on = np.abs(np.linalg.norm(nodes[1:], axis=1) - RADIUS) < 1e-9
+        along = (ends - electrode.start + 1e-9) % bench.skin.domain.perimeter
+        under = np.flatnonzero(on & (along < electrode.stop - electrode.start + 2e-9))
+        electrodes.append({"nodes": under[:: -1 if number % 2 else 1] + 2.0, "z_contact": 2e-3})
+    stimulation = [
+        {
+            "stimulation": "Amp",
+            "stim_pattern": CURRENT * RING[:, [d]],
+            "meas_pattern": RING[:, [(d + k) % COUNT for k in range(2, COUNT - 1)]].T,
+        }
+        for d in range(COUNT)
+    ]
+    fields = {"nodes": nodes, "elems": elems.astype(float), "gnd_node": 1.0, "type": "fwd_model"}
+    found = fields | _struct("electrode", electrodes) | _struct("stimulation", stimulation)
+    return found | (change or {})
+
+
+def _write_mat(path, bench, **change):
+    """The later frame comes first in the file."""
+    frames = {"vi": {"meas": bench.frames[1]}, "vh": {"meas": bench.frames[0], "type": "data"}, "note": "none"}
+    savemat(path, frames | {"imdl": {"fwd_model": _forward_model(bench, change), "name": "mine"}})
+    return path
+
+
+def _sees_the_rod(tank, tolerance=0.005):
+    found = difference_image(tank, basis=je.Pixels(24))
+    place = np.asarray(found.recon.centres)[np.argmax(found.change)]
+    np.testing.assert_allclose(place, PLACE, atol=tolerance)
+    assert found.correlation > 0.98
+    return found
+
+
+def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
+    tank = load_tank(_write_mat(tmp_path / "tank.mat", bench))
+    assert tank.names == ("vh", "vi")
+    np.testing.assert_array_equal(tank.frames, bench.frames)
+    np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
+    np.testing.assert_allclose(je.forward(tank.model()), bench.frames[0], rtol=1e-9)
+    found = _sees_the_rod(tank)
+    assert found.background == pytest.approx(1.0)
+    points = _struct("electrode", [{"nodes": 2.0 + k, "z_contact": 0.0} for k in range(COUNT)])
+    as_points = load_tank(_write_mat(tmp_path / "points.mat", bench, **points))
+    assert all(isinstance(electrode, je.PointElectrode) for electrode in as_points.skin.electrodes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"elems": np.ones((9, 4))}, "elements have 4 nodes; a sheet is a plane mesh of triangles"),
+        ({"elems": np.full((9, 3), 1e4)}, "elems: names nodes outside 1 to"),
+        ({"electrode": []}, "electrode: missing"),
+        ({"electrode": _struct("e", [{"nodes": [2.0, 9.0]}])["e"]}, r"electrode\(1\): its nodes are no single stretch"),
+        ({"stimulation": _struct("s", [{"stim_pattern": "{ad}"}])["s"]}, r"stimulation\(1\).stim_pattern: is '{ad}'"),
+    ],
+)
+def test_what_is_no_tank_of_eidors_is_refused(bench, tmp_path, change, message):
+    with pytest.raises(TankError, match=message):
+        load_tank(_write_mat(tmp_path / "tank.mat", bench, **change))
+
+
+def test_files_that_do_not_describe_their_tank(bench, tmp_path):
+    csv = load_tank(_write_csv(tmp_path / CSV, bench.frames), je.Disc(RADIUS))
+    assert (csv.skin.protocol.current, csv.skin.protocol.frequency) == (pytest.approx(CURRENT), 1000)
+    np.testing.assert_allclose(csv.frames, bench.frames)
+    np.testing.assert_allclose(csv.quadrature, -0.1 * bench.frames)
+    found = _sees_the_rod(csv)
+    half = difference_image(csv, 0, 1, basis=je.Pixels(24))
+    assert float(half.change.min()) < 0 < float(found.change.max())
+
+    np.savez(tmp_path / "rows.npz", frames=bench.frames, pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
+    np.testing.assert_array_equal(load_tank(tmp_path / "rows.npz", je.Disc(RADIUS)).frames, bench.frames)
+    with pytest.raises(TankError, match="does not tell the shape of the tank"):
+        load_tank(tmp_path / "rows.npz")
+    reversed_polarity = calib.tanks.Tank(csv.skin, -csv.frames, csv.names)
+    with pytest.raises(TankError, match=r"correlation of frame 0 .* is -.*check the order and the polarity"):
+        difference_image(reversed_polarity)
+    with pytest.raises(TankError, match="give two different frames"):
+        difference_image(csv, 0)
+
+
+def test_potentials_of_sciospec(bench, tmp_path):
+    """Potentials above an unknown ground; two frequencies, of which the first is taken."""
+    mean = je.Protocol.from_matrices(CURRENT * RING, np.eye(COUNT) - 1 / COUNT)
+    skin = skin_of(bench.skin.domain, bench.skin.electrodes, mean.pattern)
+    model = je.discretise(je.Scene(je.Skin("", skin.domain, 1.0, skin.electrodes, mean)), je.Fidelity(edge_length=0.06))
+    potential = np.asarray(je.forward(model)).reshape(COUNT, COUNT) + 2e-5
+    head = ["18", "2", "setup", "2024-01-01", "1000", "2000", "0", "2", f"{CURRENT:.6E}"] + ["1"] * 7
+    lines = [*head, "MeasurementChannels: 1,2", "MeasurementChannelsIndependentFromInjectionPattern: 1,2"]
+    for drive in range(COUNT):
+        rows = np.stack([potential[drive], 0.2 * potential[drive]], 1).ravel()
+        twice = ["\t".join(f"{value:.9E}" for value in factor * rows) for factor in (1, 7)]
+        lines += [f"{drive + 1} {(drive + 1) % COUNT + 1}", *twice]
+    for name in ("setup_00001.eit", "setup_00002.eit"):
+        (tmp_path / name).write_text("\n".join(lines) + "\n")
+    tank = load_tank(tmp_path, bench.skin.domain, bench.skin.electrodes)
+    assert tank.names == ("setup_00001", "setup_00002")
+    assert (tank.skin.protocol.readings, tank.skin.protocol.frequency) == (208, 1000)
+    rows = {tuple(row): value for row, value in zip(bench.skin.protocol.pattern.tolist(), bench.frames[0], strict=True)}
+    expected = [rows[tuple(row)] for row in tank.skin.protocol.pattern.tolist()]
+    np.testing.assert_allclose(tank.frames[0], expected, rtol=1e-5)
+    (tmp_path / "setup_00003.eit").write_bytes(b"\x00\x01binary")
+    with pytest.raises(TankError, match=r"setup_00003\.eit: does not begin like"):
+        load_tank(tmp_path, bench.skin.domain)
+
+
+def test_frames_of_the_kuopio_challenge(tmp_path):
+    """Each drive has its own current, in mA; the reference lies beside the frame."""
+    disc = je.Disc(0.115)
+    rim = je.skin.rim_electrodes(disc, COUNT, contact=1e-4, start=np.pi / 2)
+    current = RING[:, ::2] * np.linspace(1.4, 1.6, 8)
+    protocol = je.Protocol.from_matrices(1e-3 * current, RING[:, :15])
+    tank = je.Skin("", disc, 1.0, rim, protocol)
+    readings = np.asarray(je.forward(je.discretise(je.Scene(tank), je.Fidelity.draft())))
+    savemat(tmp_path / "ref.mat", {"Injref": current, "Mpat": RING[:, :15], "Uelref": readings[:, None]})
+    savemat(tmp_path / "data1.mat", {"Inj": current, "Mpat": RING[:, :15], "Uel": 1.1 * readings[:, None]})
+    found = load_tank(tmp_path / "data1.mat")
+    assert found.names == ("ref", "data1")
+    np.testing.assert_allclose(je.forward(found.model()), readings, rtol=1e-12)
+    assert load_tank(tmp_path / "ref.mat").names == ("ref",)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", "1,2\n" * 17, "has 17 lines, which is no n"),
+        ("a.csv", "1,2\n1,2\n1,x\n1,2\n", "line 3: '1,x' has a word"),
+        ("a.csv", "1\n" * 4, r"lines have \[1\] columns"),
+        ("a.mat", "no MATLAB", "cannot be read as a MATLAB file"),
+        ("a.npz", "no archive", "cannot be read as a NumPy archive"),
+        ("a.xyz", "", "is no file of a tank by its name"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(TankError, match=message):
+        load_tank(tmp_path / name, je.Disc(RADIUS))
+
+
+def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypatch, capsys):
+    """At most ten lines; the same from the command line."""
+    page = root / "docs" / "tanks.md"
+    first = next(text for language, _, text in blocks(page) if language == "python")
+    assert len([line for line in first.splitlines() if line]) <= 10
+    monkeypatch.chdir(tmp_path)
+    _write_csv(tmp_path / CSV, bench.frames)
+    _write_mat(tmp_path / "tank.mat", bench)
+    names = run(page, {})
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert "('vh', 'vi'), 1.0000" in capsys.readouterr().out
+    assert np.abs(np.asarray(names["voltages"])[:, [0]]).max() > 0
+    assert main(["image", CSV, "--radius", str(RADIUS), "--start", "90", "-o", "turned.svg"]) == 0
+    assert "correlation with an even tank" in capsys.readouterr().out
+    assert "<svg" in (tmp_path / "turned.svg").read_text()
+    assert main(["image", CSV, "-o", "no.png"]) == 2
+    assert "--radius" in capsys.readouterr().err
+    assert main(["image", CSV, "--radius", str(RADIUS), "-o", "no.gif"]) == 2
+    assert not (tmp_path / "no.gif").exists()
+
+
+TANK = REAL_DATA / "pyeidors_tank" / "tank"
+KTC = REAL_DATA / "ktc2023" / "training" / "data1.mat"
+
+
+@pytest.mark.skipif(not TANK.is_dir(), reason="pyeidors_tank is not at hand; set JAXEIT_REAL_DATA to its folder")
+def test_the_page_on_a_real_tank(root, tmp_path, monkeypatch):
+    """Plastic at electrode 5 and 9, metal at 1 and 13, counted from 1."""
+    (path,) = TANK.glob("*/*plastic_electrode13_metal/*-21-27-54*.csv")
+    program = next(text for language, _, text in blocks(root / "docs" / "tanks.md") if language == "python")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(program.replace(CSV, str(path)), names)
+    found, skin = names["found"], names["tank"].skin
+    assert found.correlation > 0.99
+    for number, sign in ((1, 1), (5, -1), (9, -1), (13, 1)):
+        place = 0.65 * skin.electrode_positions[number - 1]
+        near = np.linalg.norm(np.asarray(found.recon.centres) - place, axis=1) < 0.005
+        assert sign * float(jnp.mean(found.change[near])) > 0.2, number
+
+
+@pytest.mark.skipif(not KTC.exists(), reason="ktc2023 is not at hand; set JAXEIT_REAL_DATA to its folder")
+def test_matrices_of_the_kuopio_challenge_explain_its_water():
+    tank = load_tank(KTC)
+    water = tank.frames[0]
+    assert tank.skin.protocol.readings == len(water) == 2356
+    assert np.corrcoef(np.asarray(je.forward(tank.model())), water)[0, 1] > 0.99
