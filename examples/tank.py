@@ -2,18 +2,15 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import jaxeit as je
 
 jax.config.update("jax_enable_x64", True)  # jaxeit never changes the settings of JAX for you
 
 radius, count = 0.14, 16  # m, electrodes
-pitch = 2 * np.pi * radius / count  # along the rim, m
-starts = pitch * np.arange(count)
-electrodes = tuple(je.BoundaryPatch(float(s), float(s + pitch / 2), 1e-3) for s in starts)  # contact: ohm m
+electrodes = je.skin.rim_electrodes(je.Disc(radius), count, contact=1e-3)  # ohm m; half of the rim is covered
 protocol = je.Protocol(je.skin.adjacent(count), 1e-3)  # A
-tank = je.Skin("tank", je.Disc(radius), 1.0, electrodes, protocol, pads=())  # sheet resistance: 1 ohm
+tank = je.Skin("tank", je.Disc(radius), 1.0, electrodes, protocol)  # sheet resistance: 1 ohm
 
 model = je.discretise(je.Scene(tank), je.Fidelity.draft())
 middle = jnp.array([0.05, 0.03])  # of an insulating rod, m from the centre of the tank

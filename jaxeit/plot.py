@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 else:
     Axes = Any
 
+__all__ = ["PlotError", "show_contacts", "show_image", "show_mesh", "show_sensitivity", "show_skin"]
+
 MM = 1e3
 GREY, BLUE, ORANGE = "#8a8a8a", "#1f5fa8", "#d9730d"
 ELLIPSE_90 = 2.1460  # radius over standard deviation of an ellipse that holds 90 %: sqrt(-2 log 0.1)

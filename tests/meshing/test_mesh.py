@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxeit as je
 from jaxeit.geometry.shapes import Disc, Polygon, Rectangle
 from jaxeit.meshing.generation import Mesh, MeshError, TrianglePattern, structured, triangulate
-from jaxeit.meshing.triangles import CROWDED
 from jaxeit.meshing.outlines import ArcFootprint, DiscFootprint, PointFootprint, polygon_radius
+from jaxeit.meshing.triangles import CROWDED
 
 L_SHAPE = Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)))
 SQUARE = Rectangle(0.2, 0.2)
@@ -532,7 +532,7 @@ def test_a_surface_must_give_points_in_space():
 def test_a_flat_triangle_of_a_foreign_mesh_is_accepted_by_its_angle():
     """The advice is about that mesh; where jaxeit makes the mesh it is about its edge length."""
     nodes = np.array([[0, 0], [1, 0], [2, 0], [1, 0.2], [1, -0.9]])
-    mesh = Mesh(nodes, [[0, 1, 3], [1, 2, 3], [0, 4, 1], [1, 4, 2]])
+    mesh = Mesh(nodes, np.array([[0, 1, 3], [1, 2, 3], [0, 4, 1], [1, 4, 2]]))
     ends = tuple(je.PointElectrode((float(x), float(y))) for x, y in nodes[[0, 4, 2, 3]])
     sheet = je.Polygon(nodes[[0, 4, 2, 3]])
     scene = je.Scene(je.Skin("kite", sheet, 1.0, ends, je.Protocol(np.array([[0, 1, 2, 3]]))))
