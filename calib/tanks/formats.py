@@ -45,17 +45,21 @@ def load_tank(path: str | Path, domain: Domain | None = None, rim: Rim | None = 
     return readers[kind](path, domain, rim)
 
 
-def load_eidors(path: str | Path) -> Tank:
+def load_eidors(path: str | Path, protocol: je.Protocol | None = None) -> Tank:
     """A MATLAB file with a forward model of EIDORS (``fmdl``, ``img`` or ``imdl``) and frames (``vh``, ``vi``).
 
     The model is taken with its mesh, electrodes (points, or complete ones along the outer rim), contact impedances and
     stimulation. Every variable that is an array or a data structure of as many readings is a frame.
 
+    Args:
+        path: of the file.
+        protocol: in place of the stimulation of the file, which may have none.
+
     Raises:
         TankError: for a volume, electrodes inside the mesh, or a file of MATLAB's format 7.3.
     """
     path = Path(path)
-    return eidors_tank(path, read_matlab(path))
+    return eidors_tank(path, read_matlab(path), protocol)
 
 
 def load_ktc(path: str | Path) -> Tank:

@@ -40,7 +40,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
 # --- EIDORS
 
 
-def eidors_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
+def eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol | None = None) -> Tank:
     """A forward model of EIDORS, on its own mesh, and every variable that holds a frame of it."""
     model = next((found for value in variables.values() for found in _forward_models(value)), None)
     if model is None:
@@ -52,15 +52,7 @@ def eidors_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
         rim.electrode(f"{where}.electrode({k + 1})", one, number)
         for k, one in enumerate(_each(where, model, "electrode"))
     )
-    stimulation = _each(where, model, "stimulation")
-    current = [_pattern(f"{where}.stimulation({k + 1})", s, "stim_pattern") for k, s in enumerate(stimulation)]
-    measured = [_pattern(f"{where}.stimulation({k + 1})", s, "meas_pattern") for k, s in enumerate(stimulation)]
-    sizes = {len(column.ravel()) for column in current} | {matrix.shape[1] for matrix in measured}
-    if sizes != {len(electrodes)}:
-        raise TankError(f"{where}.stimulation: patterns are for {sorted(sizes)} electrodes, not {len(electrodes)}")
-    protocol = je.Protocol.from_matrices(
-        np.stack([column.ravel() for column in current], 1), [matrix.T for matrix in measured]
-    )
+    protocol = _stimulation(where, model, len(electrodes)) if protocol is None else protocol
     skin = je.Skin(path.stem, rim.domain, 1.0, electrodes, protocol)
     frames = {
         name if columns.shape[1] == 1 else f"{name}({k + 1})": column
@@ -72,6 +64,22 @@ def eidors_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
     values = np.array([frames[name] for name in names]).reshape(len(names), protocol.readings)
     parts = np.ascontiguousarray(values.real), values.imag if np.iscomplexobj(values) else None
     return Tank(skin, parts[0].astype(float), names, parts[1], mesh)
+
+
+def _stimulation(where: str, model: mat_struct, electrodes: int) -> je.Protocol:
+    """The protocol of ``stimulation``; its currents are in A unless it says mA."""
+    stimulation = _each(where, model, "stimulation")
+    current = [
+        (1e-3 if getattr(s, "stimulation", "Amp") == "mA" else 1.0)
+        * _pattern(f"{where}.stimulation({k + 1})", s, "stim_pattern")
+        for k, s in enumerate(stimulation)
+    ]
+    measured = [_pattern(f"{where}.stimulation({k + 1})", s, "meas_pattern") for k, s in enumerate(stimulation)]
+    sizes = {len(column.ravel()) for column in current} | {matrix.shape[1] for matrix in measured}
+    if sizes != {electrodes}:
+        raise TankError(f"{where}.stimulation: patterns are for {sorted(sizes)} electrodes, not {electrodes}")
+    columns = np.stack([column.ravel() for column in current], 1)
+    return je.Protocol.from_matrices(columns, [matrix.T for matrix in measured])
 
 
 def _forward_models(value: Any) -> Iterator[mat_struct]:
@@ -86,7 +94,8 @@ def _forward_models(value: Any) -> Iterator[mat_struct]:
 def _each(where: str, model: mat_struct, name: str) -> list[mat_struct]:
     found = [one for one in np.ravel(np.array(getattr(model, name, []), object)) if isinstance(one, mat_struct)]
     if not found:
-        raise TankError(f"{where}.{name}: missing; a tank needs its electrodes and its stimulation")
+        hint = "; give protocol= to load_eidors" if name == "stimulation" else ""
+        raise TankError(f"{where}.{name}: missing; a tank needs its electrodes and its stimulation{hint}")
     return found
 
 
@@ -134,9 +143,10 @@ class _Rim:
 
     def electrode(self, where: str, struct: mat_struct, number: np.ndarray) -> je.BoundaryPatch | je.PointElectrode:
         """One node: a point; neighbours along the rim: the complete electrode model, z_contact in ohm m."""
-        nodes = number[np.ravel(np.asarray(getattr(struct, "nodes", []))).astype(int) - 1]
-        if not len(nodes) or (nodes < 0).any():
-            raise TankError(f"{where}: names no node of the mesh")
+        named = np.ravel(np.asarray(getattr(struct, "nodes", []))).astype(int) - 1
+        nodes = number[named[(named >= 0) & (named < len(number))]]
+        if not len(nodes) or len(nodes) < len(named) or (nodes < 0).any():
+            raise TankError(f"{where}: names nodes that are none of the mesh")
         if len(nodes) == 1:
             x, y = self._nodes[nodes[0]]
             return je.PointElectrode((float(x), float(y)))
@@ -190,6 +200,8 @@ def ktc_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
     water = path.with_name("ref.mat")
     if "Uelref" not in variables and water.is_file():
         reference = _ktc_frame(water, read_matlab(water))
+        if len(reference.readings) != len(frame.readings):
+            raise TankError(f"{water.name}: has {len(reference.readings)} readings, {path.name} {len(frame.readings)}")
         frames, names = [reference.readings, *frames], ["ref", *names]
     count = len(frame.current)
     disc = je.Disc(KTC_RADIUS)
