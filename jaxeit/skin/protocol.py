@@ -102,6 +102,8 @@ class Protocol:
         amplitude = float(np.abs(current).max())
         if not amplitude > 0:
             raise ProtocolError("current is zero in every drive; give currents in A")
+        largest = int(np.count_nonzero(current, 0).max()) * sum(int(np.count_nonzero(matrix)) for matrix in senses)
+        require("array_bytes", 64.0 * largest, "from_matrices: pairs of driving and sensing electrodes")
         terms = _Terms(electrodes, reference)
         for drive, (column, matrix) in enumerate(zip(current.T, senses, strict=True)):
             terms.add(drive, column / amplitude, _matrix(f"measurement of drive {drive}", matrix, electrodes))
@@ -168,7 +170,7 @@ class _Terms:
             raise ProtocolError(
                 f"reference is electrode {reference}; electrodes are counted from 0 to {electrodes - 1}"
             )
-        self.reference = reference
+        self.electrodes, self.reference = electrodes, reference
         self.readings = 0
         self.parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
@@ -185,10 +187,11 @@ class _Terms:
     def joined(self) -> tuple[np.ndarray, sp.csr_array | None]:
         """The pattern, and the mixing unless it is the identity."""
         reading, rows, share = (np.concatenate(part) for part in zip(*self.parts, strict=True))
-        require("array_bytes", 32 * len(rows), "protocol: four-electrode readings in the matrices")
         if len(rows) == self.readings and np.allclose(share, 1, rtol=1e-12):
             return rows, None
-        pattern, number = np.unique(rows, axis=0, return_inverse=True)
+        code = np.ravel_multi_index(rows.T, (self.electrodes,) * 4)  # sorts faster than rows
+        codes, number = np.unique(code, return_inverse=True)
+        pattern = np.stack(np.unravel_index(codes, (self.electrodes,) * 4), 1)
         return pattern, sp.csr_array((share, (reading, number.ravel())), (self.readings, len(pattern)))
 
 
