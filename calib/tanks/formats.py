@@ -56,7 +56,7 @@ def load_eidors(path: str | Path, protocol: je.Protocol | None = None) -> Tank:
         protocol: in place of the stimulation of the file, which may have none.
 
     Raises:
-        TankError: for a volume, electrodes inside the mesh, or a file of MATLAB's format 7.3.
+        TankError: for a volume, or electrodes inside the mesh.
     """
     path = Path(path)
     return eidors_tank(path, read_matlab(path), protocol)

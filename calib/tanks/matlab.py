@@ -6,17 +6,17 @@ The fields are those that EIDORS documents for a forward model: ``nodes``, ``ele
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError, mat_struct
 
 import jaxeit as je
-from jaxeit.files import open_regular
 from jaxeit.geometry import Polygon
 
+from ..session import SessionError
+from ..session.importers.mat_trees import read_mat_tree
 from .recording import Tank, TankError
 
 REFERENCES = ("vh", "v_h", "homg", "ref", "reference", "Uelref")
@@ -26,15 +26,11 @@ KTC_RADIUS, KTC_CONTACT = 0.115, 1e-4  # m; ohm m at 1 S: no contact impedance i
 
 
 def read_matlab(path: Path) -> dict[str, Any]:
-    """The variables of a MATLAB file before version 7.3, structures as objects with fields."""
+    """The variables of a MATLAB file; see `calib.session.importers.read_mat_tree`."""
     try:
-        with open_regular(path) as file:
-            found = loadmat(file, squeeze_me=True, struct_as_record=False)
-    except NotImplementedError:
-        raise TankError(f"{path.name}: is of MATLAB's format 7.3; save it with save(..., '-v7')") from None
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError) as error:
-        raise TankError(f"{path.name}: cannot be read as a MATLAB file: {error}") from None
-    return {name: value for name, value in found.items() if not name.startswith("__")}
+        return read_mat_tree(path)
+    except SessionError as error:
+        raise TankError(str(error)) from None
 
 
 # --- EIDORS
@@ -66,7 +62,7 @@ def eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol 
     return Tank(skin, parts[0].astype(float), names, parts[1], mesh)
 
 
-def _stimulation(where: str, model: mat_struct, electrodes: int) -> je.Protocol:
+def _stimulation(where: str, model: SimpleNamespace, electrodes: int) -> je.Protocol:
     """The protocol of ``stimulation``; its currents are in A unless it says mA."""
     stimulation = _each(where, model, "stimulation")
     current = [
@@ -82,33 +78,38 @@ def _stimulation(where: str, model: mat_struct, electrodes: int) -> je.Protocol:
     return je.Protocol.from_matrices(columns, [matrix.T for matrix in measured])
 
 
-def _forward_models(value: Any) -> Iterator[mat_struct]:
-    for one in np.ravel(value) if isinstance(value, np.ndarray) and value.dtype == object else [value]:
-        if isinstance(one, mat_struct):
+def _forward_models(value: Any) -> Iterator[SimpleNamespace]:
+    for one in value if isinstance(value, list) else [value]:
+        if isinstance(one, SimpleNamespace):
             if hasattr(one, "nodes") and hasattr(one, "elems"):
                 yield one
             elif hasattr(one, "fwd_model"):
                 yield from _forward_models(one.fwd_model)
 
 
-def _each(where: str, model: mat_struct, name: str) -> list[mat_struct]:
-    found = [one for one in np.ravel(np.array(getattr(model, name, []), object)) if isinstance(one, mat_struct)]
+def _each(where: str, model: SimpleNamespace, name: str) -> list[SimpleNamespace]:
+    value = getattr(model, name, [])
+    found = [one for one in (value if isinstance(value, list) else [value]) if isinstance(one, SimpleNamespace)]
     if not found:
         hint = "; give protocol= to load_eidors" if name == "stimulation" else ""
         raise TankError(f"{where}.{name}: missing; a tank needs its electrodes and its stimulation{hint}")
     return found
 
 
-def _pattern(where: str, struct: mat_struct, name: str) -> np.ndarray:
-    value = getattr(struct, name, None)
-    if value is None or isinstance(value, str):  # a word stands for a pattern that EIDORS makes when it solves
+def _pattern(where: str, struct: SimpleNamespace, name: str) -> np.ndarray:
+    value: Any = getattr(struct, name, None)
+    if not (
+        isinstance(value, np.ndarray) or sp.issparse(value)
+    ):  # a word stands for a pattern that EIDORS makes when it solves
         raise TankError(f"{where}.{name}: is {value!r}; give a matrix, as mk_stim_patterns does")
-    return np.atleast_2d(value.toarray() if sp.issparse(value) else np.asarray(value, float))
+    return np.atleast_2d(value.toarray() if sp.issparse(value) else value)
 
 
-def _mesh(where: str, model: mat_struct) -> tuple[je.meshing.Mesh, np.ndarray]:
+def _mesh(where: str, model: SimpleNamespace) -> tuple[je.meshing.Mesh, np.ndarray]:
     """The mesh, all triangles counter-clockwise, and the new number of each node, -1 for one without triangles."""
-    nodes, elems = np.asarray(model.nodes, float), np.atleast_2d(np.asarray(model.elems)).astype(int) - 1
+    if not all(isinstance(part, np.ndarray) and part.dtype.kind in "iuf" for part in (model.nodes, model.elems)):
+        raise TankError(f"{where}: nodes and elems are no arrays of numbers")
+    nodes, elems = model.nodes.astype(float), np.atleast_2d(model.elems).astype(int) - 1
     flat = nodes.ndim == 2 and nodes.shape[1] >= 2 and (nodes[:, 2:] == nodes[:1, 2:]).all()
     if not flat or elems.shape[1] != 3:
         raise TankError(f"{where}: elements have {elems.shape[1]} nodes; a sheet is a plane mesh of triangles")
@@ -141,9 +142,11 @@ class _Rim:
         sides = np.linalg.norm(np.diff(mesh.nodes[[*self._loop, self._loop[0]]], axis=0), axis=1)
         self._along = np.concatenate([[0.0], np.cumsum(sides)])
 
-    def electrode(self, where: str, struct: mat_struct, number: np.ndarray) -> je.BoundaryPatch | je.PointElectrode:
+    def electrode(
+        self, where: str, struct: SimpleNamespace, number: np.ndarray
+    ) -> je.BoundaryPatch | je.PointElectrode:
         """One node: a point; neighbours along the rim: the complete electrode model, z_contact in ohm m."""
-        named = np.ravel(np.asarray(getattr(struct, "nodes", []))).astype(int) - 1
+        named = _numbers(struct, "nodes").astype(int) - 1
         nodes = number[named[(named >= 0) & (named < len(number))]]
         if not len(nodes) or len(nodes) < len(named) or (nodes < 0).any():
             raise TankError(f"{where}: names nodes that are none of the mesh")
@@ -157,16 +160,24 @@ class _Rim:
             raise TankError(f"{where}: its nodes are no single stretch of the outer rim, on which electrodes lie here")
         start, perimeter = self._along[first[0]], self._along[-1]
         stop = self._along[(first[0] + len(sides)) % len(on)]
-        contact = float(np.real(np.ravel(getattr(struct, "z_contact", 0.01))[0]))
+        contact = float(np.append(_numbers(struct, "z_contact"), 0.01)[0])  # the default of EIDORS
         return je.BoundaryPatch(float(start), float(stop if stop > start else stop + perimeter), contact)
+
+
+def _numbers(struct: SimpleNamespace, name: str) -> np.ndarray:
+    """The real numbers of a field, or none."""
+    value = getattr(struct, name, None)
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiuc":
+        return np.zeros(0)
+    return np.asarray(value.real.ravel(), float)
 
 
 def _frames_of(value: Any, readings: int) -> np.ndarray | None:
     """The frames of a variable as columns, if it is an array or a data structure of so many readings."""
     value = getattr(value, "meas", value)
-    if isinstance(value, mat_struct) or np.asarray(value).dtype.kind not in "fiuc":
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiuc":
         return None
-    columns = np.asarray(value)
+    columns = value
     columns = columns[:, None] if columns.ndim == 1 else columns
     return columns if columns.ndim == 2 and len(columns) == readings else None
 
@@ -187,10 +198,10 @@ def is_ktc(variables: Mapping[str, Any]) -> bool:
 
 def _ktc_frame(path: Path, variables: Mapping[str, Any]) -> _KtcFrame:
     current = variables.get("Inj", variables.get("Injref"))
-    readings = variables.get("Uel", variables.get("Uelref"))
-    if current is None or readings is None or "Mpat" not in variables:
-        raise TankError(f"{path.name}: has no Inj, Mpat and Uel, as frames of the Kuopio challenge have")
-    return _KtcFrame(1e-3 * np.asarray(current, float), np.asarray(variables["Mpat"], float), np.ravel(readings))
+    readings, measured = variables.get("Uel", variables.get("Uelref")), variables.get("Mpat")
+    if not all(isinstance(part, np.ndarray) and part.dtype.kind in "fiu" for part in (current, readings, measured)):
+        raise TankError(f"{path.name}: has no numbers Inj, Mpat and Uel, as frames of the Kuopio challenge have")
+    return _KtcFrame(1e-3 * np.asarray(current), np.asarray(measured, float), np.ravel(np.asarray(readings, float)))
 
 
 def ktc_tank(path: Path, variables: Mapping[str, Any]) -> Tank:

@@ -1,10 +1,13 @@
 """Files of tanks, written here as other programs write them; the programs of docs/tanks.md on them."""
 
+import itertools
 from types import SimpleNamespace
 
+import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from scipy.io import savemat
 
 import calib
@@ -81,6 +84,41 @@ def _write_mat(path, bench, **change):
     return path
 
 
+def _put(group, name, value, number):
+    """A value as MATLAB writes it in format 7.3; ``number`` makes the names of what references lead to."""
+    if isinstance(value, dict):
+        part = group.create_group(name)
+        for key, one in value.items():
+            _put(part, key, one, number)
+        kind = "struct"
+    elif isinstance(value, np.ndarray) and value.dtype.names:
+        part, hidden, kind = group.create_group(name), group.file.require_group("#refs#"), "struct"
+        for key in value.dtype.names:
+            places = [f"r{next(number)}" for _ in value.flat]
+            for place, one in zip(places, value[key].flat, strict=True):
+                _put(hidden, place, one, number)
+            refs = np.array([[hidden[place].ref] for place in places], h5py.ref_dtype)
+            part.create_dataset(key, data=refs, dtype=h5py.ref_dtype)
+    elif sp.issparse(value):
+        part, kind, value = group.create_group(name), "double", sp.csc_array(value)
+        part.attrs["MATLAB_sparse"] = np.uint64(value.shape[0])
+        for key, numbers in (("data", value.data), ("ir", value.indices), ("jc", value.indptr)):
+            part.create_dataset(key, data=numbers.astype(float if key == "data" else np.uint64))
+    elif isinstance(value, str):
+        part, kind = group.create_dataset(name, data=np.array([[ord(c)] for c in value], np.uint16)), "char"
+    else:
+        part, kind = group.create_dataset(name, data=np.atleast_2d(np.asarray(value, float)).T), "double"
+    part.attrs["MATLAB_class"] = np.bytes_(kind)
+
+
+def _write_v73(path, variables):
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in variables.items():
+            _put(file, name, value, itertools.count(len(file.get("#refs#", ()))))
+    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM" + path.read_bytes()[128:])
+    return path
+
+
 def _sees_the_rod(tank, tolerance=0.005):
     found = difference_image(tank, basis=je.Pixels(24))
     place = np.asarray(found.recon.centres)[np.argmax(found.change)]
@@ -97,6 +135,16 @@ def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
     np.testing.assert_allclose(je.forward(tank.model()), bench.frames[0], rtol=1e-9)
     found = _sees_the_rod(tank)
     assert found.background == pytest.approx(1.0)
+    sparse = _forward_model(bench)["stimulation"].copy()
+    for stimulation in sparse.flat:
+        stimulation["stim_pattern"] = sp.csc_array(stimulation["stim_pattern"])
+        stimulation["meas_pattern"] = sp.csc_array(stimulation["meas_pattern"])
+    variables = {"fmdl": _forward_model(bench, {"stimulation": sparse}), "vh": {"meas": bench.frames[0][:, None]}}
+    later = load_tank(_write_v73(tmp_path / "later.mat", variables))
+    np.testing.assert_array_equal(later.frames, bench.frames[:1])
+    np.testing.assert_array_equal(later.mesh.triangles, tank.mesh.triangles)
+    assert later.skin.electrodes == tank.skin.electrodes
+    np.testing.assert_array_equal(later.skin.protocol.pattern, tank.skin.protocol.pattern)
     points = _struct("electrode", [{"nodes": 2.0 + k, "z_contact": 0.0} for k in range(COUNT)])
     as_points = load_tank(_write_mat(tmp_path / "points.mat", bench, **points))
     assert all(isinstance(electrode, je.PointElectrode) for electrode in as_points.skin.electrodes)
@@ -184,7 +232,7 @@ def test_frames_of_the_kuopio_challenge(tmp_path):
         ("a.csv", "1,2\n" * 17, "has 17 lines, which is no n"),
         ("a.csv", "1,2\n1,2\n1,x\n1,2\n", "line 3: '1,x' has a word"),
         ("a.csv", "1\n" * 4, r"lines have \[1\] columns"),
-        ("a.mat", "no MATLAB", "cannot be read as a MATLAB file"),
+        ("a.mat", "no MATLAB", "is no MATLAB file"),
         ("a.npz", "no archive", "cannot be read as a NumPy archive"),
         ("a.xyz", "", "is no file of a tank by its name"),
     ],

@@ -30,7 +30,7 @@ class MatImporter(AbstractArrayImporter):
     @classmethod
     def outline(cls, path: Path) -> dict[str, ArrayShape]:
         """See `AbstractArrayImporter.outline`."""
-        if _is_hdf5(path):
+        if is_hdf5(path):
             with h5py.File(path, "r") as file:
                 return {name: shape for name, _, shape in _matlab_datasets(path, file)}
         shapes = {}
@@ -47,7 +47,7 @@ class MatImporter(AbstractArrayImporter):
     @classmethod
     def arrays(cls, path: Path, names: Sequence[str]) -> list[np.ndarray]:
         """See `AbstractArrayImporter.arrays`."""
-        if _is_hdf5(path):
+        if is_hdf5(path):
             with h5py.File(path, "r") as file:
                 found = {name: (dataset, shape) for name, dataset, shape in _matlab_datasets(path, file)}
                 picked = [known(path, found, name) for name in names]
@@ -58,7 +58,7 @@ class MatImporter(AbstractArrayImporter):
         return [table_values(*known(path, fields, name)) for name in names]
 
 
-def _is_hdf5(path: Path) -> bool:
+def is_hdf5(path: Path) -> bool:
     """Whether a MATLAB file is of version 7.3; `SessionError` for a file of another program."""
     head = first_bytes(path, 1024)
     if b"\x89HDF\r\n\x1a\n" in (head[512:520], head[:8]):
