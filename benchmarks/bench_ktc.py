@@ -96,10 +96,7 @@ def load(folder: Path) -> Data:
 def tank(data: Data, edge_length: float = 0.03) -> je.Model:
     """Our own mesh of the tank: electrode 0 at +y, counter-clockwise, half of the rim covered; 1 S and mA."""
     disc = je.Disc(RADIUS)
-    middles = disc.perimeter * (0.25 + np.arange(ELECTRODES) / ELECTRODES)
-    width = disc.perimeter / (2 * ELECTRODES)
-    starts = (middles - width / 2) % disc.perimeter
-    patches = tuple(je.BoundaryPatch(float(s), float(s + width), 1e-4) for s in starts)
+    patches = je.skin.rim_electrodes(disc, ELECTRODES, contact=1e-4, start=np.pi / 2)
     protocol = je.Protocol(data.pattern, data.current)
     return je.discretise(je.Scene(je.Skin("ktc", disc, 1.0, patches, protocol)), je.Fidelity(edge_length=edge_length))
 

@@ -1,5 +1,8 @@
 """Pictures hold what they are given."""
 
+import subprocess
+import sys
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -50,6 +53,11 @@ def test_an_image_is_of_the_pixels_on_the_sheet(model, pixels):
         je.plot.show_image(pixels, np.zeros(3))
     with pytest.raises(PlotError, match="give the model in place of it"):
         je.plot.show_image(je.Elements().on(model), np.zeros(len(model.areas)))
+
+
+def test_jaxeit_does_not_import_matplotlib():
+    code = "import jaxeit, sys; jaxeit.forward; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_meshes_and_sensitivities(model):

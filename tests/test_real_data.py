@@ -20,9 +20,7 @@ needs_tank = pytest.mark.skipif(not TANK, reason="pyeidors_tank is not at hand; 
 def tank():
     """A 60 mm saline tank with 16 electrodes, in two dimensions."""
     disc = je.Disc(0.03)
-    step, width = disc.perimeter / 16, 0.4 * disc.perimeter / 16
-    starts = (np.arange(16) * step - width / 2) % disc.perimeter
-    patches = [je.BoundaryPatch(float(s), float(s + width), 1e-3) for s in starts]
+    patches = je.skin.rim_electrodes(disc, 16, width=0.4 * disc.perimeter / 16, contact=1e-3)
     skin = skin_of(disc, patches, je.skin.adjacent(16))
     model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.05))
     return skin, model, je.Pixels(24).on(model)

@@ -106,23 +106,17 @@ def _pattern(where: str, struct: SimpleNamespace, name: str) -> np.ndarray:
 
 
 def _mesh(where: str, model: SimpleNamespace) -> tuple[je.meshing.Mesh, np.ndarray]:
-    """The mesh, all triangles counter-clockwise, and the new number of each node, -1 for one without triangles."""
-    if not all(isinstance(part, np.ndarray) and part.dtype.kind in "iuf" for part in (model.nodes, model.elems)):
+    """The mesh, and the number in it of each node of the file, -1 for one without triangles."""
+    nodes, elems = model.nodes, model.elems
+    if not all(isinstance(part, np.ndarray) and part.dtype.kind in "iuf" and part.size for part in (nodes, elems)):
         raise TankError(f"{where}: nodes and elems are no arrays of numbers")
-    nodes, elems = model.nodes.astype(float), np.atleast_2d(model.elems).astype(int) - 1
-    flat = nodes.ndim == 2 and nodes.shape[1] >= 2 and (nodes[:, 2:] == nodes[:1, 2:]).all()
-    if not flat or elems.shape[1] != 3:
+    elems = np.atleast_2d(elems)
+    if elems.shape[1] != 3 or nodes.ndim != 2:
         raise TankError(f"{where}: elements have {elems.shape[1]} nodes; a sheet is a plane mesh of triangles")
-    if elems.min() < 0 or elems.max() >= len(nodes):
-        raise TankError(f"{where}.elems: names nodes outside 1 to {len(nodes)}")
-    corners = nodes[elems, :2]
-    (u, v) = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    flipped = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0
-    elems[flipped] = elems[flipped][:, [0, 2, 1]]
-    used, triangles = np.unique(elems, return_inverse=True)
-    number = np.full(len(nodes), -1)
-    number[used] = np.arange(len(used))
-    return je.meshing.Mesh(nodes[used, :2], triangles.reshape(-1, 3)), number
+    try:
+        return je.meshing.flat_mesh(nodes.astype(float), elems.astype(int) - 1)
+    except je.meshing.MeshError as error:
+        raise TankError(f"{where}: {error}; nodes of the file are counted from 1") from None
 
 
 class _Rim:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxeit as je
+from jaxeit.budget import require
 from jaxeit.files import open_regular
 from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
@@ -18,7 +19,8 @@ AMPERE = {"uA": 1e-6, "mA": 1e-3}
 
 
 def text_of(path: Path) -> str:
-    """The text of a file."""
+    """The text of a file; raises TankError for one that is larger than a file may be."""
+    require("file_bytes", path.stat().st_size, path.name, TankError)
     with open_regular(path) as file:
         return file.read().decode("utf-8", "replace")
 

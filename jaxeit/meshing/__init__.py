@@ -2,6 +2,7 @@
 
 from .elements import Lagrange, Space, function_space
 from .footprints import AbstractFootprint
+from .foreign import flat_mesh, read_mesh, write_mesh
 from .generation import TrianglePattern, structured, triangulate
 from .triangles import Mesh, MeshError
 
@@ -12,7 +13,10 @@ __all__ = [
     "MeshError",
     "Space",
     "TrianglePattern",
+    "flat_mesh",
     "function_space",
+    "read_mesh",
     "structured",
     "triangulate",
+    "write_mesh",
 ]

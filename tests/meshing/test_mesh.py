@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxeit as je
 from jaxeit.geometry.shapes import Disc, Polygon, Rectangle
+from jaxeit.meshing.foreign import flat_mesh, read_mesh, write_mesh
 from jaxeit.meshing.generation import Mesh, MeshError, TrianglePattern, structured, triangulate
 from jaxeit.meshing.outlines import ArcFootprint, DiscFootprint, PointFootprint, polygon_radius
 from jaxeit.meshing.triangles import CROWDED
@@ -541,3 +542,36 @@ def test_a_flat_triangle_of_a_foreign_mesh_is_accepted_by_its_angle():
     with pytest.raises(MeshError, match="use a shorter edge_length"):
         mesh.check(advice=CROWDED)
     assert np.isfinite(np.asarray(je.forward(je.discretise(scene, mesh=mesh, min_angle=10)))).all()
+
+
+def test_meshes_of_other_programs(tmp_path):
+    """Any numbering and direction; files that meshio knows, with values on the triangles."""
+    own = structured(SQUARE, 4, 3)
+    nodes = np.concatenate([[[9.0, 9.0]], own.nodes])
+    clockwise = own.triangles.copy()
+    clockwise[::2] = clockwise[::2, ::-1]
+    mesh, number = flat_mesh(nodes, clockwise + 1)
+    assert_array_equal(mesh.nodes, own.nodes)
+    assert_array_equal(number, np.arange(-1, len(own.nodes)))
+    assert_allclose(mesh.check().areas, own.areas)
+    with pytest.raises(MeshError, match="its triangles name nodes outside 0 to 20"):
+        flat_mesh(nodes, clockwise + 2)
+    with pytest.raises(MeshError, match="its nodes are at different heights"):
+        flat_mesh(np.random.default_rng(0).normal(size=(21, 3)), clockwise)
+
+    meshio = pytest.importorskip("meshio")
+    sigma = np.arange(len(mesh.triangles), dtype=float)
+    for name in ("a.vtu", "a.vtk"):
+        write_mesh(tmp_path / name, mesh, sigma=sigma)
+        assert_array_equal(meshio.read(tmp_path / name).cell_data["sigma"][0], sigma)
+        again = read_mesh(tmp_path / name)
+        assert_array_equal(again.nodes, mesh.nodes)
+        assert_array_equal(again.triangles, mesh.triangles)
+    with pytest.raises(MeshError, match=r"sigma has shape \(3,\); the mesh has 24 triangles"):
+        write_mesh(tmp_path / "b.vtu", mesh, sigma=np.zeros(3))
+    (tmp_path / "c.vtk").write_text("no mesh")
+    with pytest.raises(MeshError, match=r"c\.vtk: meshio cannot read it"):
+        read_mesh(tmp_path / "c.vtk")
+    meshio.write_points_cells(tmp_path / "d.vtu", np.zeros((3, 3)), [("line", np.array([[0, 1]]))])
+    with pytest.raises(MeshError, match=r"has no triangles, but \['line'\]"):
+        read_mesh(tmp_path / "d.vtu")

@@ -154,7 +154,7 @@ def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
     ("change", "message"),
     [
         ({"elems": np.ones((9, 4))}, "elements have 4 nodes; a sheet is a plane mesh of triangles"),
-        ({"elems": np.full((9, 3), 1e4)}, "elems: names nodes outside 1 to"),
+        ({"elems": np.full((9, 3), 1e4)}, "its triangles name nodes outside 0 to"),
         ({"electrode": []}, "electrode: missing"),
         ({"electrode": _struct("e", [{"nodes": [2.0, 9.0]}])["e"]}, r"electrode\(1\): its nodes are no single stretch"),
         ({"stimulation": _struct("s", [{"stim_pattern": "{ad}"}])["s"]}, r"stimulation\(1\).stim_pattern: is '{ad}'"),
