@@ -31,6 +31,8 @@ def load_tank(path: str | Path, domain: Domain | None = None, rim: Rim | None = 
         TankError, OSError: naming the file and what is wrong with it.
     """
     path = Path(path)
+    if not path.exists():
+        raise TankError(f"{path}: does not exist; check the name and the folder")
     if path.is_dir():
         return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
     kind = path.suffix.lower()

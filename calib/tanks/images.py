@@ -58,11 +58,11 @@ def difference_image(
         TankError: if there is one frame, or the reference does not look like the model.
     """
     count = len(tank.frames)
-    first, last = (number % count for number in (reference, frame) if -count <= number < count) if count > 1 else (0, 0)
-    if first == last:
+    if not all(-count <= number < count for number in (frame, reference)) or (frame - reference) % count == 0:
         raise TankError(
-            f"{tank.skin.name}: frame {frame} less frame {reference}, of {count}; give two different frames"
+            f"{tank.skin.name}: frame {frame} less frame {reference}, of {count} frames; give two different ones"
         )
+    first, last = reference % count, frame % count
     model = tank.model(fidelity)
     before, after = tank.frames[first], tank.frames[last]
     even = np.asarray(je.forward(model))

@@ -20,7 +20,7 @@ AMPERE = {"uA": 1e-6, "mA": 1e-3}
 
 def text_of(path: Path) -> str:
     """The text of a file; raises TankError for one that is larger than a file may be."""
-    require("file_bytes", path.stat().st_size, path.name, TankError)
+    require("array_bytes", path.stat().st_size, path.name, TankError)
     with open_regular(path) as file:
         return file.read().decode("utf-8", "replace")
 

@@ -181,8 +181,11 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
     reversed_polarity = calib.tanks.Tank(csv.skin, -csv.frames, csv.names)
     with pytest.raises(TankError, match=r"correlation of frame 0 .* is -.*check the order and the polarity"):
         difference_image(reversed_polarity)
-    with pytest.raises(TankError, match="give two different frames"):
-        difference_image(csv, 0)
+    for frame in (0, -2, 7):
+        with pytest.raises(TankError, match=f"frame {frame} less frame 0, of 2 frames; give two different ones"):
+            difference_image(csv, frame)
+    with pytest.raises(TankError, match=r"no\.csv: does not exist"):
+        load_tank(tmp_path / "no.csv", je.Disc(RADIUS))
 
 
 def test_potentials_of_sciospec(bench, tmp_path):

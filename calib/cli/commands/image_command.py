@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
     parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
-    parser.add_argument("--prior", default="noser", help="default: noser")
+    parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
+    parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
     parser.add_argument("--hyperparameter", type=above_zero, default=0.1, metavar="L", help="weight of the prior; 0.1")
 
 
@@ -46,9 +47,10 @@ def run(args: argparse.Namespace) -> int:
     kind = Path(args.output).suffix.lower()[1:]
     if kind not in ("png", "pdf", "svg"):
         raise ValueError(f"{args.output}: give a name that ends in .png, .pdf or .svg")
-    prior = je.imaging.PRIORS.make(args.prior)
+    prior, method = je.imaging.PRIORS.make(args.prior), je.imaging.METHODS.make(args.method)
     tank = _tank(args)
-    found = difference_image(tank, args.frame, args.reference, prior=prior, hyperparameter=args.hyperparameter)
+    choices = {"prior": prior, "method": method, "hyperparameter": args.hyperparameter}
+    found = difference_image(tank, args.frame, args.reference, **choices)
     figure = Figure(layout="constrained")  # without a window, on any machine
     axes = figure.subplots()
     je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
