@@ -66,6 +66,14 @@ def two_fingers(axes: Any, names: Names) -> None:
     axes.legend(fontsize=7)
 
 
+def electrodes_that_move(axes: Any, names: Names) -> None:
+    skin = names["skin"]
+    skin_places, slope = MM * skin.electrode_positions, np.asarray(names["gradient"])
+    axes.plot(*skin_places.T, "o", color=GREY, markersize=3)
+    axes.quiver(*skin_places.T, *slope.T, color=BLUE, angles="xy")
+    axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(0, 200), ylim=(0, 200))
+
+
 def mesh_of_my_own(axes: Any, names: Names) -> None:
     axes.triplot(Triangulation(*(MM * names["nodes"].T), names["mesh"].triangles), color=GREY, linewidth=0.4)
     axes.plot(*(MM * np.array(names["places"]).T), "o", color=ORANGE, markersize=4)
@@ -149,6 +157,7 @@ def train_on_random_scenes(axes: Any, names: Names) -> None:
 
 DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "bending": lambda axes, n: _bars(axes, {k: 100 * v for k, v in n["changes"].items()}, "change of the readings, %"),
+    "electrodes_that_move": electrodes_that_move,
     "forces_of_a_session": forces_of_a_session,
     "gradient_of_a_loss": gradient_of_a_loss,
     "image_and_forces": image_and_forces,

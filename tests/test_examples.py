@@ -11,6 +11,9 @@ FINDS = {
     "bending": lambda names: (
         names["changes"]["rolled, radius 50 mm"] < 0.005 < 0.01 < names["changes"]["on a ball, radius 200 mm"]
     ),
+    "electrodes_that_move": lambda names: (
+        jnp.linalg.norm(names["change"] - names["linear"]) < 0.1 * jnp.linalg.norm(names["change"])
+    ),
     "forces_of_a_session": lambda names: names["found"]["force_rmse"] < 1,
     "gradient_of_a_loss": lambda names: jnp.abs(names["guess"] - jnp.array([0.07, 0.12, 0.5])).max() < 1e-3,
     "image_and_forces": lambda names: jnp.abs(names["on_pads"] - names["forces"]).max() < 1e-9,

@@ -15,8 +15,10 @@ The same code serves flat and curved sheets.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.special import factorial
 
 from .triangles import Mesh
@@ -162,7 +164,8 @@ def function_space(mesh: Mesh, order: int) -> Space:
         sides = [index(dofs[:, [i, (i + 1) % 3]]) for i in range(3)]
         dofs = np.concatenate([dofs, middle[np.stack(sides, 1)]], 1)
         boundary = np.concatenate([boundary, middle[index(boundary)][:, None]], 1)
-    return Space(mesh, element, points, chart, dofs, boundary, _slopes(mesh, element))
+    slopes = element_slopes(mesh.nodes[mesh.triangles], mesh.areas, element)
+    return Space(mesh, element, points, chart, dofs, boundary, np.asarray(slopes))
 
 
 def _edge_index(edges: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -178,15 +181,16 @@ def _edge_index(edges: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return lookup
 
 
-def _slopes(mesh: Mesh, element: Lagrange) -> np.ndarray:
-    corners = mesh.nodes[mesh.triangles]
+def element_slopes(
+    corners: Float[np.ndarray | Array, "elements 3 d"], areas: Float[np.ndarray | Array, " elements"], element: Lagrange
+) -> Float[np.ndarray | Array, "elements k r"]:
+    """Weighted slopes (see above) of triangles with these corners, m, and areas, m^2; in NumPy or in JAX."""
+    xp: Any = corners.__array_namespace__()
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    length, along, twice = np.linalg.norm(first, axis=1), np.sum(first * second, 1), 2 * mesh.areas
-    to_frame = np.zeros((len(corners), 2, 2))
-    to_frame[:, 0, 0] = 1 / length
-    to_frame[:, 1, 0] = -along / (length * twice)
-    to_frame[:, 1, 1] = length / twice
-    slopes = np.einsum(
-        "ecd,qdk,eq->ekqc", to_frame, element.derivatives, np.sqrt(mesh.areas[:, None] * element.weights)
-    )
-    return np.asarray(slopes.reshape(*slopes.shape[:2], -1))
+    length, along, twice = xp.sqrt(xp.sum(first**2, -1)), xp.sum(first * second, -1), 2 * areas
+    zero = xp.zeros_like(length)
+    to_frame = xp.stack([1 / length, zero, -along / (length * twice), length / twice], -1).reshape(-1, 2, 2)
+    derivatives, weights = (xp.asarray(table, dtype=corners.dtype) for table in (element.derivatives, element.weights))
+    slopes = xp.einsum("ecd,qdk,eq->ekqc", to_frame, derivatives, xp.sqrt(areas[:, None] * weights))
+    flat: np.ndarray | Array = slopes.reshape(*slopes.shape[:2], -1)
+    return flat

@@ -14,6 +14,7 @@ from .bases import (
 from .discretisation import Model, discretise, expected_mesh_nodes, make_mesh
 from .fidelity import Fidelity, FidelityError
 from .forward_model import CoatedSheet, DerivativeError, conductivity, forward, load_spread, rounding
+from .motion import Motion, MotionError, electrode_motion, moved, shift_jacobian
 from .pneumatics import pad_response
 from .scene import Scene, SceneError, read_effects
 from .sensitivity import jacobian
@@ -32,6 +33,8 @@ __all__ = [
     "Fidelity",
     "FidelityError",
     "Model",
+    "Motion",
+    "MotionError",
     "Picture",
     "Pixels",
     "Scene",
@@ -39,12 +42,15 @@ __all__ = [
     "System",
     "conductivity",
     "discretise",
+    "electrode_motion",
     "expected_mesh_nodes",
     "forward",
     "jacobian",
     "load_spread",
     "make_mesh",
+    "moved",
     "pad_response",
     "read_effects",
     "rounding",
+    "shift_jacobian",
 ]

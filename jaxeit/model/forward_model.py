@@ -236,7 +236,7 @@ def _(_: Any, __: Any) -> NoReturn:
     raise DerivativeError(
         "the model has no derivative with respect to its mesh and the matrices made of it (nodes, chart, centroids, "
         "areas, system, coat); differentiate with respect to sigma, or to background, contact, current or the effects "
-        "of the model, one of which eqx.tree_at puts in place"
+        "of the model, one of which eqx.tree_at puts in place, or to the shifts of its electrodes (je.model.moved)"
     )
 
 
@@ -257,9 +257,9 @@ def _(_: Any, __: Any) -> NoReturn:
 def _parameters_only(model: Model, theta: Coefficients) -> tuple[Model, Coefficients]:
     """Model and coefficients that refuse derivatives which would be zero without a reason.
 
-    The derivative rule of the transfer matrix contains the coefficients only, not the nodes or areas.
+    The derivative rule of the transfer matrix contains the coefficients, and the system if its electrodes move.
     """
-    names = ("nodes", "chart", "centroids", "areas", "system", "coat")
+    names = ("nodes", "chart", "centroids", "areas", "coat", *(() if model.system.moved else ("system",)))
     fixed = _without_derivative({name: getattr(model, name) for name in names})
     system = model.system
     if not system.contact_dofs.size and not system.near_element.size:
@@ -306,12 +306,29 @@ def _transfer_jvp(
     primals: tuple[Coefficients, Model], tangents: tuple[Coefficients | None, Any]
 ) -> tuple[Float[Array, "electrodes electrodes"], Float[Array, "electrodes electrodes"]]:
     theta, model = primals
-    direction, _ = tangents
+    direction, of_model = tangents
     x = fields(model, theta)
     slope = jnp.zeros_like(x.terminal)
     if direction is not None:
         slope = -energy(model, _filled(direction, theta), x)
+    if model.system.moved and of_model is not None:
+        slope = slope - _moved_energy(model, theta, x, of_model.system)
     return x.terminal, slope
+
+
+def _moved_energy(model: Model, theta: Coefficients, x: Fields, direction: System) -> Float[Array, "a b"]:
+    """Derivative of the energy of fields that are held, in the direction of a change of slopes and contacts."""
+
+    def held(slopes: Float[Array, "elements k r"], mass: Float[Array, "p k k"]) -> Float[Array, "a b"]:
+        return energy(replace(model, system=replace(model.system, slopes=slopes, contact_mass=mass)), theta, x)
+
+    parts = (model.system.slopes, model.system.contact_mass)
+    changes = tuple(
+        jnp.zeros_like(part) if change is None else change
+        for part, change in zip(parts, (direction.slopes, direction.contact_mass), strict=True)
+    )
+    change: Array = jax.jvp(held, parts, changes)[1]
+    return change
 
 
 _transfer.def_jvp(_transfer_jvp)

@@ -126,6 +126,8 @@ def _pair_slopes(
         )
     theta, (first, second) = coefficients(model, sigma), jnp.asarray(pairs).T
     potential = fields(model, theta).potential
+    if scale is None and model.system.moved:  # the stiffness of the image is that of the mesh before
+        scale = jnp.ones_like(model.background)
     if scale is None:
         owner = None if image.single else image.coefficient
         products = image.stiffness.products(potential, (first, second), owner, image.size)

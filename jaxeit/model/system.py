@@ -50,6 +50,7 @@ class System(eqx.Module):
     | lumped: radius of discs whose contact is in closed form, else 0, m      | (electrodes,)   |
     | near_element, near_electrode, near_share: elements under those discs,   | (q,), (q,), (q,)|
     |   and their shares of each disc's area                                  |                 |
+    | moved: whether the arrays depend on where the electrodes sit (`motion`) | static          |
     """
 
     dofs: Int[Array, "elements k"]
@@ -77,6 +78,7 @@ class System(eqx.Module):
     near_electrode: Int[Array, " q"]
     near_share: Float[Array, " q"]
     plan: AbstractPlan
+    moved: bool = eqx.field(static=True, default=False)
 
     @property
     def unknowns(self) -> int:
@@ -153,6 +155,19 @@ def system_of(arrays: dict[str, Any], plan: AbstractPlan, put: Callable[[np.ndar
     """The `System` of these arrays, each moved to the device by ``put``."""
     moved = jax.tree.map(put, arrays)
     return System(**moved | {"sheet": tuple(Entries(*table) for table in moved["sheet"])}, plan=plan)
+
+
+def stiffness_places(system: System) -> list[np.ndarray]:
+    """Where each contribution to the tables of ``system.sheet`` is found among all stiffnesses of the elements,
+    (elements, k, k) as one row; -1 for padding."""
+    dofs = np.asarray(system.dofs, int)
+    numbers = 1.0 + np.arange(dofs.size * dofs.shape[1]).reshape(*dofs.shape, -1)
+    contacts = _Contacts(np.asarray(system.contact_dofs), np.zeros(0), np.asarray(system.contact_electrode))
+    rims = _Rims(np.asarray(system.rim_element), np.asarray(system.rim_electrode), np.zeros(0), np.zeros(0))
+    bridges = _Bridges(np.asarray(system.bridge_element), np.asarray(system.bridge_electrodes), np.zeros(0))
+    added = _contact_places(dofs, contacts, rims, bridges, np.asarray(system.electrode_dof))
+    tables, *_ = _matrix(dofs, numbers, added, system.unknowns)
+    return [number.astype(int) - 1 for _, number in tables]
 
 
 def _under_discs(space: Space, touched: Sequence[Touched]) -> dict[str, np.ndarray]:

@@ -34,6 +34,7 @@ HOST = {
     "compiler_options": _DESCRIBES,
     "discretise": _GEOMETRY,
     "drives": _DESCRIBES,
+    "electrode_motion": _PREPARES,
     "expected_mesh_nodes": _GEOMETRY,
     "few_choices": _PREPARES,
     "fit_model_error": _PREPARES,
@@ -155,6 +156,18 @@ def _load_spread(t):
 def _jacobian(t):
     even = t.model.background
     return Case(lambda s: je.jacobian(t.model, s, t.basis), [even, even * jnp.exp(t.draw(32))], [])
+
+
+def _moved(t):
+    motion = je.model.electrode_motion(t.model)
+    return Case(
+        lambda x: je.forward(je.model.moved(t.model, motion, x.reshape(-1, 2))), [1e-3 * t.draw(12)], [jnp.zeros(12)]
+    )
+
+
+def _shift_jacobian(t):
+    motion, even = je.model.electrode_motion(t.model), t.model.background
+    return Case(lambda s: je.model.shift_jacobian(t.model, motion, s), [even, even * jnp.exp(t.draw(32))], [])
 
 
 def _fuse(t):
@@ -353,6 +366,8 @@ CASES = {
     "conductivity": _conductivity,
     "load_spread": _load_spread,
     "jacobian": _jacobian,
+    "moved": _moved,
+    "shift_jacobian": _shift_jacobian,
     "fuse": _fuse,
     "contact_shares": _contact_shares,
     "Reconstructor": _reconstructor,

@@ -1,0 +1,346 @@
+"""Electrodes that move: readings as a differentiable function of where the electrodes sit.
+
+The mesh follows its electrodes: the nodes of an electrode move with it, those around it by a part that falls to zero
+before the next electrode and the rim. No node changes its neighbours, so that the arrays of the model are smooth
+functions of the shifts. With x_a the field of a unit current into electrode a, the transfer matrix ``Z[a, b]`` has the
+derivative ``-dA(x_a, x_b)``, that of the energy with the fields held (`forward_model`), as for a conductivity: the
+fields are stationary, and no further solve is needed. The conductivity of an element moves with it.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from .._compile import is_traced, require_known, verb
+from ..meshing.elements import BY_ORDER, element_slopes
+from ..meshing.triangles import Mesh
+from .discretisation import Model
+from .forward_model import coefficients, fields, series_resistance, voltages
+from .sensitivity import BATCH_ELEMENTS
+from .system import Entries, stiffness_places
+
+# The cosine between rim edges that meet in a corner, which no electrode passes.
+CORNER = np.cos(np.radians(30))
+# Parts of an electrode's radius that the mesh needs around it, so that its triangles are not flattened.
+LEAST_REACH = 1.25
+
+
+class MotionError(ValueError):
+    """Electrodes that cannot be moved on this mesh."""
+
+
+class Motion(eqx.Module):
+    """How the mesh of a model follows its electrodes, from `electrode_motion`.
+
+    | meaning                                                               | shape           | unit |
+    |-----------------------------------------------------------------------|-----------------|------|
+    | electrode: that each node follows                                     | (nodes,)        |      |
+    | chart_step: change of a node's flat coordinates per shift of that     | (nodes, 2, 2)   | 1    |
+    | space_step: the same of its place in space                            | (nodes, d, 2)   | 1    |
+    | reach: distance from its middle within which nodes follow an electrode | (electrodes,)  | m    |
+    | places: of each contribution to the matrix, among the stiffnesses     | (n, c) each     |      |
+    | corners: nodes of each piece under an electrode; of an edge the last one twice | (p, 3) |      |
+    """
+
+    electrode: Int[Array, " nodes"]
+    chart_step: Float[Array, "nodes 2 2"]
+    space_step: Float[Array, "nodes d 2"]
+    reach: Float[Array, " electrodes"]
+    places: tuple[Int[Array, "_ _"], ...]
+    corners: Int[Array, "p 3"]
+
+
+def electrode_motion(model: Model) -> Motion:
+    """Prepare a model for `moved`, on the host, once for each mesh.
+
+    Electrodes inside the sheet move in both directions. Electrodes on the rim move along it, and not around corners.
+
+    Raises:
+        MotionError: for a metal coat, or for electrodes so near to each other or to a corner that none can move.
+    """
+    require_known("electrode_motion", MotionError, model.nodes)
+    if model.coat is not None:
+        raise MotionError(
+            "the electrodes of a sheet with a metal coat cannot be moved; leave the coat out of the scene"
+        )
+    mesh = Mesh(np.asarray(model.nodes, float), np.asarray(model.triangles), np.asarray(model.chart, float))
+    unknown = np.zeros(len(mesh.nodes), int)
+    unknown[mesh.triangles] = np.asarray(model.system.dofs)[:, :3]
+    electrode, step, reach = _follow(mesh, _nodes_of_electrodes(model, unknown))
+    # The derivative of the place in space by the flat coordinates, constant on a triangle; at a node the mean.
+    flat, space = (_sides(places[mesh.triangles]) for places in (mesh.chart, mesh.nodes))
+    slope = np.linalg.solve(flat, space).swapaxes(1, 2)
+    tangents, around = np.zeros((len(mesh.nodes), *slope.shape[1:])), np.zeros((len(mesh.nodes), 1, 1))
+    np.add.at(tangents, mesh.triangles, slope[:, None])
+    np.add.at(around, mesh.triangles, 1.0)
+    return Motion(
+        jnp.asarray(electrode, jnp.int32),
+        jnp.asarray(step, model.dtype),
+        jnp.asarray(tangents / around @ step, model.dtype),
+        jnp.asarray(reach, model.dtype),
+        tuple(jnp.asarray(table, jnp.int32) for table in stiffness_places(model.system)),
+        jnp.asarray(_corners_of_pieces(model, unknown), jnp.int32),
+    )
+
+
+def _sides(corners: np.ndarray) -> np.ndarray:
+    """Two sides of each triangle, (elements, 2, d)."""
+    sides: np.ndarray = corners[:, 1:] - corners[:, :1]
+    return sides
+
+
+def _nodes_of_electrodes(model: Model, unknown: np.ndarray) -> list[np.ndarray]:
+    """Nodes that each electrode touches."""
+    under, own = np.asarray(model.system.under)[unknown], np.asarray(model.system.electrode_dof)
+    return [np.flatnonzero((under == k) | (unknown == own[k])) for k in range(model.electrodes)]
+
+
+def _corners_of_pieces(model: Model, unknown: np.ndarray) -> np.ndarray:
+    """Nodes at the corners of each piece under an electrode; no unknown under a complete electrode is shared."""
+    node = np.zeros(model.system.unknowns, int)
+    node[unknown] = np.arange(len(unknown))
+    corners: np.ndarray = node[np.asarray(model.system.contact_dofs)[:, :3]]
+    last = np.asarray(model.system.contact_mass)[:, -1]  # of a piece on the rim: padding, without mass
+    corners[~last.any(1), 2] = corners[~last.any(1), 1]
+    return corners
+
+
+def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The electrode that each node follows, its step per shift of that electrode, and each electrode's reach."""
+    rim = _Rim(mesh)
+    middles = np.stack([mesh.chart[nodes].mean(0) for nodes in electrodes])
+    away = np.linalg.norm(mesh.chart[:, None] - middles, axis=2)
+    radii = np.array([away[nodes, k].max() for k, nodes in enumerate(electrodes)])
+    gaps = np.linalg.norm(middles[:, None] - middles, axis=2)
+    np.fill_diagonal(gaps, np.inf)
+    on_rim = np.array([rim.inside[nodes].all() for nodes in electrodes])
+    stops = np.where(on_rim[None], rim.corner[:, None], rim.inside[:, None])
+    reach = np.minimum(0.5 * gaps.min(1), np.where(stops, away, np.inf).min(0))
+    tight = reach <= LEAST_REACH * radii
+    if tight.any():
+        k = int(np.argmax(tight))
+        raise MotionError(
+            f"electrode {k} cannot be moved: from its middle it is {1e3 * reach[k]:.3g} mm to the rim, to a corner or "
+            f"half of the way to the next electrode, and it reaches {1e3 * radii[k]:.3g} mm itself"
+        )
+    follows = np.argmin(away / reach, axis=1)
+    every = np.arange(len(away))
+    beyond = np.clip((away[every, follows] - radii[follows]) / (reach - radii)[follows], 0, 1)
+    share = 1 - beyond**2 * (3 - 2 * beyond)
+    own = np.stack(
+        [rim.direction(nodes) if flat else np.zeros(2) for nodes, flat in zip(electrodes, on_rim, strict=True)]
+    )
+    along = np.where(rim.inside[:, None], rim.tangent, own[follows])
+    bound = along[:, :, None] * own[follows][:, None, :]  # the part along the rim, turned with the rim
+    step = share[:, None, None] * np.where(on_rim[follows][:, None, None], bound, np.eye(2))
+    return follows, step, reach
+
+
+class _Rim:
+    """Which nodes lie on the rim (inside it), its direction at each of them, and its corners."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        first, second = mesh.boundary_edges.T
+        sides = mesh.chart[second] - mesh.chart[first]
+        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+        self.inside = np.zeros(len(mesh.nodes), bool)
+        self.inside[first] = True
+        out, into = np.zeros_like(mesh.chart), np.zeros_like(mesh.chart)
+        out[first], into[second] = sides, sides
+        self.corner = self.inside & ((out * into).sum(1) < CORNER)
+        both = out + into
+        self.tangent = both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), np.finfo(float).tiny)
+
+    def direction(self, nodes: np.ndarray) -> np.ndarray:
+        """The direction of the rim at an electrode, (2,)."""
+        mean = self.tangent[nodes].mean(0)
+        unit: np.ndarray = mean / np.linalg.norm(mean)
+        return unit
+
+
+def moved(model: Model, motion: Motion, shift: Float[ArrayLike, "electrodes 2"]) -> Model:
+    """The model with its electrodes moved, differentiable with respect to the shift under jit, vmap and grad.
+
+    Conductivities, and a basis that was laid over the model, move with the elements. ::
+
+        motion = je.model.electrode_motion(model)
+        slopes = jax.jacfwd(lambda shift: je.forward(je.model.moved(model, motion, shift)))(jnp.zeros((25, 2)))
+
+    Args:
+        model: with which `electrode_motion` made the motion.
+        shift: of each electrode in the sheet's flat coordinates, (electrodes, 2) m; of an electrode on the rim, the
+            part along the rim counts. Triangles turn over at about half of the reach.
+
+    Returns:
+        A model whose readings are not finite if a triangle turns over.
+
+    Raises:
+        MotionError: if the shift has another shape, or (unless JAX traces it) a triangle turns over.
+    """
+    shift = jnp.asarray(shift, model.dtype)
+    if shift.shape != (model.electrodes, 2):
+        raise MotionError(
+            f"the shift has shape {shift.shape}; give one of 2 coordinates to each of {model.electrodes} electrodes"
+        )
+    if len(motion.electrode) != len(model.nodes):
+        raise MotionError("the motion is that of another mesh; make electrode_motion(model) of this model")
+    found = _moved(model, motion, shift)
+    if not is_traced((model, shift)) and not bool(jnp.isfinite(found.system.slopes[0, 0, 0])):
+        far = np.linalg.norm(np.asarray(shift), axis=1)
+        k = int(np.argmax(far / np.asarray(motion.reach)))
+        raise MotionError(
+            f"a triangle turns over: electrode {k} moves {1e3 * far[k]:.3g} mm, and the mesh follows it within "
+            f"{1e3 * float(motion.reach[k]):.3g} mm; make smaller shifts, or a new mesh"
+        )
+    return found
+
+
+@verb
+def _moved(model: Model, motion: Motion, shift: Float[Array, "electrodes 2"]) -> Model:
+    system, own = model.system, shift[motion.electrode]
+    chart = model.chart + jnp.einsum("nij,nj->ni", motion.chart_step, own)
+    nodes = model.nodes + jnp.einsum("nij,nj->ni", motion.space_step, own)
+    areas = _areas(nodes[model.triangles])
+    order = 1 if system.dofs.shape[1] == 3 else 2
+    slopes = jnp.asarray(element_slopes(nodes[model.triangles], areas, BY_ORDER[order]))
+    slopes = jnp.where(jnp.all(_upright(chart[model.triangles])), slopes, jnp.nan)
+    stiffness = slopes @ slopes.swapaxes(1, 2)
+    entries = [jnp.where(place < 0, 0, stiffness.ravel()[jnp.maximum(place, 0)]) for place in motion.places]
+    above = system.under[system.dofs[system.bridge_element]]
+    one, other = ((above == system.bridge_electrodes[:, k, None]).astype(nodes.dtype) for k in (0, 1))
+    stretch = _sizes(nodes, motion.corners) / _sizes(model.nodes, motion.corners)
+    mass = system.contact_mass * stretch[:, None, None]
+    near = areas[system.near_element]
+    discs = jnp.zeros_like(system.measure).at[system.near_electrode].add(near)
+    after = replace(
+        system,
+        slopes=slopes,
+        sheet=tuple(Entries(old.element, weight) for old, weight in zip(system.sheet, entries, strict=True)),
+        contact_mass=mass,
+        rim_flux=jnp.einsum("eij,ej->ei", stiffness[system.rim_element], system.rim_chi),
+        bridge_flux=jnp.einsum("bi,bij,bj->b", one, stiffness[system.bridge_element], other),
+        measure=jnp.zeros_like(system.measure).at[system.contact_electrode].add(mass.sum((1, 2))),
+        near_share=near / discs[system.near_electrode],
+        moved=True,
+    )
+    # What is pressed on the sheet, and the places of an image, stay with the elements: they have no derivative.
+    fixed = (nodes, chart, chart[model.triangles].mean(1), areas)
+    nodes, chart, centroids, areas = jax.tree.map(jax.lax.stop_gradient, fixed)
+    return replace(model, nodes=nodes, chart=chart, centroids=centroids, areas=areas, system=after)
+
+
+def _areas(corners: Float[Array, "n 3 d"]) -> Float[Array, " n"]:
+    """Areas of triangles, m^2."""
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    gram = jnp.sum(u * u, 1) * jnp.sum(v * v, 1) - jnp.sum(u * v, 1) ** 2
+    return 0.5 * jnp.sqrt(jnp.maximum(gram, jnp.finfo(corners.dtype).tiny))
+
+
+def _upright(corners: Float[Array, "n 3 2"]) -> Bool[Array, " n"]:
+    """Whether each triangle is counter-clockwise."""
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return u[:, 0] * v[:, 1] > u[:, 1] * v[:, 0]
+
+
+def _sizes(nodes: Float[Array, "nodes d"], corners: Int[Array, "p 3"]) -> Float[Array, " p"]:
+    """Areas of pieces that are triangles, lengths of those that are edges."""
+    places, is_edge = nodes[corners], corners[:, 1] == corners[:, 2]
+    side = places[:, 1] - places[:, 0]
+    # An edge has no area, and the root of zero no derivative: a right angle stands in.
+    third = jnp.where(is_edge[:, None], places[:, 0] + side[:, ::-1], places[:, 2])
+    triangle = _areas(jnp.stack([places[:, 0], places[:, 1], third], 1))
+    return jnp.where(is_edge, jnp.sqrt(jnp.sum(side**2, 1)), triangle)
+
+
+@verb
+def shift_jacobian(
+    model: Model, motion: Motion, sigma: Float[Array, " elements"] | None = None
+) -> Float[Array, "readings electrodes 2"]:
+    """Derivative of `forward` with respect to the shift of each electrode, V/m; one factorisation, as `jacobian`.
+
+    With V the velocity of the elements, fields x and y that are held have the energy's derivative
+    ``integral of sigma (div V grad x . grad y - grad x . (grad V + grad V^T) grad y)`` (Sokolowski and Zolesio 1992).
+
+    Args:
+        model: as given to `electrode_motion`, or moved.
+        sigma: (elements,) S; default: the untouched sheet.
+    """
+    theta = coefficients(model, sigma)
+    x = fields(model, theta)
+    first, second = np.triu_indices(model.electrodes)
+    change = -_sheet_change(model, motion, theta.sigma, x.potential, (first, second))
+
+    def at_contacts(shift: Float[Array, "electrodes 2"]) -> Float[Array, "electrodes pairs"]:
+        """What each electrode's own contact adds to the energy, and its resistance in closed form."""
+        system = _moved(model, motion, shift).system
+        drop = x.drop[system.contact_dofs]
+        mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
+        parts = jnp.einsum("pia,pij,pjb->pab", drop, mass, drop)[:, first, second]
+        series = jnp.where(np.equal(first, second), series_resistance(system, theta)[first], 0)
+        own = jnp.where(np.arange(model.electrodes)[:, None] == first, series, 0)
+        return own.at[system.contact_electrode].add(-parts)
+
+    still = jnp.zeros((model.electrodes, 2), model.dtype)
+    for axis in range(2):  # an electrode's contact depends on its own shift only: all move at once
+        step = still.at[:, axis].set(1)
+        change = change.at[:, axis].add(jax.jvp(at_contacts, (still,), (step,))[1])
+    z = x.terminal + jnp.diag(series_resistance(model.system, theta))
+    by_pair = change.reshape(-1, len(first))
+    upper = jnp.zeros((len(by_pair), *z.shape), z.dtype).at[:, first, second].set(by_pair)
+    whole = upper.at[:, second, first].set(by_pair)
+    felt: Array = jax.vmap(lambda slope: jax.jvp(lambda z: voltages(model, z), (z,), (slope,))[1])(whole)
+    return felt.T.reshape(-1, model.electrodes, 2)
+
+
+def _sheet_change(
+    model: Model,
+    motion: Motion,
+    sigma: Float[Array, " elements"],
+    potential: Float[Array, "unknowns electrodes"],
+    pairs: tuple[np.ndarray, np.ndarray],
+) -> Float[Array, "electrodes 2 pairs"]:
+    """Change of the sheet's energy of these pairs of fields by the shift of each electrode, in batches of elements."""
+    system, (first, second) = model.system, pairs
+    batch = min(BATCH_ELEMENTS, len(model.triangles))
+
+    def add(i: Int[Array, ""], sums: Float[Array, "electrodes 2 pairs"]) -> Float[Array, "electrodes 2 pairs"]:
+        # The last batch repeats elements of the one before, so that all batches have one size.
+        start = jnp.minimum(i * batch, len(model.triangles) - batch)
+        corners, dofs, slopes, weight = (
+            jax.lax.dynamic_slice_in_dim(table, start, batch)
+            for table in (model.triangles, system.dofs, system.slopes, sigma)
+        )
+        weight = jnp.where(start + jnp.arange(batch) >= i * batch, weight, 0)
+        flat = jnp.einsum("ekr,eka->era", slopes, potential[dofs]).reshape(batch, -1, 2, model.electrodes)
+        products = jnp.einsum("eqcp,eqdp->ecdp", flat[..., first], flat[..., second])
+        frame, slope = _frames(model.nodes[corners])
+        velocity = jnp.einsum("ecx,enxs->encs", frame, motion.space_step[corners])
+        spread = jnp.einsum("encs,enc->ens", velocity, slope)
+        bent = jnp.einsum("encs,end,ecdp->ensp", velocity, slope, products + products.swapaxes(1, 2))
+        change = spread[..., None] * (products[:, 0, 0] + products[:, 1, 1])[:, None, None] - bent
+        owners = motion.electrode[corners].ravel()
+        return sums.at[owners].add((weight[:, None, None, None] * change).reshape(-1, 2, len(first)))
+
+    none = jnp.zeros((model.electrodes, 2, len(first)), model.dtype)
+    found: Array = jax.lax.fori_loop(0, -(-len(model.triangles) // batch), add, none)
+    return found
+
+
+def _frames(corners: Float[Array, "e 3 d"]) -> tuple[Float[Array, "e 2 d"], Float[Array, "e 3 2"]]:
+    """The orthonormal frame of each triangle, whose first axis points along the first edge, and the slopes of the
+    barycentric coordinates in it, 1/m."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length = jnp.sqrt(jnp.sum(first**2, 1, keepdims=True))
+    along = first / length
+    aside = second - jnp.sum(second * along, 1, keepdims=True) * along
+    height = jnp.sqrt(jnp.sum(aside**2, 1, keepdims=True))
+    frame = jnp.stack([along, aside / height], 1)
+    up = jnp.sum(second * along, 1, keepdims=True) / length
+    third = jnp.concatenate([jnp.zeros_like(height), 1 / height], 1)
+    middle = jnp.concatenate([1 / length, -up / height], 1)
+    return frame, jnp.stack([-third - middle, middle, third], 1)
