@@ -401,6 +401,8 @@ def test_tables_of_the_pages(root):
         },
         "start": {"rows": [{"start": "import jaxeit", **spread}]},
     }
+    stages = dict.fromkeys(("reading", "model and images", "fitting", "holding out", "all"), 0.125)
+    results["fit"] = {"end_to_end": [{"session": "bundled", "location": "no", "call": "later"} | stages]}
     rung = {"nodes": 1681, "voltage_error": 0.0018, "difference_error": 2e-4, "image": None}
     rung |= {name: {"median": 5.93e-3} for name in ("forward", "jacobian")}
     image = {"localisation": 1.234e-3, "frame": {"median": 6e-5}}
@@ -429,6 +431,7 @@ def test_tables_of_the_pages(root):
     assert "| **standard** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 | 1.23 | 0.06 |" in text["ladder"]
     assert "| **P1, 2 mm** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 |  |  |" in text["ladder"]
     assert "behind the front" not in text["ladder"]
+    assert "| bundled | no | later | 0.12 | 0.12 | 0.12 | 0.12 | 0.12 |" in text["calibration-seconds"]
     assert "| **standard** |" in text["ladder-chest"]
     assert "| at rest | 24 |  |  | 4,000 | 2,000 |" in text["event-scan"]
     assert "| none | 7 | 7 | 7 | 7 | 7 | 7 |" in text["effects"]

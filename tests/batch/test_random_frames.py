@@ -98,6 +98,7 @@ def _bytes(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
+@pytest.mark.slow
 def test_one_process_after_an_interruption_gives_the_same_bytes(scene, folder, tmp_path, monkeypatch, capsys):
     """After one of the first frames, and after one of frames that were to be added."""
     out = tmp_path / "one"

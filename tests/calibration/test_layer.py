@@ -168,6 +168,7 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker
     assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
 
 
+@pytest.mark.slow
 def test_calibrate_learns_from_all_its_sessions(tracker, bundled, tmp_path, monkeypatch, capsys):
     recipe = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft(), learn_layer=True)
     stages = []

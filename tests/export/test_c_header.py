@@ -350,6 +350,7 @@ def test_the_program_of_the_page(calibration, recorded, root, tmp_path):
     np.testing.assert_allclose(printed, np.where(np.isfinite(wanted), wanted, np.nan), atol=1e-3, rtol=1e-5)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_benchmark_runs(root):
     command = [sys.executable, "-m", "benchmarks.bench_firmware", "--smoke"]

@@ -48,6 +48,7 @@ def test_the_error_that_was_made_is_found(tracker, humble, presses):
     assert float(humble.filter.model_error) == pytest.approx(humble.settings.loads.model_error)
 
 
+@pytest.mark.slow
 def test_a_tracker_takes_no_error_of_the_model_for_a_second_contact(tracker, frame_of):
     """Each tip is a wide ring, which the model does not know."""
     angle = 2 * np.pi * np.arange(8) / 8

@@ -112,6 +112,7 @@ def test_places_decide_between_gain_inputs_and_nothing(tmp_path):
     assert calibrated(write_place_log(tmp_path / "even.h5", log), either).needs_place is False
 
 
+@pytest.mark.slow
 def test_a_pad_of_several_channels_whose_channels_see_the_place_differently(tmp_path):
     log, other = (place_log(k, channels=3, spread=0.3) for k in (4, 5))
     either = calib.Recipe(curve=Affine(), location=[None, GaussianProcess()])
