@@ -11,9 +11,10 @@ from .description import (
 )
 from .edges import BoundaryPatch
 from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
+from .patterns import adjacent, all_pairs, named_pattern, opposite, skip
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
-from .protocol import Protocol, ProtocolError, adjacent, reciprocal_rows
+from .protocol import Protocol, ProtocolError, reciprocal_rows
 from .rims import rim_electrodes
 from .rings import RingPatch
 
@@ -35,9 +36,13 @@ __all__ = [
     "RingPatch",
     "Skin",
     "adjacent",
+    "all_pairs",
     "load_skin",
+    "named_pattern",
+    "opposite",
     "parse_skin",
     "reciprocal_rows",
     "rim_electrodes",
     "shipped_skins",
+    "skip",
 ]

@@ -16,7 +16,8 @@ from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
 from .electrodes import ELECTRODES, AbstractElectrode
-from .protocol import Protocol, adjacent
+from .patterns import NAMES, named_pattern
+from .protocol import Protocol, ProtocolError
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +194,11 @@ def _protocol(table: TomlTable, electrodes: int) -> Protocol:
     if table.has("rows"):
         rows = table.array("rows", 4, "[[drive+, drive-, sense+, sense-], ...]")
     else:
-        table.choice("pattern", "adjacent")
-        rows = adjacent(electrodes)
+        name = table.get("pattern", lambda v: isinstance(v, str), NAMES)
+        try:
+            rows = named_pattern(name, electrodes)
+        except ProtocolError as error:
+            raise table.error("pattern", str(error)) from None
     current = table.positive("current", "the amplitude in A")
     frequency = table.number("frequency", "Hz, zero or more", 0.0)
     reading_time = table.number("reading_time", "s, zero or more", 1e-5)

@@ -236,26 +236,6 @@ def _checked_mixing(mixing: sp.csr_array, rows: int) -> sp.csr_array:
     return mixing
 
 
-def adjacent(electrodes: int) -> np.ndarray:
-    """Adjacent drive, adjacent four-terminal measurement, in rotating order.
-
-    Drive ``s`` joins electrodes ``s`` and ``s + 1``; its readings sense ``(m, m + 1)`` for
-    ``m = s + 2, ..., s + electrodes - 2``, all modulo the number of electrodes, so that no reading
-    shares an electrode with its drive: ``electrodes * (electrodes - 3)`` rows (550 for 25).
-
-    Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
-
-    Raises:
-        ProtocolError: for fewer than four electrodes.
-    """
-    if electrodes < 4:
-        raise ProtocolError(f"four-terminal readings need four electrodes; got {electrodes}")
-    drive = np.repeat(np.arange(electrodes), electrodes - 3)
-    sense = drive + np.tile(np.arange(2, electrodes - 1), electrodes)
-    return np.stack([drive, drive + 1, sense, sense + 1], 1).astype(np.int32) % electrodes
-
-
 def reciprocal_rows(pattern: np.ndarray) -> np.ndarray:
     """For each row, the row with drive and sense exchanged, or -1 where there is none: (readings,).
 

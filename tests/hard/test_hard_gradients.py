@@ -29,6 +29,7 @@ _PREPARES = "decides by looking at values, on the host, and says so under jit; w
 _INNER = "a part of the verbs above, in their cases, or in the tests of its own room"
 HOST = {
     "adjacent": _DESCRIBES,
+    "all_pairs": _DESCRIBES,
     "bind": "what it is given has",
     "compile_tracker": _PREPARES,
     "compiler_options": _DESCRIBES,
@@ -54,7 +55,9 @@ HOST = {
     "load_reconstructor": _DESCRIBES,
     "load_skin": _DESCRIBES,
     "make_mesh": _GEOMETRY,
+    "named_pattern": _DESCRIBES,
     "noise_covariance": _PREPARES,
+    "opposite": _DESCRIBES,
     "pad_masks": "geometry, on the host, and says so under jit",
     "pad_response": _GEOMETRY,
     "parse_skin": _DESCRIBES,
@@ -76,6 +79,7 @@ HOST = {
     **dict.fromkeys(("show_contacts", "show_image", "show_mesh", "show_sensitivity", "show_skin"), "draws a picture"),
     "shipped_skins": _DESCRIBES,
     "shortened": _DESCRIBES,
+    "skip": _DESCRIBES,
     "structured": _GEOMETRY,
     "to_numbers": _DESCRIBES,
     "triangulate": _GEOMETRY,

@@ -1,6 +1,7 @@
 """Skin files: what is read, and what is said about a wrong one."""
 
 import importlib.resources
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -41,6 +42,9 @@ def test_a_copied_and_edited_file(tmp_path):
         ("size = [0.2, 0.2]", "size = [0.2]", r"\[sheet\]: size: has 1 numbers"),
         ('kind = "bolt"', 'kind = "screw"', 'give one of "bolt"'),
         ('pattern = "adjacent"', "rows = [[0, 1, 2, 99]]", "names an electrode outside 0 to 24"),
+        ('pattern = "adjacent"', 'pattern = "adjacnt"', r"\[protocol\]: pattern: 'adjacnt' is no pattern; give \"adj"),
+        ('pattern = "adjacent"', 'pattern = "skip-12"', "pattern: pairs of 25 electrodes can skip 0 to 11, got 12"),
+        ('pattern = "adjacent"', "pattern = 3", "pattern: is 3; give"),
         ('pattern = "adjacent"', "rows = [[0, 0, 2, 3]]", "uses one electrode twice"),
         ("pitch = 0.04", "pitch = 0.06", "electrode 4 at .* lies outside the sheet"),
         ("current = 1e-3", "current = 0", "current"),
@@ -144,11 +148,39 @@ def test_wrong_patches_are_refused(lines, old, new, message):
         je.skin.parse_skin(_with_electrodes(lines.replace(old, new, 1)))
 
 
-def test_adjacent_never_senses_what_it_drives():
-    pattern = je.skin.adjacent(32)
-    assert pattern.shape == (32 * 29, 4)
+@pytest.mark.parametrize(
+    ("name", "readings", "drives"),
+    [("adjacent", 32 * 29, 32), ("skip-3", 32 * 29, 32), ("skip-14", 32 * 29, 32), ("opposite", 16 * 28, 16)],
+)
+def test_named_patterns_never_sense_what_they_drive(name, readings, drives):
+    pattern = je.skin.named_pattern(name, 32)
+    assert (pattern.shape, len(np.unique(pattern[:, :2], axis=0))) == ((readings, 4), drives)
     assert (pattern[:, :2, None] != pattern[:, None, 2:]).all()
-    assert (je.skin.reciprocal_rows(pattern) >= 0).all()
+    assert ((je.skin.reciprocal_rows(pattern) >= 0).all()) == (name != "opposite")
+    apart = (pattern[:, [1, 3]] - pattern[:, [0, 2]]) % 32
+    step = {"adjacent": 1, "skip-3": 4, "skip-14": 15, "opposite": 16}[name]
+    assert (apart == [step, 1 if name == "opposite" else step]).all()
+    assert len(np.unique(_without_order(pattern), axis=0)) == readings // (1 if name == "opposite" else 2)
+
+
+def _without_order(pattern):
+    """The same row for readings that differ by reciprocity or sign only."""
+    pairs = np.sort(pattern.reshape(-1, 2, 2), 2)
+    swap = (pairs[:, 0, 0] > pairs[:, 1, 0])[:, None, None]
+    return np.where(swap, pairs[:, ::-1], pairs).reshape(-1, 4)
+
+
+def test_all_pairs_are_every_reading_once():
+    pattern = je.skin.all_pairs(7)
+    every = list(permutations(range(7), 4))
+    np.testing.assert_array_equal(np.unique(_without_order(np.array(every)), axis=0), np.unique(pattern, axis=0))
+    assert len(pattern) == len(every) / 8
+    assert len(je.skin.all_pairs(25)) == 37_950
+
+
+def test_a_skin_file_names_its_pattern():
+    skin = je.skin.parse_skin(TEXT.replace('"adjacent"', '"skip-3"', 1))
+    np.testing.assert_array_equal(skin.protocol.pattern, je.skin.skip(25, 3))
 
 
 @pytest.mark.parametrize("current", [np.full(8, 1e-3), [1e-3]])
