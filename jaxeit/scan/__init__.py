@@ -1,7 +1,9 @@
-"""Which readings to take: choice of readings and event-driven scans."""
+"""Which readings to take: design of scans, choice of readings and event-driven scans."""
 
 from .covariance import around, signal_covariance
+from .design import CRITERIA, AbstractCriterion, PlaceVariance, PlaceVolume, ScanDesign, design_scan
 from .event_driven import EventScan, EventScanSettings, ScanState, prepare_event_scan
+from .place_sensitivity import DesignSettings, PlaceSensitivity, place_sensitivity
 from .selection import (
     AbstractSelection,
     Chosen,
@@ -16,18 +18,27 @@ from .selection import (
 )
 
 __all__ = [
+    "CRITERIA",
+    "AbstractCriterion",
     "AbstractSelection",
     "Chosen",
     "DOptimal",
+    "DesignSettings",
     "EventScan",
     "EventScanSettings",
+    "PlaceSensitivity",
+    "PlaceVariance",
+    "PlaceVolume",
+    "ScanDesign",
     "ScanState",
     "Sensitive",
     "Volume",
     "around",
     "choose_readings",
+    "design_scan",
     "drives",
     "in_frame",
+    "place_sensitivity",
     "prepare_event_scan",
     "scan_time",
     "shortened",

@@ -1,0 +1,216 @@
+"""What each four-terminal reading tells of the place of a contact, for contacts all over the sheet.
+
+A contact changes the conductivity of the sheet by ``sigma_0 a g(r - p; s)``, g a Gaussian bump of height one. Its place
+p is wanted; its strength a and width s are nuisances. By linearity and reciprocity each reading is a difference of four
+entries of the transfer matrix Z (`jaxeit.model.forward_model`), so that the sensitivities of *all* readings to a
+contact follow from one matrix of electrodes x electrodes for each unknown: the solver sees one drive per electrode.
+
+    M = prior + sum_i j_i j_i^T,       covariance of place = the 2 x 2 block of M^-1,
+
+with j_i the derivatives of reading i in units of its noise (Cramer-Rao, nuisances marginalised).
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Integer
+
+from .._compile import require_known, verb
+from ..budget import require
+from ..contacts.bump_responses import points_of
+from ..linalg import lapack
+from ..model.bases import Elements, Pixels
+from ..model.discretisation import Model
+from ..model.forward_model import coefficients, transfer
+from ..model.sensitivity import pair_jacobian
+from ..skin.protocol import ProtocolError
+
+UNKNOWNS = 4
+"""Unknowns of a contact: place x and y in units of its width, log strength, log width."""
+NOISE_DB = 60.0
+"""Default noise of a reading, below the rms of the readings of the skin's own scan."""
+
+
+@dataclass(frozen=True)
+class DesignSettings:
+    """The contacts and the noise for which a scan is designed.
+
+    | meaning                                                                        | default       | unit |
+    |--------------------------------------------------------------------------------|---------------|------|
+    | width: standard deviation of a contact                                         | 0.012         | m    |
+    | strength: relative change of conductivity at its centre                        | 0.25          |      |
+    | columns: sites along x, from rim to rim                                        | 8             |      |
+    | noise: standard deviation of each reading; None: 60 dB below the rms of the scan | None        | V    |
+    | relative: further noise of each reading, as part of its voltage                | 0             |      |
+    | strength_spread: standard deviation of log strength                            | 1             |      |
+    | width_spread: standard deviation of log width                                  | 0.3           |      |
+
+    Raises:
+        ProtocolError: for a value out of range.
+    """
+
+    width: float = 0.012
+    strength: float = 0.25
+    columns: int = 8
+    noise: float | None = None
+    relative: float = 0.0
+    strength_spread: float = 1.0
+    width_spread: float = 0.3
+
+    def __post_init__(self) -> None:
+        positive = ("width", "strength", "strength_spread", "width_spread", *(("noise",) if self.noise else ()))
+        for name in positive:
+            if not 0 < getattr(self, name) < np.inf:
+                raise ProtocolError(f"{name} is {getattr(self, name)}; give a number above 0")
+        if self.noise == 0:
+            raise ProtocolError("noise is 0 V; give a standard deviation above 0, or None")
+        if not 0 <= self.relative < np.inf:
+            raise ProtocolError(f"relative is {self.relative}; give 0 or more")
+        if not 1 <= self.columns <= 100:
+            raise ProtocolError(f"columns is {self.columns}; give 1 to 100 sites along x")
+
+
+class PlaceSensitivity(eqx.Module):
+    """Sensitivity of any reading to a contact at each of many sites; made by `place_sensitivity`.
+
+    | meaning                                                             | shape                           | unit |
+    |---------------------------------------------------------------------|---------------------------------|------|
+    | slopes: of the transfer matrix, times the current, for each unknown | (sites, 4, electrodes, electrodes) | V |
+    | transfer matrix of the untouched sheet, times the current           | (electrodes, electrodes)        | V    |
+    | sites                                                               | (sites, 2)                      | m    |
+    | width: unit of the unknown place                                    | ()                              | m    |
+    | noise, relative: see `DesignSettings`                               | ()                              | V, 1 |
+    | prior: precision of each unknown before a frame                     | (4,)                            |      |
+    """
+
+    slopes: Float[Array, "sites 4 electrodes electrodes"]
+    transfer: Float[Array, "electrodes electrodes"]
+    sites: Float[Array, "sites 2"]
+    width: Float[Array, ""]
+    noise: Float[Array, ""]
+    relative: Float[Array, ""]
+    prior: Float[Array, "4"]
+
+    @property
+    def electrodes(self) -> int:
+        """Number of electrodes."""
+        return self.transfer.shape[0]
+
+    @verb
+    def voltages(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, " readings"]:
+        """Readings of the untouched sheet, V."""
+        return _differences(self.transfer, jnp.asarray(pattern))
+
+    @verb
+    def rows(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, "sites 4 readings"]:
+        """Derivatives of readings with respect to the unknowns of a contact, in units of the noise of each reading."""
+        std = jnp.sqrt(self.noise**2 + (self.relative * self.voltages(pattern)) ** 2)
+        return _differences(self.slopes, jnp.asarray(pattern)) / std
+
+    def errors(
+        self, pattern: Integer[ArrayLike, "readings 4"], dead: Integer[ArrayLike, ""] | None = None
+    ) -> Float[Array, " sites"]:
+        """Expected error of the place of a contact at each site: root of the sum of both variances, m.
+
+        Args:
+            pattern: the readings of a frame.
+            dead: number of an electrode whose readings are left out.
+        """
+        return _errors(self, jnp.asarray(pattern), jnp.asarray(-1 if dead is None else dead))
+
+    def worst_dead(self, pattern: Integer[ArrayLike, "readings 4"]) -> tuple[int, float]:
+        """The electrode whose death costs most, and the rms over sites of `errors` without it, m."""
+        require_known("worst_dead", ProtocolError, pattern, self)
+        used = np.unique(np.asarray(pattern))
+        rms = [_rms(self.errors(pattern, dead)) for dead in used]
+        return int(used[np.argmax(rms)]), max(rms)
+
+
+@verb
+def _errors(
+    sensitivity: PlaceSensitivity, pattern: Integer[Array, "readings 4"], dead: Integer[Array, ""]
+) -> Float[Array, " sites"]:
+    rows = jnp.where(jnp.all(pattern != dead, 1), sensitivity.rows(pattern), 0)
+    covariance = inverse_information(jnp.einsum("sai,sbi->sab", rows, rows) + jnp.diag(sensitivity.prior))
+    return sensitivity.width * jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+
+
+def _rms(values: Float[Array, "..."]) -> float:
+    return float(jnp.sqrt(jnp.mean(values**2)))
+
+
+def _differences(
+    z: Float[Array, "... electrodes electrodes"], pattern: Integer[Array, "readings 4"]
+) -> Float[Array, "... readings"]:
+    source, sink, plus, minus = pattern.T
+    return z[..., plus, source] - z[..., minus, source] - z[..., plus, sink] + z[..., minus, sink]
+
+
+def inverse_information(information: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
+    """Covariance of all unknowns at each site."""
+
+    def solved(m: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+        return lapack.cho_solve(lapack.cho_factor(m, lower=True), jnp.eye(UNKNOWNS, dtype=m.dtype))
+
+    found: Array = jax.vmap(solved)(information)
+    return found
+
+
+def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> PlaceSensitivity:
+    """Sensitivity of every reading that the electrodes of a model can take, to contacts all over the sheet.
+
+    The current source and the amplifiers are ideal, and the sheet is the untouched one of the model. On a surface, the
+    contact is round in the flat sheet.
+
+    Args:
+        model: of a scene with the skin; its protocol sets the current and the default noise only.
+        settings: default `DesignSettings`.
+
+    Raises:
+        BudgetError: if the sensitivities need too much memory; a coarser fidelity needs less.
+    """
+    require_known("place_sensitivity", ProtocolError, model)
+    settings, electrodes = settings or DesignSettings(), model.electrodes
+    first, second = np.triu_indices(electrodes)
+    pixels = Pixels(settings.columns).on(model)
+    sites = np.asarray(pixels.centres)[np.asarray(pixels.areas) > 0.5 * np.max(np.asarray(pixels.areas))]
+    require(
+        "array_bytes", 8 * len(sites) * UNKNOWNS * electrodes**2, "place_sensitivity: sites times pairs of electrodes"
+    )
+    by_element = np.asarray(pair_jacobian(model, None, Elements().on(model), np.stack([first, second], 1)), float)
+    change = np.asarray(model.background, float)[:, None, None] * _bumps(model, sites, settings.width)
+    by_pair = float(model.current) * settings.strength * by_element @ change.reshape(len(change), -1)
+    slopes = np.zeros((len(sites) * UNKNOWNS, electrodes, electrodes))
+    slopes[:, first, second] = slopes[:, second, first] = by_pair.T
+    z = float(model.current) * np.asarray(transfer(model, coefficients(model, None)), float)
+    noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(_differences(jnp.asarray(z), model.pattern))
+    chart = np.asarray(model.chart)
+    extent = float(np.linalg.norm(np.ptp(chart, axis=0))) / settings.width  # a place is somewhere on the sheet
+    prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
+    numbers = (
+        slopes.reshape(len(sites), UNKNOWNS, *z.shape),
+        z,
+        sites,
+        settings.width,
+        noise,
+        settings.relative,
+        prior,
+    )
+    return PlaceSensitivity(*(jnp.asarray(number, model.dtype) for number in numbers))
+
+
+def _bumps(model: Model, sites: np.ndarray, width: float) -> np.ndarray:
+    """Mean over each element of a bump's derivatives with respect to the unknowns, (elements, sites, 4)."""
+    points, weights = points_of(model, width)
+    found = np.empty((len(points), len(sites), UNKNOWNS))
+    for site, place in enumerate(sites):
+        x, y = np.moveaxis((points - place) / width, -1, 0)
+        square = x**2 + y**2
+        found[:, site] = np.einsum(
+            "keq,q->ek", np.exp(-0.5 * square) * np.stack([x, y, np.ones_like(x), square]), weights
+        )
+    return found
