@@ -1,7 +1,7 @@
 """Which readings to take: design of scans, choice of readings and event-driven scans."""
 
 from .covariance import around, signal_covariance
-from .design import CRITERIA, AbstractCriterion, PlaceVariance, PlaceVolume, ScanDesign, design_scan
+from .design import CRITERIA, AbstractCriterion, PlaceError, PlaceVolume, ScanDesign, design_scan
 from .event_driven import EventScan, EventScanSettings, ScanState, prepare_event_scan
 from .place_sensitivity import DesignSettings, PlaceSensitivity, place_sensitivity
 from .selection import (
@@ -26,8 +26,8 @@ __all__ = [
     "DesignSettings",
     "EventScan",
     "EventScanSettings",
+    "PlaceError",
     "PlaceSensitivity",
-    "PlaceVariance",
     "PlaceVolume",
     "ScanDesign",
     "ScanState",

@@ -52,24 +52,29 @@ class AbstractCriterion(eqx.Module):
         """The mean of h as an error of place, in widths."""
 
 
-class PlaceVariance(AbstractCriterion):
-    """A-optimal: h is the sum of both variances of place, to a power; larger powers look at the worst sites."""
+class PlaceError(AbstractCriterion):
+    """h is a power of the error of place, the root of the sum of both variances.
 
-    name: ClassVar[str] = "a-optimal"
+    A power of 1 is the mean error over sites, 2 the mean variance (A-optimal); a larger one looks at the worst sites. h
+    is convex for every power, since the inverse of the sum of variances is concave in the information.
+    """
+
+    name: ClassVar[str] = "place-error"
     power: float = eqx.field(default=1.0, static=True)
 
     def __check_init__(self) -> None:
-        if not 1 <= self.power <= 20:
-            raise ProtocolError(f"power is {self.power}; give 1 (the mean over sites) to 20 (the worst site)")
+        if not 0 < self.power <= 40:
+            raise ProtocolError(f"power is {self.power}; give a number above 0, up to 40 (the worst site)")
 
     def after(self, place: Float[Array, "2 2"], change: Float[Array, " k"]) -> Float[Array, " k"]:
-        return jnp.maximum(jnp.trace(place) + change, 0) ** self.power
+        return jnp.maximum(jnp.trace(place) + change, 0) ** (0.5 * self.power)
 
     def metric(self, place: Float[Array, "2 2"]) -> tuple[Float[Array, ""], Float[Array, "2 2"]]:
-        return self.power * jnp.trace(place) ** (self.power - 1), jnp.eye(2, dtype=place.dtype)
+        half = 0.5 * self.power
+        return half * jnp.trace(place) ** (half - 1), jnp.eye(2, dtype=place.dtype)
 
     def length(self, mean: float) -> float:
-        return float(max(mean, 0.0) ** (0.5 / self.power))
+        return float(max(mean, 0.0) ** (1 / self.power))
 
 
 class PlaceVolume(AbstractCriterion):
@@ -101,7 +106,7 @@ class ScanDesign(NamedTuple):
     | meaning                                                                              | shape         | unit |
     |--------------------------------------------------------------------------------------|---------------|------|
     | pattern: the readings, each pair driven once, untouched readings above zero          | (readings, 4) |      |
-    | error: of place in the measure of the criterion (`PlaceVariance()`: rms over sites)  | ()            | m    |
+    | error: of place in the measure of the criterion (`PlaceError()`: mean over sites)  | ()            | m    |
     | bound: no scan of so many different candidates, and drives, has a smaller error      | ()            | m    |
     """
 
@@ -141,7 +146,7 @@ def design_scan(
     Args:
         sensitivity: of the skin, from `place_sensitivity`.
         readings: time of a frame over the time of a reading; without ``switch`` the number of readings.
-        criterion: default `PlaceVariance`.
+        criterion: default `PlaceError`.
         candidates: readings that the hardware can take; default `jaxeit.skin.all_pairs`. Drive and sense of a candidate
             may be exchanged, which by reciprocity leaves the reading as it is.
         switch: cost of a change of the driven pair, in readings. Several numbers of driven pairs are tried.
@@ -153,7 +158,7 @@ def design_scan(
     """
     require_known("design_scan", ProtocolError, sensitivity, candidates)
     pattern = np.asarray(all_pairs(sensitivity.electrodes) if candidates is None else candidates)
-    criterion = criterion or PlaceVariance()
+    criterion = criterion or PlaceError()
     if not 0 <= switch < np.inf:
         raise ProtocolError(f"switch is {switch}; give the settling time over the time of a reading, 0 or more")
     if not 1 <= readings <= len(pattern):

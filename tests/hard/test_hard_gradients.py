@@ -89,6 +89,7 @@ HOST = {
     "Cylinder": _GEOMETRY,
     "Plane": _GEOMETRY,
     "Sphere": _GEOMETRY,
+    "with_rows": _DESCRIBES,
     "verb": "a decorator",
     "AbstractEstimator": "an abstract base of cases",
     "AbstractReconstructor": "an abstract base of cases",

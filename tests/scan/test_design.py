@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.scan import CRITERIA, DesignSettings, PlaceVariance, PlaceVolume, design_scan, place_sensitivity
+from jaxeit.scan import CRITERIA, DesignSettings, PlaceError, PlaceVolume, design_scan, place_sensitivity
 
 from ..helpers import square_model
 
 POINTS = [(0.05, 0.05), (0.15, 0.05), (0.15, 0.15), (0.05, 0.15), (0.1, 0.1), (0.1, 0.0)]
 EVERY = je.skin.all_pairs(6)
+A_OPTIMAL = PlaceError(2.0)
 SETTINGS = DesignSettings(columns=2, noise=1e-5, width=0.04)
 
 
@@ -74,8 +75,8 @@ def test_errors_are_those_of_the_inverse_information(sensitivity):
 
 
 FIGURES = {
-    "a-optimal": lambda place: np.sqrt(np.trace(place, axis1=-2, axis2=-1).mean(-1)),
-    "a-optimal:power=3": lambda place: (np.trace(place, axis1=-2, axis2=-1) ** 3).mean(-1) ** (1 / 6),
+    "place-error": lambda place: np.sqrt(np.trace(place, axis1=-2, axis2=-1)).mean(-1),
+    "place-error:power=6": lambda place: (np.trace(place, axis1=-2, axis2=-1) ** 3).mean(-1) ** (1 / 6),
     "d-optimal": lambda place: np.sqrt(2) * np.exp(0.25 * np.log(np.linalg.det(place)).mean(-1)),
 }
 
@@ -95,7 +96,7 @@ def test_a_design_is_near_the_best_of_all_subsets_and_its_bound_holds(sensitivit
 
 
 def test_a_design_for_a_dead_electrode_loses_less_without_it(sensitivity):
-    whole, careful = (design_scan(sensitivity, 12, any_dead=dead) for dead in (False, True))
+    whole, careful = (design_scan(sensitivity, 12, A_OPTIMAL, any_dead=dead) for dead in (False, True))
     assert sensitivity.worst_dead(careful.pattern)[1] < sensitivity.worst_dead(whole.pattern)[1]
     assert whole.error <= float(jnp.sqrt(jnp.mean(sensitivity.errors(careful.pattern) ** 2)))
     cases = [sensitivity.errors(careful.pattern, dead) for dead in (None, *range(6))]
@@ -106,7 +107,7 @@ def test_a_design_for_a_dead_electrode_loses_less_without_it(sensitivity):
 def test_a_hundred_readings_tell_more_than_the_whole_adjacent_scan(testbed, skin):
     """Of a seventh of all, which takes less time; each change of drive at the cost of ten readings: few drives."""
     adjacent = testbed.errors(skin.protocol.pattern)
-    found = design_scan(testbed, 100, candidates=je.skin.all_pairs(25)[::7])
+    found = design_scan(testbed, 100, A_OPTIMAL, candidates=je.skin.all_pairs(25)[::7])
     assert found.bound <= found.error < 1.02 * found.bound
     assert found.error < 0.75 * float(jnp.sqrt(jnp.mean(adjacent**2)))
     assert (np.asarray(testbed.voltages(found.pattern)) >= 0).all()
@@ -126,7 +127,7 @@ def test_a_hundred_readings_tell_more_than_the_whole_adjacent_scan(testbed, skin
         (lambda s: design_scan(s, 46), "readings is 46, and there are 45 candidates"),
         (lambda s: design_scan(s, 10, switch=-1.0), "switch is -1.0; give"),
         (lambda s: design_scan(s, 10, switch=20.0), "over before one drive has settled"),
-        (lambda s: PlaceVariance(0.5), "power is 0.5; give 1"),
+        (lambda s: PlaceError(0.0), "power is 0.0; give a number"),
         (lambda s: DesignSettings(width=0.0), "width is 0.0; give a number above 0"),
         (lambda s: DesignSettings(noise=0.0), "noise is 0 V"),
         (lambda s: DesignSettings(relative=-1.0), "relative is -1.0"),

@@ -195,3 +195,34 @@ def test_what_is_not_text_or_cannot_be_read_is_named(tmp_path):
     (tmp_path / "skin.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(je.toml.TomlError, match=r"skin\.toml: is not text; give a TOML file"):
         read_text(tmp_path / "skin.toml")
+
+
+ROWS = np.array([[0, 6, 1, 7], [0, 6, 12, 18], [3, 9, 4, 10]])
+
+
+@pytest.mark.parametrize(
+    "scan", ['pattern = "adjacent"', "rows = [\n  [0, 1, 2, 3],  # [the] first ]\n  [4, 5, 6, 7]\n]"]
+)
+def test_a_skin_with_other_rows_keeps_all_other_lines(tmp_path, scan):
+    skin = je.skin.parse_skin(TEXT.replace('pattern = "adjacent"', scan, 1))
+    path = tmp_path / "other.toml"
+    path.write_text(je.skin.with_rows(skin, ROWS).toml)
+    other = je.load_skin(path)
+    np.testing.assert_array_equal(other.protocol.pattern, ROWS)
+    gone = set(skin.toml.splitlines()) - set(other.toml.splitlines())
+    assert len(gone) == len(scan.splitlines())
+    np.testing.assert_array_equal(
+        je.skin.with_rows(other, skin.protocol.pattern).protocol.pattern, skin.protocol.pattern
+    )
+
+
+def test_a_text_whose_rows_cannot_be_replaced_is_refused():
+    skin = je.skin.parse_skin(TEXT)
+    with pytest.raises(je.toml.TomlError, match=r"no text with a table \[protocol\]"):
+        je.skin.with_rows(je.Skin("bare", skin.domain, 1.0, skin.electrodes, skin.protocol), ROWS)
+    table = TEXT.index("[protocol]"), TEXT.index("[pressure_sensor]")
+    inline = 'protocol = {pattern = "adjacent", current = 1e-3}\n' + TEXT[: table[0]] + TEXT[table[1] :]
+    with pytest.raises(je.toml.TomlError, match=r"no text with a table \[protocol\]"):
+        je.skin.with_rows(je.skin.parse_skin(inline), ROWS)
+    with pytest.raises(je.skin.ProtocolError, match="outside 0 to 24"):
+        je.skin.with_rows(skin, ROWS + 10)
