@@ -144,7 +144,7 @@ def _channels(report: CheckReport, verbose: bool) -> Iterator[str]:
     yield (
         f"EIT      {len(table)} readings, {table.frames} frames without contact: "
         f"median SNR {_number(_median(table.snr), '.1f')} dB, "
-        f"reciprocity error {_percent(_median(table.reciprocity))}"
+        f"{_reciprocity(table)}"
     )
     yield (
         f"         {table.dead.sum()} dead, {table.saturated.sum()} saturated, "
@@ -159,6 +159,12 @@ def _channels(report: CheckReport, verbose: bool) -> Iterator[str]:
     rows = np.arange(len(table)) if verbose else worst(table)
     title = "  all readings" if verbose else f"  the worst {len(rows)} of the working ones (all: --all)"
     yield from _table(title, CHANNEL_COLUMNS, [_channel(table, int(i)) for i in rows])
+
+
+def _reciprocity(table: ChannelTable) -> str:
+    if (table.partner < 0).all():
+        return "reciprocity not tested: no two readings exchange drive and sense"
+    return f"reciprocity error {_percent(_median(table.reciprocity))}"
 
 
 CHANNEL_COLUMNS = ("  reading", "drive", "sense", "mean mV", "SNR dB", "reciprocity", "missing", "")
