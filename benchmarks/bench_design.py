@@ -3,8 +3,8 @@
 Single presses of 8 N by a 20 mm tip at places all over the testbed, simulated on another mesh than the one on which
 scans are designed and contacts found; every reading of all scans has the same noise, 60 dB below the rms of the shipped
 scan's readings. "Bound": the mean error that `place_sensitivity` expects at the sites of the design, over the whole
-sheet, for contacts of 25 % and a width of 12 mm; the presses are 15 mm or more from the rim. "Dead": the readings of one
-electrode are left out, that which costs most.
+sheet, for contacts of 25 % and a width of 12 mm; the presses are 15 mm or more from the rim. "Dead": readings of one
+electrode are left out, of the one that costs most.
 """
 
 from collections.abc import Iterator

@@ -157,6 +157,7 @@ def train_on_random_scenes(axes: Any, names: Names) -> None:
 
 DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "bending": lambda axes, n: _bars(axes, {k: 100 * v for k, v in n["changes"].items()}, "change of the readings, %"),
+    "design_a_scan": lambda axes, n: _bars(axes, n["errors"], "expected error of place, mm"),
     "electrodes_that_move": electrodes_that_move,
     "forces_of_a_session": forces_of_a_session,
     "gradient_of_a_loss": gradient_of_a_loss,

@@ -103,11 +103,13 @@ CRITERIA: Registry[AbstractCriterion] = Registry(AbstractCriterion, "criterion",
 class ScanDesign(NamedTuple):
     """The readings of a designed scan.
 
+    Without ``switch`` the bound holds for all driven pairs, with it for those that the design drives.
+
     | meaning                                                                              | shape         | unit |
     |--------------------------------------------------------------------------------------|---------------|------|
     | pattern: the readings, each pair driven once, untouched readings above zero          | (readings, 4) |      |
     | error: of place in the measure of the criterion (`PlaceError()`: mean over sites)  | ()            | m    |
-    | bound: no scan of so many different candidates, and drives, has a smaller error      | ()            | m    |
+    | bound: no so many different candidates of these driven pairs have a smaller error    | ()            | m    |
     """
 
     pattern: np.ndarray
@@ -287,7 +289,6 @@ def _summed_forms(cases: _Cases, forms: Float[Array, "sites cases 4 4"]) -> Floa
     return jnp.sum(total * cases.alive, 0)
 
 
-@verb
 def _changes(
     criterion: AbstractCriterion, cases: _Cases, covariance: Float[Array, "sites cases 4 4"], sign: float
 ) -> Float[Array, " candidates"]:
@@ -316,27 +317,30 @@ def _exchanged(
     progress: Callable[[Iterable[Any]], Iterable[Any]],
 ) -> tuple[np.ndarray, float]:
     """The readings after exchanges, and the mean of h."""
-    mean = np.inf
+    now, best = jnp.asarray(taken), np.inf
     for _ in progress(range(2 * len(taken))):
-        covariance = _of_taken(cases, jnp.asarray(taken))
-        before, mean = mean, float(_forms(criterion, covariance)[0])
-        if before - mean <= MIN_GAIN * abs(mean) or len(taken) == cases.rows.shape[2]:
+        mean, after = _exchange(criterion, cases, now)
+        if best - float(mean) <= MIN_GAIN * abs(float(mean)):
             break
-        worth = np.asarray(_changes(criterion, cases, covariance, 1.0)).copy()
-        worth[taken] = np.inf
-        more = np.append(taken, np.argmin(worth))
-        loss = _changes(criterion, cases.only(more), _of_taken(cases, jnp.asarray(more)), -1.0)
-        out = int(np.argmin(np.asarray(loss)))
-        if out == len(taken):
-            break
-        taken = np.delete(more, out)
-    return taken, mean
+        taken, best, now = np.asarray(now), float(mean), after
+    return taken, best
 
 
 @verb
-def _of_taken(cases: _Cases, taken: Int[Array, " count"]) -> Float[Array, "sites cases 4 4"]:
-    part = cases.only(taken)
-    return _covariance(part, jnp.ones(len(taken), cases.rows.dtype))
+def _exchange(
+    criterion: AbstractCriterion, cases: _Cases, taken: Int[Array, " count"]
+) -> tuple[Float[Array, ""], Int[Array, " count"]]:
+    """The mean of h for the readings taken, and the readings after the best one has come in and the least has gone."""
+
+    def of(rows: Int[Array, " k"]) -> tuple[_Cases, Float[Array, "sites cases 4 4"]]:
+        part = cases.only(rows)
+        return part, _covariance(part, jnp.ones(len(rows), cases.rows.dtype))
+
+    _, covariance = of(taken)
+    worth = _changes(criterion, cases, covariance, 1.0).at[taken].set(jnp.inf)
+    more = jnp.append(taken, jnp.argmin(worth).astype(taken.dtype))
+    out = jnp.argmin(_changes(criterion, *of(more), -1.0))
+    return _forms(criterion, covariance)[0], more.at[out].set(more[-1])[:-1]
 
 
 def cover(

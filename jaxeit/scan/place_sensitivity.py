@@ -11,6 +11,7 @@ with j_i the derivatives of reading i in units of its noise (Cramer-Rao, nuisanc
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,12 +24,13 @@ from .._compile import require_known, verb
 from ..budget import require
 from ..contacts.bump_responses import points_of
 from ..linalg import lapack
-from ..model.bases import Elements, Pixels
+from ..model.bases import BasisMap, Elements, Pixels
 from ..model.discretisation import Model
 from ..model.forward_model import coefficients, transfer
 from ..model.sensitivity import pair_jacobian
 from ..skin.protocol import ProtocolError
 
+Numbers = np.ndarray | Array
 UNKNOWNS = 4
 """Unknowns of a contact: place x and y in units of its width, log strength, log width."""
 NOISE_DB = 60.0
@@ -103,13 +105,15 @@ class PlaceSensitivity(eqx.Module):
     @verb
     def voltages(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, " readings"]:
         """Readings of the untouched sheet, V."""
-        return _differences(self.transfer, jnp.asarray(pattern))
+        found: Array = _differences(self.transfer, jnp.asarray(pattern))
+        return found
 
     @verb
     def rows(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, "sites 4 readings"]:
         """Derivatives of readings with respect to the unknowns of a contact, in units of the noise of each reading."""
         std = jnp.sqrt(self.noise**2 + (self.relative * self.voltages(pattern)) ** 2)
-        return _differences(self.slopes, jnp.asarray(pattern)) / std
+        found: Array = _differences(self.slopes, jnp.asarray(pattern)) / std
+        return found
 
     def errors(
         self, pattern: Integer[ArrayLike, "readings 4"], dead: Integer[ArrayLike, ""] | None = None
@@ -139,13 +143,12 @@ def _errors(
     return sensitivity.width * jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
 
 
-def _rms(values: Float[Array, "..."]) -> float:
-    return float(jnp.sqrt(jnp.mean(values**2)))
+def _rms(values: Numbers) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
 
 
-def _differences(
-    z: Float[Array, "... electrodes electrodes"], pattern: Integer[Array, "readings 4"]
-) -> Float[Array, "... readings"]:
+def _differences(z: Numbers, pattern: Numbers) -> Any:
+    """Readings (..., readings) of a pattern from matrices (..., electrodes, electrodes)."""
     source, sink, plus, minus = pattern.T
     return z[..., plus, source] - z[..., minus, source] - z[..., plus, sink] + z[..., minus, sink]
 
@@ -181,13 +184,15 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
     require(
         "array_bytes", 8 * len(sites) * UNKNOWNS * electrodes**2, "place_sensitivity: sites times pairs of electrodes"
     )
-    by_element = np.asarray(pair_jacobian(model, None, Elements().on(model), np.stack([first, second], 1)), float)
     change = np.asarray(model.background, float)[:, None, None] * _bumps(model, sites, settings.width)
-    by_pair = float(model.current) * settings.strength * by_element @ change.reshape(len(change), -1)
+    pairs, change = np.stack([first, second], 1), change.reshape(len(change), -1).astype(model.dtype)
+    by_pair, transferred = _solved(model, Elements().on(model), pairs, change)
     slopes = np.zeros((len(sites) * UNKNOWNS, electrodes, electrodes))
-    slopes[:, first, second] = slopes[:, second, first] = by_pair.T
-    z = float(model.current) * np.asarray(transfer(model, coefficients(model, None)), float)
-    noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(_differences(jnp.asarray(z), model.pattern))
+    slopes[:, first, second] = slopes[:, second, first] = (
+        settings.strength * float(model.current) * np.asarray(by_pair).T
+    )
+    z = float(model.current) * np.asarray(transferred, float)
+    noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(_differences(z, np.asarray(model.pattern)))
     chart = np.asarray(model.chart)
     extent = float(np.linalg.norm(np.ptp(chart, axis=0))) / settings.width  # a place is somewhere on the sheet
     prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
@@ -201,6 +206,14 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
         prior,
     )
     return PlaceSensitivity(*(jnp.asarray(number, model.dtype) for number in numbers))
+
+
+@verb
+def _solved(
+    model: Model, image: BasisMap, pairs: Integer[ArrayLike, "pairs 2"], change: Float[ArrayLike, "elements k"]
+) -> tuple[Float[Array, "pairs k"], Float[Array, "electrodes electrodes"]]:
+    """Changes of entries of the transfer matrix by changes of the conductivity, and the matrix."""
+    return pair_jacobian(model, None, image, pairs) @ change, transfer(model, coefficients(model, None))
 
 
 def _bumps(model: Model, sites: np.ndarray, width: float) -> np.ndarray:

@@ -1,0 +1,105 @@
+"""`jaxeit design`: the skin it writes, and a session that is simulated and checked with it."""
+
+import re
+
+import numpy as np
+import pytest
+
+import calib
+import jaxeit as je
+from calib.cli import main
+
+SKIN = """
+format = "jaxeit-skin"
+version = 1
+name = "mine"          # a comment that stays
+
+[sheet]
+shape = "rectangle"
+size = [0.12, 0.08]
+sheet_resistance = 150.0
+
+[electrodes]
+kind = "point"
+positions = [[0.02, 0.02], [0.06, 0.02], [0.1, 0.02], [0.1, 0.06], [0.06, 0.06], [0.02, 0.06]]
+
+[protocol]
+pattern = "adjacent"   # eighteen readings
+current = 1e-3
+
+[[pads]]
+name = "all"
+rectangle = [0.0, 0.0, 0.12, 0.08]
+"""
+SCENE = """
+format = "jaxeit-scene"
+version = 1
+title = "designed"
+skin = "better.toml"
+seed = 1
+
+[bench]
+columns = 2
+rows = 2
+margin = 0.025
+forces = [8.0]
+blank = 3.0
+rest = 1.0
+ramp = 0.2
+hold = 1.0
+release = 0.2
+recovery = 0.5
+eit_rate = 20.0
+pad_rate = 50.0
+
+[[effects]]
+type = "ContactPiezoresistance"
+
+[[effects]]
+type = "Noise"
+stream = "eit"
+std = 1e-5
+"""
+
+
+def test_a_designed_skin_is_simulated_and_checked(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(SKIN)
+    assert main(["design", "mine.toml", "-o", "better.toml", "--readings", "12", "--picture", "map.png"]) == 0
+    told = capsys.readouterr().out
+    better = je.load_skin("better.toml")
+    assert better.protocol.readings == 12
+    assert '"mine"          # a comment that stays' in better.toml
+    before, after = map(float, re.search(r"error of place, mean, mm +(\S+) +(\S+)", told).groups())
+    assert after < before
+    bound = float(re.search(r"less than (\S+) mm", told)[1])
+    assert bound <= float(re.search(r"by the criterion (\S+) mm", told)[1])
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    assert main(["simulate", "scene.toml", "-o", "session.h5"]) == 0
+    assert main(["check", "session.h5"]) == 0
+    told = capsys.readouterr().out
+    assert "reciprocity not tested" in told
+    assert "Nothing wrong was found" in told
+    with calib.open_session("session.h5") as session:
+        np.testing.assert_array_equal(je.skin.parse_skin(session.skin_toml).protocol.pattern, better.protocol.pattern)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--readings", "46"], "there are 45 candidates"),
+        (["--rate", "1e6"], "a reading alone takes 1e-05 s; give a lower rate"),
+        (["--criterion", "best"], 'no criterion \'best\'; give one of "place-error", "d-optimal"'),
+        (["--criterion", "place-error:power=-1"], "power"),
+        (["--readings", "9", "--switch", "9"], "before one drive has settled"),
+    ],
+)
+def test_a_wrong_design_is_one_line(tmp_path, monkeypatch, capsys, options, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(SKIN)
+    assert main(["design", "mine.toml", "-o", "better.toml", *options]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "better.toml").exists()
