@@ -1,9 +1,9 @@
 """Which readings to take: design of scans, choice of readings and event-driven scans."""
 
+from .contact_information import DesignSettings, PlaceSensitivity, place_sensitivity
 from .covariance import around, signal_covariance
 from .design import CRITERIA, AbstractCriterion, PlaceError, PlaceVolume, ScanDesign, design_scan
 from .event_driven import EventScan, EventScanSettings, ScanState, prepare_event_scan
-from .place_sensitivity import DesignSettings, PlaceSensitivity, place_sensitivity
 from .selection import (
     AbstractSelection,
     Chosen,

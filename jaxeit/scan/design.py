@@ -27,7 +27,7 @@ from ..budget import require
 from ..registry import Registry
 from ..skin.patterns import all_pairs
 from ..skin.protocol import ProtocolError
-from .place_sensitivity import UNKNOWNS, PlaceSensitivity, inverse_information
+from .contact_information import UNKNOWNS, PlaceSensitivity, inverse_information
 
 ITERATIONS, TOLERANCE = 300, 5e-3  # of the weights: at most so many, or until the gap is this part of h
 MIN_GAIN = 1e-4  # part of h by which an exchange must lower it
@@ -146,7 +146,7 @@ def design_scan(
     """The readings that tell most of the place of a contact anywhere on the sheet, in a given time of a frame.
 
     Args:
-        sensitivity: of the skin, from `place_sensitivity`.
+        sensitivity: of the skin, from .contact_information`.
         readings: time of a frame over the time of a reading; without ``switch`` the number of readings.
         criterion: default `PlaceError`.
         candidates: readings that the hardware can take; default `jaxeit.skin.all_pairs`. Drive and sense of a candidate
