@@ -108,7 +108,7 @@ class EventScanSettings:
     | onset: change of pressure at which a contact begins, one for all pads or (pads,) |               | Pa       |
     | release: change of pressure at which a contact ends, as onset                    | half of onset | Pa       |
     | idle: readings of a frame at rest                                                | 24            |          |
-    | local: readings for a pad, or for the surroundings of a contact                  | 80            |          |
+    | local: readings for a pad, or for the surroundings of a contact; at most all     | 80            |          |
     | every: frames from one whole scan to the next                                    | 50            |          |
     | radius: of the surroundings of a contact (`around`)                              | 0.03          | m        |
     | switch: cost of a change of the driven pair, as for `choose_readings`            | 0             | readings |
@@ -194,7 +194,7 @@ def prepare_event_scan(
     for name, (regions, count) in kinds.items():
         covariances = (expected(region.astype(model.dtype)) for region in regions)
         choices = [
-            choose_readings(k, count, settings.selection, pattern=model.pattern, switch=settings.switch)
+            choose_readings(k, min(count, len(k)), settings.selection, pattern=model.pattern, switch=settings.switch)
             for k in covariances
         ]
         rows = [choice.rows for choice in choices]

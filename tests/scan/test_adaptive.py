@@ -225,6 +225,15 @@ def test_an_event_scan_that_makes_no_sense(model, skin, settings, said):
         je.scan.prepare_event_scan(model, skin, je.scan.EventScanSettings(**settings))
 
 
+def test_a_short_scan_has_no_more_readings_than_it_has(model, skin, pixels):
+    few = skin.protocol.pattern[::25]
+    short = je.Skin("short", skin.domain, 150.0, skin.electrodes, je.Protocol(few), skin.pads)
+    settings = je.scan.EventScanSettings(onset=200.0, radius=0.1)
+    scan = je.scan.prepare_event_scan(eqx.tree_at(lambda m: m.pattern, model, few), short, settings, basis=pixels)
+    assert scan.by_pad.shape == (4, 22)
+    assert scan.by_pad.all()
+
+
 def test_an_event_scan_needs_pads(model, skin):
     bare = je.Skin("bare", skin.domain, skin.sheet_resistance, skin.electrodes, skin.protocol)
     with pytest.raises(je.skin.ProtocolError, match="has no pads"):
