@@ -26,10 +26,13 @@ from .._compile import require_known, verb
 from ..budget import require
 from ..registry import Registry
 from ..skin.patterns import all_pairs
-from ..skin.protocol import ProtocolError
+from ..skin.protocol import Protocol, ProtocolError
 from .contact_information import UNKNOWNS, PlaceSensitivity, inverse_information
 
-ITERATIONS, TOLERANCE = 300, 5e-3  # of the weights: at most so many, or until the gap is this part of h
+ITERATIONS, TOLERANCE = (
+    300,
+    4e-3,
+)  # of the weights: at most so many, or until the bound is so near, as part of the error
 MIN_GAIN = 1e-4  # part of h by which an exchange must lower it
 UPPER = np.triu_indices(UNKNOWNS)
 
@@ -146,7 +149,7 @@ def design_scan(
     """The readings that tell most of the place of a contact anywhere on the sheet, in a given time of a frame.
 
     Args:
-        sensitivity: of the skin, from .contact_information`.
+        sensitivity: of the skin, from `place_sensitivity`.
         readings: time of a frame over the time of a reading; without ``switch`` the number of readings.
         criterion: default `PlaceError`.
         candidates: readings that the hardware can take; default `jaxeit.skin.all_pairs`. Drive and sense of a candidate
@@ -159,7 +162,8 @@ def design_scan(
         ProtocolError: for too few readings or candidates.
     """
     require_known("design_scan", ProtocolError, sensitivity, candidates)
-    pattern = np.asarray(all_pairs(sensitivity.electrodes) if candidates is None else candidates)
+    given = all_pairs(sensitivity.electrodes) if candidates is None else np.asarray(candidates)
+    pattern = Protocol(given).check(sensitivity.electrodes).pattern
     criterion = criterion or PlaceError()
     if not 0 <= switch < np.inf:
         raise ProtocolError(f"switch is {switch}; give the settling time over the time of a reading, 0 or more")
@@ -180,7 +184,7 @@ def design_scan(
     for count in _drive_counts(pattern, weights, readings, switch):
         kept, left = np.arange(len(pattern)), int(readings - switch * count)
         if switch:
-            kept = np.flatnonzero(cover(pattern, weights, count) >= 0)
+            kept = np.flatnonzero(cover(pattern, weights, count)[0] >= 0)
             left = min(left, len(kept))
         part, start = whole.only(kept), weights[kept]
         if switch:
@@ -197,9 +201,9 @@ def _drive_counts(pattern: np.ndarray, weights: np.ndarray, readings: int, switc
     """Numbers of driven pairs to try: those that leave a fifth to nine tenths of a frame's time for readings."""
     if not switch:
         return [0]
-    counts = np.unique(np.floor(readings * np.array([0.1, 0.2, 0.35, 0.5, 0.65, 0.8]) / switch).astype(int))
-    most = int(cover(pattern, weights > 0.5).max(initial=0)) + 1
-    return sorted({int(min(max(count, 1), max(most, 1))) for count in counts})
+    most = min(len(cover(pattern, weights > 0.5)[1]), int((readings - 1) / switch))
+    counts = np.floor(readings * np.array([0.1, 0.2, 0.35, 0.5, 0.65, 0.8]) / switch)
+    return sorted({int(count) for count in np.clip(counts, 1, max(most, 1))})
 
 
 def _relaxed(
@@ -218,7 +222,7 @@ def _relaxed(
     for _ in progress(range(ITERATIONS)):
         after, mean, gap = _step(criterion, cases, weights, count)
         bound = max(bound, float(mean - gap))
-        if mean - bound <= TOLERANCE * max(abs(float(mean)), 1.0 if isinstance(criterion, PlaceVolume) else 0.0):
+        if criterion.length(bound) >= (1 - TOLERANCE) * criterion.length(float(mean)):
             break
         weights = after
     return np.asarray(weights), bound
@@ -345,42 +349,34 @@ def _exchange(
 
 def cover(
     pattern: np.ndarray, weights: Float[np.ndarray, " k"] | Bool[np.ndarray, " k"], most: int | None = None
-) -> Int[np.ndarray, " k"]:
-    """For each reading, the number of the driven pair that takes it, as drive or by reciprocity as sense; -1: none.
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "drives 2"]]:
+    """For each reading the number of the driven pair that takes it, as drive or by reciprocity as sense; and the pairs.
 
-    Pairs are taken one by one, each time the one of the largest weight of readings not yet covered, until readings with
-    a weight are covered or ``most`` pairs are taken.
+    Pairs are taken one by one, each time the one of the largest weight of readings not yet covered, until all readings
+    with a weight are covered or ``most`` pairs are taken. A reading that is not covered has the number -1.
     """
-    pairs = np.sort(pattern.reshape(-1, 2, 2), 2)
     size = int(pattern.max()) + 1
-    ends = pairs[..., 0] * size + pairs[..., 1]
+    ends = np.sort(pattern.reshape(-1, 2, 2), 2) @ [size, 1]
     found, left = np.full(len(pattern), -1), np.asarray(weights, float).copy()
-    for number in range(len(pattern) if most is None else most):
-        if not left.any():
-            break
-        best = np.argmax(sum(np.bincount(ends[:, end], left, minlength=size**2) for end in (0, 1)))
+    taken: list[tuple[int, int]] = []
+    while left.any() and len(taken) < (len(pattern) if most is None else most):
+        best = int(np.argmax(sum(np.bincount(ends[:, end], left, minlength=size**2) for end in (0, 1))))
         new = (ends == best).any(1) & (found < 0)
-        found[new], left[new] = number, 0
-    return found
+        found[new], left[new] = len(taken), 0
+        taken.append(divmod(best, size))
+    return found, np.array(taken, int).reshape(-1, 2)
 
 
 def in_order(
     pattern: Integer[np.ndarray, "readings 4"], voltages: Float[np.ndarray, " readings"]
 ) -> Int[np.ndarray, "readings 4"]:
     """Readings sorted by driven pair, of which as few are used as possible, with untouched voltages above zero."""
-    group = cover(pattern, np.ones(len(pattern)))
-    pairs = np.sort(pattern.reshape(-1, 2, 2), 2)
-    out = pattern.copy()
-    for number in range(group.max() + 1):
-        rows = np.flatnonzero(group == number)
-        common = set(map(tuple, pairs[rows[0]]))
-        for row in rows[1:]:
-            common &= set(map(tuple, pairs[row]))
-        drive = min(common)
-        swap = rows[(pairs[rows, 0] != drive).any(1)]
-        out[swap] = out[swap][:, [2, 3, 0, 1]]
-        turned = rows[(out[rows, :2] != drive).any(1)]
-        out[turned] = out[turned][:, [1, 0, 3, 2]]
+    group, pairs = cover(pattern, np.ones(len(pattern)))
+    drive, out = pairs[group], pattern.copy()
+    swap = (np.sort(out[:, :2], 1) != drive).any(1)
+    out[swap] = out[swap][:, [2, 3, 0, 1]]
+    turned = (out[:, :2] != drive).any(1)
+    out[turned] = out[turned][:, [1, 0, 3, 2]]
     negative = voltages < 0
     out[negative] = out[negative][:, [0, 1, 3, 2]]
     order = np.lexsort((*out.T[::-1], group))
