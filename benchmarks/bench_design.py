@@ -3,8 +3,8 @@
 Single presses of 8 N by a 20 mm tip at places all over the testbed, simulated on another mesh than the one on which
 scans are designed and contacts found; every reading of all scans has the same noise, 60 dB (and once more 50 dB) below
 the rms of the shipped scan's readings; three draws of it. "Bound": the mean error that `place_sensitivity` expects at
-the sites of the design, over the whole sheet, for contacts of 25 % and a width of 12 mm; the presses are 15 mm or more
-from the rim. "Dead": readings of one electrode are left out, of the one that costs most.
+the sites of the design, over the whole sheet, for contacts of 25 %, a width of 12 mm and a model error of 1.5 %; the
+presses are 15 mm or more from the rim. "Dead": readings of one electrode are left out, of the one that costs most.
 """
 
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ LOUD = (
 )  # a second noise over the first: 50 dB below the readings, where the model of the fit errs less than noise
 DRAWS = 3  # of noise
 LOAD = 8.0  # N
-MARGIN, PRESSES, SEED = 0.015, 120, 2029
+MARGIN, PRESSES, SEED = 0.015, 120, 2030
 GREEDY, DESIGNED, CAREFUL = "D-optimal among the adjacent", "designed", "designed for a dead electrode"
 
 

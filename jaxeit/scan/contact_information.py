@@ -48,6 +48,7 @@ class DesignSettings:
     | columns: sites along x, from rim to rim                                        | 8             |      |
     | noise: standard deviation of each reading; None: 60 dB below the rms of the scan | None        | V    |
     | relative: further noise of each reading, as part of its voltage                | 0             |      |
+    | model_error: as of `ContactSettings`: part of the signal that a fit gets wrong  | 0.015         |      |
     | strength_spread: standard deviation of log strength                            | 1             |      |
     | width_spread: standard deviation of log width                                  | 0.3           |      |
 
@@ -60,6 +61,7 @@ class DesignSettings:
     columns: int = 8
     noise: float | None = None
     relative: float = 0.0
+    model_error: float = 0.015
     strength_spread: float = 1.0
     width_spread: float = 0.3
 
@@ -70,8 +72,9 @@ class DesignSettings:
                 raise ProtocolError(f"{name} is {getattr(self, name)}; give a number above 0")
         if self.noise == 0:
             raise ProtocolError("noise is 0 V; give a standard deviation above 0, or None")
-        if not 0 <= self.relative < np.inf:
-            raise ProtocolError(f"relative is {self.relative}; give 0 or more")
+        for name in ("relative", "model_error"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ProtocolError(f"{name} is {getattr(self, name)}; give 0 or more")
         if not 1 <= self.columns <= 100:
             raise ProtocolError(f"columns is {self.columns}; give 1 to 100 sites along x")
 
@@ -85,7 +88,7 @@ class PlaceSensitivity(eqx.Module):
     | transfer matrix of the untouched sheet, times the current           | (electrodes, electrodes)        | V    |
     | sites                                                               | (sites, 2)                      | m    |
     | width: unit of the unknown place                                    | ()                              | m    |
-    | noise, relative: see `DesignSettings`                               | ()                              | V, 1 |
+    | noise, relative, model_error: see `DesignSettings`                  | ()                              | V, 1 |
     | prior: precision of each unknown before a frame                     | (4,)                            |      |
     """
 
@@ -95,6 +98,7 @@ class PlaceSensitivity(eqx.Module):
     width: Float[Array, ""]
     noise: Float[Array, ""]
     relative: Float[Array, ""]
+    model_error: Float[Array, ""]
     prior: Float[Array, "4"]
 
     @property
@@ -110,9 +114,11 @@ class PlaceSensitivity(eqx.Module):
 
     @verb
     def rows(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, "sites 4 readings"]:
-        """Derivatives of readings with respect to the unknowns of a contact, in units of the noise of each reading."""
+        """Derivatives of readings with respect to the unknowns of a contact, in units of the error of each reading."""
         std = jnp.sqrt(self.noise**2 + (self.relative * self.voltages(pattern)) ** 2)
         found: Array = _differences(self.slopes, jnp.asarray(pattern)) / std
+        change = found[:, 2:3]  # with respect to log strength: the change by the contact itself
+        found = found / jnp.sqrt(1 + (self.model_error * change) ** 2)
         return found
 
     def errors(
@@ -181,9 +187,8 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
     first, second = np.triu_indices(electrodes)
     pixels = Pixels(settings.columns).on(model)
     sites = np.asarray(pixels.centres)[np.asarray(pixels.areas) > 0.5 * np.max(np.asarray(pixels.areas))]
-    require(
-        "array_bytes", 8 * len(sites) * UNKNOWNS * electrodes**2, "place_sensitivity: sites times pairs of electrodes"
-    )
+    size = 8 * len(sites) * UNKNOWNS * max(electrodes**2, len(model.areas))
+    require("array_bytes", size, "place_sensitivity: sites times elements or pairs of electrodes")
     change = np.asarray(model.background, float)[:, None, None] * _bumps(model, sites, settings.width)
     pairs, change = np.stack([first, second], 1), change.reshape(len(change), -1).astype(model.dtype)
     by_pair, transferred = _solved(model, Elements().on(model), pairs, change)
@@ -196,15 +201,8 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
     chart = np.asarray(model.chart)
     extent = float(np.linalg.norm(np.ptp(chart, axis=0))) / settings.width  # a place is somewhere on the sheet
     prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
-    numbers = (
-        slopes.reshape(len(sites), UNKNOWNS, *z.shape),
-        z,
-        sites,
-        settings.width,
-        noise,
-        settings.relative,
-        prior,
-    )
+    errors = (noise, settings.relative, settings.model_error)
+    numbers = (slopes.reshape(len(sites), UNKNOWNS, *z.shape), z, sites, settings.width, *errors, prior)
     return PlaceSensitivity(*(jnp.asarray(number, model.dtype) for number in numbers))
 
 

@@ -1,5 +1,6 @@
 """Designs of scans: sensitivities against the forward map, designs against all subsets, and what the testbed gains."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from ..helpers import square_model
 POINTS = [(0.05, 0.05), (0.15, 0.05), (0.15, 0.15), (0.05, 0.15), (0.1, 0.1), (0.1, 0.0)]
 EVERY = je.skin.all_pairs(6)
 A_OPTIMAL = PlaceError(2.0)
-SETTINGS = DesignSettings(columns=2, noise=1e-5, width=0.04)
+SETTINGS = DesignSettings(columns=2, noise=1e-5, width=0.04, model_error=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +140,12 @@ def test_what_cannot_be_designed(sensitivity, call, said):
         call(sensitivity)
 
 
-def test_relative_noise_makes_large_voltages_worth_less(small, sensitivity):
-    noisy = place_sensitivity(small, DesignSettings(columns=2, noise=1e-5, width=0.04, relative=0.1))
+def test_relative_noise_and_errors_of_the_model_make_large_readings_worth_less(small, sensitivity):
+    noisy = place_sensitivity(small, replace(SETTINGS, relative=0.1))
     ratio = np.asarray(noisy.rows(EVERY)) / np.asarray(sensitivity.rows(EVERY))
     voltages = np.asarray(sensitivity.voltages(EVERY))
     np.testing.assert_allclose(ratio[0, 0], 1e-5 / np.hypot(1e-5, 0.1 * voltages), rtol=1e-9)
     assert isinstance(CRITERIA.make("d-optimal"), PlaceVolume)
+    wrong = np.asarray(place_sensitivity(small, replace(SETTINGS, model_error=0.03)).rows(EVERY))
+    signal = np.asarray(sensitivity.rows(EVERY))[:, 2:3]
+    np.testing.assert_allclose(wrong * np.hypot(1, 0.03 * signal), sensitivity.rows(EVERY), rtol=1e-9, atol=1e-9)

@@ -106,7 +106,7 @@ def _report(
     rows = [heads, *((name, columns[0][name], columns[1][name]) for name in columns[0])]
     return [
         f"{before.name}: {len(before.electrodes)} electrodes, contacts of {width:.3g} mm at {sites} places, "
-        f"noise {1e6 * float(sensitivity.noise):.3g} uV",
+        f"noise {1e6 * float(sensitivity.noise):.3g} uV, model error {100 * float(sensitivity.model_error):.3g} %",
         *(f"{name:<44}{one:>16}{two:>16}" for name, one, two in rows),
         f"by the criterion {1e3 * found.error:.4g} mm; no scan of {len(found.pattern)} readings has less than "
         f"{1e3 * found.bound:.4g} mm",
