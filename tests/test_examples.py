@@ -13,6 +13,7 @@ FINDS = {
     ),
     "design_a_scan": lambda names: (
         names["design"].bound < 1e-3 * names["errors"]["designed, 100"] < 0.8e-3 * names["errors"]["shipped, 550"]
+    ),
     "electrodes_that_move": lambda names: (
         jnp.linalg.norm(names["change"] - names["linear"]) < 0.1 * jnp.linalg.norm(names["change"])
     ),

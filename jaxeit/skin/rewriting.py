@@ -29,7 +29,7 @@ def with_rows(skin: Skin, rows: Integer[np.ndarray, "readings 4"]) -> Skin:
         TomlError: if the skin has no text, or its text gives the scan in another way than by ``pattern`` or ``rows`` on
             lines of a table ``[protocol]``.
     """
-    protocol = dataclasses.replace(skin.protocol, pattern=rows).check(len(skin.electrodes))
+    protocol = dataclasses.replace(skin.protocol, pattern=rows, mixing=None).check(len(skin.electrodes))
     pattern = protocol.pattern.tolist()
     lines = [", ".join(map(str, pattern[k : k + 6])) for k in range(0, len(pattern), 6)]
     value = "rows = [  # drive+, drive-, sense+, sense-\n" + "".join(f"    {line},\n" for line in lines) + "]"
