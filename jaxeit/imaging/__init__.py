@@ -9,6 +9,7 @@ from .absolute import (
     least_squares_image,
 )
 from .background import fit_background
+from .electrode_fit import ElectrodeFit, ElectrodeFitSettings, KnownPresses, fit_electrodes
 from .hyperparameters import (
     HYPERPARAMETERS,
     AbstractFrameChoice,
@@ -81,6 +82,8 @@ __all__ = [
     "Covariance",
     "Diagonal",
     "Discrepancy",
+    "ElectrodeFit",
+    "ElectrodeFitSettings",
     "EqualNoise",
     "GaussianSmooth",
     "GeneralisedCrossValidation",
@@ -90,6 +93,7 @@ __all__ = [
     "InverseError",
     "IsotropicVariation",
     "IterativeReconstructor",
+    "KnownPresses",
     "LCurve",
     "Laplace",
     "LogConductivity",
@@ -110,6 +114,7 @@ __all__ = [
     "TotalVariation",
     "TruncatedSvd",
     "fit_background",
+    "fit_electrodes",
     "from_numbers",
     "gauss_newton",
     "least_squares_image",

@@ -134,10 +134,23 @@ def gauss_newton(
         steps: largest number of steps.
     """
     weight, readings = _weights(jnp.asarray(readings), jnp.asarray(std))
-    return _most_probable(_Posterior(physics, penalty, readings, weight), steps, tolerance)
+    start = jnp.zeros(physics.image.size, readings.dtype)
+    return most_probable(_Posterior(physics, penalty, readings, weight), start, steps, tolerance)
 
 
-class _Posterior(eqx.Module):
+class AbstractPosterior(eqx.Module):
+    """Minus the logarithm of a posterior probability, as half a sum of squares: what `most_probable` minimises."""
+
+    @abstractmethod
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """Of which half the sum of squares is minimised."""
+
+    @abstractmethod
+    def quadratic(self, x: Float[Array, " n"]) -> HalfSquares:
+        """Gauss and Newton's quadratic near x."""
+
+
+class _Posterior(AbstractPosterior):
     """Minus the logarithm of the posterior probability of an image x, as half a sum of squares."""
 
     physics: LogConductivity
@@ -161,13 +174,16 @@ class _Posterior(eqx.Module):
 
 
 @eqx.filter_jit
-def _most_probable(posterior: _Posterior, steps: int, tolerance: float) -> Float[Array, " basis"]:
+def most_probable(
+    posterior: AbstractPosterior, start: Float[Array, " n"], steps: int, tolerance: float
+) -> Float[Array, " n"]:
+    """The x of largest posterior probability, by Gauss and Newton's method as `gauss_newton` describes it."""
     newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
     solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance, descent=newton, search=optx.BacktrackingArmijo())
     found: optx.Solution[Array, Any] = optx.least_squares(
         lambda x, posterior: posterior.residual(x),
         solver,
-        jnp.zeros(posterior.physics.image.size, posterior.readings.dtype),
+        start,
         posterior,
         {"quadratic": lambda x, posterior: posterior.quadratic(x)},
         max_steps=steps + 1,  # the first evaluates the start

@@ -58,12 +58,11 @@ def fit_background(
             polarity of the readings is not that of the skin's protocol.
     """
     v0, even = jnp.asarray(v0, model.dtype), forward(model, model.background)
-    _check(v0, even, std=std, length=length, model_error=model_error, columns=columns)
+    require_frame(v0, even)
+    require_positive(std=std, length=length, model_error=model_error, columns=columns)
     there = jnp.isfinite(v0)
     known = jnp.where(there, v0, 0)
-    level = jnp.sum(jnp.where(there, even**2, 0)) / (even @ known)
-    if _is_known(level) and not level > 0:
-        raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
+    level = sheet_level(v0, even)
     image = Pixels(columns).on(model) if basis is None else basis
     physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
     # The setting of a prior is a number; a length that JAX traces takes its place.
@@ -103,12 +102,26 @@ def _is_known(value: Any) -> bool:
     return not isinstance(value, Tracer)
 
 
-def _check(v0: Float[Array, "..."], even: Float[Array, " readings"], **positive: Any) -> None:
+def sheet_level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) -> Float[Array, ""]:
+    """Conductivity of the even sheet nearest to a frame, over that of the model; ``even``: the model's readings."""
+    there = jnp.isfinite(v0)
+    level = jnp.sum(jnp.where(there, even**2, 0)) / (even @ jnp.where(there, v0, 0))
+    if _is_known(level) and not level > 0:
+        raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
+    return level
+
+
+def require_frame(v0: Float[Array, "..."], even: Float[Array, " readings"]) -> None:
+    """Raise InverseError unless v0 is a frame with readings; ``even``: readings of the model."""
     if v0.shape != even.shape:
         raise InverseError(f"v0 has shape {v0.shape}; give the {len(even)} readings of one frame")
     if _is_known(v0) and not np.any(np.nan_to_num(v0, posinf=0, neginf=0)):
         raise InverseError("v0 has no reading that is finite and not zero")
-    for name, value in positive.items():
+
+
+def require_positive(**values: Any) -> None:
+    """Raise InverseError, with the name of the value, unless every value that is known is above zero."""
+    for name, value in values.items():
         if _is_known(value) and not 0 < value < np.inf:
             raise InverseError(f"{name} is {value}; give a number above zero")
 

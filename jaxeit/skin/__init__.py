@@ -15,7 +15,7 @@ from .patterns import adjacent, all_pairs, named_pattern, opposite, skip
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
 from .protocol import Protocol, ProtocolError, reciprocal_rows
-from .rewriting import with_rows
+from .rewriting import with_positions, with_rows
 from .rims import rim_electrodes
 from .rings import RingPatch
 
@@ -46,5 +46,6 @@ __all__ = [
     "rim_electrodes",
     "shipped_skins",
     "skip",
+    "with_positions",
     "with_rows",
 ]

@@ -1,20 +1,59 @@
-"""A skin with another scan, its TOML text changed to match."""
+"""A skin with another scan or with its electrodes elsewhere, its TOML text changed to match."""
 
 import dataclasses
 import re
 
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Float, Integer
 
 from ..toml import TomlError, parse_values
-from .description import Skin
+from .description import Skin, parse_skin
 
-# The [protocol] table up to its next header, which unlike a row of numbers begins with a letter or a quote.
-_TABLE = re.compile(
-    r"""^[ \t]*\[[ \t]*protocol[ \t]*\][^\n]*\n(?P<body>.*?)(?=^[ \t]*\[{1,2}[ \t]*["'A-Za-z]|\Z)""", re.M | re.S
-)
+
+def _table(name: str) -> re.Pattern[str]:
+    """A table up to the next header, which unlike a row of numbers begins with a letter or a quote."""
+    header = rf"^[ \t]*\[[ \t]*{name}[ \t]*\][^\n]*\n"
+    return re.compile(rf"""{header}(?P<body>.*?)(?=^[ \t]*\[{{1,2}}[ \t]*["'A-Za-z]|\Z)""", re.M | re.S)
+
+
+_TABLE, _ELECTRODES, _GRID = _table("protocol"), _table("electrodes"), _table(r"electrodes[ \t]*\.[ \t]*grid")
 _ROWS = r"\[(?:[^\[\]#]|#[^\n]*|\[(?:[^\[\]#]|#[^\n]*)*\])*\]"
 _KEY = re.compile(rf"""^[ \t]*(?:pattern[ \t]*=[ \t]*["'][^\n"']*["']|rows[ \t]*=[ \t]*{_ROWS})[^\n]*$""", re.M)
+_POSITIONS = re.compile(rf"""^[ \t]*positions[ \t]*=[ \t]*{_ROWS}[^\n]*\n""", re.M)
+
+
+def with_positions(skin: Skin, positions: Float[np.ndarray, "electrodes 2"]) -> Skin:
+    """The skin with its electrodes elsewhere; all other lines of its text stay as they are.
+
+    Args:
+        skin: from `load_skin`, with its text; its electrodes have ``positions`` or a ``grid``.
+        positions: of the electrodes' middles in the sheet's flat coordinates, m, in the order of their numbers.
+
+    Raises:
+        TomlError: if the skin has no text, its electrodes have no positions, or one would lie outside the sheet.
+    """
+    if np.shape(positions) != (len(skin.electrodes), 2):
+        raise TomlError(
+            f"{skin.name}: positions have shape {np.shape(positions)}; give two coordinates to each of "
+            f"{len(skin.electrodes)} electrodes"
+        )
+    places = [[round(float(value), 9) for value in place] for place in positions]
+    value = "positions = [\n" + "".join(f"    {place},\n" for place in places) + "]\n"
+    text = _GRID.sub("", skin.toml)
+    table = _ELECTRODES.search(text)
+    if table is None:
+        raise TomlError(f"{skin.name}: the skin has no text with a table [electrodes]")
+    old = _POSITIONS.search(text, *table.span("body"))
+    begin, end = old.span() if old else (table.start("body"), table.start("body"))
+    text = text[:begin] + value + text[end:]
+    before, after = parse_values(skin.toml, skin.name), parse_values(text, skin.name)
+    others = {name: given for name, given in before["electrodes"].items() if name not in ("positions", "grid")}
+    if len(others) == len(before["electrodes"]) or after != before | {"electrodes": others | {"positions": places}}:
+        raise TomlError(
+            f"{skin.name}: its electrodes have no positions and no grid that can be replaced in the text; write them "
+            "as positions = [[x, y], ...] on lines alone"
+        )
+    return parse_skin(text, skin.name)
 
 
 def with_rows(skin: Skin, rows: Integer[np.ndarray, "readings 4"]) -> Skin:

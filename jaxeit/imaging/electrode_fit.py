@@ -1,0 +1,327 @@
+"""Where the electrodes sit, found from what the skin reads: misplaced bolts cost a skin more than an uneven coat.
+
+An untouched frame tells the shifts of the electrodes apart from the coat of the sheet only in part, since both are
+smooth. Presses at known places tell the rest: each is a bump of conductivity whose place is known, and whose strength
+and width are not. Unknown are, all Gaussian before the readings are seen,
+
+- the shift of each electrode;
+- the logarithm of the conductivity of the untouched sheet, a smooth field;
+- the logarithm of the gain of the contact layer, a smooth field, which the presses have in common;
+- the logarithms of strength and width of each press.
+
+The most probable ones are found by Gauss and Newton's method through the full forward map (`most_probable`), and the
+covariance of the shifts is that of the curvature there, with all else marginalised.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import block_diag, cho_solve
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._compile import require_known
+from ..least_squares import normal_equations, quadratic
+from ..least_squares.searches import Quadratic as HalfSquares
+from ..model.bases import BasisMap, Pixels
+from ..model.discretisation import Model
+from ..model.forward_model import forward
+from ..model.motion import Motion, electrode_motion, moved, shift_jacobian
+from ..model.sensitivity import scaled_jacobian
+from .absolute import AbstractPosterior, most_probable
+from .background import ERROR_FLOOR, require_frame, sheet_level
+from .noise import InverseError
+from .priors import GaussianSmooth
+
+STRENGTH_STD = 1.0  # of the logarithm of a press's strength, whose first value comes from its readings
+WIDTH_STD = 0.3  # of the logarithm of a press's width
+FLATNESS_STD = 0.5  # of the logarithm of the exponent over that of a Gaussian
+
+
+class ElectrodeFitSettings(eqx.Module):
+    """What is believed before the readings are seen.
+
+    | meaning                                                              | default | unit |
+    |----------------------------------------------------------------------|---------|------|
+    | shift: standard deviation of an electrode's shift, in each direction | 1e-3    | m    |
+    | coat_std, coat_length: of the logarithm of the conductivity          | 0.15, 0.03 | 1, m |
+    | gain_std, gain_length: of the logarithm of the contact layer's gain  | 0.12, 0.015 | 1, m |
+    | width: standard deviation of the bump of a press                     | 0.012   | m    |
+    | model_error: of each reading of the untouched frame, relative        | 3e-3    | 1    |
+    | press_error: of each change by a press, relative to its size         | 3e-2    | 1    |
+    | columns: pixels of both fields along x                               | 20      |      |
+    """
+
+    shift: float = 1e-3
+    coat_std: float = 0.15
+    coat_length: float = 0.03
+    gain_std: float = 0.12
+    gain_length: float = 0.015
+    width: float = 0.012
+    model_error: float = 3e-3
+    press_error: float = 3e-2
+    columns: int = eqx.field(static=True, default=20)
+
+
+class KnownPresses(eqx.Module):
+    """Presses of one finger or tip at places that a stage tells.
+
+    | meaning                                                            | shape               | unit |
+    |--------------------------------------------------------------------|---------------------|------|
+    | change of the readings by each press; NaN: missing                 | (presses, readings) | V    |
+    | place of each, in the sheet's flat coordinates                     | (presses, 2)        | m    |
+    | noise: standard deviation of a change                              | (readings,)         | V    |
+    """
+
+    change: Float[Array, "presses readings"] = eqx.field(converter=jnp.asarray)
+    place: Float[Array, "presses 2"] = eqx.field(converter=jnp.asarray)
+    noise: Float[Array, " readings"] = eqx.field(converter=jnp.asarray)
+
+
+class ElectrodeFit(eqx.Module):
+    """Where the electrodes sit.
+
+    | meaning                                                                    | shape            | unit |
+    |----------------------------------------------------------------------------|------------------|------|
+    | shift of each electrode from its place in the skin                         | (electrodes, 2)  | m    |
+    | covariance of all shifts, those of an electrode side by side               | (2 electrodes, 2 electrodes) | m^2 |
+    | sigma: conductivity of the untouched sheet, on the mesh that is moved along | (elements,)      | S    |
+    | misfit: root mean square of what is left of the readings, in their errors  | ()               | 1    |
+    """
+
+    shift: Float[Array, "electrodes 2"]
+    covariance: Float[Array, "both both"]
+    sigma: Float[Array, " elements"]
+    misfit: Float[Array, ""]
+
+    @property
+    def standard_error(self) -> Float[Array, "electrodes 2"]:
+        """Of each shift, m; as large as the deviation before the fit where the readings tell nothing."""
+        return jnp.sqrt(jnp.diagonal(self.covariance)).reshape(self.shift.shape)
+
+
+def fit_electrodes(
+    model: Model,
+    v0: Float[ArrayLike, " readings"],
+    presses: KnownPresses | None = None,
+    settings: ElectrodeFitSettings | None = None,
+) -> ElectrodeFit:
+    """Find how far the electrodes sit from where the skin's file says.
+
+    `je.skin.with_positions(skin, skin.electrode_positions + fit.shift)` is the skin as it is. Compiling takes a minute.
+
+    Args:
+        model: of the skin as its file describes it, with elements of second order: the errors of a mesh of first order
+            are larger than those that ``model_error`` states.
+        v0: untouched frame, V, best a mean over many; readings that are not finite are left out.
+        presses: at known places; some ten to forty, spread over the sheet.
+
+    Raises:
+        InverseError: if a shape or a value is wrong.
+        MotionError: if the electrodes cannot be moved on this mesh.
+    """
+    require_known("fit_electrodes", InverseError, model.nodes, v0)
+    settings = ElectrodeFitSettings() if settings is None else settings
+    motion, image = electrode_motion(model), Pixels(settings.columns).on(model)
+    frame, even = jnp.asarray(v0, model.dtype), forward(model)
+    require_frame(frame, even)
+    level = sheet_level(frame, even) * jnp.average(model.background, weights=model.areas)
+    there = jnp.isfinite(frame)
+    known = jnp.where(there, frame, 0)
+    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
+    weight = jnp.where(there, 1 / jnp.hypot(settings.model_error * known, floor), 0)
+    seen = _no_presses(model) if presses is None else _checked(model, presses)
+    strength = _first_strengths(model, image, seen, level, settings)
+    posterior = _Posterior(model, motion, image, level, settings, (known, weight), seen, strength)
+    x = most_probable(posterior, jnp.zeros(posterior.size, model.dtype), 12, 2e-3)
+    return _described(posterior, x)
+
+
+def _no_presses(model: Model) -> KnownPresses:
+    none = jnp.zeros((0, len(model.pattern)), model.dtype)
+    return KnownPresses(none, jnp.zeros((0, 2), model.dtype), jnp.ones(len(model.pattern), model.dtype))
+
+
+def _checked(model: Model, presses: KnownPresses) -> KnownPresses:
+    """The presses in the model's precision; raises InverseError if shapes or values are wrong."""
+    count, readings = len(presses.place), len(model.pattern)
+    wanted = {"change": (count, readings), "place": (count, 2), "noise": (readings,)}
+    for name, shape in wanted.items():
+        if getattr(presses, name).shape != shape:
+            raise InverseError(f"presses: {name} has shape {getattr(presses, name).shape}; give {shape}")
+    for name in ("place", "noise"):
+        if not np.isfinite(getattr(presses, name)).all():
+            raise InverseError(f"presses: {name} has a value that is not finite; leave such presses out")
+    if not (np.asarray(presses.noise) > 0).all():
+        raise InverseError("presses: noise has a value that is not above zero")
+    cast: KnownPresses = jax.tree.map(lambda values: values.astype(model.dtype), presses)
+    return cast
+
+
+@eqx.filter_jit
+def _first_strengths(
+    model: Model, image: BasisMap, presses: KnownPresses, level: Float[Array, ""], settings: ElectrodeFitSettings
+) -> Float[Array, " presses"]:
+    """Logarithm of the relative change of conductivity in the middle of each press, by linear least squares."""
+    jacobian = scaled_jacobian(model, None, image, model.background)
+    away = jnp.sum((image.picture.centres - presses.place[:, None]) ** 2, -1)
+    expected = jnp.exp(-0.5 * away / settings.width**2) @ jacobian.T * (level / jnp.mean(model.background)) ** -1
+    change = jnp.where(jnp.isfinite(presses.change), presses.change, 0)
+    found = jnp.sum(expected * change, 1) / jnp.sum(expected**2, 1)
+    return jnp.log(jnp.clip(found, 0.01, 3))
+
+
+class _Parts(NamedTuple):
+    """The unknowns, apart."""
+
+    coat: Float[Array, " basis"]
+    shift: Float[Array, "electrodes 2"]  # in standard deviations
+    gain: Float[Array, " basis"]
+    strength: Float[Array, " presses"]
+    width: Float[Array, " presses"]
+    flatness: Float[Array, "1"]
+
+
+class _Posterior(AbstractPosterior):
+    """Minus the logarithm of the posterior probability of all unknowns, as half a sum of squares."""
+
+    model: Model
+    motion: Motion
+    image: BasisMap
+    level: Float[Array, ""]
+    settings: ElectrodeFitSettings
+    untouched: tuple[Float[Array, " readings"], Float[Array, " readings"]]  # V, and one over the error
+    presses: KnownPresses
+    strength: Float[Array, " presses"]  # expected
+
+    @property
+    def size(self) -> int:
+        return 2 * self.image.size + 2 * self.model.electrodes + 2 * len(self.strength) + 1
+
+    def parts(self, x: Float[Array, " n"]) -> _Parts:
+        n, e, k = self.image.size, self.model.electrodes, len(self.strength)
+        coat, shift, gain, strength, width, flatness = jnp.split(x, np.cumsum([n, 2 * e, n, k, k]))
+        return _Parts(coat, shift.reshape(e, 2), gain, strength, width, flatness)
+
+    def precision(self) -> Float[Array, "n n"]:
+        """Of the unknowns before the readings are seen."""
+        fields = [
+            GaussianSmooth(length)
+            .precision(jnp.zeros((1, self.image.size), self.level.dtype), self.image.picture)
+            .matrix()
+            / std**2
+            for std, length in (
+                (self.settings.coat_std, self.settings.coat_length),
+                (self.settings.gain_std, self.settings.gain_length),
+            )
+        ]
+        ones = [
+            jnp.full(count, std**-2)
+            for count, std in ((len(self.strength), STRENGTH_STD), (len(self.strength), WIDTH_STD), (1, FLATNESS_STD))
+        ]
+        shift = jnp.eye(2 * self.model.electrodes, dtype=self.level.dtype)
+        whole: Array = block_diag(
+            fields[0], shift, fields[1], *(jnp.diag(one.astype(self.level.dtype)) for one in ones)
+        )
+        return whole
+
+    def sheet(self, parts: _Parts) -> tuple[Model, Float[Array, " elements"]]:
+        """The model with its electrodes where they sit, and the conductivity of the untouched sheet."""
+        there = moved(self.model, self.motion, self.settings.shift * parts.shift)
+        return there, self.level * jnp.exp(self.image.expand(parts.coat))
+
+    def bump(
+        self, parts: _Parts, press: tuple[Float[Array, "2"], Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+    ) -> tuple[Float[Array, " elements"], Float[Array, " elements"], Float[Array, " elements"]]:
+        """Relative change of conductivity by a press, and its derivatives by the logarithms of width and exponent."""
+        place, expected, strength, width = press
+        spread = jnp.square(self.settings.width * jnp.exp(width))
+        away = jnp.maximum(jnp.sum((self.model.centroids - place) ** 2, 1) / spread, 1e-6)
+        exponent = jnp.exp(parts.flatness)
+        fall = 0.5 * away**exponent
+        change = jnp.exp(expected + strength + self.image.expand(parts.gain) - fall)
+        return change, 2 * exponent * change * fall, -change * fall * jnp.log(away) * exponent
+
+    def each(self, parts: _Parts) -> tuple[Any, ...]:
+        """What `jax.lax.map` hands over for each press."""
+        return self.presses.change, (self.presses.place, self.strength, parts.strength, parts.width)
+
+    def weigh(self, change: Float[Array, " readings"]) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
+        """The change by a press without what is missing, and one over the error of each reading."""
+        there = jnp.isfinite(change)
+        known = jnp.where(there, change, 0)
+        typical = jnp.sqrt(known @ known / jnp.maximum(jnp.sum(there, dtype=known.dtype), 1))
+        error = jnp.hypot(self.presses.noise, self.settings.press_error * jnp.hypot(known, typical))
+        return known, jnp.where(there, 1 / error, 0)
+
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " readings_and_one"]:
+        """Weighted misfits, and a number of which half the square is the penalty plus 1/2, whose root is smooth."""
+        parts = self.parts(x)
+        there, sigma = self.sheet(parts)
+        still = forward(there, sigma)
+
+        def missed(one: tuple[Any, ...]) -> Float[Array, " readings"]:
+            change, weight = self.weigh(one[0])
+            return weight * (change - (forward(there, sigma * (1 + self.bump(parts, one[1])[0])) - still))
+
+        frame, weight = self.untouched
+        pressed = jax.lax.map(missed, self.each(parts)).ravel()
+        return jnp.concatenate([weight * (frame - still), pressed, jnp.sqrt(1 + x @ self.precision() @ x)[None]])
+
+    def quadratic(self, x: Float[Array, " n"]) -> HalfSquares:
+        """Gauss and Newton's quadratic of the misfits, plus that of the prior."""
+        parts, prior = self.parts(x), self.precision()
+        there, sigma = self.sheet(parts)
+        still, shift = forward(there, sigma), self.settings.shift
+        n, k, m = self.image.size, len(self.strength), len(self.model.pattern)
+        coat = scaled_jacobian(there, sigma, self.image, sigma)
+        by_shift = shift * shift_jacobian(there, self.motion, sigma).reshape(m, -1)
+        frame, weight = self.untouched
+        slopes = jnp.concatenate([coat, by_shift, jnp.zeros((m, n + 2 * k + 1), x.dtype)], 1)
+        data = normal_equations(weight * (frame - still), -weight[:, None] * slopes)
+
+        def add(sums: tuple[Array, Array, Array], one: tuple[Any, ...]) -> tuple[tuple[Array, Array, Array], None]:
+            number, (change, press) = one
+            known, weight = self.weigh(change)
+            bump, by_width, by_flatness = self.bump(parts, press)
+            there_too = sigma * (1 + bump)
+            found, linear = jax.linearize(lambda sigma: forward(there, sigma), there_too)
+            widened, flattened = linear(sigma * by_width), linear(sigma * by_flatness)
+            by_gain = scaled_jacobian(there, there_too, self.image, sigma * bump)
+            here = jnp.arange(k) == number
+            columns = [
+                scaled_jacobian(there, there_too, self.image, there_too) - coat,
+                shift * shift_jacobian(there, self.motion, there_too).reshape(m, -1) - by_shift,
+                by_gain,
+                jnp.where(here, by_gain.sum(1)[:, None], 0),
+                jnp.where(here, widened[:, None], 0),
+                flattened[:, None],
+            ]
+            part = normal_equations(weight * (known - (found - still)), -weight[:, None] * jnp.concatenate(columns, 1))
+            return (sums[0] + part.f, sums[1] + part.grad, sums[2] + part.hessian.matrix), None
+
+        sums = (data.f, data.grad, data.hessian.matrix)
+        (value, gradient, curvature), _ = jax.lax.scan(add, sums, (jnp.arange(k), self.each(parts)))
+        return quadratic(value + 0.5 * x @ prior @ x, gradient + prior @ x, curvature + prior)
+
+
+@eqx.filter_jit
+def _described(posterior: _Posterior, x: Float[Array, " n"]) -> ElectrodeFit:
+    parts, shift = posterior.parts(x), posterior.settings.shift
+    curvature = posterior.quadratic(x).hessian.matrix
+    n, both = posterior.image.size, 2 * posterior.model.electrodes
+    scale = jax.lax.rsqrt(jnp.diagonal(curvature))
+    factor = jnp.linalg.cholesky(scale[:, None] * curvature * scale)
+    wanted = jnp.eye(len(x), dtype=x.dtype)[:, n : n + both] * scale[:, None]
+    covariance = (scale[:, None] * cho_solve((factor, True), wanted))[n : n + both]
+    missed = posterior.residual(x)[:-1]
+    used = jnp.sum(missed != 0, dtype=x.dtype)
+    return ElectrodeFit(
+        shift * parts.shift,
+        shift**2 * 0.5 * (covariance + covariance.T),
+        posterior.sheet(parts)[1],
+        jnp.sqrt(missed @ missed / jnp.maximum(used, 1)),
+    )
