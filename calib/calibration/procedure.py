@@ -20,6 +20,7 @@ from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
+from .localisation.electrode_places import place_electrodes
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
@@ -27,7 +28,10 @@ from .recipe import Recipe
 from .storage import describe
 
 STAGES = ("reading", "model and images", "fitting", "holding out")
-LEARNING = "learning the contact layer"  # a further stage, if the recipe asks for it
+PLACING, LEARNING = (
+    "placing the electrodes",
+    "learning the contact layer",
+)  # further stages, if the recipe asks for them
 
 
 def calibrate(
@@ -46,7 +50,7 @@ def calibrate(
         recipe: all choices of the procedure; default: those of the paper.
         ignore_errors: calibrate also from sessions in which `check_session` finds an error; the errors are then kept in
             the calibration's notes and provenance.
-        progress: called with the name of each of the `STAGES`, or `LEARNING`, when the stage begins.
+        progress: called with the name of each of the `STAGES`, `PLACING` or `LEARNING`, when the stage begins.
 
     Raises:
         SessionError: a session cannot be used, or was recorded on another skin.
@@ -62,6 +66,11 @@ def calibrate(
     presses = pool_presses(sessions, skin, recipe.processing)
     ignored = accept(sessions, skin, ignore_errors=ignore_errors)
     require_every_pad_pressed(skin, presses.data)
+    placed: tuple[str, ...] = ()
+    if recipe.fit_electrodes:
+        progress(PLACING)
+        skin, note = place_electrodes(skin, presses)
+        placed = (note,)
     progress("model and images")
     imager = prepare_imager(skin, presses, recipe)
     images = imager.presses(presses.dv)
@@ -93,7 +102,7 @@ def calibrate(
         ),
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=(*ignored, *presses.notes, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
+        notes=(*ignored, *presses.notes, *placed, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
         field=model.field,
         crosstalk=presses.crosstalk,
         noise=held_out.noise,

@@ -34,6 +34,7 @@ class Recipe:
     | imaging: how images are computed from frames                                                | `jaxeit.Imaging` |
     | fidelity: accuracy of the finite-element model from which images are computed               | standard         |
     | even_sheet: take the sheet for even; otherwise the untouched frames tell its conductivity   | False            |
+    | fit_electrodes: put the electrodes where untouched frames and presses tell that they sit     | False            |
     | learn_layer: follow the contacts through the sessions and keep what they tell of the contact | False           |
     |   layer's gain, by which `apply` and `live` then follow contacts                            |                  |
 
@@ -54,6 +55,7 @@ class Recipe:
     imaging: je.Imaging = field(default_factory=je.Imaging)
     fidelity: je.Fidelity = field(default_factory=je.Fidelity.standard)
     even_sheet: bool = False
+    fit_electrodes: bool = False
     learn_layer: bool = False
 
     def __post_init__(self) -> None:

@@ -4,6 +4,7 @@ curve = ["linear", "power"]                       # several: one is chosen by cr
 location = {type = "edge", width = 0.008}         # or "edge:width=0.008", as on the command line
 fidelity = "standard"
 even_sheet = false
+fit_electrodes = false
 learn_layer = false
 
 [imaging]
@@ -47,7 +48,7 @@ LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
     "standard": je.Fidelity.standard,
     "reference": je.Fidelity.reference,
 }
-SWITCHES = ("even_sheet", "learn_layer")
+SWITCHES = ("even_sheet", "fit_electrodes", "learn_layer")
 """Fields of a recipe that are true or false."""
 
 # --- choices by name, as words ---------------------------------------------------------------------------------------

@@ -57,6 +57,10 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
     text = "take the conductive sheet for even; default: its conductivity is fitted to the untouched frames"
     group.add_argument("--even-sheet", action="store_true", help=text)
+    text = (
+        "put the electrodes where untouched frames and presses tell that they sit; the places of presses must be right"
+    )
+    group.add_argument("--fit-electrodes", action="store_true", help=text)
     text = "follow the contacts and keep what they tell of the contact layer's gain; helps `--track` of apply and live"
     group.add_argument("--learn-layer", action="store_true", help=text)
     _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")

@@ -19,13 +19,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag, cho_solve
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._compile import require_known
 from ..least_squares import normal_equations, quadratic
-from ..least_squares.searches import Quadratic as HalfSquares
+from ..least_squares.searches import Quadratic as HalfSquares, normal_inverse
 from ..model.bases import BasisMap, Pixels
 from ..model.discretisation import Model
 from ..model.forward_model import forward
@@ -135,7 +134,8 @@ def fit_electrodes(
     weight = jnp.where(there, 1 / jnp.hypot(settings.model_error * known, floor), 0)
     seen = _no_presses(model) if presses is None else _checked(model, presses)
     strength = _first_strengths(model, image, seen, level, settings)
-    posterior = _Posterior(model, motion, image, level, settings, (known, weight), seen, strength)
+    prior = _prior(image, model.electrodes, len(strength), settings)
+    posterior = _Posterior(model, motion, image, level, settings, (known, weight), seen, strength, prior)
     x = most_probable(posterior, jnp.zeros(posterior.size, model.dtype), 12, 2e-3)
     return _described(posterior, x)
 
@@ -185,6 +185,20 @@ class _Parts(NamedTuple):
     flatness: Float[Array, "1"]
 
 
+@eqx.filter_jit
+def _prior(image: BasisMap, electrodes: int, presses: int, settings: ElectrodeFitSettings) -> Float[Array, "n n"]:
+    """Precision of the unknowns, in the order of `_Parts`, before the readings are seen."""
+    kind, n = image.picture.centres.dtype, image.size
+    still = jnp.zeros((1, n), kind)
+    coat = GaussianSmooth(settings.coat_length).precision(still, image.picture).matrix() / settings.coat_std**2
+    gain = GaussianSmooth(settings.gain_length).precision(still, image.picture).matrix() / settings.gain_std**2
+    counts = (n, 2 * electrodes, n, presses, presses, 1)
+    ones = (0.0, 1.0, 0.0, STRENGTH_STD**-2, WIDTH_STD**-2, FLATNESS_STD**-2)
+    whole = jnp.diag(jnp.repeat(jnp.array(ones, kind), np.array(counts), total_repeat_length=sum(counts)))
+    after = n + 2 * electrodes
+    return whole.at[:n, :n].set(coat).at[after : after + n, after : after + n].set(gain)
+
+
 class _Posterior(AbstractPosterior):
     """Minus the logarithm of the posterior probability of all unknowns, as half a sum of squares."""
 
@@ -196,6 +210,7 @@ class _Posterior(AbstractPosterior):
     untouched: tuple[Float[Array, " readings"], Float[Array, " readings"]]  # V, and one over the error
     presses: KnownPresses
     strength: Float[Array, " presses"]  # expected
+    prior: Float[Array, "n n"]  # precision of all unknowns before the readings are seen
 
     @property
     def size(self) -> int:
@@ -205,28 +220,6 @@ class _Posterior(AbstractPosterior):
         n, e, k = self.image.size, self.model.electrodes, len(self.strength)
         coat, shift, gain, strength, width, flatness = jnp.split(x, np.cumsum([n, 2 * e, n, k, k]))
         return _Parts(coat, shift.reshape(e, 2), gain, strength, width, flatness)
-
-    def precision(self) -> Float[Array, "n n"]:
-        """Of the unknowns before the readings are seen."""
-        fields = [
-            GaussianSmooth(length)
-            .precision(jnp.zeros((1, self.image.size), self.level.dtype), self.image.picture)
-            .matrix()
-            / std**2
-            for std, length in (
-                (self.settings.coat_std, self.settings.coat_length),
-                (self.settings.gain_std, self.settings.gain_length),
-            )
-        ]
-        ones = [
-            jnp.full(count, std**-2)
-            for count, std in ((len(self.strength), STRENGTH_STD), (len(self.strength), WIDTH_STD), (1, FLATNESS_STD))
-        ]
-        shift = jnp.eye(2 * self.model.electrodes, dtype=self.level.dtype)
-        whole: Array = block_diag(
-            fields[0], shift, fields[1], *(jnp.diag(one.astype(self.level.dtype)) for one in ones)
-        )
-        return whole
 
     def sheet(self, parts: _Parts) -> tuple[Model, Float[Array, " elements"]]:
         """The model with its electrodes where they sit, and the conductivity of the untouched sheet."""
@@ -269,11 +262,11 @@ class _Posterior(AbstractPosterior):
 
         frame, weight = self.untouched
         pressed = jax.lax.map(missed, self.each(parts)).ravel()
-        return jnp.concatenate([weight * (frame - still), pressed, jnp.sqrt(1 + x @ self.precision() @ x)[None]])
+        return jnp.concatenate([weight * (frame - still), pressed, jnp.sqrt(1 + x @ self.prior @ x)[None]])
 
     def quadratic(self, x: Float[Array, " n"]) -> HalfSquares:
         """Gauss and Newton's quadratic of the misfits, plus that of the prior."""
-        parts, prior = self.parts(x), self.precision()
+        parts, prior = self.parts(x), self.prior
         there, sigma = self.sheet(parts)
         still, shift = forward(there, sigma), self.settings.shift
         n, k, m = self.image.size, len(self.strength), len(self.model.pattern)
@@ -313,10 +306,8 @@ def _described(posterior: _Posterior, x: Float[Array, " n"]) -> ElectrodeFit:
     parts, shift = posterior.parts(x), posterior.settings.shift
     curvature = posterior.quadratic(x).hessian.matrix
     n, both = posterior.image.size, 2 * posterior.model.electrodes
-    scale = jax.lax.rsqrt(jnp.diagonal(curvature))
-    factor = jnp.linalg.cholesky(scale[:, None] * curvature * scale)
-    wanted = jnp.eye(len(x), dtype=x.dtype)[:, n : n + both] * scale[:, None]
-    covariance = (scale[:, None] * cho_solve((factor, True), wanted))[n : n + both]
+    solve = normal_inverse(curvature, jnp.ones(len(x), bool))
+    covariance = solve(jnp.eye(len(x), dtype=x.dtype)[:, n : n + both])[n : n + both]
     missed = posterior.residual(x)[:-1]
     used = jnp.sum(missed != 0, dtype=x.dtype)
     return ElectrodeFit(

@@ -153,6 +153,8 @@ def test_options_come_before_the_file_and_the_file_before_the_defaults(tmp_path)
     assert plain.fidelity == je.Fidelity.draft(order=2)
     assert not plain.even_sheet
     assert options("--even-sheet").even_sheet
+    assert options("--fit-electrodes").fit_electrodes
+    assert not plain.fit_electrodes
     path.write_text("even_sheet = true\n")
     assert options("--recipe", str(path)).even_sheet
 

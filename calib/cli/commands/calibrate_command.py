@@ -65,7 +65,7 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         if all("eit" not in session.streams for session in sessions):
             return _calibrate_logs(args, recipe, sessions)
         announce_model(skin or parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml"), recipe.fidelity)
-        stages = stack.enter_context(stage_bar(len(STAGES) + recipe.learn_layer))
+        stages = stack.enter_context(stage_bar(len(STAGES) + recipe.fit_electrodes + recipe.learn_layer))
         calibration = calibrate(sessions, skin, recipe=recipe, ignore_errors=args.force, progress=stages)
         tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}
         tried = {name: evaluate(calibration, s, ignore_errors=args.force) for name, s in tests.items()}
