@@ -141,13 +141,13 @@ def fit_electrodes(
 
 
 def _no_presses(model: Model) -> KnownPresses:
-    none = jnp.zeros((0, len(model.pattern)), model.dtype)
-    return KnownPresses(none, jnp.zeros((0, 2), model.dtype), jnp.ones(len(model.pattern), model.dtype))
+    none = jnp.zeros((0, model.readings), model.dtype)
+    return KnownPresses(none, jnp.zeros((0, 2), model.dtype), jnp.ones(model.readings, model.dtype))
 
 
 def _checked(model: Model, presses: KnownPresses) -> KnownPresses:
     """The presses in the model's precision; raises InverseError if shapes or values are wrong."""
-    count, readings = len(presses.place), len(model.pattern)
+    count, readings = len(presses.place), model.readings
     wanted = {"change": (count, readings), "place": (count, 2), "noise": (readings,)}
     for name, shape in wanted.items():
         if getattr(presses, name).shape != shape:
@@ -269,7 +269,7 @@ class _Posterior(AbstractPosterior):
         parts, prior = self.parts(x), self.prior
         there, sigma = self.sheet(parts)
         still, shift = forward(there, sigma), self.settings.shift
-        n, k, m = self.image.size, len(self.strength), len(self.model.pattern)
+        n, k, m = self.image.size, len(self.strength), self.model.readings
         coat = scaled_jacobian(there, sigma, self.image, sigma)
         by_shift = shift * shift_jacobian(there, self.motion, sigma).reshape(m, -1)
         frame, weight = self.untouched

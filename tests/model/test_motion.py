@@ -149,3 +149,19 @@ def test_what_cannot_be_moved_is_refused(skin):
     coated = je.discretise(je.Scene(skin, (je.effects.ContinuousCoating(),)), je.Fidelity.draft())
     with pytest.raises(MotionError, match="metal coat"):
         electrode_motion(coated)
+
+
+def test_readings_of_any_currents_move_too():
+    """Trigonometric currents: each reading is a sum over readings of four electrodes."""
+    angle = 2 * np.pi * np.arange(8) / 8
+    current = np.stack([np.cos(angle), np.sin(angle)], 1)
+    protocol = je.Protocol.from_matrices(current, np.eye(8)[:, :-1] - np.eye(8)[:, 1:])
+    patches = je.skin.rim_electrodes(je.Disc(1.0), 8, width=0.3, contact=0.01)
+    model = je.discretise(
+        je.Scene(je.Skin("tank", je.Disc(1.0), 1.0, patches, protocol)), je.Fidelity(edge_length=0.2, solver=Dense())
+    )
+    motion = electrode_motion(model)
+    slopes = shift_jacobian(model, motion)
+    expected = jax.jacfwd(lambda shift: je.forward(moved(model, motion, shift)))(jnp.zeros((8, 2)))
+    assert slopes.shape == (14, 8, 2)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-9, atol=1e-12)
