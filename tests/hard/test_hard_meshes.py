@@ -44,7 +44,7 @@ def test_slivers_are_refused_and_would_cost_no_digits(hard):
         double = strip_error(mesh)
         assert double < 1e-10
         with pytest.raises(
-            je.meshing.MeshError, match=r"triangle \d+ at .* has an angle of .* use a shorter edge_length"
+            je.meshing.MeshError, match=r"triangle \d+ at .* has an angle of .* accept such triangles with min_angle="
         ):
             je.meshing.Mesh(mesh.nodes, mesh.triangles).check()
     with np.errstate(divide="ignore", invalid="ignore"):
