@@ -181,6 +181,20 @@ def test_a_calibration_whose_pads_were_exchanged_is_refused(calibration, folder)
         calib.load_calibration(folder / "changed.h5")
 
 
+def test_an_estimator_of_contacts_is_kept_in_the_file(model, calibration, folder):
+    """With every array and setting it has; what it leaves out, such as the shares of mixed readings, is left out."""
+    locator = calib.calibration.FittedContact(columns=7, widths=(0.012, 0.02))
+    made = locator.prepare(model, np.full(550, 1e-5), np.ones(550, bool))
+    assert made.finder.whitening.shares is None
+    again = locator_from_numbers(locator_numbers(made), model.dtype)
+    assert jax.tree.structure(again) == jax.tree.structure(made)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (made, again)), strict=True))
+    arrays = {name: (array, "", "") for name, array in locator_numbers(made).items()}
+    calib.session.write_archive(folder / "locator.h5", "skin-calibration", {}, arrays)
+    kept = calib.session.read_archive(folder / "locator.h5", "skin-calibration").arrays
+    assert kept.keys() == arrays.keys()
+
+
 @pytest.mark.slow
 def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, calibration, grid):
     locator = calib.calibration.FittedContact(columns=21, widths=(0.008, 0.03))

@@ -197,7 +197,7 @@ def _numbers(module: eqx.Module, at: str = "") -> Iterator[tuple[str, np.ndarray
         value = getattr(module, part.name)
         if isinstance(value, eqx.Module):
             yield from _numbers(value, f"{at}{part.name}-")
-        else:
+        elif value is not None:
             array = np.asarray(value)
             large = array.dtype == np.float64 and array.size >= _SINGLE_PRECISION_SIZE
             yield at + part.name, array.astype(np.float32) if large else array
@@ -217,6 +217,8 @@ def _module(kind: type, numbers: dict[str, np.ndarray], at: str, dtype: Any) -> 
         hint = hints[part.name]
         if isinstance(hint, type) and issubclass(hint, eqx.Module):
             parts[part.name] = _module(hint, numbers, f"{at}{part.name}-", dtype)
+        elif part.default is None and at + part.name not in numbers:
+            parts[part.name] = None
         elif hint is int:
             parts[part.name] = int(numbers[at + part.name])
         else:
