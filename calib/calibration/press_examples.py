@@ -8,6 +8,7 @@ import numpy as np
 import jaxeit as je
 
 from ..presses.pooled import PooledPresses
+from .localisation.spread import farthest_first
 
 COUNT = 4
 PROBES = 24  # presses all over the sheet
@@ -55,21 +56,16 @@ def press_examples(presses: PooledPresses, skin: je.Skin) -> PressExamples:
     pads = [skin.pads[k] for k in np.unique(np.linspace(0, len(skin.pads) - 1, COUNT - 1).round().astype(int))]
     middles = [rows[np.linalg.norm(position[rows] - np.mean(pad.outline, 0), axis=1).argmin()] for pad in pads]
     chosen = list(dict.fromkeys([int(shared), *map(int, middles)]))
-    return _rows(presses, chosen)
+    return _rows(presses, np.array(chosen))
 
 
 def press_probes(presses: PooledPresses) -> PressExamples:
     """Presses all over the sheet and of all forces: each is the one farthest from those before it."""
     span = np.ptp(presses.position, axis=0).max() or 1.0
     every = np.column_stack([presses.position / span, presses.data.force / presses.data.force.max()])
-    chosen = [int(np.linalg.norm(every - every.mean(0), axis=1).argmin())]
-    away = np.full(len(every), np.inf)
-    while len(chosen) < min(PROBES, len(every)):
-        away = np.minimum(away, np.linalg.norm(every - every[chosen[-1]], axis=1))
-        chosen.append(int(away.argmax()))
-    return _rows(presses, chosen)
+    return _rows(presses, farthest_first(every, PROBES)[0])
 
 
-def _rows(presses: PooledPresses, chosen: list[int]) -> PressExamples:
+def _rows(presses: PooledPresses, chosen: np.ndarray) -> PressExamples:
     readings = np.concatenate([recording.pressure for recording in presses.recordings])
     return PressExamples(presses.dv[chosen], readings[chosen], presses.position[chosen], presses.data.force[chosen])

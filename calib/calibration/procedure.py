@@ -28,10 +28,8 @@ from .recipe import Recipe
 from .storage import describe
 
 STAGES = ("reading", "model and images", "fitting", "holding out")
-PLACING, LEARNING = (
-    "placing the electrodes",
-    "learning the contact layer",
-)  # further stages, if the recipe asks for them
+# Further stages, if the recipe asks for them.
+PLACING, LEARNING = "placing the electrodes", "learning the contact layer"
 
 
 def calibrate(

@@ -8,11 +8,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from ..budget import require
+
+Vectors = TypeVar("Vectors", np.ndarray, Array)
 
 TOLERANCE = 1e-9
 """Points this close to the rim, relative to the domain's diagonal, count as being on it."""
@@ -303,9 +307,9 @@ def _by_blocks(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray,
     return np.concatenate([function(values[start : start + rows]) for start in range(0, len(values), rows)])
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """z component of the cross product of plane vectors (..., 2); NumPy >= 2.5 has no cross product in the plane."""
-    product: np.ndarray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def cross(a: Vectors, b: Vectors) -> Vectors:
+    """z component of the cross product of plane vectors (..., 2), in NumPy or in JAX; NumPy >= 2.5 has none."""
+    product: Vectors = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return product
 
 

@@ -133,7 +133,7 @@ def gauss_newton(
     Args:
         steps: largest number of steps.
     """
-    weight, readings = _weights(jnp.asarray(readings), jnp.asarray(std))
+    weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     start = jnp.zeros(physics.image.size, readings.dtype)
     return most_probable(_Posterior(physics, penalty, readings, weight), start, steps, tolerance)
 
@@ -193,7 +193,7 @@ def most_probable(
     return found.value
 
 
-def _weights(
+def reading_weights(
     readings: Float[Array, " readings"], std: Float[Array, " readings"]
 ) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
     """One over the noise, and the readings; both 0 where a reading or its noise is not finite."""
@@ -222,7 +222,7 @@ def least_squares_image(
     Returns:
         (basis,); NaN throughout if the solver did not converge.
     """
-    weight, readings = _weights(jnp.asarray(readings), jnp.asarray(std))
+    weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     tolerance = 1e-6 if readings.dtype == jnp.float64 else 1e-3
     solver = LevenbergMarquardt(tolerance, tolerance) if solver is None else solver
     return _solved(_Posterior(physics, penalty, readings, weight), solver, steps)

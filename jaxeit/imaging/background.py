@@ -60,19 +60,17 @@ def fit_background(
     v0, even = jnp.asarray(v0, model.dtype), forward(model, model.background)
     require_frame(v0, even)
     require_positive(std=std, length=length, model_error=model_error, columns=columns)
-    there = jnp.isfinite(v0)
-    known = jnp.where(there, v0, 0)
     level = sheet_level(v0, even)
     image = Pixels(columns).on(model) if basis is None else basis
     physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
     # The setting of a prior is a number; a length that JAX traces takes its place.
     smooth = eqx.tree_at(lambda prior: prior.length, GaussianSmooth(), jnp.asarray(length, model.dtype))
     prior = smooth.precision(jnp.zeros((1, image.size), model.dtype), image.picture)
-    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
-    error = jnp.hypot(model_error * known, floor)
+    error = frame_error(v0, model_error)
     penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)
     x = gauss_newton(physics, penalty, v0, error, tolerance=tolerance)
-    _check_explained(physics.voltages(x), known, there)
+    there = jnp.isfinite(v0)
+    _check_explained(physics.voltages(x), jnp.where(there, v0, 0), there)
     return physics.sigma(x)
 
 
@@ -109,6 +107,14 @@ def sheet_level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) 
     if _is_known(level) and not level > 0:
         raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
     return level
+
+
+def frame_error(v0: Float[Array, " readings"], model_error: Float[ArrayLike, ""]) -> Float[Array, " readings"]:
+    """Standard error of each reading of an untouched frame: a part of itself, and a thousandth of their rms."""
+    there = jnp.isfinite(v0)
+    known = jnp.where(there, v0, 0)
+    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
+    return jnp.hypot(model_error * known, floor)
 
 
 def require_frame(v0: Float[Array, "..."], even: Float[Array, " readings"]) -> None:

@@ -30,8 +30,8 @@ from ..model.discretisation import Model
 from ..model.forward_model import forward
 from ..model.motion import Motion, electrode_motion, moved, shift_jacobian
 from ..model.sensitivity import scaled_jacobian
-from .absolute import AbstractPosterior, most_probable
-from .background import ERROR_FLOOR, require_frame, sheet_level
+from .absolute import AbstractPosterior, most_probable, reading_weights
+from .background import frame_error, require_frame, sheet_level
 from .noise import InverseError
 from .priors import GaussianSmooth
 
@@ -128,10 +128,7 @@ def fit_electrodes(
     frame, even = jnp.asarray(v0, model.dtype), forward(model)
     require_frame(frame, even)
     level = sheet_level(frame, even) * jnp.average(model.background, weights=model.areas)
-    there = jnp.isfinite(frame)
-    known = jnp.where(there, frame, 0)
-    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
-    weight = jnp.where(there, 1 / jnp.hypot(settings.model_error * known, floor), 0)
+    weight, known = reading_weights(frame, frame_error(frame, settings.model_error))
     seen = _no_presses(model) if presses is None else _checked(model, presses)
     strength = _first_strengths(model, image, seen, level, settings)
     prior = _prior(image, model.electrodes, len(strength), settings)
@@ -168,7 +165,7 @@ def _first_strengths(
     """Logarithm of the relative change of conductivity in the middle of each press, by linear least squares."""
     jacobian = scaled_jacobian(model, None, image, model.background)
     away = jnp.sum((image.picture.centres - presses.place[:, None]) ** 2, -1)
-    expected = jnp.exp(-0.5 * away / settings.width**2) @ jacobian.T * (level / jnp.mean(model.background)) ** -1
+    expected = jnp.exp(-0.5 * away / settings.width**2) @ jacobian.T * (jnp.mean(model.background) / level)
     change = jnp.where(jnp.isfinite(presses.change), presses.change, 0)
     found = jnp.sum(expected * change, 1) / jnp.sum(expected**2, 1)
     return jnp.log(jnp.clip(found, 0.01, 3))

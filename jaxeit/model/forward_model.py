@@ -216,9 +216,14 @@ def _checked_values(model: Model, name: str, values: Float[Array, " elements"]) 
 
 def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:
     """Voltages of the protocol from the transfer matrix in ohm."""
-    source, sink, plus, minus = model.pattern.T
-    found = model.current * (z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
+    found: Array = model.current * four_terminal(z, model.pattern)
     return found if model.mixing is None else model.mixing(found)
+
+
+def four_terminal(z: Any, pattern: Any) -> Any:
+    """Readings (..., readings) of a pattern (readings, 4) from matrices (..., electrodes, electrodes), NumPy or JAX."""
+    source, sink, plus, minus = pattern.T
+    return z[..., plus, source] - z[..., minus, source] - z[..., plus, sink] + z[..., minus, sink]
 
 
 class DerivativeError(ValueError):

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._compile import is_traced, require_known, verb
-from ..meshing.elements import BY_ORDER, element_slopes
+from ..geometry.shapes import cross
+from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.triangles import Mesh
 from .discretisation import Model
 from .forward_model import coefficients, fields, series_resistance, voltages
@@ -208,7 +209,9 @@ def _moved(model: Model, motion: Motion, shift: Float[Array, "electrodes 2"]) ->
     areas = _areas(nodes[model.triangles])
     order = 1 if system.dofs.shape[1] == 3 else 2
     slopes = jnp.asarray(element_slopes(nodes[model.triangles], areas, BY_ORDER[order]))
-    slopes = jnp.where(jnp.all(_upright(chart[model.triangles])), slopes, jnp.nan)
+    flat = chart[model.triangles]
+    upright = cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]) > 0
+    slopes = jnp.where(jnp.all(upright), slopes, jnp.nan)
     stiffness = slopes @ slopes.swapaxes(1, 2)
     entries = [jnp.where(place < 0, 0, stiffness.ravel()[jnp.maximum(place, 0)]) for place in motion.places]
     above = system.under[system.dofs[system.bridge_element]]
@@ -239,12 +242,6 @@ def _areas(corners: Float[Array, "n 3 d"]) -> Float[Array, " n"]:
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     gram = jnp.sum(u * u, 1) * jnp.sum(v * v, 1) - jnp.sum(u * v, 1) ** 2
     return 0.5 * jnp.sqrt(jnp.maximum(gram, jnp.finfo(corners.dtype).tiny))
-
-
-def _upright(corners: Float[Array, "n 3 2"]) -> Bool[Array, " n"]:
-    """Whether each triangle is counter-clockwise."""
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return u[:, 0] * v[:, 1] > u[:, 1] * v[:, 0]
 
 
 def _sizes(nodes: Float[Array, "nodes d"], corners: Int[Array, "p 3"]) -> Float[Array, " p"]:
@@ -318,7 +315,12 @@ def _sheet_change(
         weight = jnp.where(start + jnp.arange(batch) >= i * batch, weight, 0)
         flat = jnp.einsum("ekr,eka->era", slopes, potential[dofs]).reshape(batch, -1, 2, model.electrodes)
         products = jnp.einsum("eqcp,eqdp->ecdp", flat[..., first], flat[..., second])
-        frame, slope = _frames(model.nodes[corners])
+        # The slopes of the barycentric coordinates l_i, 1/m, and the frame that they are in: its axes are those of
+        # the place, which is the sum of l_i times corner i.
+        places = model.nodes[corners]
+        areas = _areas(places)
+        slope = jnp.asarray(element_slopes(places, areas, P1)) / jnp.sqrt(areas)[:, None, None]
+        frame = jnp.einsum("enc,enx->ecx", slope, places)
         velocity = jnp.einsum("ecx,enxs->encs", frame, motion.space_step[corners])
         spread = jnp.einsum("encs,enc->ens", velocity, slope)
         bent = jnp.einsum("encs,end,ecdp->ensp", velocity, slope, products + products.swapaxes(1, 2))
@@ -329,18 +331,3 @@ def _sheet_change(
     none = jnp.zeros((model.electrodes, 2, len(first)), model.dtype)
     found: Array = jax.lax.fori_loop(0, -(-len(model.triangles) // batch), add, none)
     return found
-
-
-def _frames(corners: Float[Array, "e 3 d"]) -> tuple[Float[Array, "e 2 d"], Float[Array, "e 3 2"]]:
-    """The orthonormal frame of each triangle, whose first axis points along the first edge, and the slopes of the
-    barycentric coordinates in it, 1/m."""
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    length = jnp.sqrt(jnp.sum(first**2, 1, keepdims=True))
-    along = first / length
-    aside = second - jnp.sum(second * along, 1, keepdims=True) * along
-    height = jnp.sqrt(jnp.sum(aside**2, 1, keepdims=True))
-    frame = jnp.stack([along, aside / height], 1)
-    up = jnp.sum(second * along, 1, keepdims=True) / length
-    third = jnp.concatenate([jnp.zeros_like(height), 1 / height], 1)
-    middle = jnp.concatenate([1 / length, -up / height], 1)
-    return frame, jnp.stack([-third - middle, middle, third], 1)

@@ -11,7 +11,6 @@ with j_i the derivatives of reading i in units of its noise (Cramer-Rao, nuisanc
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,7 +25,7 @@ from ..contacts.bump_responses import points_of
 from ..linalg import lapack
 from ..model.bases import BasisMap, Elements, Pixels
 from ..model.discretisation import Model
-from ..model.forward_model import coefficients, transfer
+from ..model.forward_model import coefficients, four_terminal, transfer
 from ..model.sensitivity import pair_jacobian
 from ..skin.protocol import ProtocolError
 
@@ -109,14 +108,14 @@ class PlaceSensitivity(eqx.Module):
     @verb
     def voltages(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, " readings"]:
         """Readings of the untouched sheet, V."""
-        found: Array = _differences(self.transfer, jnp.asarray(pattern))
+        found: Array = four_terminal(self.transfer, jnp.asarray(pattern))
         return found
 
     @verb
     def rows(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, "sites 4 readings"]:
         """Derivatives of readings with respect to the unknowns of a contact, in units of the error of each reading."""
         std = jnp.sqrt(self.noise**2 + (self.relative * self.voltages(pattern)) ** 2)
-        found: Array = _differences(self.slopes, jnp.asarray(pattern)) / std
+        found: Array = four_terminal(self.slopes, jnp.asarray(pattern)) / std
         change = found[:, 2:3]  # with respect to log strength: the change by the contact itself
         found = found / jnp.sqrt(1 + (self.model_error * change) ** 2)
         return found
@@ -151,12 +150,6 @@ def _errors(
 
 def _rms(values: Numbers) -> float:
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
-
-
-def _differences(z: Numbers, pattern: Numbers) -> Any:
-    """Readings (..., readings) of a pattern from matrices (..., electrodes, electrodes)."""
-    source, sink, plus, minus = pattern.T
-    return z[..., plus, source] - z[..., minus, source] - z[..., plus, sink] + z[..., minus, sink]
 
 
 def inverse_information(information: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
@@ -197,7 +190,7 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
         settings.strength * float(model.current) * np.asarray(by_pair).T
     )
     z = float(model.current) * np.asarray(transferred, float)
-    noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(_differences(z, np.asarray(model.pattern)))
+    noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(four_terminal(z, np.asarray(model.pattern)))
     chart = np.asarray(model.chart)
     extent = float(np.linalg.norm(np.ptp(chart, axis=0))) / settings.width  # a place is somewhere on the sheet
     prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2

@@ -29,10 +29,8 @@ from ..skin.patterns import all_pairs
 from ..skin.protocol import Protocol, ProtocolError
 from .contact_information import UNKNOWNS, PlaceSensitivity, inverse_information
 
-ITERATIONS, TOLERANCE = (
-    300,
-    4e-3,
-)  # of the weights: at most so many, or until the bound is so near, as part of the error
+# Of the weights: at most so many iterations, or until the bound is so near, as part of the error.
+ITERATIONS, TOLERANCE = 300, 4e-3
 MIN_GAIN = 1e-4  # part of h by which an exchange must lower it
 UPPER = np.triu_indices(UNKNOWNS)
 

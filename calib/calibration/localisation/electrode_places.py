@@ -7,6 +7,7 @@ import jaxeit as je
 from jaxeit.imaging import ElectrodeFit, InverseError, KnownPresses, fit_electrodes
 
 from ...presses.pooled import PooledPresses
+from .spread import farthest_first
 
 # The errors of a mesh of first order would be taken for shifts of electrodes.
 FIDELITY = je.Fidelity(order=2, edge_length=je.Fidelity.draft().edge_length)
@@ -36,9 +37,8 @@ def place_electrodes(skin: je.Skin, presses: PooledPresses) -> tuple[je.Skin, st
             f"no places of the electrodes explain the presses: what is left is {float(fit.misfit):.2g} times the "
             "stated errors; check the skin's file and the places of the presses, or leave out fit_electrodes"
         )
-    return je.skin.with_positions(skin, skin.electrode_positions + np.asarray(fit.shift, float)), _note(
-        fit, len(chosen)
-    )
+    there = je.skin.with_positions(skin, skin.electrode_positions + np.asarray(fit.shift, float))
+    return there, _note(fit, len(chosen))
 
 
 def spread_presses(position: np.ndarray) -> np.ndarray:
@@ -46,13 +46,9 @@ def spread_presses(position: np.ndarray) -> np.ndarray:
     placed = np.flatnonzero(np.isfinite(position).all(1))
     if not len(placed):
         return placed
-    places = position[placed]
-    taken = [int(np.argmin(np.linalg.norm(places - places.mean(0), axis=1)))]
-    away = np.linalg.norm(places - places[taken[0]], axis=1)
-    while len(taken) < MOST_PRESSES and away.max() > 0:
-        taken.append(int(np.argmax(away)))
-        away = np.minimum(away, np.linalg.norm(places - places[taken[-1]], axis=1))
-    return placed[taken]
+    taken, gaps = farthest_first(position[placed], MOST_PRESSES)
+    rows: np.ndarray = placed[taken[gaps > 0]]
+    return rows
 
 
 def _note(fit: ElectrodeFit, presses: int) -> str:
