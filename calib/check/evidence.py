@@ -1,7 +1,7 @@
 """Changes of all streams during the presses of a recording, for the checks that compare streams with each other."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,8 +66,7 @@ def gather_evidence(streams: Mapping[str, Stream], presses: PressColumns, window
 
 def _chosen(presses: PressColumns, windows: PressWindows, rows: np.ndarray) -> tuple[PressColumns, PressWindows]:
     """Some of the presses, with windows that take all presses into account."""
-    parts = {name: getattr(windows, name)[rows] for name in windows.__dataclass_fields__}
-    return select(presses, rows), replace(windows, **parts)
+    return select(presses, rows), windows.rows(rows)
 
 
 def _sites(streams: Mapping[str, Stream], presses: PressColumns, rows: np.ndarray) -> np.ndarray | None:

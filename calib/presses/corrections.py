@@ -199,48 +199,50 @@ BLOCKS_PER_WINDOW = 8
 def _window_mean(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, standard error and count of finite samples per channel of one window (n, channels)."""
     good = np.isfinite(values)
-    if len(values) and good.all():  # the usual case, in a fifth of the time
-        return *_finite_window(values), np.full(values.shape[1], len(values))
     count = good.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = finite_mean(values)
         return mean, _standard_error(np.where(good, values - mean, 0.0), good, count), count
 
 
-def _block_edges(rows: int) -> np.ndarray:
-    """First rows of the blocks of a window, and its length."""
-    blocks = min(BLOCKS_PER_WINDOW, rows)
-    return np.arange(blocks + 1) * rows // max(blocks, 1)
-
-
-def _finite_window(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and `_standard_error` of finite samples, from the sums of the blocks."""
-    rows, edges = len(values), _block_edges(len(values))
-    blocks = len(edges) - 1
-    sums = np.add.reduceat(values - values[0], edges[:-1], axis=0)  # of differences: levels are large, noise is small
-    shift = sums.sum(axis=0) / rows
-    if blocks < 2:
-        return values[0] + shift, np.full(values.shape[1], np.nan)
-    sums -= (edges[1:] - edges[:-1])[:, None] * shift
-    scatter = np.einsum("bc,bc->c", sums, sums) * (blocks / (blocks - 1))
-    return values[0] + shift, np.sqrt(scatter) / rows
-
-
 def _standard_error(residual: np.ndarray, good: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Standard error of a mean from the scatter of block sums (batch means); NaN with fewer than two blocks."""
-    edges = _block_edges(len(residual))[:-1]
-    if not len(edges):
+    rows, blocks = len(residual), min(BLOCKS_PER_WINDOW, len(residual))
+    if not blocks:
         return np.full(count.shape, np.nan)
+    edges = np.arange(blocks) * rows // blocks
     sums = np.add.reduceat(residual, edges, axis=0)
     used = (np.add.reduceat(good.astype(int), edges, axis=0) > 0).sum(axis=0)
     scatter = (sums**2).sum(axis=0) * used / np.where(used > 1, used - 1, np.nan)
     return np.asarray(np.sqrt(scatter) / count)
 
 
+def _whole_windows(values: np.ndarray, ranges: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Means and standard errors (windows, channels) of windows of finite samples, each cut into so many blocks."""
+    rows = ranges[:, 1] - ranges[:, 0]
+    ends = np.cumsum(rows)
+    index = np.repeat(ranges[:, 1] - ends, rows) + np.arange(ends[-1])
+    level = values[ranges[:, 0]]  # levels are large, noise is small; and a constant window has no error at all
+    away = values[index] - np.repeat(level, rows, axis=0)
+    edges = np.arange(blocks + 1) * rows[:, None] // blocks
+    first = (edges + (ends - rows)[:, None])[:, :-1]
+    sums = np.add.reduceat(away, first.ravel(), axis=0).reshape(*first.shape, -1)
+    shift = sums.sum(axis=1) / rows[:, None]
+    sums -= np.diff(edges)[:, :, None] * shift[:, None]
+    scatter = np.einsum("wbc,wbc->wc", sums, sums) * (blocks / (blocks - 1) if blocks > 1 else np.nan)
+    return level + shift, np.sqrt(scatter) / rows[:, None]
+
+
 def window_means(values: np.ndarray, ranges: np.ndarray) -> WindowMeans:
     """Means of `values` (n, channels) over half-open index `ranges` (windows, 2)."""
-    parts = [_window_mean(values[a:b]) for a, b in ranges]
-    if not parts:
-        empty = np.empty((0, values.shape[1]))
-        return WindowMeans(empty, empty, empty.astype(int))
-    return WindowMeans(*(np.stack(column) for column in zip(*parts, strict=True)))
+    shape, rows = (len(ranges), values.shape[1]), ranges[:, 1] - ranges[:, 0]
+    mean, error, count = np.empty(shape), np.empty(shape), np.empty(shape, int)
+    lost = np.append(0, np.cumsum(~np.isfinite(values).all(axis=1)))
+    blocks = np.where(lost[ranges[:, 1]] == lost[ranges[:, 0]], np.minimum(rows, BLOCKS_PER_WINDOW), 0)
+    for number in np.unique(blocks[blocks > 0]):  # whole windows, the usual case, take a fraction of the time together
+        alike = blocks == number
+        mean[alike], error[alike] = _whole_windows(values, ranges[alike], int(number))
+        count[alike] = rows[alike, None]
+    for i in np.flatnonzero(blocks == 0):
+        mean[i], error[i], count[i] = _window_mean(values[slice(*ranges[i])])
+    return WindowMeans(mean, error, count)

@@ -1,13 +1,13 @@
 """Mean change of each stream over the hold of each press, with the baseline removed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from ..session.units import SECOND
 from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, WindowMeans, correct, window_means
-from .streams import ReadableStream, ReadAhead, index_ranges
+from .streams import READ_AHEAD_BYTES, ReadableStream, index_ranges
 from .times import PressColumns
 from .windows import PressWindows
 
@@ -35,27 +35,42 @@ class PressMeans:
         return np.asarray(np.isnan(self.change.mean).sum(axis=0))
 
 
-def _span(time: np.ndarray, windows: PressWindows, i: int) -> tuple[int, int]:
-    start, stop = windows.rest_before[i, 0] - FILTER_MARGIN, windows.rest_after[i, 1] + FILTER_MARGIN
-    return tuple(int(k) for k in np.searchsorted(time, [start, stop]))  # type: ignore[return-value]
+def _spans(time: np.ndarray, windows: PressWindows) -> np.ndarray:
+    """Half-open index ranges (presses, 2) of the samples around each press, with the margin of filters."""
+    start, stop = windows.rest_before[:, 0] - FILTER_MARGIN, windows.rest_after[:, 1] + FILTER_MARGIN
+    return index_ranges(time, np.stack([start, stop], 1))
 
 
 def read_press(
     stream: ReadableStream, windows: PressWindows, i: int, corrections: Sequence[AbstractCorrection]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Time stamps (n,) ns and corrected values (n, channels) around press `i`."""
-    a, b = _span(stream.time, windows, i)
+    ((a, b),) = _spans(stream.time, windows.rows(slice(i, i + 1))).tolist()
     time = stream.time[a:b]
     return time, correct(corrections, time, stream.read(a, b), stream.name)
 
 
+def _read_together(spans: np.ndarray, rows: int) -> Iterator[slice]:
+    """Presses of these index ranges (presses, 2), those together that follow each other within so many rows."""
+    first = 0
+    for i in range(1, len(spans) + 1):
+        if i == len(spans) or spans[i, 0] < spans[first, 0] or spans[i, 1] - spans[first, 0] > rows:
+            yield slice(first, i)
+            first = i
+
+
 def _averaged_windows(
-    stream: ReadableStream, windows: PressWindows, i: int, corrections: Sequence[AbstractCorrection]
-) -> WindowMeans:
-    """Means of one press over the three averaged windows, in the order of `AVERAGED_WINDOWS`."""
-    time, values = read_press(stream, windows, i, corrections)
-    times = np.stack([getattr(windows, name)[i] for name in AVERAGED_WINDOWS])
-    return window_means(values, index_ranges(time, times))
+    stream: ReadableStream, windows: PressWindows, corrections: Sequence[AbstractCorrection]
+) -> Iterator[WindowMeans]:
+    """Means over the three averaged windows of each press, in the order of `AVERAGED_WINDOWS`, in parts of presses."""
+    time, spans = stream.time, _spans(stream.time, windows)
+    ranges = index_ranges(time, np.stack([getattr(windows, name) for name in AVERAGED_WINDOWS], 1))
+    # A filter sees each press alone, so that no press changes the means of another one.
+    rows = 0 if corrections else READ_AHEAD_BYTES // (8 * max(stream.channels, 1))
+    for presses in _read_together(spans, rows):
+        a, b = int(spans[presses, 0].min()), int(spans[presses, 1].max())
+        values = correct(corrections, time[a:b], stream.read(a, b), stream.name)
+        yield window_means(values, np.clip(ranges[presses].reshape(-1, 2) - a, 0, b - a))
 
 
 def press_means(
@@ -73,8 +88,7 @@ def press_means(
     Returns: rows for all presses; NaN where a channel has no finite sample in a window that the baseline uses.
     """
     rule = TwoSided() if baseline is None else baseline
-    ahead = ReadAhead(stream)
-    parts = [_averaged_windows(ahead, windows, i, corrections) for i in range(len(windows.hold))]
+    parts = list(_averaged_windows(stream, windows, corrections))
     held, before, after = (_nth_window(parts, k, stream.channels) for k in range(3))
     centres = tuple(windows.centre(name) for name in AVERAGED_WINDOWS)
     change = rule.remove(held, before, after, centres)
@@ -83,9 +97,8 @@ def press_means(
 
 def _nth_window(parts: list[WindowMeans], k: int, width: int) -> WindowMeans:
     """The k-th window of every press."""
-    return WindowMeans(
-        *(np.array([getattr(p, f.name)[k] for p in parts]).reshape(len(parts), width) for f in fields(WindowMeans))
-    )
+    columns = ([getattr(part, f.name)[k :: len(AVERAGED_WINDOWS)] for part in parts] for f in fields(WindowMeans))
+    return WindowMeans(*(np.concatenate([np.empty((0, width)), *column]) for column in columns))
 
 
 def hold_positions(presses: PressColumns, stage: ReadableStream) -> np.ndarray:

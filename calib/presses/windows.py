@@ -1,7 +1,7 @@
 """Time windows of presses: rest before, ramp, hold, release, rest after. All windows are half open."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -24,6 +24,10 @@ class PressWindows:
     def centre(self, name: str) -> np.ndarray:
         """Middle of a window, (presses,) ns as float."""
         return np.asarray(getattr(self, name).astype(float).mean(axis=1))
+
+    def rows(self, index: np.ndarray | slice) -> "PressWindows":
+        """Windows of some of the presses."""
+        return PressWindows(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 @dataclass(frozen=True)
