@@ -13,7 +13,15 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ..least_squares import Cholesky, ImplicitStep, LevenbergMarquardt, normal_equations, quadratic
+from .._compile import verb
+from ..least_squares import (
+    Cholesky,
+    ImplicitStep,
+    LeastSquaresState,
+    LevenbergMarquardt,
+    normal_equations,
+    quadratic,
+)
 from ..least_squares.searches import Quadratic as HalfSquares
 from ..model.bases import BasisMap, Picture
 from ..model.discretisation import Model
@@ -135,7 +143,7 @@ def gauss_newton(
     """
     weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     start = jnp.zeros(physics.image.size, readings.dtype)
-    return most_probable(_Posterior(physics, penalty, readings, weight), start, steps, tolerance)
+    return most_probable(_Posterior(physics, penalty, readings, weight), start, steps, tolerance)[0]
 
 
 class AbstractPosterior(eqx.Module):
@@ -173,11 +181,12 @@ class _Posterior(AbstractPosterior):
         return quadratic(value, data.grad + matrix @ x, data.hessian.matrix + matrix)
 
 
-@eqx.filter_jit
+@verb
 def most_probable(
     posterior: AbstractPosterior, start: Float[Array, " n"], steps: int, tolerance: float
-) -> Float[Array, " n"]:
-    """The x of largest posterior probability, by Gauss and Newton's method as `gauss_newton` describes it."""
+) -> tuple[Float[Array, " n"], LeastSquaresState]:
+    """The x of largest posterior probability, by Gauss and Newton's method as `gauss_newton` describes it; and where
+    the fit stands then, whose quadratic is that before the last step, next to nothing."""
     newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
     solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance, descent=newton, search=optx.BacktrackingArmijo())
     found: optx.Solution[Array, Any] = optx.least_squares(
@@ -190,7 +199,7 @@ def most_probable(
         adjoint=ImplicitStep(),
         throw=False,
     )
-    return found.value
+    return found.value, found.state
 
 
 def reading_weights(
@@ -228,7 +237,7 @@ def least_squares_image(
     return _solved(_Posterior(physics, penalty, readings, weight), solver, steps)
 
 
-@eqx.filter_jit
+@verb
 def _solved(
     posterior: _Posterior, solver: optx.AbstractLeastSquaresSolver[Any, Any, Any, Any], steps: int
 ) -> Float[Array, " basis"]:

@@ -13,6 +13,7 @@ The most probable ones are found by Gauss and Newton's method through the full f
 covariance of the shifts is that of the curvature there, with all else marginalised.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,16 +21,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._compile import require_known
-from ..least_squares import normal_equations, quadratic
+from .._compile import require_known, verb
+from ..least_squares import LeastSquaresState, normal_equations, quadratic
 from ..least_squares.searches import Quadratic as HalfSquares, normal_inverse
 from ..model.bases import BasisMap, Pixels
 from ..model.discretisation import Model
-from ..model.forward_model import forward
-from ..model.motion import Motion, electrode_motion, moved, shift_jacobian
-from ..model.sensitivity import scaled_jacobian
+from ..model.forward_model import coefficients, fields, forward, terminal_matrix, voltages
+from ..model.motion import Motion, electrode_motion, field_shift_jacobian, moved
+from ..model.sensitivity import field_jacobian, field_slope, scaled_jacobian
 from .absolute import AbstractPosterior, most_probable, reading_weights
 from .background import frame_error, require_frame, sheet_level
 from .noise import InverseError
@@ -128,13 +129,15 @@ def fit_electrodes(
     frame, even = jnp.asarray(v0, model.dtype), forward(model)
     require_frame(frame, even)
     level = sheet_level(frame, even) * jnp.average(model.background, weights=model.areas)
-    weight, known = reading_weights(frame, frame_error(frame, settings.model_error))
     seen = _no_presses(model) if presses is None else _checked(model, presses)
+    weight, known = reading_weights(
+        jnp.concatenate([frame[None], seen.change]),
+        jnp.concatenate([frame_error(frame, settings.model_error)[None], _press_errors(seen, settings)]),
+    )
     strength = _first_strengths(model, image, seen, level, settings)
     prior = _prior(image, model.electrodes, len(strength), settings)
-    posterior = _Posterior(model, motion, image, level, settings, (known, weight), seen, strength, prior)
-    x = most_probable(posterior, jnp.zeros(posterior.size, model.dtype), 12, 2e-3)
-    return _described(posterior, x)
+    posterior = _Posterior(model, motion, image, level, settings, known, weight, seen.place, strength, prior)
+    return _described(posterior, *most_probable(posterior, jnp.zeros(posterior.size, model.dtype), 12, 2e-3))
 
 
 def _no_presses(model: Model) -> KnownPresses:
@@ -158,7 +161,7 @@ def _checked(model: Model, presses: KnownPresses) -> KnownPresses:
     return cast
 
 
-@eqx.filter_jit
+@verb
 def _first_strengths(
     model: Model, image: BasisMap, presses: KnownPresses, level: Float[Array, ""], settings: ElectrodeFitSettings
 ) -> Float[Array, " presses"]:
@@ -169,6 +172,15 @@ def _first_strengths(
     change = jnp.where(jnp.isfinite(presses.change), presses.change, 0)
     found = jnp.sum(expected * change, 1) / jnp.sum(expected**2, 1)
     return jnp.log(jnp.clip(found, 0.01, 3))
+
+
+def _press_errors(presses: KnownPresses, settings: ElectrodeFitSettings) -> Float[Array, "presses readings"]:
+    """Standard error of each change by a press, V: its noise, and a part of its size."""
+    there = jnp.isfinite(presses.change)
+    known = jnp.where(there, presses.change, 0)
+    count = jnp.maximum(jnp.sum(there, 1, dtype=known.dtype), 1)
+    typical = jnp.sqrt(jnp.sum(known**2, 1) / count)
+    return jnp.hypot(presses.noise, settings.press_error * jnp.hypot(known, typical[:, None]))
 
 
 class _Parts(NamedTuple):
@@ -182,7 +194,7 @@ class _Parts(NamedTuple):
     flatness: Float[Array, "1"]
 
 
-@eqx.filter_jit
+@verb
 def _prior(image: BasisMap, electrodes: int, presses: int, settings: ElectrodeFitSettings) -> Float[Array, "n n"]:
     """Precision of the unknowns, in the order of `_Parts`, before the readings are seen."""
     kind, n = image.picture.centres.dtype, image.size
@@ -196,22 +208,35 @@ def _prior(image: BasisMap, electrodes: int, presses: int, settings: ElectrodeFi
     return whole.at[:n, :n].set(coat).at[after : after + n, after : after + n].set(gain)
 
 
+class _Press(NamedTuple):
+    """A press as the fit has it; the untouched frame is one without strength."""
+
+    place: Float[Array, "2"]
+    expected: Float[Array, ""]  # logarithm of its strength at the first value
+    strength: Float[Array, ""]
+    width: Float[Array, ""]
+
+
 class _Posterior(AbstractPosterior):
-    """Minus the logarithm of the posterior probability of all unknowns, as half a sum of squares."""
+    """Minus the logarithm of the posterior probability of all unknowns, as half a sum of squares.
+
+    Frames are the untouched one, and the change by each press.
+    """
 
     model: Model
     motion: Motion
     image: BasisMap
     level: Float[Array, ""]
     settings: ElectrodeFitSettings
-    untouched: tuple[Float[Array, " readings"], Float[Array, " readings"]]  # V, and one over the error
-    presses: KnownPresses
+    readings: Float[Array, "frames readings"]  # V, zero where missing
+    weight: Float[Array, "frames readings"]  # one over the error
+    place: Float[Array, "presses 2"]
     strength: Float[Array, " presses"]  # expected
     prior: Float[Array, "n n"]  # precision of all unknowns before the readings are seen
 
     @property
     def size(self) -> int:
-        return 2 * self.image.size + 2 * self.model.electrodes + 2 * len(self.strength) + 1
+        return len(self.prior)
 
     def parts(self, x: Float[Array, " n"]) -> _Parts:
         n, e, k = self.image.size, self.model.electrodes, len(self.strength)
@@ -223,93 +248,89 @@ class _Posterior(AbstractPosterior):
         there = moved(self.model, self.motion, self.settings.shift * parts.shift)
         return there, self.level * jnp.exp(self.image.expand(parts.coat))
 
+    def presses(self, parts: _Parts) -> _Press:
+        """The presses of all frames."""
+        none = _Press(jnp.zeros(2, self.level.dtype), *jnp.array([-jnp.inf, 0, 0], self.level.dtype))
+        each = _Press(self.place, self.strength, parts.strength, parts.width)
+        whole: _Press = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), none, each)
+        return whole
+
     def bump(
-        self, parts: _Parts, press: tuple[Float[Array, "2"], Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+        self, parts: _Parts, press: _Press
     ) -> tuple[Float[Array, " elements"], Float[Array, " elements"], Float[Array, " elements"]]:
         """Relative change of conductivity by a press, and its derivatives by the logarithms of width and exponent."""
-        place, expected, strength, width = press
-        spread = jnp.square(self.settings.width * jnp.exp(width))
-        away = jnp.maximum(jnp.sum((self.model.centroids - place) ** 2, 1) / spread, 1e-6)
+        spread = jnp.square(self.settings.width * jnp.exp(press.width))
+        away = jnp.maximum(jnp.sum((self.model.centroids - press.place) ** 2, 1) / spread, 1e-6)
         exponent = jnp.exp(parts.flatness)
         fall = 0.5 * away**exponent
-        change = jnp.exp(expected + strength + self.image.expand(parts.gain) - fall)
+        change = jnp.exp(press.expected + press.strength + self.image.expand(parts.gain) - fall)
         return change, 2 * exponent * change * fall, -change * fall * jnp.log(away) * exponent
 
-    def each(self, parts: _Parts) -> tuple[Any, ...]:
-        """What `jax.lax.map` hands over for each press."""
-        return self.presses.change, (self.presses.place, self.strength, parts.strength, parts.width)
-
-    def weigh(self, change: Float[Array, " readings"]) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
-        """The change by a press without what is missing, and one over the error of each reading."""
-        there = jnp.isfinite(change)
-        known = jnp.where(there, change, 0)
-        typical = jnp.sqrt(known @ known / jnp.maximum(jnp.sum(there, dtype=known.dtype), 1))
-        error = jnp.hypot(self.presses.noise, self.settings.press_error * jnp.hypot(known, typical))
-        return known, jnp.where(there, 1 / error, 0)
-
-    def residual(self, x: Float[Array, " n"]) -> Float[Array, " readings_and_one"]:
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " frames_readings_and_one"]:
         """Weighted misfits, and a number of which half the square is the penalty plus 1/2, whose root is smooth."""
         parts = self.parts(x)
         there, sigma = self.sheet(parts)
-        still = forward(there, sigma)
+        found = jax.lax.map(lambda one: forward(there, sigma * (1 + self.bump(parts, one)[0])), self.presses(parts))
+        missed = self.weight * (self.readings - found.at[1:].add(-found[0]))
+        return jnp.append(missed.ravel(), jnp.sqrt(1 + x @ self.prior @ x))
 
-        def missed(one: tuple[Any, ...]) -> Float[Array, " readings"]:
-            change, weight = self.weigh(one[0])
-            return weight * (change - (forward(there, sigma * (1 + self.bump(parts, one[1])[0])) - still))
-
-        frame, weight = self.untouched
-        pressed = jax.lax.map(missed, self.each(parts)).ravel()
-        return jnp.concatenate([weight * (frame - still), pressed, jnp.sqrt(1 + x @ self.prior @ x)[None]])
+    def frame(
+        self, parts: _Parts, sheet: tuple[Model, Float[Array, " elements"]], number: Int[Array, ""], press: _Press
+    ) -> tuple[Float[Array, " readings"], Float[Array, "readings n"]]:
+        """Readings under a press, and their slopes in all unknowns; one factorisation serves them all."""
+        there, sigma = sheet
+        bump, by_width, by_flatness = self.bump(parts, press)
+        theta = coefficients(there, sigma * (1 + bump))
+        x = fields(there, theta)
+        by_shift = self.settings.shift * field_shift_jacobian(there, self.motion, theta, x)
+        scales = jnp.stack([theta.sigma, sigma * bump])
+        by_coat, by_gain = jax.vmap(partial(field_jacobian, there, theta, x, self.image))(scales)
+        by_shape = jax.vmap(partial(field_slope, there, theta, x))(sigma * jnp.stack([by_width, by_flatness]))
+        own = (jnp.arange(len(self.strength)) == number - 1).astype(sigma.dtype)
+        columns = [
+            by_coat,
+            by_shift.reshape(len(by_shift), -1),
+            by_gain,
+            jnp.outer(by_gain.sum(1), own),  # the pixels of an image sum to one everywhere
+            jnp.outer(by_shape[0], own),
+            by_shape[1][:, None],
+        ]
+        return voltages(there, terminal_matrix(there, theta, x)), jnp.concatenate(columns, 1)
 
     def quadratic(self, x: Float[Array, " n"]) -> HalfSquares:
         """Gauss and Newton's quadratic of the misfits, plus that of the prior."""
         parts, prior = self.parts(x), self.prior
-        there, sigma = self.sheet(parts)
-        still, shift = forward(there, sigma), self.settings.shift
-        n, k, m = self.image.size, len(self.strength), self.model.readings
-        coat = scaled_jacobian(there, sigma, self.image, sigma)
-        by_shift = shift * shift_jacobian(there, self.motion, sigma).reshape(m, -1)
-        frame, weight = self.untouched
-        slopes = jnp.concatenate([coat, by_shift, jnp.zeros((m, n + 2 * k + 1), x.dtype)], 1)
-        data = normal_equations(weight * (frame - still), -weight[:, None] * slopes)
+        sheet = self.sheet(parts)
 
-        def add(sums: tuple[Array, Array, Array], one: tuple[Any, ...]) -> tuple[tuple[Array, Array, Array], None]:
-            number, (change, press) = one
-            known, weight = self.weigh(change)
-            bump, by_width, by_flatness = self.bump(parts, press)
-            there_too = sigma * (1 + bump)
-            found, linear = jax.linearize(lambda sigma: forward(there, sigma), there_too)
-            widened, flattened = linear(sigma * by_width), linear(sigma * by_flatness)
-            by_gain = scaled_jacobian(there, there_too, self.image, sigma * bump)
-            here = jnp.arange(k) == number
-            columns = [
-                scaled_jacobian(there, there_too, self.image, there_too) - coat,
-                shift * shift_jacobian(there, self.motion, there_too).reshape(m, -1) - by_shift,
-                by_gain,
-                jnp.where(here, by_gain.sum(1)[:, None], 0),
-                jnp.where(here, widened[:, None], 0),
-                flattened[:, None],
-            ]
-            part = normal_equations(weight * (known - (found - still)), -weight[:, None] * jnp.concatenate(columns, 1))
-            return (sums[0] + part.f, sums[1] + part.grad, sums[2] + part.hessian.matrix), None
+        def add(sums: tuple[Any, Any], one: tuple[Any, ...]) -> tuple[tuple[Any, Any], None]:
+            (total, still), (number, readings, weight, press) = sums, one
+            now = self.frame(parts, sheet, number, press)
+            found, slopes = jax.tree.map(jnp.subtract, now, still)
+            part = normal_equations(weight * (readings - found), -weight[:, None] * slopes)
+            total = jax.tree.map(jnp.add, total, (part.f, part.grad, part.hessian.matrix))
+            # The first frame is the untouched one, from which all others are changes.
+            still = jax.tree.map(lambda new, old: jnp.where(number == 0, new, old), now, still)
+            return (total, still), None
 
-        sums = (data.f, data.grad, data.hessian.matrix)
-        (value, gradient, curvature), _ = jax.lax.scan(add, sums, (jnp.arange(k), self.each(parts)))
+        count, m = self.readings.shape
+        zeros = partial(jnp.zeros, dtype=x.dtype)
+        none = ((zeros(()), zeros(len(x)), zeros(prior.shape)), (zeros(m), zeros((m, len(x)))))
+        frames = (jnp.arange(count), self.readings, self.weight, self.presses(parts))
+        ((value, gradient, curvature), _), _ = jax.lax.scan(add, none, frames)
         return quadratic(value + 0.5 * x @ prior @ x, gradient + prior @ x, curvature + prior)
 
 
-@eqx.filter_jit
-def _described(posterior: _Posterior, x: Float[Array, " n"]) -> ElectrodeFit:
+@verb
+def _described(posterior: _Posterior, x: Float[Array, " n"], state: LeastSquaresState) -> ElectrodeFit:
     parts, shift = posterior.parts(x), posterior.settings.shift
-    curvature = posterior.quadratic(x).hessian.matrix
     n, both = posterior.image.size, 2 * posterior.model.electrodes
-    solve = normal_inverse(curvature, jnp.ones(len(x), bool))
+    solve = normal_inverse(state.quadratic.hessian.matrix, jnp.ones(len(x), bool))
     covariance = solve(jnp.eye(len(x), dtype=x.dtype)[:, n : n + both])[n : n + both]
-    missed = posterior.residual(x)[:-1]
-    used = jnp.sum(missed != 0, dtype=x.dtype)
+    used = jnp.sum(posterior.weight > 0, dtype=x.dtype)
+    square = jnp.maximum(state.square - x @ posterior.prior @ x, 0)
     return ElectrodeFit(
         shift * parts.shift,
         shift**2 * 0.5 * (covariance + covariance.T),
         posterior.sheet(parts)[1],
-        jnp.sqrt(missed @ missed / jnp.maximum(used, 1)),
+        jnp.sqrt(square / jnp.maximum(used, 1)),
     )

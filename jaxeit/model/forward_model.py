@@ -300,6 +300,11 @@ def series_resistance(system: System, theta: Coefficients) -> Float[Array, " ele
     return jnp.where(lumped, resistance, 0.0)
 
 
+def terminal_matrix(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "electrodes electrodes"]:
+    """The transfer matrix Z in ohm, from the fields x at theta."""
+    return x.terminal + jnp.diag(series_resistance(model.system, theta))
+
+
 @eqx.filter_custom_jvp
 def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes electrodes"]:
     plan, matrix = _matrix(model, theta)

@@ -21,14 +21,15 @@ from ..geometry.shapes import cross
 from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.triangles import Mesh
 from .discretisation import Model
-from .forward_model import coefficients, fields, series_resistance, voltages
-from .sensitivity import BATCH_ELEMENTS
+from .forward_model import Coefficients, Fields, coefficients, fields, series_resistance, terminal_matrix, voltages
 from .system import Entries, stiffness_places
 
 # The cosine between rim edges that meet in a corner, which no electrode passes.
 CORNER = np.cos(np.radians(30))
 # Parts of an electrode's radius that the mesh needs around it, so that its triangles are not flattened.
 LEAST_REACH = 1.25
+# In a batch, whose products of fields stay in a core's cache.
+BATCH_ELEMENTS = 128
 
 
 class MotionError(ValueError):
@@ -268,29 +269,34 @@ def shift_jacobian(
         sigma: (elements,) S; default: the untouched sheet.
     """
     theta = coefficients(model, sigma)
-    x = fields(model, theta)
-    first, second = np.triu_indices(model.electrodes)
-    change = -_sheet_change(model, motion, theta.sigma, x.potential, (first, second))
+    return field_shift_jacobian(model, motion, theta, fields(model, theta))
 
-    def at_contacts(shift: Float[Array, "electrodes 2"]) -> Float[Array, "electrodes pairs"]:
+
+def field_shift_jacobian(
+    model: Model, motion: Motion, theta: Coefficients, x: Fields
+) -> Float[Array, "readings electrodes 2"]:
+    """`shift_jacobian` from the fields x at theta, without a factorisation."""
+    change = -_sheet_change(model, motion, theta.sigma, x.potential)
+    each = np.arange(model.electrodes)
+
+    def at_contacts(shift: Float[Array, "electrodes 2"]) -> Float[Array, "electrodes a b"]:
         """What each electrode's own contact adds to the energy, and its resistance in closed form."""
         system = _moved(model, motion, shift).system
         drop = x.drop[system.contact_dofs]
         mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
-        parts = jnp.einsum("pia,pij,pjb->pab", drop, mass, drop)[:, first, second]
-        series = jnp.where(np.equal(first, second), series_resistance(system, theta)[first], 0)
-        own = jnp.where(np.arange(model.electrodes)[:, None] == first, series, 0)
+        parts = jnp.einsum("pia,pij,pjb->pab", drop, mass, drop)
+        own = jnp.zeros((model.electrodes, *x.terminal.shape), mass.dtype)
+        own = own.at[each, each, each].set(series_resistance(system, theta))
         return own.at[system.contact_electrode].add(-parts)
 
     still = jnp.zeros((model.electrodes, 2), model.dtype)
     for axis in range(2):  # an electrode's contact depends on its own shift only: all move at once
         step = still.at[:, axis].set(1)
         change = change.at[:, axis].add(jax.jvp(at_contacts, (still,), (step,))[1])
-    z = x.terminal + jnp.diag(series_resistance(model.system, theta))
-    by_pair = change.reshape(-1, len(first))
-    upper = jnp.zeros((len(by_pair), *z.shape), z.dtype).at[:, first, second].set(by_pair)
-    whole = upper.at[:, second, first].set(by_pair)
-    felt: Array = jax.vmap(lambda slope: jax.jvp(lambda z: voltages(model, z), (z,), (slope,))[1])(whole)
+    z = terminal_matrix(model, theta, x)
+    felt: Array = jax.vmap(lambda slope: jax.jvp(lambda z: voltages(model, z), (z,), (slope,))[1])(
+        change.reshape(-1, *z.shape)
+    )
     return felt.T.reshape(-1, model.electrodes, 2)
 
 
@@ -299,13 +305,12 @@ def _sheet_change(
     motion: Motion,
     sigma: Float[Array, " elements"],
     potential: Float[Array, "unknowns electrodes"],
-    pairs: tuple[np.ndarray, np.ndarray],
-) -> Float[Array, "electrodes 2 pairs"]:
-    """Change of the sheet's energy of these pairs of fields by the shift of each electrode, in batches of elements."""
-    system, (first, second) = model.system, pairs
+) -> Float[Array, "electrodes 2 a b"]:
+    """Change of the sheet's energy of all pairs of fields by the shift of each electrode, in batches of elements."""
+    system = model.system
     batch = min(BATCH_ELEMENTS, len(model.triangles))
 
-    def add(i: Int[Array, ""], sums: Float[Array, "electrodes 2 pairs"]) -> Float[Array, "electrodes 2 pairs"]:
+    def add(i: Int[Array, ""], sums: Float[Array, "electrodes 2 a b"]) -> Float[Array, "electrodes 2 a b"]:
         # The last batch repeats elements of the one before, so that all batches have one size.
         start = jnp.minimum(i * batch, len(model.triangles) - batch)
         corners, dofs, slopes, weight = (
@@ -314,20 +319,23 @@ def _sheet_change(
         )
         weight = jnp.where(start + jnp.arange(batch) >= i * batch, weight, 0)
         flat = jnp.einsum("ekr,eka->era", slopes, potential[dofs]).reshape(batch, -1, 2, model.electrodes)
-        products = jnp.einsum("eqcp,eqdp->ecdp", flat[..., first], flat[..., second])
+        xx, yy, xy = (jnp.einsum("eqa,eqb->eab", flat[:, :, c], flat[:, :, d]) for c, d in ((0, 0), (1, 1), (0, 1)))
+        products = jnp.stack([xx, yy, xy], 1)
         # The slopes of the barycentric coordinates l_i, 1/m, and the frame that they are in: its axes are those of
         # the place, which is the sum of l_i times corner i.
         places = model.nodes[corners]
         areas = _areas(places)
         slope = jnp.asarray(element_slopes(places, areas, P1)) / jnp.sqrt(areas)[:, None, None]
         frame = jnp.einsum("enc,enx->ecx", slope, places)
-        velocity = jnp.einsum("ecx,enxs->encs", frame, motion.space_step[corners])
-        spread = jnp.einsum("encs,enc->ens", velocity, slope)
-        bent = jnp.einsum("encs,end,ecdp->ensp", velocity, slope, products + products.swapaxes(1, 2))
-        change = spread[..., None] * (products[:, 0, 0] + products[:, 1, 1])[:, None, None] - bent
-        owners = motion.electrode[corners].ravel()
-        return sums.at[owners].add((weight[:, None, None, None] * change).reshape(-1, 2, len(first)))
+        velocity = weight[:, None, None, None] * jnp.einsum("ecx,enxs->encs", frame, motion.space_step[corners])
+        bent = jnp.einsum("encs,end->ensdc", velocity, slope)
+        spread = bent[..., 0, 0] + bent[..., 1, 1]
+        crossed = -2 * (bent[..., 0, 1] + bent[..., 1, 0])  # of which the result keeps the symmetric half
+        shares = jnp.stack([spread - 2 * bent[..., 0, 0], spread - 2 * bent[..., 1, 1], crossed], -1)
+        owner = motion.electrode[corners]
+        rows = jnp.zeros((model.electrodes, batch, 2, 3), model.dtype).at[owner, jnp.arange(batch)[:, None]].add(shares)
+        return sums + jnp.einsum("oesk,ekab->osab", rows, products)
 
-    none = jnp.zeros((model.electrodes, 2, len(first)), model.dtype)
+    none = jnp.zeros((model.electrodes, 2, model.electrodes, model.electrodes), model.dtype)
     found: Array = jax.lax.fori_loop(0, -(-len(model.triangles) // batch), add, none)
-    return found
+    return 0.5 * (found + found.swapaxes(2, 3))

@@ -20,7 +20,17 @@ from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model
-from .forward_model import CoatedSheet, Coefficients, coefficients, fields, series_resistance, transfer, voltages
+from .forward_model import (
+    CoatedSheet,
+    Coefficients,
+    Fields,
+    coefficients,
+    energy,
+    fields,
+    series_resistance,
+    terminal_matrix,
+    voltages,
+)
 
 BATCH_ELEMENTS = 512  # elements in a batch, whose slopes and products fit in a core's cache
 
@@ -57,15 +67,23 @@ def scaled_jacobian(
     scale: Float[Array, " elements"] | None = None,
 ) -> Float[Array, "readings basis"]:
     """`jacobian`, for coefficients that change the elements' conductivity by ``scale`` times the basis."""
+    theta = coefficients(model, sigma)
+    return field_jacobian(model, theta, fields(model, theta), image, scale)
+
+
+def field_jacobian(
+    model: Model, theta: Coefficients, x: Fields, image: BasisMap, scale: Float[Array, " elements"] | None = None
+) -> Float[Array, "readings basis"]:
+    """`scaled_jacobian` from the fields x at theta, without a factorisation."""
     first, second = np.triu_indices(model.electrodes)
     # dZ is symmetric: `pair` finds an unordered pair of electrodes among the columns.
     number = np.zeros((model.electrodes, model.electrodes), np.int32)
     number[first, second] = number[second, first] = np.arange(len(first))
     pair = jnp.asarray(number)
-    slopes = _pair_slopes(model, sigma, image, np.stack([first, second], 1), scale)
+    slopes = _pair_slopes(model, theta, x.potential, image, np.stack([first, second], 1), scale)
     by_pair: Array = jax.lax.optimization_barrier(slopes.T)
     if chosen(model.effects, AbstractTerminalEffect):
-        z = transfer(model, coefficients(model, sigma))
+        z = terminal_matrix(model, theta, x)
         at_terminals = partial(jax.jvp, partial(voltages, model), (z,))
         felt: Array = jax.vmap(lambda column: at_terminals((column[pair],))[1], 1, 1)(by_pair)
         return felt
@@ -73,6 +91,17 @@ def scaled_jacobian(
     out = by_pair[pair[plus, source]] - by_pair[pair[minus, source]]
     found: Array = model.current * (out - by_pair[pair[plus, sink]] + by_pair[pair[minus, sink]])
     return found if model.mixing is None else model.mixing(found)
+
+
+def field_slope(
+    model: Model, theta: Coefficients, x: Fields, direction: Float[Array, " elements"]
+) -> Float[Array, " readings"]:
+    """Derivative of the readings along a change of the elements' conductivity, V, from the fields x at theta."""
+    change = theta._replace(sigma=direction, contact=jnp.zeros_like(theta.contact))
+    own = jax.jvp(partial(series_resistance, model.system), (theta,), (change,))[1]
+    slope = jnp.diag(own) - energy(model, change, x)
+    felt: Array = jax.jvp(partial(voltages, model), (terminal_matrix(model, theta, x),), (slope,))[1]
+    return felt
 
 
 @verb
@@ -85,7 +114,8 @@ def pair_jacobian(
 ) -> Float[Array, "k basis"] | Float[Array, "r basis"]:
     """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S, or of mixtures of them; see
     `whitening`."""
-    slopes = _pair_slopes(model, sigma, image, electrodes).T
+    theta = coefficients(model, sigma)
+    slopes = _pair_slopes(model, theta, fields(model, theta).potential, image, electrodes).T
     return slopes if mixed is None else mixed @ slopes
 
 
@@ -110,7 +140,8 @@ def element_slopes(
 
 def _pair_slopes(
     model: Model,
-    sigma: Float[Array, " elements"] | None,
+    theta: Coefficients,
+    potential: Float[Array, "n electrodes"],
     image: BasisMap,
     pairs: Integer[ArrayLike, "k 2"],
     scale: Float[Array, " elements"] | None = None,
@@ -124,8 +155,7 @@ def _pair_slopes(
             f"the basis lies on a model of {made_for[0]} elements and {made_for[1]} unknowns, this one has {given[0]} "
             f"and {given[1]}; make basis.on(model) of this model"
         )
-    theta, (first, second) = coefficients(model, sigma), jnp.asarray(pairs).T
-    potential = fields(model, theta).potential
+    first, second = jnp.asarray(pairs).T
     if scale is None and model.system.moved:  # the stiffness of the image is that of the mesh before
         scale = jnp.ones_like(model.background)
     if scale is None:
