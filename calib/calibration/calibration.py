@@ -24,6 +24,7 @@ from ..presses.table import Processing
 from ..session import SessionError, read_archive, write_archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
+from .localisation.electrode_places import PlacedElectrodes
 from .localisation.locators import AbstractLocator, locate
 from .press_examples import PressExamples
 from .recalibration.changes import Recalibration
@@ -62,6 +63,8 @@ class Calibration:
     | recalibration: how pads have moved since; None: never recalibrated       |
     | layer: gain of the contact layer, by which contacts are followed; None:  |
     |   not learned (`learn_layer`)                                            |
+    | electrodes: how far they sit from where the skin's file said; None:      |
+    |   taken from the file                                                    |
     """
 
     skin: je.Skin
@@ -86,6 +89,7 @@ class Calibration:
     rest: np.ndarray | None = None
     recalibration: Recalibration | None = None
     layer: LearnedLayer | None = None
+    electrodes: PlacedElectrodes | None = None
 
     @cached_property
     def pads(self) -> PadModel:

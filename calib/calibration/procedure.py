@@ -64,11 +64,10 @@ def calibrate(
     presses = pool_presses(sessions, skin, recipe.processing)
     ignored = accept(sessions, skin, ignore_errors=ignore_errors)
     require_every_pad_pressed(skin, presses.data)
-    placed: tuple[str, ...] = ()
+    placed = None
     if recipe.fit_electrodes:
         progress(PLACING)
-        skin, note = place_electrodes(skin, presses)
-        placed = (note,)
+        skin, placed = place_electrodes(skin, presses)
     progress("model and images")
     imager = prepare_imager(skin, presses, recipe)
     images = imager.presses(presses.dv)
@@ -100,7 +99,13 @@ def calibrate(
         ),
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=(*ignored, *presses.notes, *placed, *([f"chosen: {choice.why}"] if choice.why else []), *imager.notes),
+        notes=(
+            *ignored,
+            *presses.notes,
+            *([placed.note] if placed else []),
+            *([f"chosen: {choice.why}"] if choice.why else []),
+            *imager.notes,
+        ),
         field=model.field,
         crosstalk=presses.crosstalk,
         noise=held_out.noise,
@@ -113,6 +118,7 @@ def calibrate(
         examples=press_examples(presses, skin),
         probes=press_probes(presses),
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
+        electrodes=placed,
     )
     if recipe.learn_layer:
         progress(LEARNING)

@@ -23,6 +23,7 @@ from ..presses.table import Processing
 from ..session import Archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
+from .localisation.electrode_places import PlacedElectrodes
 from .localisation.layer_arrays import layer_arrays, layer_from
 from .localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
 from .press_examples import PressExamples
@@ -92,6 +93,8 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         arrays |= cal.recalibration.arrays()
     if cal.layer is not None:
         arrays |= layer_arrays(cal.layer)
+    if cal.electrodes is not None:
+        arrays |= cal.electrodes.arrays()
     given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
     return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
 
@@ -250,6 +253,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "rest": shaped(arrays, "pads/rest", (len(skin.pads),), "f") if "pads/rest" in arrays else None,
         "recalibration": Recalibration.restore(attrs, arrays, len(skin.pads)),
         "layer": layer_from(arrays),
+        "electrodes": PlacedElectrodes.restore(arrays, len(skin.electrodes)),
         "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
     }
     _require_sealed(archive)  # last: what does not fit is named by the checks above
@@ -338,6 +342,7 @@ _COVARIANCES = (
     "location/covariance",
     "recalibration/covariance",
     "layer/covariance",
+    "electrodes/covariance",
 )
 
 

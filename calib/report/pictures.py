@@ -16,6 +16,7 @@ from .captions import (
     about_sensitivity,
 )
 from .curved_figure import curved_figure, curved_panels
+from .electrode_figures import about_electrodes, electrodes_figure, electrodes_panels
 from .figures import localisation_figure, png, sensitivity_figure
 from .html_parts import html_table
 from .layer_figures import about_layer, layer_figure, layer_panels
@@ -97,6 +98,9 @@ def calibration_pictures(calibration: Calibration, evaluations: Mapping[str, Eva
     if calibration.layer is not None:
         maps, about = png(layer_figure(calibration)), about_layer(calibration.layer)
         pictures.append(Picture("layer", "Contact layer", maps, *about, layer_panels(calibration)))
+    if calibration.electrodes is not None:
+        shifts, about = png(electrodes_figure(calibration)), about_electrodes(calibration)
+        pictures.append(Picture("electrodes", "Electrodes", shifts, *about, electrodes_panels(calibration)))
     return pictures
 
 

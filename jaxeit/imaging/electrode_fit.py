@@ -111,7 +111,7 @@ def fit_electrodes(
 ) -> ElectrodeFit:
     """Find how far the electrodes sit from where the skin's file says.
 
-    `je.skin.with_positions(skin, skin.electrode_positions + fit.shift)` is the skin as it is. Compiling takes a minute.
+    `je.skin.with_positions(skin, skin.electrode_positions + fit.shift)` is the skin as it is.
 
     Args:
         model: of the skin as its file describes it, with elements of second order: the errors of a mesh of first order

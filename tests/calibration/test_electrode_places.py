@@ -10,6 +10,7 @@ import calib
 import jaxeit as je
 from calib.calibration.localisation import electrode_places
 from calib.calibration.localisation.electrode_places import MOST_PRESSES, spread_presses
+from calib.report.document import write_report
 from jaxeit.imaging import ElectrodeFit, InverseError
 
 QUICK = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft(), fit_electrodes=True)
@@ -22,7 +23,7 @@ def session(root):
 
 
 def _fit(shift, misfit):
-    """What `fit_electrodes` finds, without its minute of compiling; the frames that it is given are kept."""
+    """What `fit_electrodes` finds, without its half minute of compiling; the frames that it is given are kept."""
     given = []
 
     def fit(model, v0, presses):
@@ -51,7 +52,14 @@ def test_a_calibration_keeps_the_skin_with_its_electrodes_where_they_sit(session
     kept = calib.load_calibration(tmp_path / "c.h5")
     for calibration in (found, kept):
         np.testing.assert_allclose(calibration.skin.electrode_positions, skin.electrode_positions + shift, atol=1e-9)
+        np.testing.assert_array_equal(calibration.electrodes.shift, shift)
+        np.testing.assert_allclose(calibration.electrodes.standard_error, 1e-4)
+        assert (calibration.electrodes.misfit, calibration.electrodes.presses) == (0.8, len(presses.place))
+    report = write_report(kept, tmp_path / "r.html")
+    assert tmp_path / "r_electrodes.png" in report
+    assert "Shifts of the electrodes, 10 times larger" in report[0].read_text()
     plain = calib.calibrate([session], recipe=replace(QUICK, fit_electrodes=False))
+    assert plain.electrodes is None
     assert float(jnp.abs(found.recon.matrix - plain.recon.matrix).max()) > 1e-3 * float(
         jnp.abs(plain.recon.matrix).max()
     )
