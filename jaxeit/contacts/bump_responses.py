@@ -149,12 +149,19 @@ _RULE_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 def points_of(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Points of each element, (elements, q, 2), as close as the width asks for, and their weights, (q,)."""
+    rule, weights = rule_of(model, width)
+    corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
+    return np.einsum("qk,ekd->eqd", rule, corners), weights
+
+
+def rule_of(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric coordinates of the points of each element, (q, 3), and their weights, (q,)."""
     corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max()
     parts = int(np.clip(np.ceil(longest / (3 * width)), 1, 3))
     small = _parts(parts)
     rule = np.einsum("qk,pkc->pqc", _RULE, small).reshape(-1, 3)
-    return np.einsum("qk,ekd->eqd", rule, corners), np.tile(_RULE_WEIGHTS, len(small)) / len(small)
+    return rule, np.tile(_RULE_WEIGHTS, len(small)) / len(small)
 
 
 def _parts(n: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from .contact_information import DesignSettings, PlaceSensitivity, place_sensiti
 from .covariance import around, signal_covariance
 from .design import CRITERIA, AbstractCriterion, PlaceError, PlaceVolume, ScanDesign, design_scan
 from .event_driven import EventScan, EventScanSettings, ScanState, prepare_event_scan
+from .placement import Placement, PlacementLimits, move_electrodes
 from .selection import (
     AbstractSelection,
     Chosen,
@@ -29,6 +30,8 @@ __all__ = [
     "PlaceError",
     "PlaceSensitivity",
     "PlaceVolume",
+    "Placement",
+    "PlacementLimits",
     "ScanDesign",
     "ScanState",
     "Sensitive",
@@ -38,6 +41,7 @@ __all__ = [
     "design_scan",
     "drives",
     "in_frame",
+    "move_electrodes",
     "place_sensitivity",
     "prepare_event_scan",
     "scan_time",

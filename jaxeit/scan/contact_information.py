@@ -21,12 +21,11 @@ from jaxtyping import Array, Float, Integer
 
 from .._compile import require_known, verb
 from ..budget import require
-from ..contacts.bump_responses import points_of
+from ..contacts.bump_responses import rule_of
 from ..linalg import lapack
-from ..model.bases import BasisMap, Elements, Pixels
+from ..model.bases import Pixels
 from ..model.discretisation import Model
-from ..model.forward_model import coefficients, four_terminal, transfer
-from ..model.sensitivity import pair_jacobian
+from ..model.forward_model import coefficients, fields, four_terminal, series_resistance, terminal_matrix, transfer
 from ..skin.protocol import ProtocolError
 
 Numbers = np.ndarray | Array
@@ -176,45 +175,81 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
         BudgetError: if the sensitivities need too much memory; a coarser fidelity needs less.
     """
     require_known("place_sensitivity", ProtocolError, model)
-    settings, electrodes = settings or DesignSettings(), model.electrodes
-    first, second = np.triu_indices(electrodes)
-    pixels = Pixels(settings.columns).on(model)
-    sites = np.asarray(pixels.centres)[np.asarray(pixels.areas) > 0.5 * np.max(np.asarray(pixels.areas))]
-    size = 8 * len(sites) * UNKNOWNS * max(electrodes**2, len(model.areas))
-    require("array_bytes", size, "place_sensitivity: sites times elements or pairs of electrodes")
-    change = np.asarray(model.background, float)[:, None, None] * _bumps(model, sites, settings.width)
-    pairs, change = np.stack([first, second], 1), change.reshape(len(change), -1).astype(model.dtype)
-    by_pair, transferred = _solved(model, Elements().on(model), pairs, change)
-    slopes = np.zeros((len(sites) * UNKNOWNS, electrodes, electrodes))
-    slopes[:, first, second] = slopes[:, second, first] = (
-        settings.strength * float(model.current) * np.asarray(by_pair).T
-    )
-    z = float(model.current) * np.asarray(transferred, float)
-    noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(four_terminal(z, np.asarray(model.pattern)))
-    chart = np.asarray(model.chart)
-    extent = float(np.linalg.norm(np.ptp(chart, axis=0))) / settings.width  # a place is somewhere on the sheet
-    prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
-    errors = (noise, settings.relative, settings.model_error)
-    numbers = (slopes.reshape(len(sites), UNKNOWNS, *z.shape), z, sites, settings.width, *errors, prior)
-    return PlaceSensitivity(*(jnp.asarray(number, model.dtype) for number in numbers))
+    settings = settings or DesignSettings()
+    return SiteContacts.of(model, settings, sites_of(model, settings.columns)).sensitivity(model, model.chart)
 
 
-@verb
-def _solved(
-    model: Model, image: BasisMap, pairs: Integer[ArrayLike, "pairs 2"], change: Float[ArrayLike, "elements k"]
-) -> tuple[Float[Array, "pairs k"], Float[Array, "electrodes electrodes"]]:
-    """Changes of entries of the transfer matrix by changes of the conductivity, and the matrix."""
-    return pair_jacobian(model, None, image, pairs) @ change, transfer(model, coefficients(model, None))
-
-
-def _bumps(model: Model, sites: np.ndarray, width: float) -> np.ndarray:
-    """Mean over each element of a bump's derivatives with respect to the unknowns, (elements, sites, 4)."""
-    points, weights = points_of(model, width)
-    found = np.empty((len(points), len(sites), UNKNOWNS))
-    for site, place in enumerate(sites):
-        x, y = np.moveaxis((points - place) / width, -1, 0)
-        square = x**2 + y**2
-        found[:, site] = np.einsum(
-            "keq,q->ek", np.exp(-0.5 * square) * np.stack([x, y, np.ones_like(x), square]), weights
-        )
+def sites_of(model: Model, columns: int) -> Float[np.ndarray, "sites 2"]:
+    """Middles of the pixels that lie on the sheet by more than half, m."""
+    pixels = Pixels(columns).on(model)
+    areas = np.asarray(pixels.areas)
+    found: np.ndarray = np.asarray(pixels.centres, float)[areas > 0.5 * areas.max()]
     return found
+
+
+class SiteContacts(eqx.Module):
+    """Contacts at sites of the sheet, and what is known of them and of the noise.
+
+    | meaning                                                             | shape      | unit |
+    |---------------------------------------------------------------------|------------|------|
+    | sites                                                               | (sites, 2) | m    |
+    | rule, weights: points of an element, and their weights              | (q, 3), (q,) | 1  |
+    | width, strength, relative, model_error: see `DesignSettings`        | ()         | m, 1 |
+    | noise: standard deviation of each reading                           | ()         | V    |
+    | prior: precision of each unknown before a frame                     | (4,)       |      |
+    """
+
+    sites: Float[Array, "sites 2"]
+    rule: Float[Array, "q 3"]
+    weights: Float[Array, " q"]
+    width: Float[Array, ""]
+    strength: Float[Array, ""]
+    noise: Float[Array, ""]
+    relative: Float[Array, ""]
+    model_error: Float[Array, ""]
+    prior: Float[Array, "4"]
+
+    @staticmethod
+    def of(model: Model, settings: DesignSettings, sites: Float[np.ndarray, "sites 2"]) -> "SiteContacts":
+        """Contacts at these sites, for a model of this skin; raises BudgetError if the slopes need too much memory."""
+        pairs = model.electrodes**2
+        size = 8 * (len(sites) * UNKNOWNS * max(pairs, len(model.areas)) + pairs * len(model.areas))
+        require("array_bytes", size, "place_sensitivity: sites times elements or pairs of electrodes")
+        z = float(model.current) * np.asarray(transfer(model, coefficients(model, None)), float)
+        noise = settings.noise or 10 ** (-NOISE_DB / 20) * _rms(four_terminal(z, np.asarray(model.pattern)))
+        extent = float(np.linalg.norm(np.ptp(np.asarray(model.chart), axis=0))) / settings.width  # it is on the sheet
+        prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
+        errors = (noise, settings.relative, settings.model_error)
+        numbers = (sites, *rule_of(model, settings.width), settings.width, settings.strength, *errors, prior)
+        return SiteContacts(*(jnp.asarray(number, model.dtype) for number in numbers))
+
+    @verb
+    def sensitivity(self, model: Model, chart: Float[Array, "nodes 2"]) -> PlaceSensitivity:
+        """Sensitivity of every reading to the contacts; ``chart``: flat coordinates of the nodes, m, which may move."""
+        theta = coefficients(model, None)
+        x = fields(model, theta)
+        system = model.system
+        flat = jnp.einsum("ekr,eka->era", system.slopes, x.potential[system.dofs])
+        products = jnp.einsum("era,erb->eab", flat, flat)
+        resistances = jax.jacrev(lambda sigma: series_resistance(system, theta._replace(sigma=sigma)))(theta.sigma)
+        corners = chart[model.triangles]
+        own = np.arange(model.electrodes)
+
+        def slopes(site: Float[Array, "2"]) -> Float[Array, "4 electrodes electrodes"]:
+            change = model.background * self._bump(corners, site)
+            found = -jnp.einsum("ke,eab->kab", change, products)
+            return found.at[:, own, own].add(change @ resistances.T)
+
+        found = self.strength * model.current * jax.lax.map(slopes, self.sites)
+        z = model.current * terminal_matrix(model, theta, x)
+        return PlaceSensitivity(
+            found, z, self.sites, self.width, self.noise, self.relative, self.model_error, self.prior
+        )
+
+    def _bump(self, corners: Float[Array, "elements 3 2"], site: Float[Array, "2"]) -> Float[Array, "4 elements"]:
+        """Mean over each element of a bump's derivatives with respect to the unknowns."""
+        x, y = jnp.moveaxis((jnp.einsum("qk,ekd->eqd", self.rule, corners) - site) / self.width, -1, 0)
+        square = x**2 + y**2
+        of_each = jnp.exp(-0.5 * square) * jnp.stack([x, y, jnp.ones_like(x), square])
+        found: Array = of_each @ self.weights
+        return found

@@ -85,9 +85,27 @@ def test_a_designed_skin_is_simulated_and_checked(tmp_path, monkeypatch, capsys)
         np.testing.assert_array_equal(je.skin.parse_skin(session.skin_toml).protocol.pattern, better.protocol.pattern)
 
 
+def test_a_design_moves_electrodes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(SKIN)
+    options = ["--readings", "12", "--move", "--margin", "0.012", "--keep-out", "0.06,0.04,0.01"]
+    assert main(["design", "mine.toml", "-o", "better.toml", *options, "--picture", "map.png"]) == 0
+    told = capsys.readouterr().out
+    before, after = je.load_skin("mine.toml"), je.load_skin("better.toml")
+    far = np.linalg.norm(after.electrode_positions - before.electrode_positions, axis=1)
+    assert f"electrodes moved by {1e3 * far.mean():.3g} mm on average" in told
+    assert after.protocol.readings == 12
+    first, second = map(float, re.search(r"error of place, mean, mm +(\S+) +(\S+)", told).groups())
+    assert second < 0.6 * first
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["--margin", "0.01"], "--margin is about electrodes that move; add --move"),
+        (["--asymmetric"], "--asymmetric is about electrodes that move; add --move"),
+        (["--move", "--distance", "0.05"], "the electrodes break the limits where they sit now, by 10 mm"),
         (["--readings", "46"], "there are 45 candidates"),
         (["--rate", "1e6"], "a reading alone takes 1e-05 s; give a lower rate"),
         (["--criterion", "best"], 'no criterion \'best\'; give one of "place-error", "d-optimal"'),

@@ -34,6 +34,7 @@ HOST = {
     "compile_tracker": _PREPARES,
     "compiler_options": _DESCRIBES,
     "design_scan": _PREPARES,
+    "move_electrodes": _PREPARES,
     "discretise": _GEOMETRY,
     "drives": _DESCRIBES,
     "electrode_motion": _PREPARES,

@@ -9,12 +9,12 @@ from ..terminal import announce_model, progress_bar
 
 if TYPE_CHECKING:
     import jaxeit as je
-    from jaxeit.scan import PlaceSensitivity, ScanDesign
+    from jaxeit.scan import DesignSettings, PlacementLimits, PlaceSensitivity, ScanDesign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The skin, the time of a frame, and what is wanted of it."""
-    from jaxeit.scan import CRITERIA, DesignSettings
+    from jaxeit.scan import CRITERIA, DesignSettings, PlacementLimits
 
     usual = DesignSettings()
     parser.add_argument("skin", metavar="SKIN", help="a shipped skin by its name, or the TOML file of your own")
@@ -35,11 +35,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--noise", type=above_zero, metavar="V", help=text)
     text = "further noise of a reading, as part of its voltage, such as 1e-3; default: 0"
     parser.add_argument("--relative-noise", type=above_zero, default=0.0, metavar="PART", help=text)
+    moving = parser.add_argument_group("places of the electrodes")
+    text = "also move the electrodes to where the scan places contacts best; takes minutes"
+    moving.add_argument("--move", action="store_true", help=text)
+    text = f"between the middles of two electrodes, at least, m; default: {PlacementLimits().distance}"
+    moving.add_argument("--distance", type=above_zero, metavar="M", help=text)
+    text = "from the rim, at least, m; default: that of the electrode nearest to it"
+    moving.add_argument("--margin", type=above_zero, metavar="M", help=text)
+    text = "no electrode in this circle, m; may be given more than once"
+    moving.add_argument("--keep-out", type=_circle, action="append", default=[], metavar="X,Y,RADIUS", help=text)
+    text = "from where an electrode sits now, at most, m; default: any distance"
+    moving.add_argument("--farthest", type=above_zero, metavar="M", help=text)
+    text = "give up mirror symmetries that the electrodes have"
+    moving.add_argument("--asymmetric", action="store_true", help=text)
     parser.add_argument("--picture", metavar="MAP.png", help="draw the expected error over the sheet, before and after")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the skin with the designed scan, and print what is expected of it."""
+    from dataclasses import replace
+    from functools import partial
     from time import perf_counter
 
     import jaxeit as je
@@ -56,27 +71,62 @@ def run(args: argparse.Namespace) -> int:
         skin_of(args.skin),
         je.scan.CRITERIA.make(args.criterion, allow_import=True),
     )
-    readings = _readings(args, skin)
+    limits, readings = _limits(args), _readings(args, skin)
     settings = je.scan.DesignSettings(width=args.width, noise=args.noise, relative=args.relative_noise)
-    fidelity = je.Fidelity.draft()
-    announce_model(skin, fidelity)
-    sensitivity = je.scan.place_sensitivity(je.discretise(je.Scene(skin), fidelity), settings)
-    found = je.scan.design_scan(
-        sensitivity,
-        readings,
-        criterion,
+    announce_model(skin, je.Fidelity.draft())
+    scan = partial(
+        je.scan.design_scan,
+        readings=readings,
+        criterion=criterion,
         switch=args.switch,
         any_dead=args.electrode_dead,
         progress=progress_bar("design"),
     )
-    better = je.skin.with_rows(skin, found.pattern)
+    before = after = _sensitivity(skin, settings)
+    found, better = scan(before), skin
+    if limits is not None:
+        # The noise of a reading is that of the hardware, wherever the electrodes sit.
+        settings, bar = replace(settings, noise=float(before.noise)), progress_bar("move")
+        better = je.scan.move_electrodes(skin, criterion, limits, settings, pattern=found.pattern, progress=bar).skin
+        after = _sensitivity(better, settings)
+        found = scan(after)
+    better = je.skin.with_rows(better, found.pattern)
     with replacing(Path(args.output)) as new:
         new.write_text(better.toml, encoding="utf-8")
-    print("\n".join(_report(skin, better, sensitivity, found, args.switch)))
+    print("\n".join(_report((skin, better), (before, after), found, args.switch)))
     print(f"{args.output}: written after {perf_counter() - began:.0f} s")
     if args.picture:
-        _write_picture(skin, better, sensitivity, Path(args.picture))
+        _write_picture((skin, better), (before, after), Path(args.picture))
     return 0
+
+
+def _sensitivity(skin: "je.Skin", settings: "DesignSettings") -> "PlaceSensitivity":
+    import jaxeit as je
+
+    return je.scan.place_sensitivity(je.discretise(je.Scene(skin), je.Fidelity.draft()), settings)
+
+
+def _circle(text: str) -> tuple[float, float, float]:
+    """X,Y,RADIUS in m."""
+    numbers = text.split(",")
+    try:
+        x, y, radius = map(float, numbers)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: give X,Y,RADIUS in m, such as 0.1,0.1,0.02") from None
+    return x, y, radius
+
+
+def _limits(args: argparse.Namespace) -> "PlacementLimits | None":
+    """What the hardware asks of the places of electrodes; None: they stay."""
+    from jaxeit.scan import PlacementLimits
+
+    given = {name: getattr(args, name) for name in ("distance", "margin", "farthest") if getattr(args, name)}
+    if not args.move:
+        others = [f"--{name}" for name in given] + ["--keep-out"] * bool(args.keep_out)
+        if others or args.asymmetric:
+            raise ValueError(f"{(others or ['--asymmetric'])[0]} is about electrodes that move; add --move")
+        return None
+    return PlacementLimits(**given, keep_out=tuple(args.keep_out), symmetric=not args.asymmetric)
 
 
 def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
@@ -98,18 +148,28 @@ def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
 
 
 def _report(
-    before: "je.Skin", after: "je.Skin", sensitivity: "PlaceSensitivity", found: "ScanDesign", switch: float
+    skins: tuple["je.Skin", "je.Skin"],
+    sensitivities: tuple["PlaceSensitivity", "PlaceSensitivity"],
+    found: "ScanDesign",
+    switch: float,
 ) -> list[str]:
-    columns = [_figures(skin, sensitivity, switch) for skin in (before, after)]
+    import numpy as np
+
+    before, after = skins
+    columns = [_figures(*pair, switch) for pair in zip(skins, sensitivities, strict=True)]
+    sensitivity = sensitivities[0]
     sites, width = len(sensitivity.sites), 1e3 * float(sensitivity.width)
     heads = ("", "before", "after")
     rows = [heads, *((name, columns[0][name], columns[1][name]) for name in columns[0])]
+    far = 1e3 * np.linalg.norm(after.electrode_positions - before.electrode_positions, axis=1)
+    moved = [f"electrodes moved by {far.mean():.3g} mm on average, no. {far.argmax()} by {far.max():.3g} mm"]
     return [
         f"{before.name}: {len(before.electrodes)} electrodes, contacts of {width:.3g} mm at {sites} places, "
         f"noise {1e6 * float(sensitivity.noise):.3g} uV, model error {100 * float(sensitivity.model_error):.3g} %",
         *(f"{name:<44}{one:>16}{two:>16}" for name, one, two in rows),
-        f"by the criterion {1e3 * found.error:.4g} mm; no scan of {len(found.pattern)} readings has less than "
-        f"{1e3 * found.bound:.4g} mm",
+        *(moved if far.any() else []),
+        f"by the criterion {1e3 * found.error:.4g} mm; no scan of {len(found.pattern)} readings"
+        f"{' by these electrodes' if far.any() else ''} has less than {1e3 * found.bound:.4g} mm",
     ]
 
 
@@ -135,14 +195,18 @@ def _figures(skin: "je.Skin", sensitivity: "PlaceSensitivity", switch: float) ->
     }
 
 
-def _write_picture(before: "je.Skin", after: "je.Skin", sensitivity: "PlaceSensitivity", path: Path) -> None:
+def _write_picture(
+    skins: tuple["je.Skin", "je.Skin"], sensitivities: tuple["PlaceSensitivity", "PlaceSensitivity"], path: Path
+) -> None:
     import numpy as np
 
-    from ...report.design_figure import design_figure
+    from ...report.design_figure import ExpectedErrors, design_figure
     from ...report.figures import write_figure
 
-    errors = {
-        f"{name}: {skin.protocol.readings} readings": np.asarray(sensitivity.errors(skin.protocol.pattern))
-        for name, skin in (("before", before), ("after", after))
+    maps = {
+        f"{name}: {skin.protocol.readings} readings": ExpectedErrors(
+            skin, np.asarray(sensitivity.sites), np.asarray(sensitivity.errors(skin.protocol.pattern))
+        )
+        for name, skin, sensitivity in zip(("before", "after"), skins, sensitivities, strict=True)
     }
-    write_figure(design_figure(before, np.asarray(sensitivity.sites), errors), path)
+    write_figure(design_figure(maps), path)

@@ -1,0 +1,98 @@
+"""Electrodes moved to where a scan places contacts best, verified by fits of contacts.
+
+For the worst places (`PlaceError(8.0)`), for the adjacent scan and for one designed afterwards. "Expected": the error
+of place that `place_sensitivity` states at sites that the search has not seen, on a finer mesh than that of the search.
+"Fitted": presses of 8 N by a 20 mm tip all over the sheet, 8 mm or more from the rim, simulated on a third mesh, with
+the noise that is 60 dB below the readings of the shipped skin for all; by region of a sixth of the sheet's sides the
+mean error, the worst region apart.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from calib.runtime import set_up
+
+from .harness import Question, Run
+from .problems import pressed
+from .rows import Row
+
+CASES = (("testbed", None), ("testbed", 0.01), ("chest", None))  # skin, and how near to the rim electrodes may sit, m
+WORST = je.scan.PlaceError(8.0)
+COLUMNS = 13  # of the sites at which errors are stated; the search has 8
+REGIONS, PRESSES, CLEAR, LOAD, SEED = 6, 288, 0.008, 8.0, 2040
+AS_IT_IS, MOVED, DESIGNED = "as it is", "electrodes moved", "electrodes moved, scan designed"
+
+
+def measure(run: Run) -> Iterator[Row]:
+    """Rows of a skin as it is, with its electrodes moved, and with a scan designed for these."""
+    for name, margin in run.sizes(CASES, CASES[1:2]):
+        shipped = je.load_skin(name)
+        model = je.discretise(je.Scene(shipped), je.Fidelity.draft())
+        noise = 1e-3 * float(jnp.sqrt(jnp.mean(je.forward(model) ** 2)))
+        settings = je.scan.DesignSettings(noise=noise, columns=4 if run.smoke else 8)
+        limits, meshes = je.scan.PlacementLimits(margin=margin), 2 if run.smoke else 12
+        began = perf_counter()
+        moved = je.scan.move_electrodes(shipped, WORST, limits, settings, meshes=meshes).skin
+        seconds = perf_counter() - began
+        there = je.scan.place_sensitivity(je.discretise(je.Scene(moved), je.Fidelity.draft()), settings)
+        designed = je.scan.design_scan(there, shipped.protocol.readings, WORST).pattern
+        skins = {AS_IT_IS: shipped, MOVED: moved, DESIGNED: je.skin.with_rows(moved, designed)}
+        low, high = (np.asarray(corner) for corner in shipped.domain.bounds)
+        about = {
+            "skin": name,
+            "margin_mm": 1e3 * float(shipped.domain.boundary_distance(moved.electrode_positions).min()),
+        }
+        for way, skin in skins.items():
+            spent = seconds if way == MOVED else None
+            yield {"rows": [about | {"way": way, "search_s": spent} | errors(run, skin, noise, (low, high))]}
+
+
+def errors(run: Run, skin: je.Skin, noise: float, bounds: tuple[np.ndarray, np.ndarray]) -> Row:
+    """Expected and fitted errors of a skin, mm."""
+    fidelity = je.Fidelity.draft() if run.smoke else je.Fidelity.standard()
+    settings = je.scan.DesignSettings(noise=noise, columns=5 if run.smoke else COLUMNS)
+    sensitivity = je.scan.place_sensitivity(je.discretise(je.Scene(skin), fidelity), settings)
+    expected = 1e3 * np.asarray(sensitivity.errors(skin.protocol.pattern))
+    sites, fitted = fits(run, skin, noise, bounds)
+    low, high = bounds
+    cell = np.clip(((sites - low) / (high - low) * REGIONS).astype(int), 0, REGIONS - 1)
+    region = cell[:, 0] * REGIONS + cell[:, 1]
+    means = [np.nanmean(fitted[region == one]) for one in np.unique(region)]
+    return {
+        "expected_mm": float(expected.mean()),
+        "expected_worst_mm": float(expected.max()),
+        "fit_mm": float(np.nanmean(fitted)),
+        "fit_median_mm": float(np.nanmedian(fitted)),
+        "fit_region_mm": float(np.max(means)),
+        "fit_lost": float(np.mean(np.isnan(fitted))),
+    }
+
+
+def fits(run: Run, skin: je.Skin, noise: float, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Sites of presses, (presses, 2) m, and errors of the contacts fitted there, (presses,) mm; NaN: none found."""
+    rng = np.random.default_rng(SEED)
+    sites = rng.uniform(*bounds, (4 * PRESSES, 2))
+    clear = skin.domain.contains(sites) & (skin.domain.boundary_distance(sites) > CLEAR)
+    sites = sites[clear][: 6 if run.smoke else PRESSES]
+    loads = np.full((len(sites), 1), LOAD)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "skin.toml"
+        path.write_text(skin.toml, encoding="utf-8")
+        change = pressed((), sites[:, None], loads, 0.06 if run.smoke else 0.026, skin=str(path)).change
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    settings = je.contacts.ContactSettings(most=2, columns=21 if run.smoke else 41)
+    fit = je.prepare_contacts(model, settings, noise=np.full(change.shape[1], noise))
+    frames = jnp.asarray(change + noise * rng.normal(size=change.shape))
+    return sites, 1e3 * np.asarray(je.localisation_error(je.contacts.strongest(fit(frames)), sites))
+
+
+main = Question("placement", __doc__, {"rows": measure}, prepare=set_up)
+
+if __name__ == "__main__":
+    main()
