@@ -1,11 +1,13 @@
 """Every program of examples/ runs, and finds what it says."""
 
+import json
 import runpy
 
 import jax.numpy as jnp
 import pytest
 
 from benchmarks.gallery import DRAWN
+from benchmarks.notebooks import PICTURES, cells_of
 
 FINDS = {
     "bending": lambda names: (
@@ -85,3 +87,16 @@ def test_an_example_finds_what_it_says(root, name, capsys):
     names = runpy.run_path(str(root / "examples" / f"{name}.py"))
     assert FINDS[name](names)
     assert capsys.readouterr().out.count("\n") >= 1
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_notebooks_are_the_examples_with_a_picture(root, name):
+    """`python -m benchmarks.notebooks` writes them."""
+    notebook = json.loads((root / "examples" / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))
+    head, *cells = notebook["cells"]
+    question, program = cells_of(name)
+    assert question in head["source"]
+    assert [cell["source"] for cell in cells] == [*program, PICTURES[name]]
+    assert "image/png" in cells[-1]["outputs"][-1]["data"]
+    page = (root / "examples" / "README.md").read_text(encoding="utf-8")
+    assert f"(notebooks/{name}.ipynb)" in page
