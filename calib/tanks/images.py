@@ -7,7 +7,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxeit as je
-from jaxeit.imaging import AbstractIterativeMethod, AbstractLinearMethod, IterativeReconstructor
+from jaxeit.imaging import (
+    AbstractIterativeMethod,
+    AbstractLinearMethod,
+    IterativeReconstructor,
+    ReferenceFit,
+    ReferenceSettings,
+    fit_reference,
+)
 from jaxeit.model import AbstractBasis
 
 from .recording import Tank, TankError
@@ -25,12 +32,14 @@ class TankImage(NamedTuple):
     | recon: the reconstructor, whose ``shape``, ``extent`` belong to the image |               |      |
     | background: conductivity of the reference, if its content is even        | ()             | S    |
     | correlation of the reference with the model of even content              | ()             | 1    |
+    | fit: conductivity and contacts that the reference tells, where asked for |                |      |
     """
 
     change: Float[Array, " basis"]
     recon: je.Reconstructor | IterativeReconstructor
     background: float
     correlation: float
+    fit: ReferenceFit | None = None
 
 
 def difference_image(
@@ -43,6 +52,7 @@ def difference_image(
     basis: AbstractBasis | None = None,
     hyperparameter: float = 0.1,
     fidelity: je.Fidelity | None = None,
+    fit: ReferenceSettings | None = None,
 ) -> TankImage:
     """The change from one frame to another.
 
@@ -53,9 +63,12 @@ def difference_image(
         frame, reference: numbers of the frames.
         prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x.
         fidelity: as for `Tank.model`.
+        fit: fit conductivity and contacts to the reference by `je.imaging.fit_reference`, for the image;
+            default: contacts as the tank has them.
 
     Raises:
         TankError: if there is one frame, or the reference does not look like the model.
+        InverseError: if ``fit`` is given, and no even content explains the reference.
     """
     count = len(tank.frames)
     if not all(-count <= number < count for number in (frame, reference)) or (frame - reference) % count == 0:
@@ -65,17 +78,19 @@ def difference_image(
     first, last = reference % count, frame % count
     model = tank.model(fidelity)
     before, after = tank.frames[first], tank.frames[last]
-    even = np.asarray(je.forward(model))
     used = np.isfinite(before) & np.isfinite(after)
     if used.sum() < 3:
         raise TankError(f"{tank.skin.name}: the frames share {int(used.sum())} finite readings; more are needed")
-    correlation = float(np.corrcoef(even[used], before[used])[0, 1])
+    correlation = float(np.corrcoef(np.asarray(je.forward(model))[used], before[used])[0, 1])
     if not correlation > LEAST_CORRELATION:
         raise TankError(
             f"{tank.skin.name}: the correlation of frame {first} with a model of even content is {correlation:.2f}; "
             "check the order and the polarity of readings, and the place and direction of electrodes"
         )
+    found = None if fit is None else fit_reference(model, np.where(used, before, np.nan), fit)
+    model = model if found is None else found.model
+    level, even = float(model.background[0]), np.asarray(je.forward(model))
     scale = float(even[used] @ before[used] / (before[used] @ before[used]))
     recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=hyperparameter)
-    change = recon(jnp.asarray(scale * (after - before), model.dtype)) * tank.skin.sheet_resistance
-    return TankImage(change, recon, scale / tank.skin.sheet_resistance, correlation)
+    change = recon(jnp.asarray(scale * (after - before), model.dtype)) / level
+    return TankImage(change, recon, scale * level, correlation, found)

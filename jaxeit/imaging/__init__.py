@@ -51,6 +51,7 @@ from .priors import (
     TotalVariation,
 )
 from .reconstruction import AbstractReconstructor, IterativeReconstructor, Provenance, Reconstructor
+from .reference import ReferenceFit, ReferenceParameters, ReferenceSettings, fit_reference
 from .settings import Imaging
 from .storage import (
     NUMBERS,
@@ -107,6 +108,9 @@ __all__ = [
     "Provenance",
     "Quadratic",
     "Reconstructor",
+    "ReferenceFit",
+    "ReferenceParameters",
+    "ReferenceSettings",
     "Reweighted",
     "SparseBayes",
     "StorageError",
@@ -115,6 +119,7 @@ __all__ = [
     "TruncatedSvd",
     "fit_background",
     "fit_electrodes",
+    "fit_reference",
     "from_numbers",
     "gauss_newton",
     "least_squares_image",

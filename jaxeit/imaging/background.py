@@ -70,7 +70,7 @@ def fit_background(
     penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)
     x = gauss_newton(physics, penalty, v0, error, tolerance=tolerance)
     there = jnp.isfinite(v0)
-    _check_explained(physics.voltages(x), jnp.where(there, v0, 0), there)
+    require_explained("coating", physics.voltages(x), jnp.where(there, v0, 0), there)
     return physics.sigma(x)
 
 
@@ -132,12 +132,13 @@ def require_positive(**values: Any) -> None:
             raise InverseError(f"{name} is {value}; give a number above zero")
 
 
-def _check_explained(
-    found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
+def require_explained(
+    what: str, found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
 ) -> None:
+    """Raise InverseError if too much of a frame is left by the readings that were found for it."""
     left = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
     if _is_known(left) and not left < MAX_UNEXPLAINED:
         raise InverseError(
-            f"no coating explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
+            f"no {what} explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
             "the skin's protocol"
         )

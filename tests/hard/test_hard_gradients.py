@@ -180,6 +180,18 @@ def _shift_jacobian(t):
     return Case(lambda s: je.model.shift_jacobian(t.model, motion, s), [even, even * jnp.exp(t.draw(32))], [])
 
 
+def _reference(t):
+    """Conductivity and gains from a frame; the electrodes of the model are points, without contacts."""
+    settings = je.imaging.ReferenceSettings(contact=0, contact_each=0, gain=0.01)
+    frame = je.forward(t.model)
+
+    def fitted(change):
+        value = je.imaging.fit_reference(t.model, frame * (1 + 0.01 * change), settings).value
+        return jnp.append(value.gain, value.level)
+
+    return Case(fitted, [t.draw(len(frame))], [])
+
+
 def _fuse(t):
     half = (jnp.arange(PIXELS) < PIXELS // 2).astype(t.dtype)
     masks = je.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
@@ -378,6 +390,7 @@ CASES = {
     "jacobian": _jacobian,
     "moved": _moved,
     "shift_jacobian": _shift_jacobian,
+    "fit_reference": _reference,
     "fuse": _fuse,
     "contact_shares": _contact_shares,
     "Reconstructor": _reconstructor,

@@ -28,23 +28,35 @@ def disc_potentials(
 ) -> np.ndarray:
     """Electrode potentials for +1 A in electrode 0 and -1 A in electrode 1, summing to zero."""
     width = cover * np.pi / electrodes
+    rim = _neumann_to_dirichlet(electrodes, width, degree, modes, sigma1, rho)
+    current = np.zeros(electrodes)
+    current[:2] = 1, -1
+    return potentials(rim, width, np.full(electrodes, z), current)
+
+
+def even_disc(electrodes: int = 16, cover: float = 0.5, degree: int = 12, modes: int = 20000):
+    """Potentials as a function of the contact impedance of each electrode and of currents (electrodes, drives)."""
+    width = cover * np.pi / electrodes
+    rim = _neumann_to_dirichlet(electrodes, width, degree, modes, 1.0, 0.0)
+    return lambda z, currents: potentials(rim, width, z, currents)
+
+
+def potentials(rim: np.ndarray, width: float, z: np.ndarray, currents: np.ndarray) -> np.ndarray:
+    """Electrode potentials for these currents, (electrodes, ...), from the map of the rim."""
+    electrodes, degree = len(z), len(rim) // len(z)
     net = np.kron(np.eye(electrodes), 2 * width * np.eye(degree, 1))  # only P_0 carries net current
-    contact = z * np.diag(np.tile(2 * width / (2 * np.arange(degree) + 1), electrodes))
-    total = _neumann_to_dirichlet(electrodes, width, degree, modes, sigma1, rho) + contact
+    contact = np.diag(np.outer(z, 2 * width / (2 * np.arange(degree) + 1)).ravel())
     ones = np.ones((electrodes, 1))
     system = np.block(
         [
-            [total, -net, net @ ones],
+            [rim + contact, -net, net @ ones],
             [net.T, np.zeros((electrodes, electrodes + 1))],
             [np.zeros((1, len(net))), ones.T, np.zeros((1, 1))],
         ]
     )
-    current = np.zeros(electrodes)
-    current[:2] = 1, -1
-    right = np.concatenate([np.zeros(len(net)), current, [0]])
+    right = np.concatenate([np.zeros((len(net), *currents.shape[1:])), currents, np.zeros((1, *currents.shape[1:]))])
     # One equation too many: the currents sum to zero already.
-    solution = np.linalg.lstsq(system, right, rcond=None)[0]
-    return solution[len(net) : -1]
+    return np.linalg.lstsq(system, right, rcond=None)[0][len(net) : -1]
 
 
 def _neumann_to_dirichlet(electrodes, width, degree, modes, sigma1, rho) -> np.ndarray:

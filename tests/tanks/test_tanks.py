@@ -261,6 +261,8 @@ def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypat
     assert main(["image", CSV, "--radius", str(RADIUS), "--start", "90", "-o", "turned.svg"]) == 0
     assert "correlation with an even tank" in capsys.readouterr().out
     assert "<svg" in (tmp_path / "turned.svg").read_text()
+    assert main(["image", "tank.mat", "--fit-contacts", "one", "-o", "fitted.png"]) == 0
+    assert "fitted to the reference: 1 S +- " in capsys.readouterr().out
     assert main(["image", CSV, "-o", "no.png"]) == 2
     assert "--radius" in capsys.readouterr().err
     assert main(["image", CSV, "--radius", str(RADIUS), "-o", "no.gif"]) == 2

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
 
 if TYPE_CHECKING:
+    from jaxeit.imaging import ReferenceFit, ReferenceSettings
+
     from ...tanks import Tank
 
 
@@ -25,6 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
     parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
+    text = "fit conductivity and contact resistances (one, or one of each electrode) to the reference; image with them"
+    parser.add_argument("--fit-contacts", choices=("one", "each"), help=text)
     parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
     parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
     parser.add_argument("--hyperparameter", type=above_zero, default=0.1, metavar="L", help="weight of the prior; 0.1")
@@ -49,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"{args.output}: give a name that ends in .png, .pdf or .svg")
     prior, method = je.imaging.PRIORS.make(args.prior), je.imaging.METHODS.make(args.method)
     tank = _tank(args)
-    choices = {"prior": prior, "method": method, "hyperparameter": args.hyperparameter}
+    choices = {"prior": prior, "method": method, "hyperparameter": args.hyperparameter, "fit": _fit(args)}
     found = difference_image(tank, args.frame, args.reference, **choices)
     figure = Figure(layout="constrained")  # without a window, on any machine
     axes = figure.subplots()
@@ -62,8 +66,32 @@ def run(args: argparse.Namespace) -> int:
     count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
     print(f"{count} electrodes, {readings} readings, frames: {', '.join(tank.names)}")
     print(f"reference: {found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}")
+    if found.fit is not None:
+        print(f"fitted to the reference: {_fitted(found.fit)}")
     print(f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity")
     return 0
+
+
+def _fit(args: argparse.Namespace) -> "ReferenceSettings | None":
+    """What is to be fitted to the reference."""
+    import jaxeit as je
+
+    if args.fit_contacts is None:
+        return None
+    return je.imaging.ReferenceSettings(**({} if args.fit_contacts == "each" else {"contact_each": 0.0}))
+
+
+def _fitted(fit: "ReferenceFit") -> str:
+    """Conductivity and contacts in words, with standard errors in percent."""
+    import numpy as np
+
+    touching = np.asarray(fit.value.contact) > 0
+    contact, error = (np.asarray(part.contact)[touching] for part in (fit.value, fit.standard_error))
+    percent = 100 * np.array([fit.standard_error.level, error.min(), error.max()])
+    return (
+        f"{float(fit.value.level):.4g} S +- {percent[0]:.2g} %, contact resistances {contact.min():.3g} to "
+        f"{contact.max():.3g} ohm m (ohm m^2 of bolts) +- {percent[1]:.2g} to {percent[2]:.2g} %"
+    )
 
 
 def _tank(args: argparse.Namespace) -> "Tank":

@@ -1,0 +1,292 @@
+"""What a frame of even content tells about a tank: conductivity, contacts, channels, and where the electrodes sit.
+
+A tank that is filled with saline, or a skin that nobody touches, has one unknown conductivity. The frame also depends
+on the contact of each electrode, on the gain and the offset of each channel, and on the places of the electrodes: where
+currents pass the electrodes that sense, a wrong contact makes the conductivity wrong by tens of percent.
+
+All unknowns are Gaussian before the frame is seen, conductivity and contacts by their logarithms. The most probable
+ones are found through the full forward map by `LevenbergMarquardt`; their covariance is that of the curvature there.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Integer
+from scipy.linalg import block_diag
+
+from ..least_squares import ImplicitStep, LevenbergMarquardt
+from ..linalg.lapack import eigh
+from ..model.discretisation import Model
+from ..model.forward_model import forward
+from ..model.motion import Motion, electrode_motion, moved
+from .absolute import reading_weights
+from .background import frame_error, require_explained, require_frame, sheet_level
+from .noise import InverseError
+
+MODEL_ERROR = 3e-3
+"""Standard error of a reading, relative, where nothing else is said: that of the mesh and the places of electrodes."""
+MORE_FITS = 2  # with errors as large as the misfit of the fit before
+TOLERANCE, MAX_STEPS = 1e-6, 64  # tolerance of the sum of squares: 1 is one standard error
+
+
+class ReferenceSettings(eqx.Module):
+    """Standard deviations before the frame is seen. What has the deviation zero stays as the model has it.
+
+    | meaning                                                                  | default | unit |
+    |--------------------------------------------------------------------------|---------|------|
+    | level: of the logarithm of the conductivity; 0: the content is known     | 3       | 1    |
+    | contact: of the logarithm of what all contact resistances have in common | 3       | 1    |
+    | contact_each: of the logarithm of each one's own part; 0: all are alike  | 1       | 1    |
+    | gain: of each channel, relative                                          | 0       | 1    |
+    | offset: of each channel                                                  | 0       | V    |
+    | shift: of each electrode in each direction                               | 0       | m    |
+    """
+
+    level: float = 3.0
+    contact: float = 3.0
+    contact_each: float = 1.0
+    gain: float = 0.0
+    offset: float = 0.0
+    shift: float = 0.0
+
+    def __check_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < np.inf:
+                raise InverseError(f"{name} is {value}; give a standard deviation, zero or more")
+        if not any(vars(self).values()):
+            raise InverseError("all standard deviations are zero; give one above zero to what is unknown")
+
+
+class ReferenceParameters(NamedTuple):
+    """One number for each unknown, whatever it says of them: values, standard deviations or a direction.
+
+    | meaning                                                       | shape           |
+    |---------------------------------------------------------------|-----------------|
+    | level: of the conductivity                                    | ()              |
+    | contact: of the specific contact resistance of each electrode | (electrodes,)   |
+    | gain, offset: of each channel                                 | (channels,)     |
+    | shift: of each electrode                                      | (electrodes, 2) |
+    """
+
+    level: Float[Array, ""]
+    contact: Float[Array, " electrodes"]
+    gain: Float[Array, " channels"]
+    offset: Float[Array, " channels"]
+    shift: Float[Array, "electrodes 2"]
+
+
+class ReferenceFit(eqx.Module):
+    """What a frame of even content tells. NaN throughout if the fit did not converge.
+
+    | meaning                                                                            | shape  |
+    |------------------------------------------------------------------------------------|--------|
+    | value: mean conductivity, S; contacts, ohm m^2, or ohm m of edges; gain relative to 1; offset, V; shift, m | |
+    | standard_error: the same, but of the logarithms of conductivity and contacts       |        |
+    | covariance of the unknowns, ordered as `ReferenceParameters`; level, contacts by logarithms | (n, n) |
+    | information: what the frame adds along each direction, over what was believed      | (k,)   |
+    | directions: independent before and after; each is one standard deviation before    | (k, n) |
+    | misfit: root mean square of what is left of the readings, in their errors          | ()     |
+    | model with the conductivity, contacts and electrodes that were found               |        |
+    """
+
+    value: ReferenceParameters
+    standard_error: ReferenceParameters
+    covariance: Float[Array, "n n"]
+    information: Float[Array, " k"]
+    directions: Float[Array, "k n"]
+    misfit: Float[Array, ""]
+    model: Model
+
+    @property
+    def untold(self) -> list[ReferenceParameters]:
+        """Directions of which the frame tells less than was believed before: their information is below 1.
+
+        A direction has the units of `standard_error`.
+        """
+        electrodes, channels = self.model.electrodes, len(self.value.gain)
+        found = np.asarray(self.directions)[np.asarray(self.information) < 1]
+        return [_parts(jnp.asarray(direction), electrodes, channels) for direction in found]
+
+
+def fit_reference(
+    model: Model,
+    frame: Float[ArrayLike, " readings"],
+    settings: ReferenceSettings | None = None,
+    *,
+    std: Float[ArrayLike, " readings"] | None = None,
+    channel: Integer[ArrayLike, " readings"] | None = None,
+) -> ReferenceFit:
+    """Fit conductivity, contacts, channels and places of electrodes to one frame of even content.
+
+    A reading is ``(1 + gain) v + offset`` of its channel, with v that of the model. A gain that all channels have in
+    common has the same effect as another conductivity with contacts in proportion: only the deviations believed before
+    tell them apart. `ReferenceFit.untold` names such directions.
+
+    Works under `jax.jit` and `jax.grad`; values that are traced are not checked.
+
+    Args:
+        model: of the tank. Its contact resistances times its conductivity are the most probable ones before the frame
+            is seen, and electrodes with a perfect contact keep it. Whether the mesh resolves a bolt depends on the
+            contact that the model has.
+        frame: V, best a mean over many; readings that are not finite are left out.
+        settings: what is unknown, and how far.
+        std: standard error of each reading, V; default: 0.3 % of itself, and a thousandth of their rms, enlarged until
+            the misfit is 1.
+        channel: number of the channel of each reading, from 0; default: one for each pair of sense electrodes.
+
+    Raises:
+        InverseError: if a shape or a value is wrong, or no even content explains the frame.
+        MotionError: if the electrodes cannot be moved on this mesh.
+    """
+    settings = ReferenceSettings() if settings is None else settings
+    readings, even = jnp.asarray(frame, model.dtype), forward(model)
+    require_frame(readings, even)
+    level = sheet_level(readings, even) if settings.level else jnp.ones((), model.dtype)
+    error = frame_error(readings, MODEL_ERROR) if std is None else jnp.asarray(std, model.dtype)
+    require_frame(error, even)
+    weight, known = reading_weights(readings, error)
+    each = _channels(model, channel) if settings.gain or settings.offset else None
+    channels = 0 if each is None else int(each.max()) + 1
+    motion = electrode_motion(model) if settings.shift else None
+    spread = jnp.asarray(_spread(model, settings, channels), model.dtype)
+    numbers = None if each is None else jnp.asarray(each, jnp.int32)
+    touches = bool(settings.contact or settings.contact_each)
+    problem = _Problem(model, motion, numbers, channels, touches, level, spread)
+    fit, found = _fitted(problem, known, weight)
+    for _ in range(0 if std is not None else MORE_FITS):
+        weight = weight / jnp.maximum(fit.misfit, 1)
+        fit, found = _fitted(problem, known, weight)
+    require_explained("even content", found, known, weight > 0)
+    return fit
+
+
+def _channels(model: Model, channel: Integer[ArrayLike, " readings"] | None) -> np.ndarray:
+    """The channel of each reading, from 0; raises InverseError if they are not known."""
+    if channel is None:
+        if model.mixing is not None:
+            raise InverseError(
+                "the readings are those of matrices; give channel=, the number of each reading's channel"
+            )
+        _, number = np.unique(np.asarray(model.pattern)[:, 2:], axis=0, return_inverse=True)
+        return np.asarray(number).ravel()
+    channels = np.asarray(channel)
+    if channels.shape != (model.readings,) or channels.min() < 0:
+        raise InverseError(
+            f"channel has shape {channels.shape}; give a number from 0 to each of {model.readings} readings"
+        )
+    return channels
+
+
+def _spread(model: Model, settings: ReferenceSettings, channels: int) -> np.ndarray:
+    """The unknowns, (n, k), from k independent ones of unit variance, as they are before the frame is seen."""
+    touching = np.asarray(model.contact) > 0
+    if not touching.any() and (settings.contact or settings.contact_each):
+        raise InverseError(
+            "no electrode of the model has a contact resistance to fit; give the electrodes a contact above zero, or "
+            "the settings contact=0 and contact_each=0"
+        )
+    blocks = [
+        np.array([[settings.level]]),
+        _alike(touching, settings.contact, settings.contact_each),
+        settings.gain * np.eye(channels),
+        settings.offset * np.eye(channels),
+        settings.shift * np.eye(2 * model.electrodes),
+    ]
+    whole: np.ndarray = block_diag(*blocks)
+    return whole[:, whole.any(0)]
+
+
+def _alike(touching: np.ndarray, together: float, each: float) -> np.ndarray:
+    """A root of the covariance ``together^2 1 1^T + each^2 I`` of what touches, of as many columns as it has ranks."""
+    ones, count = touching.astype(float)[:, None], max(1, int(touching.sum()))
+    if not each:
+        return together * ones
+    more = (np.hypot(each, np.sqrt(count) * together) - each) / count
+    root: np.ndarray = each * np.diag(ones[:, 0]) + more * ones @ ones.T
+    return root
+
+
+def _parts(values: Float[Array, " n"], electrodes: int, channels: int) -> ReferenceParameters:
+    """The unknowns, apart."""
+    level, contact, gain, offset, shift = jnp.split(values, np.cumsum([1, electrodes, channels, channels]))
+    return ReferenceParameters(level[0], contact, gain, offset, shift.reshape(electrodes, 2))
+
+
+class _Problem(eqx.Module):
+    """The readings as a function of the unknowns."""
+
+    model: Model
+    motion: Motion | None
+    channel: Int[Array, " readings"] | None
+    channels: int = eqx.field(static=True)
+    touches: bool = eqx.field(static=True)  # whether contacts are fitted
+    level: Float[Array, ""]  # conductivity to begin with, over the model's
+    spread: Float[Array, "n k"]
+
+    def parts(self, x: Float[Array, " k"]) -> ReferenceParameters:
+        """The unknowns, from those of unit variance."""
+        return _parts(self.spread @ x, self.model.electrodes, self.channels)
+
+    def there(self, parts: ReferenceParameters) -> Model:
+        """The model with these unknowns."""
+        model = self.model if self.motion is None else moved(self.model, self.motion, parts.shift)
+        background = self.level * jnp.exp(parts.level) * model.background
+        contact = self.level * jnp.exp(-parts.contact) * model.contact if self.touches else model.contact
+        after: Model = eqx.tree_at(lambda m: (m.background, m.contact), model, (background, contact))
+        return after
+
+    def read(self, x: Float[Array, " k"]) -> Float[Array, " readings"]:
+        """The frame, V."""
+        parts = self.parts(x)
+        readings = forward(self.there(parts))
+        if self.channel is None:
+            return readings
+        return (1 + parts.gain[self.channel]) * readings + parts.offset[self.channel]
+
+
+@eqx.filter_jit
+def _fitted(
+    problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"]
+) -> tuple[ReferenceFit, Float[Array, " readings"]]:
+    """The fit, and the frame as it explains it."""
+
+    def residual(x: Float[Array, " k"], given: tuple[Any, ...]) -> Float[Array, " residuals"]:
+        problem, known, weight = given
+        return jnp.append(weight * (known - problem.read(x)), x)
+
+    found: optx.Solution[Array, Any] = optx.least_squares(
+        residual,
+        LevenbergMarquardt(0.0, 0.0, fall_rtol=TOLERANCE, fall_atol=TOLERANCE),
+        jnp.zeros(problem.spread.shape[1], known.dtype),
+        (problem, known, weight),
+        max_steps=MAX_STEPS,
+        adjoint=ImplicitStep(),
+        throw=False,
+    )
+    x = jnp.where(found.result == optx.RESULTS.successful, found.value, jnp.nan)
+    readings, slopes = problem.read(x), weight[:, None] * jax.jacfwd(problem.read)(x)
+    return _described(problem, x, weight * (known - readings), slopes), readings
+
+
+def _described(
+    problem: _Problem, x: Float[Array, " k"], missed: Float[Array, " readings"], slopes: Float[Array, "readings k"]
+) -> ReferenceFit:
+    information, axes = eigh(slopes.T @ slopes)
+    information = jnp.maximum(information, 0)  # rounding
+    directions = (problem.spread @ axes).T
+    covariance = directions.T @ (directions / (1 + information)[:, None])
+    parts = problem.parts(x)
+    model = problem.there(parts)
+    touching = model.contact > 0
+    value = parts._replace(
+        level=jnp.average(model.background, weights=problem.model.areas),
+        contact=jnp.where(touching, 1 / jnp.where(touching, model.contact, 1), 0),
+    )
+    error = _parts(jnp.sqrt(jnp.diagonal(covariance)), model.electrodes, problem.channels)
+    used = jnp.maximum(jnp.sum(missed != 0, dtype=missed.dtype), 1)
+    return ReferenceFit(value, error, covariance, information, directions, jnp.sqrt(missed @ missed / used), model)
