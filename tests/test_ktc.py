@@ -33,7 +33,7 @@ def test_gauss_newton_finds_both_kinds_without_some_readings(disc):
     truth = _bump(disc, 0.45, 0.0, 2.0) + _bump(disc, -0.45, 0.0, -2.0)
     readings = disc.voltages(truth).at[jnp.array([3, 17])].set(jnp.nan)
     std = jnp.full(len(readings), 1e-3 * float(jnp.nanmax(jnp.abs(readings))))
-    found = np.asarray(je.gauss_newton(disc, je.imaging.IsotropicVariation(weight=1.0), readings, std))
+    found = np.asarray(je.gauss_newton(disc, je.imaging.IsotropicVariation(weight=np.sqrt(np.pi)), readings, std))
     assert np.isfinite(found).all()
     assert np.corrcoef(found, truth)[0, 1] > 0.8
     assert np.std(found[np.asarray(disc.image.areas) == 0]) == 0

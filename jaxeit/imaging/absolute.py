@@ -83,17 +83,22 @@ class Quadratic(AbstractPenalty):
 
 
 class IsotropicVariation(AbstractPenalty):
-    """``weight * integral of sqrt(|grad x|^2 + (beta / h)^2)`` over pixels of side h: piecewise constant images whose
-    edges may lie in any direction (Rudin, Osher and Fatemi 1992), plus ``ridge / 2 * |x|^2`` that keeps it definite.
+    """``weight / L * integral of sqrt(|grad x|^2 + (beta / h)^2)`` over pixels of side h, with L the root of the area
+    of the image: piecewise constant images whose edges may lie in any direction (Rudin, Osher and Fatemi 1992), plus
+    ``ridge / 2 * |x|^2`` that keeps it definite.
 
-    | meaning                                     | unit |
-    |---------------------------------------------|------|
-    | weight                                      | 1/m  |
-    | beta: jumps below it are smoothed over      |      |
-    | ridge                                       |      |
+    All have no unit, so that they mean the same in tanks of any size. The default suits errors of 1 to 5 % of a reading
+    of some thousands; it is 350 per metre in the tank of the Kuopio challenge, whose L is 0.204 m. Where fewer readings
+    tell less, more weight leaves less of their noise.
+
+    | meaning                                                           |
+    |-------------------------------------------------------------------|
+    | weight: penalty of an edge of height 1 through the whole image    |
+    | beta: jumps below it are smoothed over                            |
+    | ridge                                                             |
     """
 
-    weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=350.0)
+    weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=71.0)
     beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.05)
     ridge: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1e-3)
 
@@ -112,10 +117,11 @@ class IsotropicVariation(AbstractPenalty):
     def _jumps(
         self, picture: Picture, x: Float[Array, " basis"]
     ) -> tuple[Float[Array, ""], Float[Array, " basis"], tuple[Int[Array, " edges"], Int[Array, " edges"]]]:
-        """Weight of a jump; size of each pixel's jump to its neighbours on one side, smoothed by beta; the pairs."""
+        """Weight of a jump between pixels; size of each pixel's jump to its neighbours on one side, smoothed by beta;
+        the pairs."""
         first, second = jnp.sort(picture.edges, 1).T
         square = jnp.zeros_like(x).at[first].add((x[second] - x[first]) ** 2)
-        side = jnp.sqrt(jnp.max(picture.areas))
+        side = jnp.sqrt(jnp.max(picture.areas) / jnp.sum(picture.areas))
         size = jnp.sqrt(square + self.beta.astype(x.dtype) ** 2)
         return self.weight.astype(x.dtype) * side, size, (first, second)
 

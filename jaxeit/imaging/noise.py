@@ -27,7 +27,7 @@ from scipy.linalg.lapack import dpstrf
 
 from .._compile import is_traced, require_known
 from ..budget import require
-from ..effects import AbstractTerminalEffect, chosen
+from ..effects import AbstractTerminalEffect, CommonMode, chosen
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
 from ..model.discretisation import Model
 from ..model.mixing import Mixing, matrix_of_rows, padded_rows
@@ -104,15 +104,24 @@ def whitened(
     channels: np.ndarray,
     dtype: np.dtype,
     mixing: sp.csr_array | None = None,
+    common: float = 0.0,
 ) -> "Whitened":
-    """The pair sums of a protocol, from its pattern (rows, 4); in NumPy unless JAX traces current or weight."""
+    """The pair sums of a protocol, from its pattern (rows, 4); in NumPy unless JAX traces current or weight.
+
+    Args:
+        common: gain of the amplifiers for the common-mode voltage (`CommonMode`).
+    """
     electrodes, pairs = pairs_of(pattern)
+    if common:
+        electrodes, p = with_common_mode(pattern, common)
+    else:
+        p = matrix_of(pairs, len(electrodes))
     require("array_bytes", 8 * len(electrodes) ** 2, "prepare: covariance of the pairs of electrodes")
-    p, shares = matrix_of(pairs, len(electrodes)), None
-    if mixing is None:
+    shares = None
+    if mixing is None and not common:
         lines, sign = lines_of(pairs, len(electrodes))
     else:
-        p = mixing @ p
+        p = p if mixing is None else mixing @ p
         (pairs, shares), (lines, sign) = padded_rows(p), padded_rows(p.T.tocsr())
     arrays = {
         "pairs": pairs.astype(np.int32),
@@ -156,6 +165,18 @@ class Whitened(NamedTuple):
 
 
 SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def with_common_mode(pattern: np.ndarray, gain: float) -> tuple[np.ndarray, sp.csr_array]:
+    """The pairs of electrodes, (k, 2), and P for a unit current, (readings, k), of readings
+    ``V + gain (V+ + V-) / 2``, with potentials above drive-."""
+    source, sink, plus, minus = pattern.T
+    ends = np.stack([(plus, source), (minus, source), (plus, sink), (minus, sink), (sink, source), (sink, sink)])
+    pairs, number = np.unique(np.sort(ends, 1).swapaxes(1, 2).reshape(-1, 2), axis=0, return_inverse=True)
+    shares = np.append(SIGNS, [0, 0]) + gain / 2 * np.array([1, 1, -1, -1, -2, 2])
+    rows = np.tile(np.arange(len(pattern)), len(ends))
+    p = sp.csr_array((np.repeat(shares, len(pattern)), (rows, number.ravel())), (len(pattern), len(pairs)))
+    return pairs.astype(np.int64), p
 
 
 def lines_of(pairs: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -228,12 +249,7 @@ def _factors(p: sp.csr_array, current: Any, weight: Any, channels: np.ndarray) -
 
 def whitened_readings(model: Model, noise: Any, channels: Any) -> Whitened:
     """What of a frame is used, and how much it weighs; noise and channels as for `prepare`."""
-    between = chosen(model.effects, AbstractTerminalEffect)
-    if between:
-        raise InverseError(
-            f"{type(between[0]).__name__} acts between sheet and readings, which are then not the differences of "
-            "potentials that reconstruction takes them for; reconstruct with a scene without it"
-        )
+    common = _common_gain(chosen(model.effects, AbstractTerminalEffect))
     if is_traced(model.pattern, model.mixing):
         raise InverseError(
             "jit, grad or vmap hides the protocol of the model, which decides the shapes of a reconstruction; use the "
@@ -247,7 +263,24 @@ def whitened_readings(model: Model, noise: Any, channels: Any) -> Whitened:
     current = model.current if is_traced(model.current) else float(model.current)
     rows = len(model.pattern)
     mixing = None if model.mixing is None else matrix_of_rows(model.mixing, rows)
-    return whitened(np.asarray(model.pattern), current, weight, used, model.dtype, mixing)
+    return whitened(np.asarray(model.pattern), current, weight, used, model.dtype, mixing, common)
+
+
+def _common_gain(effects: tuple[AbstractTerminalEffect, ...]) -> float:
+    """The gain for the common mode, if that is all that acts between sheet and readings."""
+    gain = 0.0
+    for effect in effects:
+        if not isinstance(effect, CommonMode):
+            raise InverseError(
+                f"{type(effect).__name__} acts between sheet and readings, which are then not the sums of potentials "
+                "that reconstruction takes them for; reconstruct with a scene without it"
+            )
+        if is_traced(effect.gain):
+            raise InverseError(
+                "jit, grad or vmap hides the gain of CommonMode, which decides what readings are made of"
+            )
+        gain += float(effect.gain)
+    return gain
 
 
 def known_flags(channels: Any, readings: int) -> np.ndarray:

@@ -8,6 +8,7 @@ All unknowns are Gaussian before the frame is seen, conductivity and contacts by
 ones are found through the full forward map by `LevenbergMarquardt`; their covariance is that of the curvature there.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 from scipy.linalg import block_diag
 
+from ..effects import CommonMode, chosen
 from ..least_squares import ImplicitStep, LevenbergMarquardt
 from ..linalg.lapack import eigh
 from ..model.discretisation import Model
@@ -45,6 +47,7 @@ class ReferenceSettings(eqx.Module):
     | gain: of each channel, relative                                          | 0       | 1    |
     | offset: of each channel                                                  | 0       | V    |
     | shift: of each electrode in each direction                               | 0       | m    |
+    | common_mode: of the amplifiers' gain for the common-mode voltage         | 0       | 1    |
     """
 
     level: float = 3.0
@@ -53,6 +56,7 @@ class ReferenceSettings(eqx.Module):
     gain: float = 0.0
     offset: float = 0.0
     shift: float = 0.0
+    common_mode: float = 0.0
 
     def __check_init__(self) -> None:
         for name, value in vars(self).items():
@@ -71,6 +75,7 @@ class ReferenceParameters(NamedTuple):
     | contact: of the specific contact resistance of each electrode | (electrodes,)   |
     | gain, offset: of each channel                                 | (channels,)     |
     | shift: of each electrode                                      | (electrodes, 2) |
+    | common_mode: gain of `je.effects.CommonMode`                  | ()              |
     """
 
     level: Float[Array, ""]
@@ -78,6 +83,7 @@ class ReferenceParameters(NamedTuple):
     gain: Float[Array, " channels"]
     offset: Float[Array, " channels"]
     shift: Float[Array, "electrodes 2"]
+    common_mode: Float[Array, ""]
 
 
 class ReferenceFit(eqx.Module):
@@ -155,8 +161,8 @@ def fit_reference(
     motion = electrode_motion(model) if settings.shift else None
     spread = jnp.asarray(_spread(model, settings, channels), model.dtype)
     numbers = None if each is None else jnp.asarray(each, jnp.int32)
-    touches = bool(settings.contact or settings.contact_each)
-    problem = _Problem(model, motion, numbers, channels, touches, level, spread)
+    touches, amplifies = bool(settings.contact or settings.contact_each), bool(settings.common_mode)
+    problem = _Problem(model, motion, numbers, channels, touches, amplifies, level, spread)
     fit, found = _fitted(problem, known, weight)
     for _ in range(0 if std is not None else MORE_FITS):
         weight = weight / jnp.maximum(fit.misfit, 1)
@@ -190,12 +196,15 @@ def _spread(model: Model, settings: ReferenceSettings, channels: int) -> np.ndar
             "no electrode of the model has a contact resistance to fit; give the electrodes a contact above zero, or "
             "the settings contact=0 and contact_each=0"
         )
+    if settings.common_mode and not chosen(model.effects, CommonMode):
+        raise InverseError("the scene has no CommonMode whose gain could be fitted; add je.effects.CommonMode() to it")
     blocks = [
         np.array([[settings.level]]),
         _alike(touching, settings.contact, settings.contact_each),
         settings.gain * np.eye(channels),
         settings.offset * np.eye(channels),
         settings.shift * np.eye(2 * model.electrodes),
+        np.array([[settings.common_mode]]),
     ]
     whole: np.ndarray = block_diag(*blocks)
     return whole[:, whole.any(0)]
@@ -213,8 +222,9 @@ def _alike(touching: np.ndarray, together: float, each: float) -> np.ndarray:
 
 def _parts(values: Float[Array, " n"], electrodes: int, channels: int) -> ReferenceParameters:
     """The unknowns, apart."""
-    level, contact, gain, offset, shift = jnp.split(values, np.cumsum([1, electrodes, channels, channels]))
-    return ReferenceParameters(level[0], contact, gain, offset, shift.reshape(electrodes, 2))
+    counts = [1, electrodes, channels, channels, 2 * electrodes]
+    level, contact, gain, offset, shift, common = jnp.split(values, np.cumsum(counts))
+    return ReferenceParameters(level[0], contact, gain, offset, shift.reshape(electrodes, 2), common[0])
 
 
 class _Problem(eqx.Module):
@@ -225,6 +235,7 @@ class _Problem(eqx.Module):
     channel: Int[Array, " readings"] | None
     channels: int = eqx.field(static=True)
     touches: bool = eqx.field(static=True)  # whether contacts are fitted
+    amplifies: bool = eqx.field(static=True)  # whether the gain for the common mode is
     level: Float[Array, ""]  # conductivity to begin with, over the model's
     spread: Float[Array, "n k"]
 
@@ -237,8 +248,13 @@ class _Problem(eqx.Module):
         model = self.model if self.motion is None else moved(self.model, self.motion, parts.shift)
         background = self.level * jnp.exp(parts.level) * model.background
         contact = self.level * jnp.exp(-parts.contact) * model.contact if self.touches else model.contact
-        after: Model = eqx.tree_at(lambda m: (m.background, m.contact), model, (background, contact))
-        return after
+        effects = tuple(
+            eqx.tree_at(lambda e: e.gain, effect, effect.gain + parts.common_mode)
+            if self.amplifies and isinstance(effect, CommonMode)
+            else effect
+            for effect in model.effects
+        )
+        return replace(model, background=background, contact=contact, effects=effects)
 
     def read(self, x: Float[Array, " k"]) -> Float[Array, " readings"]:
         """The frame, V."""
@@ -286,6 +302,7 @@ def _described(
     value = parts._replace(
         level=jnp.average(model.background, weights=problem.model.areas),
         contact=jnp.where(touching, 1 / jnp.where(touching, model.contact, 1), 0),
+        common_mode=sum((effect.gain for effect in chosen(model.effects, CommonMode)), jnp.zeros_like(parts.level)),
     )
     error = _parts(jnp.sqrt(jnp.diagonal(covariance)), model.electrodes, problem.channels)
     used = jnp.maximum(jnp.sum(missed != 0, dtype=missed.dtype), 1)

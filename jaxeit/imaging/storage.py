@@ -69,13 +69,13 @@ def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.nd
     """The arrays of a reconstructor under the names of `NUMBERS`; of an iterative one, all but its method and prior.
 
     Raises:
-        StorageError: for a protocol of matrices (`Protocol.from_matrices`).
+        StorageError: for a protocol of matrices (`Protocol.from_matrices`), or amplifiers with a `CommonMode`.
     """
     require_known("to_numbers", StorageError, recon)
     if recon.whitening.shares is not None:
         raise StorageError(
-            "a reconstructor for a protocol of matrices (Protocol.from_matrices) has no form in a file; make it with "
-            "prepare where it is used"
+            "a reconstructor for a protocol of matrices (Protocol.from_matrices), or for amplifiers with a CommonMode, "
+            "has no form in a file; make it with prepare where it is used"
         )
     parts = (recon, recon.whitening, recon.picture)
     if isinstance(recon, Reconstructor):

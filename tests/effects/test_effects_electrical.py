@@ -207,5 +207,5 @@ def test_the_jacobian_is_that_of_what_the_terminals_see():
     np.testing.assert_allclose(je.jacobian(model), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
     bare = square_model(points, [[0, 1, 2, 3], [2, 3, 0, 1], [1, 2, 0, 3]], 10)
     assert np.abs(je.jacobian(bare) - expected).max() > 0.1 * np.abs(expected).max()
-    with pytest.raises(ValueError, match="CommonMode acts between sheet and readings"):
+    with pytest.raises(ValueError, match="ElectrodeFault acts between sheet and readings"):
         je.prepare(model)

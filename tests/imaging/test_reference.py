@@ -19,10 +19,10 @@ RING = np.eye(COUNT) - np.roll(np.eye(COUNT), 1, 0)
 ROWS = je.skin.adjacent(COUNT)
 
 
-def _tank(protocol, **changes):
+def _tank(protocol, effects=(), **changes):
     disc = je.Disc(RADIUS)
     rim = je.skin.rim_electrodes(disc, COUNT, contact=2e-2)
-    scene = je.Scene(replace(skin_of(disc, rim, ROWS), protocol=protocol))
+    scene = je.Scene(replace(skin_of(disc, rim, ROWS), protocol=protocol), effects)
     return je.discretise(scene, je.Fidelity(order=2, **changes))
 
 
@@ -156,6 +156,8 @@ def test_what_cannot_be_fitted_is_refused(adjacent):
     with pytest.raises(InverseError, match=r"channel has shape \(3,\)"):
         fit_reference(adjacent, frame, ReferenceSettings(gain=0.01), channel=np.arange(3))
     matrices = _tank(je.Protocol.from_matrices(CURRENT * (RING + np.roll(RING, 3, 0)), RING), edge_length=0.1)
+    with pytest.raises(InverseError, match="no CommonMode"):
+        fit_reference(adjacent, frame, ReferenceSettings(common_mode=0.01))
     with pytest.raises(InverseError, match="give channel="):
         fit_reference(matrices, je.forward(matrices), ReferenceSettings(gain=0.01))
     points = [je.PointElectrode((x, y)) for x, y in ((0.05, 0.05), (0.15, 0.05), (0.1, 0.15), (0.05, 0.12))]
@@ -163,3 +165,17 @@ def test_what_cannot_be_fitted_is_refused(adjacent):
     with pytest.raises(InverseError, match="no electrode of the model has a contact resistance"):
         fit_reference(perfect, je.forward(perfect))
     jax.jit(lambda frame: fit_reference(adjacent, frame).value.level)(frame)
+
+
+def test_the_gain_for_the_common_mode(saline):
+    """Readings with it, made here from the potentials of the exact solution."""
+    gain, (_, potential) = 8e-3, saline(9, np.eye(COUNT) - 1 / COUNT)
+    source, sink, plus, minus = ROWS.T
+    felt, reading = potential[:, source] - potential[:, sink], np.arange(len(ROWS))
+    above = felt - felt[sink, reading]
+    shared = CURRENT * 0.5 * (above[plus, reading] + above[minus, reading])
+    amplifier = (je.effects.CommonMode(gain=0.0),)
+    model = _tank(je.Protocol(ROWS, CURRENT), amplifier, edge_length=0.06)
+    fit = fit_reference(model, _recorded(_rows(potential) + gain * shared, 9), ReferenceSettings(common_mode=1e-2))
+    assert abs(fit.value.common_mode - gain) < 3 * fit.standard_error.common_mode
+    assert fit.standard_error.common_mode < 0.2 * gain

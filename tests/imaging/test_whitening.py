@@ -1,5 +1,7 @@
 """Pair sums: nothing of a frame is lost in them, and what a frame lacks is taken out exactly."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,6 +49,25 @@ def test_readings_weigh_by_the_inverse_of_their_noise(noisy):
     recon, j, r, strength, _, weight = noisy
     expected = generalised(j, r, strength, weight)
     np.testing.assert_allclose(recon.matrix, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_images_know_what_amplifiers_make_of_the_common_mode(model, pixels):
+    """With readings that are no differences, and a NaN: the same image as by the Jacobian of all readings."""
+    amplified = replace(model, effects=(je.effects.CommonMode(gain=8e-3),))
+    recon = je.prepare(amplified, basis=pixels, noise=STD)
+    j, weight = np.asarray(je.jacobian(amplified, basis=pixels)), np.diag(STD**-2.0)
+    assert np.abs(j - je.jacobian(model, basis=pixels)).max() > 1e-3 * np.abs(j).max()
+    r = np.asarray(je.Noser().precision(jnp.asarray(np.linalg.cholesky(weight).T @ j), pixels.picture).values)
+    strength = 0.1**2 * np.trace(weight @ j / r @ j.T) / len(j)
+    expected = generalised(j, r, strength, weight)
+    np.testing.assert_allclose(recon.matrix, expected, atol=1e-8 * np.abs(expected).max())
+    dv = 1e-4 * np.random.default_rng(0).normal(size=550)
+    kept = np.setdiff1d(np.arange(550), [3, 77])
+    gone = np.where(np.isin(np.arange(550), kept), dv, np.nan)
+    expected = generalised(j, r, strength, remaining(STD, kept)) @ dv
+    np.testing.assert_allclose(recon(gone), expected, atol=1e-7 * np.abs(expected).max())
+    with pytest.raises(je.imaging.InverseError, match="hides the gain of CommonMode"):
+        jax.jit(lambda gain: je.prepare(replace(model, effects=(je.effects.CommonMode(gain=gain),))).matrix)(8e-3)
 
 
 @pytest.mark.parametrize("noise", NOISES)
