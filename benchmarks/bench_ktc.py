@@ -15,7 +15,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy.io import loadmat
-from scipy.ndimage import distance_transform_edt, label, map_coordinates
 from scipy.optimize import minimize_scalar
 
 import jaxeit as je
@@ -28,21 +27,6 @@ RADIUS, ELECTRODES, GRID = 0.115, 32, 256
 LEVELS, SMOKE_LEVELS = tuple(range(1, 8)), (1, 7)
 WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
 PUBLISHED = {"linear baseline": 10.30, "winners (trained networks), about": 15.0}
-
-
-def half_height(image: np.ndarray, floor: float, least: int) -> np.ndarray:
-    """Labels of a picture that is zero in water: each region beyond ``floor``, cut at half of its own peak.
-
-    A blurred edge lies at half the height, however high. Regions of fewer than ``least`` pixels are left out.
-    """
-    labels = np.full(image.shape, WATER)
-    for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):
-        regions, count = label(sign * image > floor)
-        for region in (regions == number for number in range(1, count + 1)):
-            cut = max(floor, 0.5 * np.max(sign * image[region]))
-            if region.sum() >= least:
-                labels[region & (sign * image > cut)] = kind
-    return labels
 
 
 def otsu_labels(image: np.ndarray) -> np.ndarray:
@@ -153,21 +137,16 @@ def with_level(data: Data, level: int) -> Data:
     return replace(data, reference=np.where(lost, np.nan, data.reference), frames=frames)
 
 
+LINE = np.linspace(-1, 1, GRID)
+INSIDE = np.hypot(LINE, LINE[:, None]) <= 1
+
+
 def on_grid(values: np.ndarray, picture: Any) -> np.ndarray:
     """The challenge's 256 x 256 pixels, row 0 at +y, from those of an image by bilinear interpolation."""
-    inside = (np.asarray(picture.areas) > 0).reshape(picture.shape)
-    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    filled = values.reshape(picture.shape)[tuple(nearest)]
-    line = np.linspace(-RADIUS, RADIUS, GRID)
-    x, y = np.meshgrid(line, -line)
-    (rows, columns), (x0, x1, y0, y1) = picture.shape, picture.extent
-    places = [(y - y0) / (y1 - y0) * rows - 0.5, (x - x0) / (x1 - x0) * columns - 0.5]
-    return np.where(np.hypot(x, y) <= RADIUS, map_coordinates(filled, places, order=1, mode="nearest"), 0.0)
+    return np.where(INSIDE, je.imaging.on_grid(values, picture.picture, (GRID, GRID))[::-1], 0.0)
 
 
 Method = Callable[[Data], list[np.ndarray]]  # frames to the labels of each
-FLOOR, LEAST = 0.5, 150  # of a region: change of log conductivity, and pixels
-RELATIVE, ABSOLUTE = 0.05, 0.01  # share of a change, and of the largest, that the model misses
 
 
 def linear(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) -> list[np.ndarray]:
@@ -179,26 +158,12 @@ def linear(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) 
 
 
 def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) -> list[np.ndarray]:
-    """Gauss-Newton on log conductivity with total variation, each region cut at half its height.
-
-    The model is asked for the change only: ``voltages(0) + frame - reference``. It misses the change by RELATIVE of it,
-    ABSOLUTE of the largest, and in the measure in which it missed the reference.
-    """
-    model = eqx.tree_at(lambda m: m.contact, model, jnp.full_like(model.contact, 1 / water.contact))
-    physics = je.imaging.LogConductivity(model, image, jnp.asarray(water.sigma))
-    rest, labels = np.asarray(_rest(physics)), []
-    for change in data.frames - data.reference:
-        share = np.sqrt(np.nansum(change**2) / np.nansum(data.reference**2))
-        std = RELATIVE * np.abs(change) + ABSOLUTE * np.nanmax(np.abs(change)) + share * np.abs(water.missed)
-        prior = je.imaging.IsotropicVariation()
-        found = je.gauss_newton(physics, prior, jnp.asarray(rest + change), jnp.asarray(std))
-        labels.append(half_height(on_grid(np.asarray(found), image.picture), FLOOR, LEAST))
-    return labels
-
-
-@eqx.filter_jit
-def _rest(physics):
-    return physics.voltages(jnp.zeros(physics.image.size, physics.model.dtype))
+    """`je.imaging.segment`, with water as the reference tells it and one weight for all levels."""
+    filled = jnp.full_like(model.background, water.sigma), jnp.full_like(model.contact, 1 / water.contact)
+    model = eqx.tree_at(lambda m: (m.background, m.contact), model, filled)
+    how: dict[str, Any] = {"missed": water.missed, "penalty": je.imaging.IsotropicVariation()}
+    found = [je.imaging.segment(model, data.reference, frame, image, **how) for frame in data.frames]
+    return [np.where(INSIDE, one.classes[::-1], WATER) for one in found]
 
 
 def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method]:

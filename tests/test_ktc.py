@@ -44,10 +44,33 @@ def test_regions_are_cut_at_half_their_height():
     image[5:15, 5:15], image[8:12, 8:12] = 1.4, 3.0  # a shoulder below half of the peak
     image[25:35, 25:35] = -0.8
     image[0:2, 38:40] = 5.0  # too small
-    labels = ktc.half_height(image, floor=0.5, least=10)
+    labels = je.imaging.half_height_classes(image, floor=0.5, least=10 / 1600)
     assert np.unique(labels[:20, :20], return_counts=True)[1].tolist() == [400 - 16, 16]
     assert (labels[25:35, 25:35] == ktc.RESISTIVE).all()
     assert (labels == ktc.CONDUCTIVE).sum() == 16
+
+
+def test_a_tank_in_classes():
+    """A conductive and a resistive piece, simulated on another mesh, with the water's contacts unknown to the model."""
+    fine, coarse = (
+        disc_model(z, edge, electrodes=16, order=2, pattern=je.skin.adjacent(16))
+        for z, edge in ((0.05, 0.05), (0.02, 0.1))
+    )
+    away = [np.linalg.norm(np.asarray(fine.centroids) - place, axis=1) < 0.25 for place in ((0.5, 0.0), (-0.4, 0.3))]
+    sigma = np.where(away[0], 6.0, np.where(away[1], 0.2, 1.0))
+    reference, frame = np.array(je.forward(fine)), np.array(je.forward(fine, jnp.asarray(sigma)))
+    frame[5] = np.nan
+    water = je.imaging.fit_reference(coarse, reference).model
+    found = je.imaging.segment(water, reference, frame, je.Pixels(24), pixels=100)
+    line = (np.arange(100) + 0.5) / 50 - 1
+    x, y = np.meshgrid(line, line)
+    for kind, place in ((ktc.CONDUCTIVE, (0.5, 0.0)), (ktc.RESISTIVE, (-0.4, 0.3))):
+        truth, seen = np.hypot(x - place[0], y - place[1]) < 0.25, found.classes == kind
+        assert (truth & seen).sum() > 0.6 * (truth | seen).sum()
+    with pytest.raises(je.imaging.InverseError, match=r"floor is 0\.0"):
+        je.imaging.segment(water, reference, frame, floor=0.0)
+    with pytest.raises(je.imaging.InverseError, match="is no picture"):
+        je.imaging.segment(water, reference, frame, je.model.Elements())
 
 
 @pytest.mark.parametrize(

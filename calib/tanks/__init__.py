@@ -1,7 +1,7 @@
 """Tanks of others: files of EIDORS, the Kuopio challenge, PyEIDORS, Sciospec and NumPy, and images of their frames."""
 
 from .formats import load_eidors, load_ktc, load_npz, load_pyeidors, load_sciospec, load_tank
-from .images import TankImage, difference_image
+from .images import TankImage, difference_image, segmented_frame
 from .recording import Tank, TankError
 
 __all__ = [
@@ -15,4 +15,5 @@ __all__ = [
     "load_pyeidors",
     "load_sciospec",
     "load_tank",
+    "segmented_frame",
 ]

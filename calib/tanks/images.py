@@ -13,7 +13,9 @@ from jaxeit.imaging import (
     IterativeReconstructor,
     ReferenceFit,
     ReferenceSettings,
+    Segmentation,
     fit_reference,
+    segment,
 )
 from jaxeit.model import AbstractBasis
 
@@ -50,7 +52,7 @@ def difference_image(
     prior: je.AbstractPrior | None = None,
     method: AbstractLinearMethod | AbstractIterativeMethod | None = None,
     basis: AbstractBasis | None = None,
-    hyperparameter: float = 0.1,
+    hyperparameter: float = 0.3,
     fidelity: je.Fidelity | None = None,
     fit: ReferenceSettings | None = None,
 ) -> TankImage:
@@ -61,7 +63,8 @@ def difference_image(
 
     Args:
         frame, reference: numbers of the frames.
-        prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x.
+        prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x. The default
+            hyperparameter suits tanks whose geometry is known to a few percent (docs/tanks.md).
         fidelity: as for `Tank.model`.
         fit: fit conductivity and contacts to the reference by `je.imaging.fit_reference`, for the image;
             default: contacts as the tank has them.
@@ -70,6 +73,44 @@ def difference_image(
         TankError: if there is one frame, or the reference does not look like the model.
         InverseError: if ``fit`` is given, and no even content explains the reference.
     """
+    scaled = _scaled(tank, frame, reference, fidelity, fit)
+    model = scaled.model
+    recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=hyperparameter)
+    change = recon(jnp.asarray(scaled.after - scaled.before, model.dtype)) / model.background[0]
+    return TankImage(change, recon, scaled.gain * float(model.background[0]), scaled.correlation, scaled.fit)
+
+
+def segmented_frame(
+    tank: Tank,
+    frame: int = -1,
+    reference: int = 0,
+    *,
+    basis: AbstractBasis | None = None,
+    fidelity: je.Fidelity | None = None,
+    fit: ReferenceSettings | None = None,
+) -> Segmentation:
+    """What conducts less and more in one frame than in another, by `je.imaging.segment`.
+
+    Arguments and errors as for `difference_image`.
+    """
+    scaled = _scaled(tank, frame, reference, fidelity, fit)
+    return segment(scaled.model, scaled.before, scaled.after, basis)
+
+
+class _Scaled(NamedTuple):
+    """Two frames times the gain with which the model reads like the first of them."""
+
+    model: je.Model
+    before: np.ndarray
+    after: np.ndarray
+    gain: float
+    correlation: float
+    fit: ReferenceFit | None
+
+
+def _scaled(
+    tank: Tank, frame: int, reference: int, fidelity: je.Fidelity | None, fit: ReferenceSettings | None
+) -> _Scaled:
     count = len(tank.frames)
     if not all(-count <= number < count for number in (frame, reference)) or (frame - reference) % count == 0:
         raise TankError(
@@ -89,8 +130,6 @@ def difference_image(
         )
     found = None if fit is None else fit_reference(model, np.where(used, before, np.nan), fit)
     model = model if found is None else found.model
-    level, even = float(model.background[0]), np.asarray(je.forward(model))
+    even = np.asarray(je.forward(model))
     scale = float(even[used] @ before[used] / (before[used] @ before[used]))
-    recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=hyperparameter)
-    change = recon(jnp.asarray(scale * (after - before), model.dtype)) / level
-    return TankImage(change, recon, scale * level, correlation, found)
+    return _Scaled(model, scale * before, scale * after, scale, correlation, found)

@@ -52,6 +52,7 @@ from .priors import (
 )
 from .reconstruction import AbstractReconstructor, IterativeReconstructor, Provenance, Reconstructor
 from .reference import ReferenceFit, ReferenceParameters, ReferenceSettings, fit_reference
+from .segmentation import Segmentation, half_height_classes, on_grid, segment
 from .settings import Imaging
 from .storage import (
     NUMBERS,
@@ -112,6 +113,7 @@ __all__ = [
     "ReferenceParameters",
     "ReferenceSettings",
     "Reweighted",
+    "Segmentation",
     "SparseBayes",
     "StorageError",
     "Tikhonov",
@@ -122,10 +124,13 @@ __all__ = [
     "fit_reference",
     "from_numbers",
     "gauss_newton",
+    "half_height_classes",
     "least_squares_image",
     "load_reconstructor",
     "noise_covariance",
+    "on_grid",
     "prepare",
     "save_reconstructor",
+    "segment",
     "to_numbers",
 ]

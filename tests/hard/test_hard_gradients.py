@@ -61,6 +61,7 @@ HOST = {
     "named_pattern": _DESCRIBES,
     "noise_covariance": _PREPARES,
     "opposite": _DESCRIBES,
+    **dict.fromkeys(("half_height_classes", "on_grid", "segment"), "finds regions, on the host, and says so under jit"),
     "pad_masks": "geometry, on the host, and says so under jit",
     "pad_response": _GEOMETRY,
     "parse_skin": _DESCRIBES,

@@ -263,6 +263,8 @@ def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypat
     assert "<svg" in (tmp_path / "turned.svg").read_text()
     assert main(["image", "tank.mat", "--fit-contacts", "one", "-o", "fitted.png"]) == 0
     assert "fitted to the reference: 1 S +- " in capsys.readouterr().out
+    assert main(["image", "tank.mat", "--classes", "-o", "classes.png"]) == 0
+    assert " 0 cm^2 resistive (blue), " in capsys.readouterr().out
     assert main(["image", CSV, "-o", "no.png"]) == 2
     assert "--radius" in capsys.readouterr().err
     assert main(["image", CSV, "--radius", str(RADIUS), "-o", "no.gif"]) == 2

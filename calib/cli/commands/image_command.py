@@ -4,14 +4,19 @@ import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
 
 if TYPE_CHECKING:
-    from jaxeit.imaging import ReferenceFit, ReferenceSettings
+    from matplotlib.axes import Axes
+
+    from jaxeit.imaging import AbstractPrior, ReferenceFit, ReferenceSettings
 
     from ...tanks import Tank
+
+COLOURS = ("#ffffff", "#2166ac", "#b2182b")
+"""Of the classes: as the reference, resistive, conductive."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,9 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
     text = "fit conductivity and contact resistances (one, or one of each electrode) to the reference; image with them"
     parser.add_argument("--fit-contacts", choices=("one", "each"), help=text)
+    text = "what conducts less and more than the reference, in place of an image; its prior and method are its own"
+    parser.add_argument("--classes", action="store_true", help=text)
     parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
     parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
-    parser.add_argument("--hyperparameter", type=above_zero, default=0.1, metavar="L", help="weight of the prior; 0.1")
+    parser.add_argument("--hyperparameter", type=above_zero, default=0.3, metavar="L", help="weight of the prior; 0.3")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,30 +53,54 @@ def run(args: argparse.Namespace) -> int:
     import jaxeit as je
 
     from ...session import replacing
-    from ...tanks import difference_image
 
     kind = Path(args.output).suffix.lower()[1:]
     if kind not in ("png", "pdf", "svg"):
         raise ValueError(f"{args.output}: give a name that ends in .png, .pdf or .svg")
     prior, method = je.imaging.PRIORS.make(args.prior), je.imaging.METHODS.make(args.method)
     tank = _tank(args)
-    choices = {"prior": prior, "method": method, "hyperparameter": args.hyperparameter, "fit": _fit(args)}
-    found = difference_image(tank, args.frame, args.reference, **choices)
     figure = Figure(layout="constrained")  # without a window, on any machine
     axes = figure.subplots()
-    je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
+    lines = _classes(args, tank, axes) if args.classes else _change(args, tank, prior, method, axes)
     je.plot.show_skin(tank.skin, axes)
     axes.set_title(f"{tank.names[args.frame]} less {tank.names[args.reference]}", fontsize=9)
     with replacing(Path(args.output)) as new:
         figure.savefig(new, format=kind, dpi=150)
-    low, high = float(found.change.min()), float(found.change.max())
     count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
     print(f"{count} electrodes, {readings} readings, frames: {', '.join(tank.names)}")
-    print(f"reference: {found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}")
-    if found.fit is not None:
-        print(f"fitted to the reference: {_fitted(found.fit)}")
-    print(f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity")
+    print("\n".join(lines))
     return 0
+
+
+def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", method: Any, axes: "Axes") -> list[str]:
+    """Draw the difference image; what is printed of it."""
+    import jaxeit as je
+
+    from ...tanks import difference_image
+
+    choices = {"prior": prior, "method": method, "hyperparameter": args.hyperparameter, "fit": _fit(args)}
+    found = difference_image(tank, args.frame, args.reference, **choices)
+    je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
+    low, high = float(found.change.min()), float(found.change.max())
+    of_reference = f"{found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}"
+    fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
+    of_image = f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity"
+    return [f"reference: {of_reference}", *fitted, of_image]
+
+
+def _classes(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:
+    """Draw the classes of the frame; what is printed of them."""
+    import numpy as np
+    from matplotlib.colors import ListedColormap
+
+    from ...tanks import segmented_frame
+
+    found = segmented_frame(tank, args.frame, args.reference, fit=_fit(args))
+    x0, x1, y0, y1 = (1e3 * end for end in found.picture.extent)  # mm
+    axes.imshow(found.classes, ListedColormap(COLOURS), origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=2)
+    shares = np.bincount(found.classes.ravel(), minlength=3) / found.classes.size
+    areas = 1e-2 * (x1 - x0) * (y1 - y0) * shares
+    return [f"{args.output}: {areas[1]:.3g} cm^2 resistive (blue), {areas[2]:.3g} cm^2 conductive (red)"]
 
 
 def _fit(args: argparse.Namespace) -> "ReferenceSettings | None":

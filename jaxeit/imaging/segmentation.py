@@ -1,0 +1,131 @@
+"""Classes of an image: what conducts less than the reference, what conducts more, and the rest.
+
+The image is the logarithm of the conductivity over that of the reference, found through the full forward map with a
+penalty on edges (`gauss_newton`, `IsotropicVariation`); each region that stands out is cut at half of its own height. A
+blurred edge lies at half the height, however high.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Shaped
+from scipy.ndimage import distance_transform_edt, label, map_coordinates
+
+from .._compile import require_known
+from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
+from ..model.discretisation import Model
+from ..model.forward_model import forward
+from .absolute import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton
+from .background import require_frame, require_positive
+from .noise import InverseError
+
+UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
+"""The classes."""
+WEIGHT = 0.03
+"""Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
+
+
+class Segmentation(eqx.Module):
+    """Classes of a frame.
+
+    | meaning                                                                      | shape           |
+    |------------------------------------------------------------------------------|-----------------|
+    | image: logarithm of the conductivity over that of the reference              | (basis,)        |
+    | picture that the image belongs to                                            |                 |
+    | classes: 0 as the reference, 1 resistive, 2 conductive; row 0 at low y       | (rows, columns) |
+    """
+
+    image: Float[Array, " basis"]
+    picture: Picture
+    classes: Int[np.ndarray, "rows columns"]
+
+
+def segment(
+    model: Model,
+    reference: Float[ArrayLike, " readings"],
+    frame: Float[ArrayLike, " readings"],
+    basis: AbstractBasis | BasisMap | None = None,
+    *,
+    penalty: AbstractPenalty | None = None,
+    missed: Float[ArrayLike, " readings"] | None = None,
+    relative_error: float = 0.05,
+    absolute_error: float = 0.01,
+    floor: float = 0.5,
+    least: float = 2.28e-3,
+    pixels: int = 256,
+) -> Segmentation:
+    """Find what changed from a reference of even content, in three classes; on the host, seconds a frame.
+
+    The model is asked for the change only, ``forward(model) + frame - reference``, since what it misses of the
+    reference it mostly misses of the frame too. The error of a reading is a part of its own change, a part of the
+    largest, and of what the model misses of the reference the part that the change is of the readings.
+
+    Args:
+        model: with the reference's conductivity and contacts, as `fit_reference` gives it.
+        reference, frame: V; readings that are not finite in either are left out.
+        basis: default `Pixels`, 40 along x.
+        penalty: default `IsotropicVariation` with a weight of 0.03 for each reading that is used.
+        missed: of the reference by the model, V; default: the difference.
+        relative_error, absolute_error: of a change, over itself and over the largest.
+        floor: least height of a region, logarithm of conductivity.
+        least: smallest region, over the area of the picture.
+        pixels: of the classes along each axis.
+
+    Raises:
+        InverseError: if a shape or a value is wrong.
+    """
+    require_known("segment", InverseError, model.background)
+    before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
+    for values in (before, after):
+        require_frame(values, even)
+    require_positive(
+        relative_error=relative_error, absolute_error=absolute_error, floor=floor, least=least, pixels=pixels
+    )
+    basis = Pixels() if basis is None else basis
+    image = basis if isinstance(basis, BasisMap) else basis.on(model)
+    if len(image.picture.shape) != 2:
+        raise InverseError("the basis is no picture; give pixels, such as basis=Pixels(40)")
+    change, left = after - before, before - even if missed is None else jnp.asarray(missed, model.dtype)
+    share = jnp.sqrt(jnp.nansum(change**2) / jnp.nansum(before**2))
+    size = jnp.abs(change)
+    std = relative_error * size + absolute_error * jnp.nanmax(size) + share * jnp.abs(left)
+    physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
+    if penalty is None:
+        penalty = IsotropicVariation(weight=WEIGHT * jnp.sum(jnp.isfinite(change), dtype=model.dtype))
+    found = gauss_newton(physics, penalty, even + change, std)
+    fine = on_grid(found, image.picture, (pixels, pixels))
+    return Segmentation(found, image.picture, half_height_classes(fine, floor, least))
+
+
+def on_grid(
+    image: Shaped[ArrayLike, " basis"], picture: Picture, shape: tuple[int, int]
+) -> Float[np.ndarray, "rows columns"]:
+    """An image of pixels on another grid over the same extent, by bilinear interpolation; row 0 at low y.
+
+    Pixels that miss the sheet have the value of the nearest one that does not.
+    """
+    inside = (np.asarray(picture.areas) > 0).reshape(picture.shape)
+    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    filled = np.asarray(image, float).reshape(picture.shape)[tuple(nearest)]
+    rows, columns = ((np.arange(n) + 0.5) / n * old - 0.5 for n, old in zip(shape, picture.shape, strict=True))
+    found: np.ndarray = map_coordinates(filled, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest")
+    return found
+
+
+def half_height_classes(
+    image: Float[np.ndarray, "rows columns"], floor: float, least: float
+) -> Int[np.ndarray, "rows columns"]:
+    """Classes of an image that is zero where nothing changed: regions beyond ``floor``, each cut at half its own peak.
+
+    Args:
+        least: smallest region, over the area of the picture.
+    """
+    classes = np.full(image.shape, UNCHANGED)
+    for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):
+        regions, count = label(sign * image > floor)
+        for region in (regions == number for number in range(1, count + 1)):
+            cut = max(floor, 0.5 * float(np.max(sign * image[region])))
+            if region.mean() >= least:
+                classes[region & (sign * image > cut)] = kind
+    return classes
