@@ -66,6 +66,19 @@ def two_fingers(axes: Any, names: Names) -> None:
     axes.legend(fontsize=7)
 
 
+def one_two_or_an_edge(axes: Any, names: Names) -> None:
+    """Probabilities of each kind, a group of bars for each touch."""
+    for row, (touch, stated) in enumerate(names["probabilities"].items()):
+        left = 0.0
+        for (kind, share), colour in zip(stated.items(), ("white", BLUE, ORANGE, GREY, "lightgrey"), strict=True):
+            axes.barh(row, share, left=left, color=colour, label=kind if row == 0 else None)
+            left += share
+        axes.text(0.02, row, touch, va="center", fontsize=8)
+    axes.set(xlabel="probability", yticks=[], xlim=(0, 1))
+    axes.invert_yaxis()
+    axes.legend(fontsize=6, ncols=5, loc="upper center", bbox_to_anchor=(0.5, 1.18))
+
+
 def electrodes_that_move(axes: Any, names: Names) -> None:
     skin = names["skin"]
     skin_places, slope = MM * skin.electrode_positions, np.asarray(names["gradient"])
@@ -170,6 +183,7 @@ DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "my_own_prior": lambda axes, n: _bars(axes, n["far"], "artefact beyond 50 mm, of the peak"),
     "noise_of_an_image": noise_of_an_image,
     "one_effect_at_a_time": one_effect_at_a_time,
+    "one_two_or_an_edge": one_two_or_an_edge,
     "pressure_to_force": pressure_to_force,
     "reciprocity": lambda axes, n: _bars(axes, {k: 100 * v for k, v in n["found"].items()}, "largest difference, %"),
     "sharpness": sharpness,

@@ -7,6 +7,7 @@ from . import (
     check as check,
     export as export,
     fitting as fitting,
+    learning as learning,
     live as live,
     presses as presses,
     record as record,

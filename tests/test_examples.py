@@ -34,6 +34,10 @@ FINDS = {
     "one_effect_at_a_time": lambda names: (
         [change > 0 for change in names["largest"].values()] == [False, True, True, True]
     ),
+    "one_two_or_an_edge": lambda names: (
+        all(max(stated, key=stated.get) == name for name, stated in names["probabilities"].items())
+        and max(names["errors"].values()) < 5
+    ),
     "pressure_to_force": lambda names: (
         names["errors"]["power"] < 0.05 < names["errors"]["linear"] and bool(names["found"].valid.all())
     ),

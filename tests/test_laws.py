@@ -26,7 +26,7 @@ ORDER = [
 ]  # fmt: skip
 BENCH = [
     "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "export", "bench",
-    "simulators", "live", "report", "batch", "tanks", "cli",
+    "simulators", "live", "report", "batch", "learning", "tanks", "cli",
 ]  # fmt: skip
 
 

@@ -14,6 +14,10 @@ from .bench import BenchError
 MAX_CONTACTS = 3
 TIPS = 12  # of a frame, shared by its contacts: 12, 6 or 4 each
 SUM_TOLERANCE = 1e-9  # of probabilities
+# Ranges of `RandomScenes`, and the least value of each.
+RANGES = {"force": 0.0, "size": 0.0, "length": 0.0, "apart": 0.0, "hold": 0.0, "peak": 1.0, "strength": 0.0}
+STRENGTHS = ("std", "fraction", "width")
+"""Fields of effects that `RandomScenes.strength` multiplies: deviations, crosstalk, how far a pad spreads a load."""
 
 
 class Footprint(IntEnum):
@@ -39,8 +43,15 @@ class RandomScenes:
     | footprints: probabilities of tip, disc, ring and edge                        | (4,)  | 1    |
     | force of a contact: lowest and highest; its logarithm is uniform             | (2,)  | N    |
     | size: radius of a disc or ring, half the length of an edge; uniform          | (2,)  | m    |
+    | together: probabilities of footprints of contacts that are not alone, if not | (4,)  | 1    |
+    |   as `footprints`                                                            |       |      |
+    | length: half the length of an edge, if not as `size`; uniform                | (2,)  | m    |
+    | near: probability that each further contact is near the first                | ()    | 1    |
+    | apart: distance of these from the first; uniform                             | (2,)  | m    |
     | hold: time since the load is constant; its logarithm is uniform              | (2,)  | s    |
     | peak: highest load before the hold over that of the hold, in half the frames | (2,)  | 1    |
+    | strength: factors of the `STRENGTHS` of a skin's effects; log-uniform         | (2,)  | 1    |
+    | misplaced: standard deviation of each coordinate of a skin's electrodes      | ()    | m    |
 
     Places are uniform over the sheet, directions of edges uniform. `hold` and `peak` matter only if the scene has an
     effect with memory: the load rises to the peak in half the hold time, falls in the same time, and is then held.
@@ -55,17 +66,26 @@ class RandomScenes:
     size: tuple[float, float] = (0.003, 0.02)
     hold: tuple[float, float] = (0.1, 10.0)
     peak: tuple[float, float] = (1.0, 2.0)
+    together: tuple[float, float, float, float] | None = None
+    length: tuple[float, float] | None = None
+    near: float = 0.0
+    apart: tuple[float, float] = (0.015, 0.06)
+    strength: tuple[float, float] = (1.0, 1.0)
+    misplaced: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("counts", "footprints"):
-            values = np.asarray(getattr(self, name), float)
+        for name in ("counts", "footprints", "together"):
+            values = np.asarray(getattr(self, name) or self.footprints, float)
             if values.shape != (4,) or not (values >= 0).all() or abs(values.sum() - 1) > SUM_TOLERANCE:
                 raise BenchError(f"RandomScenes: {name} is {getattr(self, name)}; give 4 probabilities whose sum is 1")
-        for name, least in (("force", 0.0), ("size", 0.0), ("hold", 0.0), ("peak", 1.0)):
-            low, high = getattr(self, name)
+        for name, least in RANGES.items():
+            low, high = getattr(self, name) or (1.0, 1.0)
             if not (least <= low <= high < np.inf) or low <= 0:
                 what = "above zero" if least == 0 else f"from {least:g}"
                 raise BenchError(f"RandomScenes: {name} is {getattr(self, name)}; give a range {what}, lowest first")
+        if not (0 <= self.near <= 1 and 0 <= self.misplaced < np.inf):
+            what = f"near is {self.near}, misplaced is {self.misplaced}"
+            raise BenchError(f"RandomScenes: {what}; give a probability, and a length in m")
 
 
 class DrawnContacts(NamedTuple):
@@ -118,7 +138,7 @@ def draw_contacts(
     place = _places(domain, frames * MAX_CONTACTS, rng).reshape(*shape, 2)
     size = np.where(footprint == Footprint.TIP, 0, rng.uniform(*scenes.size, shape))
     there = np.arange(MAX_CONTACTS) < number[:, None]
-    return DrawnContacts(
+    drawn = DrawnContacts(
         number=number,
         place=np.where(there[..., None], place, 0),
         force=np.where(there, _log_uniform(scenes.force, shape, rng), 0),
@@ -128,6 +148,29 @@ def draw_contacts(
         hold=_log_uniform(scenes.hold, (frames,), rng),
         peak=np.where(rng.random(frames) < 0.5, rng.uniform(*scenes.peak, frames), 1),
     )
+    # What follows draws nothing with the default scenes, whose frames are those of earlier versions.
+    if scenes.together is not None:
+        several = there & (number > 1)[:, None]
+        footprint = np.where(several, 1 + rng.choice(4, shape, p=scenes.together), drawn.footprint)
+        size = np.where(several, rng.uniform(*scenes.size, shape), drawn.size)
+        drawn = drawn._replace(footprint=footprint, size=np.where(footprint == Footprint.TIP, 0, size))
+    if scenes.length is not None:
+        length = rng.uniform(*scenes.length, shape)
+        drawn = drawn._replace(size=np.where(drawn.footprint == Footprint.EDGE, length, drawn.size))
+    return _crowded(scenes, domain, drawn, rng) if scenes.near else drawn
+
+
+def _crowded(
+    scenes: RandomScenes, domain: je.geometry.Domain, drawn: DrawnContacts, rng: np.random.Generator
+) -> DrawnContacts:
+    """Some further contacts near the first, where that is on the sheet."""
+    shape = drawn.force.shape
+    turn, distance = rng.uniform(0, 2 * np.pi, shape), rng.uniform(*scenes.apart, shape)
+    place = drawn.place[:, :1] + distance[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    moved = (rng.random(shape) < scenes.near) & (drawn.footprint > Footprint.ABSENT)
+    moved &= domain.contains(place.reshape(-1, 2)).reshape(shape)
+    moved[:, 0] = False
+    return drawn._replace(place=np.where(moved[..., None], place, drawn.place))
 
 
 def _log_uniform(

@@ -20,7 +20,7 @@ from jaxeit import effects as fx
 
 from .bench import Bench, BenchError
 from .dataset import grid
-from .random_scenes import DrawnContacts, RandomScenes, Tips, arrange_tips, draw_contacts
+from .random_scenes import STRENGTHS, DrawnContacts, RandomScenes, Tips, arrange_tips, draw_contacts
 from .streams import history
 
 SHARD_FRAMES = 1024  # frames of one skin
@@ -80,12 +80,14 @@ class SceneFrames:
 
     Raises:
         BenchError: if pressure changes no conductivity in the scene; if a flat tip is too small for the mesh.
+        jaxeit.model.MotionError: if electrodes are to be misplaced that cannot move.
     """
 
     def __init__(self, bench: Bench, fidelity: je.Fidelity, basis: je.Pixels, scenes: RandomScenes):
         self.bench, self._scenes = bench, scenes
         bench.scene.skin.protocol.rows("a bench")
         self._model = je.discretise(bench.scene, fidelity)
+        self._motion = je.model.electrode_motion(self._model) if scenes.misplaced else None
         self._diameter = jnp.asarray(bench.tip_diameter, self._model.dtype)
         if not fx.chosen(self._model.effects, fx.AbstractSheetEffect):
             raise BenchError(UNPRESSED)
@@ -120,6 +122,7 @@ class SceneFrames:
             "contact_footprint": contacts.footprint,
             "contact_size": contacts.size,
             "contact_angle": contacts.angle,
+            "load_spread": np.full(SHARD_FRAMES, _load_spread(model)),
         }
         return recorded | {name: values[:frames] for name, values in drawn.items()}
 
@@ -156,7 +159,13 @@ class SceneFrames:
     def _drawn_skin(self, rng: np.random.Generator) -> je.Model:
         """The model of a skin of the scene whose effects have drawn seeds; equal in form to that of any other."""
         effects = tuple(_reseeded(effect, rng) for effect in self.bench.scene.effects)
-        return dataclasses.replace(self._model, effects=_laid(effects, self._model.centroids))
+        model = self._model
+        if self._scenes.strength != (1.0, 1.0):
+            effects = tuple(_of_strength(effect, self._scenes.strength, rng) for effect in effects)
+        if self._motion is not None:
+            shift = rng.normal(scale=self._scenes.misplaced, size=(model.electrodes, 2))
+            model = je.model.moved(model, self._motion, shift)
+        return dataclasses.replace(model, effects=_laid(effects, self._model.centroids))
 
     def _presses(self, contacts: DrawnContacts, tips: Tips, warmth: float, air: float) -> tuple[np.ndarray, ...]:
         """The fields of `Press`, first of the untouched skin, on the host: a slice of them compiles nothing."""
@@ -271,6 +280,22 @@ def _reseeded(effect: fx.AbstractEffect, rng: np.random.Generator) -> fx.Abstrac
         return effect
     changes: Any = {"seed": jnp.asarray(int(rng.integers(2**31)))}
     return dataclasses.replace(effect, **changes)
+
+
+def _of_strength(
+    effect: fx.AbstractEffect, factors: tuple[float, float], rng: np.random.Generator
+) -> fx.AbstractEffect:
+    """The effect with each of its `STRENGTHS` times a drawn factor."""
+    low, high = np.log(factors)
+    names = [field.name for field in dataclasses.fields(effect) if field.name in STRENGTHS]
+    changes: Any = {name: getattr(effect, name) * float(np.exp(rng.uniform(low, high))) for name in names}
+    return dataclasses.replace(effect, **changes)
+
+
+def _load_spread(model: je.Model) -> float:
+    """Standard deviation of the Gaussian that the pad makes of each tip, m; 0: flat tips."""
+    found = [effect.width for effect in model.effects if isinstance(effect, fx.LoadSpreading)]
+    return float(found[0]) if found else 0.0
 
 
 def _check_response(voltages: Float[np.ndarray, "n readings"], maps: Float[np.ndarray, "n pixels"]) -> None:

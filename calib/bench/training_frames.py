@@ -23,7 +23,7 @@ from .random_scenes import MAX_CONTACTS, Footprint, RandomScenes
 from .scene_frames import SHARD_FRAMES
 
 FORMAT = "jaxeit-training-frames"
-VERSION = 1  # of the content: equal seeds give equal frames within a version
+VERSION = 2  # of the content: equal seeds give equal frames within a version
 SHARD_FORMAT = "skin-training-frames"
 CARD = "card.json"
 COUNTS = ("frames", "shards", "arrays")  # entries of a card that change where frames are added
@@ -53,6 +53,7 @@ ARRAYS = {
     "contact_footprint": About(("frame", "contact"), "1", FOOTPRINTS, "u1"),
     "contact_size": About(("frame", "contact"), "m", "radius of a disc or ring, half the length of an edge"),
     "contact_angle": About(("frame", "contact"), "rad", "direction of an edge against x"),
+    "load_spread": About(("frame",), "m", "standard deviation by which the pad spreads each tip; 0: flat tips"),
 }
 """Arrays of a shard by their names; a skin without pads has no arrays with an axis of pads."""
 
@@ -198,7 +199,8 @@ def card_of(made: FrameSet, mark: str, versions: Mapping[str, str]) -> str:
         "fidelity": str(made.fidelity),
         "pixels": str(made.pixels),
         "drawn_from": dataclasses.asdict(made.scenes),
-        "drawn_once_per_shard": "seeds of all effects, temperature and air pressure within those of the bench",
+        "drawn_once_per_shard": "seeds and strengths of all effects, places of the electrodes, temperature and air "
+        "pressure within those of the bench",
         "arrays": arrays,
         "mark": mark,
         **versions,
@@ -283,6 +285,10 @@ class TrainingFrames:
                 "apart, or write more frames"
             )
         return TrainingFrames(self.folder, self.card, self.shards[first:last])
+
+    def skins(self) -> Iterator["TrainingFrames"]:
+        """The frames of one skin after another."""
+        return (TrainingFrames(self.folder, self.card, range(number, number + 1)) for number in self.shards)
 
     def __getitem__(self, name: str) -> np.ndarray:
         """One array of all shards in memory, such as ``frames["force_map"]``, (frames, pixels).

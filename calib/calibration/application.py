@@ -31,6 +31,7 @@ def apply(
     ignore_errors: bool = False,
     progress: Progress = iter,
     loads: float | None = None,
+    proposal: je.contacts.Proposal | None = None,
     track: bool = False,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
@@ -44,14 +45,18 @@ def apply(
         ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
             file then names the errors.
         loads: also tell what touches the skin, none, one, two, an edge or more, in windows of so many s; None: do not.
+        proposal: of loads, trained for this skin by ``jaxeit train``, where their fits begin.
         track: also follow contacts from frame to frame, each with a number; smoothed over time.
         tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
 
     Raises:
         SessionError: if the session was recorded on another skin, lacks a stream, or holds no frame.
+        InverseError: if the proposal was trained for another skin.
         RecordingError: if `check_session` finds an error in its skin, frames or pressures.
     """
     processing = processing or calibration.processing
+    if proposal is not None:
+        proposal.require_skin(calibration.skin)
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     calibration, outside = agreement_of_use(calibration, session)
@@ -65,7 +70,7 @@ def apply(
         for name, (dims, units, meaning, dtype) in kinds.items():
             tail = tuple(sizes[dim] for dim in dims)
             writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
-        also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress)]
+        also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress, proposal)]
         also += [_Tracks(calibration, writer, blocks)] if track else []
         for block, found in estimated(calibration, progress(blocks)):
             _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
@@ -136,18 +141,25 @@ def _append(writer: ArchiveWriter, rows: Mapping[str, np.ndarray], names: Iterab
 class _Loads:
     """Loads in windows of so many seconds, beside the force maps."""
 
-    def __init__(self, calibration: Calibration, writer: ArchiveWriter, seconds: float, progress: Progress):
-        self._calibration, self._writer, self._progress = calibration, writer, progress
+    def __init__(
+        self,
+        calibration: Calibration,
+        writer: ArchiveWriter,
+        seconds: float,
+        progress: Progress,
+        proposal: je.contacts.Proposal | None,
+    ):
+        self._calibration, self._writer, self._progress, self._proposal = calibration, writer, progress, proposal
         self._windows = WindowedFrames(seconds, calibration.recon.readings)
 
     def add(self, block: FrameBlock, found: ForceEstimate) -> None:
         loaded = block.loaded(self._calibration)
-        self._windows.add(block.time, block.frames, block.change, loaded, found.force.sum(1))
+        self._windows.add(block.time, block.frames, block.change, loaded, found.force.sum(1), found.force)
 
     def end(self) -> str:
         """Write the loads; returns what they are in one line."""
         self._windows.close()
-        seen = fit_windows(self._calibration, self._windows, self._progress)
+        seen = fit_windows(self._calibration, self._windows, self._progress, self._proposal)
         for name, about in seen.arrays.items():
             self._writer.add(name, *about)
         return seen.render()

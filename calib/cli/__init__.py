@@ -24,6 +24,7 @@ COMMANDS = {
     "export": "write for other programs: a C header for firmware, or a bag of ROS 2 (MCAP)",
     "bench": "measure what accuracy costs in time, for a skin on this machine",
     "design": "choose which readings a skin should take, out of all that its electrodes allow",
+    "train": "train a network that proposes what touches a skin, on scenes drawn at random",
     "record": "record devices into a session file; nothing that arrived is lost",
     "live": "show force maps on a web page as frames arrive",
     "doctor": "examine this machine: versions, device, threads, cache, disk, ports",

@@ -51,6 +51,14 @@ def prepare_outputs(*paths: str | None) -> None:
             raise ValueError(f"{path}: the folder cannot be written to; choose another")
 
 
+def require_optax() -> None:
+    """Raise ImportError before the work begins if optax, which trains, is not installed."""
+    from importlib.util import find_spec
+
+    if find_spec("optax") is None:
+        raise ImportError("jaxeit train needs optax: pip install 'jaxeit[train]'")
+
+
 def require_matplotlib_for(option: str) -> None:
     """Raise ImportError before the work begins if matplotlib, which the option needs, is not installed."""
     from importlib.util import find_spec

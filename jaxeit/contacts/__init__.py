@@ -1,6 +1,16 @@
 """Where the skin is touched, and by how many contacts."""
 
-from .loads import LoadFitter, LoadKind, Loads, LoadSettings, LoadShape, prepare_loads
+from .loads import (
+    LoadFitter,
+    LoadKind,
+    Loads,
+    LoadSettings,
+    LoadShape,
+    Proposal,
+    Proposed,
+    load_proposal,
+    prepare_loads,
+)
 from .preparation import prepare_contacts
 from .refinement import refine_contacts
 from .regions import RegionError, Regions, find_regions
@@ -18,9 +28,12 @@ __all__ = [
     "LoadSettings",
     "LoadShape",
     "Loads",
+    "Proposal",
+    "Proposed",
     "RegionError",
     "Regions",
     "find_regions",
+    "load_proposal",
     "prepare_contacts",
     "prepare_loads",
     "refine_contacts",

@@ -3,13 +3,8 @@
 Numbers, not a compiled program: those fail, or worse load and differ, under another version of JAX.
 """
 
-import io
 import json
 import math
-import os
-import struct
-import tempfile
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, overload
@@ -19,8 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compile import require_known
-from ..budget import require
-from ..files import open_regular
+from ..files import DAMAGE, read_arrays, write_arrays
 from ..linalg import is_covariance
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem
@@ -254,17 +248,7 @@ def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
             "with a linear method, such as OneStep, or save the calibration that it belongs to"
         )
     about = {"format": FORMAT, "shape": recon.shape, "extent": recon.extent, "provenance": recon.provenance}
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **to_numbers(recon))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    write_arrays(path, {"about": np.array(json.dumps(about)), **to_numbers(recon)})
 
 
 def load_reconstructor(path: str | Path) -> Reconstructor:
@@ -274,46 +258,14 @@ def load_reconstructor(path: str | Path) -> Reconstructor:
         StorageError: if the file cannot be read, is damaged or of another kind.
     """
     name = Path(path).name
+    numbers = read_arrays(path, StorageError, "reconstructor", "prepare and save it again with save_reconstructor")
     try:
-        numbers = _read_numbers(path)
         about = json.loads(str(numbers.pop("about")))
         if about["format"] != FORMAT:
             raise StorageError(f"is a {about['format']!r}; this version reads {FORMAT!r}")
         return from_numbers(numbers, tuple(about["shape"]), tuple(about["extent"]), about["provenance"])
     except StorageError as error:
         raise StorageError(f"{name}: {error}") from None
-    except OSError as error:
-        raise StorageError(f"{name}: {error.strerror or 'is no reconstructor'}") from None
-    except _DAMAGE as error:
+    except DAMAGE as error:
         why = " ".join(str(error).split())[:120]
         raise StorageError(f"{name}: is damaged or no reconstructor ({why}); prepare and save it again") from None
-
-
-_DAMAGE = (
-    *(ValueError, KeyError, TypeError, AttributeError, ArithmeticError),
-    *(EOFError, RuntimeError, MemoryError, struct.error, zipfile.BadZipFile),  # RuntimeError: a password, a recursion
-)
-
-
-def _read_numbers(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz; none is taken to be larger than the file that holds it."""
-    with open_regular(path) as raw, zipfile.ZipFile(raw) as file:
-        for member in file.infolist():
-            if member.compress_type != zipfile.ZIP_STORED:
-                raise StorageError(f"{member.filename[:80]!r} is compressed; save it with save_reconstructor")
-        require("array_bytes", sum(member.file_size for member in file.infolist()), "numbers", StorageError)
-        return {m.filename.removesuffix(".npy"): _read_array(file, m) for m in file.infolist()}
-
-
-def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """One member, read whole before its own claims are looked at."""
-    stream = io.BytesIO(file.read(member))
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    if dtype.hasobject:
-        raise StorageError(f"{member.filename[:80]!r} holds Python objects, which could run any code; it is not read")
-    if math.prod(shape) * dtype.itemsize != len(stream.getbuffer()) - stream.tell():
-        raise StorageError(f"{member.filename[:80]!r} claims another size than it has")
-    stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)

@@ -64,6 +64,15 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     assert near.sum() >= 1
     share = np.take_along_axis(force[both, :2], order, 1)[near]
     np.testing.assert_allclose(share, np.tile([15.0, 10.0], (len(share), 1)), rtol=0.25)
+    assert np.isnan(arrays["loads/distance"]).all()
+    assert main(["apply", c, str(session), "-o", str(out), "--loads", "0.7", "--proposal", "testbed"]) == 0
+    proposed = calib.session.read_archive(out, "skin-forcemap").arrays
+    assert (proposed["loads/distance"] < 1).all()
+    told = both & (proposed["loads/probability"].argmax(1) == 2)
+    assert told.any()
+    order = np.argsort(proposed["loads/position"][told, :2, 0], axis=1)
+    pair = np.take_along_axis(proposed["loads/position"][told, :2], order[..., None], 1)
+    assert np.linalg.norm(pair - sites, axis=2).min(0).max() < 0.004
 
 
 def test_a_log_has_no_loads(tmp_path, capsys):

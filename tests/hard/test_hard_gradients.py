@@ -47,6 +47,8 @@ HOST = {
     "fidelity_choices": _PREPARES,
     "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
     "prepare_loads": _PREPARES,
+    "load_proposal": _DESCRIBES,
+    "Proposal": "a network in NumPy, on the host",
     "prepare_tracker": _PREPARES,
     "press_evidence": "counts the evaluations of a search on the host, and says so under jit",
     "find_regions": "counts the regions of an image, on the host, and says so under jit",

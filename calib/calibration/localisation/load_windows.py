@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxeit as je
-from jaxeit.contacts import LoadKind, Loads
+from jaxeit.contacts import LoadKind, Loads, Proposal
 
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
@@ -27,13 +27,15 @@ MAX_WINDOW_FRAMES = 4096  # of a window, so that memory stays bounded
 
 
 class Window(NamedTuple):
-    """Means over a window: begin and end (ns), change of the frames (readings,) V, force on the pads N, and frames."""
+    """Means over a window: begin and end (ns), change of the frames (readings,) V, force on all pads and on each, N;
+    and the number of frames."""
 
     begin: int
     end: int
     frame: Float[np.ndarray, " readings"]
     force: float
     frames: int
+    pads: Float[np.ndarray, " pads"]
 
 
 class WindowedFrames:
@@ -42,27 +44,33 @@ class WindowedFrames:
     def __init__(self, seconds: float, readings: int):
         self._length = round(1e9 * seconds)
         self.windows: list[Window] = []
-        self._open: list[tuple[int, np.ndarray, float]] = []
+        self._open: list[tuple[int, np.ndarray, float, np.ndarray]] = []
         self.quiet = QuietFrames(readings)
 
     def add(
-        self, time: np.ndarray, frames: np.ndarray, change: np.ndarray, loaded: np.ndarray, force: np.ndarray
+        self,
+        time: np.ndarray,
+        frames: np.ndarray,
+        change: np.ndarray,
+        loaded: np.ndarray,
+        force: np.ndarray,
+        pads: np.ndarray | None = None,
     ) -> None:
-        """Frames (n, readings) V, their change, which are touched (n,), and the force on all pads (n,) N."""
+        """Frames (n, readings) V, their change, which are touched (n,), and the force on all pads (n,) and each, N."""
+        pads = force[:, None] if pads is None else pads
         self.quiet.add(frames, change, loaded)
         for row in range(len(time)):
             if not loaded[row] or (self._open and time[row] - self._open[0][0] >= self._length):
                 self.close()
             if loaded[row] and len(self._open) < MAX_WINDOW_FRAMES:
-                self._open.append((int(time[row]), change[row], float(force[row])))
+                self._open.append((int(time[row]), change[row], float(force[row]), pads[row]))
 
     def close(self) -> None:
         """End the window that is open, if it is at least half as long as asked for."""
         if self._open and self._open[-1][0] - self._open[0][0] >= self._length / 2 - 1:
-            time, change, force = zip(*self._open, strict=True)
-            self.windows.append(
-                Window(time[0], time[-1], finite_mean(np.stack(change)), float(np.mean(force)), len(time))
-            )
+            time, change, force, pads = zip(*self._open, strict=True)
+            means = finite_mean(np.stack(change)), float(np.mean(force))
+            self.windows.append(Window(time[0], time[-1], *means, len(time), np.mean(pads, 0)))
         self._open = []
 
 
@@ -73,17 +81,22 @@ class SeenLoads:
     arrays: dict[str, tuple[Any, str, str]]
     kinds: tuple[LoadKind, ...]
     why_none: str = ""
+    outside: int = 0  # windows that are unlike the scenes of the proposal
 
     def render(self) -> str:
         """What touched the skin, in one line."""
         if self.why_none:
             return f"loads: none fitted: {self.why_none}"
         counts = ((kind.name.lower(), self.kinds.count(kind)) for kind in LoadKind)
-        return f"loads of {len(self.kinds)} windows: " + ", ".join(f"{count} {name}" for name, count in counts if count)
+        seen = ", ".join(f"{count} {name}" for name, count in counts if count)
+        unlike = f"; {self.outside} are unlike what the proposal was trained on" if self.outside else ""
+        return f"loads of {len(self.kinds)} windows: {seen}{unlike}"
 
 
-def fit_windows(calibration: Calibration, seen: WindowedFrames, progress: Any = iter) -> SeenLoads:
-    """Fit loads to each window."""
+def fit_windows(
+    calibration: Calibration, seen: WindowedFrames, progress: Any = iter, proposal: Proposal | None = None
+) -> SeenLoads:
+    """Fit loads to each window, from what a finder sees or from a proposal."""
     noise = seen.quiet.noise
     if noise is None or not seen.windows:
         why = "no frames without contact tell the noise" if noise is None else "nothing touches the skin for that long"
@@ -93,19 +106,33 @@ def fit_windows(calibration: Calibration, seen: WindowedFrames, progress: Any = 
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
-    finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
     fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels)
-    found = [_seen(fitter, finder, window, channels) for window in progress(seen.windows)]
-    return SeenLoads(_arrays(seen.windows, found), tuple(one.kind for one in found))
+    if proposal is None:
+        finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
+        found = [_searched(fitter, finder, window, channels) for window in progress(seen.windows)]
+    else:
+        found = [_refined(fitter, proposal, window, channels) for window in progress(seen.windows)]
+    loads, distance = zip(*found, strict=True)
+    outside = int(np.sum(np.array(distance) > 1))
+    return SeenLoads(_arrays(seen.windows, found), tuple(one.kind for one in loads), outside=outside)
 
 
-def _seen(fitter: je.contacts.LoadFitter, finder: je.ContactFinder, window: Window, channels: np.ndarray) -> Loads:
+# Loads of a window, and how far it is from the scenes of a proposal; NaN: there is none.
+Found = tuple[Loads, float]
+
+
+def _searched(fitter: je.contacts.LoadFitter, finder: je.ContactFinder, window: Window, channels: np.ndarray) -> Found:
     frame = np.where(channels, window.frame, 0.0)
-    return fitter(frame, finder(frame))
+    return fitter(frame, finder(frame)), np.nan
 
 
-def _arrays(windows: list[Window], found: list[Loads]) -> dict[str, tuple[Any, str, str]]:
-    rows = [dict(_row(window, one)) for window, one in zip(windows, found, strict=True)]
+def _refined(fitter: je.contacts.LoadFitter, proposal: Proposal, window: Window, channels: np.ndarray) -> Found:
+    proposed = proposal(np.where(channels, window.frame, np.nan), window.pads)
+    return fitter.refine(np.where(channels, window.frame, 0.0), proposed), float(proposed.distance)
+
+
+def _arrays(windows: list[Window], found: list[Found]) -> dict[str, tuple[Any, str, str]]:
+    rows = [dict(_row(window, *one)) for window, one in zip(windows, found, strict=True)]
     columns = {name: np.stack([row[name] for row in rows]) for name in ABOUT}
     return {f"loads/{name}": (columns[name], *about) for name, about in ABOUT.items()}
 
@@ -113,6 +140,7 @@ def _arrays(windows: list[Window], found: list[Loads]) -> dict[str, tuple[Any, s
 ABOUT = {
     "time": ("ns", "begin and end of each window, since time_epoch_utc"),
     "probability": ("1", "of none, one, two, an edge and more"),
+    "distance": ("1", "from the scenes of the proposal; above 1: unlike them; NaN: no proposal"),
     "position": ("m", "of each load of the most probable kind; of an edge, its middle; NaN: none"),
     "position_covariance": ("m2", "of each position"),
     "ends": ("m", "both ends of an edge; NaN: no edge"),
@@ -132,9 +160,10 @@ EMPTY = {
 }
 
 
-def _row(window: Window, found: Loads) -> Iterator[tuple[str, np.ndarray]]:
+def _row(window: Window, found: Loads, distance: float) -> Iterator[tuple[str, np.ndarray]]:
     yield "time", np.array([window.begin, window.end])
     yield "probability", np.asarray(found.probability)
+    yield "distance", np.array(distance)
     out = {name: np.full(shape, np.nan) for name, shape in EMPTY.items()}
     best = found.best
     if best is not None:

@@ -8,6 +8,8 @@ from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pa
 from ..terminal import progress_bar
 
 if TYPE_CHECKING:
+    from jaxeit.contacts import Proposal
+
     from ...calibration import LogCalibration
 
 
@@ -20,6 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help=text)
     text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of so many seconds"
     parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
+    text = "with --loads: begin the fits where a network proposes, from jaxeit train; several times as quick"
+    parser.add_argument("--proposal", metavar="PROPOSAL.npz", help=text)
     text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
     parser.add_argument("--track", action="store_true", help=text)
     text = "write an HTML report of the contacts that are followed: paths and forces; needs --track"
@@ -49,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
             ignore_errors=args.force,
             progress=progress_bar("frames"),
             loads=args.loads,
+            proposal=_proposal_of(args),
             track=args.track,
             tell=print,
         )
@@ -61,7 +66,15 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _proposal_of(args: argparse.Namespace) -> "Proposal | None":
+    from jaxeit.contacts import load_proposal
+
+    return None if args.proposal is None else load_proposal(args.proposal)
+
+
 def _check_report(args: argparse.Namespace) -> None:
+    if args.proposal is not None and args.loads is None:
+        raise ValueError("--proposal: it is where fits of loads begin; add --loads SECONDS")
     if args.report is not None:
         if not args.track:
             raise ValueError("--report: it is about contacts that are followed; add --track")

@@ -2,7 +2,18 @@
 
 from .fitter import LoadFitter
 from .preparation import prepare_loads
+from .proposal import Proposal, Proposed, load_proposal
 from .result import LoadKind, Loads, LoadShape
 from .settings import LoadSettings
 
-__all__ = ["LoadFitter", "LoadKind", "LoadSettings", "LoadShape", "Loads", "prepare_loads"]
+__all__ = [
+    "LoadFitter",
+    "LoadKind",
+    "LoadSettings",
+    "LoadShape",
+    "Loads",
+    "Proposal",
+    "Proposed",
+    "load_proposal",
+    "prepare_loads",
+]

@@ -64,14 +64,15 @@ class Loads(eqx.Module):
     | meaning                                                    | shape |
     |------------------------------------------------------------|-------|
     | probability of each kind, in the order of `LoadKind`       | (5,)  |
-    | one, two, edge, more: the best loads of each kind; more: three |   |
+    | one, two, edge, more: the best loads of each kind; more: three. None: a kind |   |
+    |   that was not fitted, as its proposal was all but impossible |       |
     """
 
     probability: Float[Array, "5"]
     one: LoadShape
-    two: LoadShape
-    edge: LoadShape
-    more: LoadShape
+    two: LoadShape | None = None
+    edge: LoadShape | None = None
+    more: LoadShape | None = None
 
     @property
     def kind(self) -> LoadKind:

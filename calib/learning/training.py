@@ -1,0 +1,156 @@
+"""Training of the network: what it is told for its outputs, and epochs that go on after an interruption."""
+
+from collections.abc import Callable
+from itertools import permutations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+
+from jaxeit.contacts import LoadKind
+from jaxeit.contacts.loads.proposal import KINDS, LAYERS, PARAMETERS, SHAPES
+
+from ..session import replacing
+
+WIDTH = 320  # of the hidden layers
+BATCH, RATE, DECAY = 256, 2e-3, 1e-4
+# Shares of the frames of a batch that lack an electrode, all pads, and each pad.
+DEAD_ELECTRODE, NO_PADS, DEAD_PAD = 0.2, 0.2, 0.05
+# Errors of x, y, log width, log force, and half an edge in x and y that count as one.
+TOLERANCES = (0.004, 0.004, 0.3, 0.3, 0.004, 0.004)
+PLACES = 1.0  # weight of the errors of loads against that of kinds
+
+
+class Examples(NamedTuple):
+    """Frames to learn from.
+
+    | meaning                                                          | shape            |
+    |------------------------------------------------------------------|------------------|
+    | whole, damaged: inputs of all readings, and without an electrode | (n, r + 1) each  |
+    | pads: forces as inputs, known flags                              | (n, pads) each   |
+    | kind                                                             | (n,)             |
+    | loads in units of the outputs, and of which kinds they are known | (n, 30), (n, 4)  |
+    """
+
+    whole: Float[Array, "n i"]
+    damaged: Float[Array, "n i"]
+    pads: Float[Array, "n p"]
+    kind: Int[Array, " n"]
+    loads: Float[Array, "n 30"]
+    known: Float[Array, "n 4"]
+
+
+class State(NamedTuple):
+    """Weights, what the optimiser keeps, and the number of epochs done."""
+
+    network: eqx.nn.MLP
+    optimiser: optax.OptState
+    epochs: Int[Array, ""]
+
+
+def new_network(inputs: int, key: PRNGKeyArray) -> eqx.nn.MLP:
+    """A network with random weights."""
+    return eqx.nn.MLP(inputs, KINDS + PARAMETERS, WIDTH, LAYERS - 1, dtype=jnp.float32, key=key)
+
+
+def train(
+    examples: Examples,
+    tolerance: Float[np.ndarray, " 30"],
+    epochs: int,
+    seed: int,
+    checkpoint: Path,
+    tell: Callable[[int], object],
+) -> eqx.nn.MLP:
+    """Train for so many epochs, from the checkpoint if there is one; equal arguments give equal weights.
+
+    Args:
+        tolerance: errors of the outputs that count as one.
+        tell: called after each epoch with its number.
+    """
+    key = jax.random.key(seed)
+    steps = len(examples.kind) // BATCH
+    optimiser = optax.adamw(optax.cosine_decay_schedule(RATE, epochs * steps), weight_decay=DECAY)
+    network = new_network(examples.whole.shape[1] + 2 * examples.pads.shape[1], key)
+    state = State(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
+    if checkpoint.is_file():
+        with checkpoint.open("rb") as file:
+            state = eqx.tree_deserialise_leaves(file, state)
+    run = eqx.filter_jit(epoch)
+    while int(state.epochs) < epochs:
+        number = int(state.epochs)
+        with jax.numpy_dtype_promotion("standard"):  # optax multiplies numbers of several types
+            state, _ = run(state, optimiser, examples, jnp.asarray(tolerance), jax.random.fold_in(key, number))
+        with replacing(checkpoint) as new, new.open("wb") as file:
+            eqx.tree_serialise_leaves(file, state)
+        tell(number + 1)
+    return state.network
+
+
+def epoch(
+    state: State,
+    optimiser: optax.GradientTransformation,
+    examples: Examples,
+    tolerance: Float[Array, " 30"],
+    key: Key[Array, ""],
+) -> tuple[State, Float[Array, ""]]:
+    """One pass over all examples in a drawn order, and its mean loss."""
+    weights, rest = eqx.partition(state.network, eqx.is_array)
+    count = len(examples.kind) // BATCH
+    orders = jax.random.permutation(key, len(examples.kind))[: count * BATCH].reshape(count, BATCH)
+
+    def step(carry: tuple[Any, Any], at: tuple[Array, Array]) -> tuple[tuple[Any, Any], Array]:
+        weights, kept = carry
+        rows, key = at
+        batch = jax.tree.map(lambda part: part[rows], examples)
+        x = drawn_inputs(batch, key)
+        loss, slopes = jax.value_and_grad(lambda w: mean_loss(eqx.combine(w, rest), x, batch, tolerance))(weights)
+        change, kept = optimiser.update(slopes, kept, weights)
+        return (optax.apply_updates(weights, change), kept), loss
+
+    keys = jax.random.split(jax.random.fold_in(key, 1), count)
+    (weights, kept), losses = jax.lax.scan(step, (weights, state.optimiser), (orders, keys))
+    return State(eqx.combine(weights, rest), kept, state.epochs + 1), jnp.mean(losses)
+
+
+def drawn_inputs(batch: Examples, key: Key[Array, ""]) -> Float[Array, "n i"]:
+    """Inputs of a batch, some of them without an electrode or without pads."""
+    keys = jax.random.split(key, 3)
+    dead = jax.random.bernoulli(keys[0], DEAD_ELECTRODE, (len(batch.kind), 1))
+    lost = jax.random.bernoulli(keys[1], NO_PADS, (len(batch.kind), 1))
+    lost |= jax.random.bernoulli(keys[2], DEAD_PAD, batch.pads.shape)
+    known = jnp.where(lost, 0, jnp.ones_like(batch.pads))
+    return jnp.concatenate([jnp.where(dead, batch.damaged, batch.whole), batch.pads * known, known], 1)
+
+
+def mean_loss(
+    network: eqx.nn.MLP, x: Float[Array, "n i"], batch: Examples, tolerance: Float[Array, " 30"]
+) -> Float[Array, ""]:
+    """Cross-entropy of the kinds, and errors of the loads of each kind in the order that suits best."""
+    outputs = jax.vmap(network)(x)
+    logs = jax.nn.log_softmax(outputs[:, :KINDS])
+    kinds = -jnp.take_along_axis(logs, batch.kind[:, None], 1)[:, 0]
+    errors = load_errors(outputs[:, KINDS:], batch.loads, tolerance)
+    return jnp.mean(kinds + PLACES * jnp.sum(batch.known * errors, 1) / len(SHAPES))
+
+
+def load_errors(
+    found: Float[Array, "n 30"], true: Float[Array, "n 30"], tolerance: Float[Array, " 30"]
+) -> Float[Array, "n 4"]:
+    """Pseudo-Huber errors of the loads of each kind: for any order of the loads, for either end of an edge first."""
+    errors, begin = [], 0
+    for kind, (rows, size) in SHAPES.items():
+        part = slice(begin, begin + rows * size)
+        one, other, unit = (values[..., part].reshape(-1, rows, size) for values in (found, true, tolerance))
+        if kind is LoadKind.EDGE:
+            orders = [other, other * jnp.where(jnp.arange(size) < 4, 1, -1).astype(other.dtype)]
+        else:
+            orders = [other[:, list(order)] for order in permutations(range(rows))]
+        each = [jnp.mean(jnp.sum(jnp.sqrt(1 + ((one - o) / unit) ** 2) - 1, 2), 1) for o in orders]
+        errors.append(jnp.min(jnp.stack(each), 0))
+        begin += rows * size
+    return jnp.stack(errors, 1)
