@@ -89,7 +89,7 @@ class Answer(NamedTuple):
 
 def ways(run: Run) -> Iterator[Row]:
     """Each way to tell what touches the skin, on the same frames."""
-    skins, singles, others = run.sizes((1, 8, 3), (1, 1, 1))
+    skins, singles, others = run.sizes((2, 8, 3), (1, 1, 1))
     proposal = je.contacts.load_proposal("testbed")
     model, every = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY), []
     for seed in range(FIRST_SEED, FIRST_SEED + skins):
