@@ -50,6 +50,7 @@ def test_regions_are_cut_at_half_their_height():
     assert (labels == ktc.CONDUCTIVE).sum() == 16
 
 
+@pytest.mark.slow
 def test_a_tank_in_classes():
     """A conductive and a resistive piece, simulated on another mesh, with the water's contacts unknown to the model."""
     fine, coarse = (

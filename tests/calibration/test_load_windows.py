@@ -39,6 +39,7 @@ def session(tmp_path_factory):
     return simulate(few, tmp_path_factory.mktemp("two") / "two.h5", fidelity=je.Fidelity.draft())
 
 
+@pytest.mark.slow
 def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     """From the command line: first one, then two, then the other one, each with its share of the force."""
     c, out = str(tmp_path / "c.h5"), tmp_path / "out.h5"

@@ -145,6 +145,7 @@ def proposed(kind, rows, distance=0.2):
     return Proposed(probability, **loads, distance=np.array(distance))
 
 
+@pytest.mark.slow
 def test_a_fit_from_a_proposal_ends_where_a_search_does(ready):  # noqa: F811
     fitter, finder, frames, _ = ready
     _, (places, forces) = TOUCHES["two at 30 mm"]

@@ -187,6 +187,7 @@ def test_one_reading_after_the_other_gives_the_forces_of_the_whole_log():
     assert_tracked(smooth, time[45:], np.where(np.isnan(missing[45:]), np.nan, values[45:]))
 
 
+@pytest.mark.slow
 def test_a_spike_of_one_reading_does_not_last_in_a_curve_with_hysteresis():
     n = 300
     time, load = np.arange(n) * 1e8, 1 - np.cos(np.arange(n) / 30)

@@ -435,7 +435,9 @@ CASES = {
 SLOW = {
     name
     for name in CASES
-    if name.startswith(("Iterative", "Reconstructor", "jacobian", "Log", "conductivity", "prepare", "signal"))
+    if name.startswith(
+        ("Iterative", "Reconstructor", "jacobian", "Log", "conductivity", "prepare", "signal", "fit_reference")
+    )
 }
 ELSEWHERE = {
     "ContactFinder": "below, and in tests/contacts/test_contacts.py",

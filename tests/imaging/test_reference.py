@@ -83,6 +83,7 @@ def test_level_and_contacts_within_their_errors(saline):
     assert 0.6 < np.std(levels) < 1.4
 
 
+@pytest.mark.slow
 def test_contacts_that_no_driven_electrode_tells(saline, adjacent):
     """Readings of electrodes that carry no current feel contacts little; the level is right all the same."""
     pulls = []
@@ -97,6 +98,7 @@ def test_contacts_that_no_driven_electrode_tells(saline, adjacent):
     np.testing.assert_allclose(je.forward(alike.model) / _rows(potential), 1, atol=0.1)
 
 
+@pytest.mark.slow
 def test_gains_and_offsets_of_channels(saline, adjacent):
     """One gain in common is told by nothing; what each channel has of its own is found within its error."""
     _, potential = saline(7, np.eye(COUNT) - 1 / COUNT)
@@ -126,6 +128,7 @@ def replace_background(model):
     return replace(model, background=jnp.full_like(model.background, SIGMA))
 
 
+@pytest.mark.slow
 def test_electrodes_that_sit_elsewhere(adjacent):
     """Shifts along the rim, on a mesh of their own."""
     turns = np.random.default_rng(1).normal(scale=0.01, size=COUNT)
@@ -167,6 +170,7 @@ def test_what_cannot_be_fitted_is_refused(adjacent):
     jax.jit(lambda frame: fit_reference(adjacent, frame).value.level)(frame)
 
 
+@pytest.mark.slow
 def test_the_gain_for_the_common_mode(saline):
     """Readings with it, made here from the potentials of the exact solution."""
     gain, (_, potential) = 8e-3, saline(9, np.eye(COUNT) - 1 / COUNT)

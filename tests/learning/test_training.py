@@ -35,6 +35,7 @@ def frames(skin):
     return Frames(made.simulate(3, 1))
 
 
+@pytest.mark.slow
 def test_scenes_have_pairs_edges_and_skins_of_all_strengths(skin, frames):
     drawn = draw_contacts(SCENES, skin.domain, 4000, np.random.default_rng(0))
     there = np.arange(3) < drawn.number[:, None]
@@ -156,6 +157,7 @@ def small(monkeypatch):
     return skin_of(je.Rectangle(0.1, 0.1), electrodes, je.skin.adjacent(6))
 
 
+@pytest.mark.slow
 def test_a_proposal_is_trained_again_to_the_same_bytes(small, tmp_path):
     """After an interruption in the midst of the epochs; nothing but the file is left."""
     options = {"frames": 4 * 1024, "epochs": 3, "seed": 5, "executor": ThreadPoolExecutor(1)}

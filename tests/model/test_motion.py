@@ -86,6 +86,7 @@ def test_derivatives_are_those_of_greens_function():
     assert error < 2e-3  # of the mesh; a sixteenth of it on 160 cells a side
 
 
+@pytest.mark.slow
 def test_a_bolt_that_moves_is_the_bolt_of_another_mesh(skin):
     """The derivative against skins whose bolt sits 2 mm aside, each on a mesh of its own."""
     fidelity = je.Fidelity(edge_length=0.06, order=2)

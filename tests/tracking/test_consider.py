@@ -62,6 +62,7 @@ def _held(place, track, covariance):
     return away @ np.linalg.solve(covariance, away) < chi2.ppf(0.9, 2)
 
 
+@pytest.mark.slow
 def test_ellipses_hold_the_places_of_tips_of_any_shape(followed):
     """Those of the belief alone do not."""
     tracks = [(place, now.tracks[0], np.asarray(now.belief.covariance)[:2, :2]) for place, now in followed]
@@ -155,6 +156,7 @@ def on_coats(model, even_tracker, blank, coats):
     return told
 
 
+@pytest.mark.slow
 def test_ellipses_hold_places_on_a_sheet_of_unknown_coat(on_coats):
     """Those of the belief alone do not."""
     assert all(len(now.tracks) == 1 for _, now in on_coats)

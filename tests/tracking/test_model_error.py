@@ -71,6 +71,7 @@ def test_a_tracker_takes_no_error_of_the_model_for_a_second_contact(tracker, fra
     assert counts[1][1] >= 5 * len(PLACES)
 
 
+@pytest.mark.slow
 def test_ellipses_hold_places_under_an_error_that_lasts_as_long_as_the_press(humble, presses):
     """No frame lessens it, and the filter by itself forgets it."""
     rng, by_filter, whole = np.random.default_rng(6), [], []
