@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
 
 from jaxeit.contacts import LoadKind
-from jaxeit.contacts.loads.proposal import SHAPES, Proposed
+from jaxeit.contacts.loads.proposal import Proposed, loads_by_kind
 
 from .targets import Targets
 
@@ -57,10 +57,9 @@ def place_errors(
     kind: LoadKind, found: Float[np.ndarray, "n rows size"], loads: Float[np.ndarray, "n 30"]
 ) -> Float[np.ndarray, " n"]:
     """Mean distance of loads from true ones in the best order, m."""
-    begin = sum(rows * size for other, (rows, size) in SHAPES.items() if other < kind)
-    rows, size = SHAPES[kind]
-    true = loads[:, begin : begin + rows * size].reshape(-1, rows, size)[..., :2]
-    orders = [np.linalg.norm(found[..., :2] - true[:, list(o)], axis=2).mean(1) for o in permutations(range(rows))]
+    true = loads_by_kind(loads)[kind][..., :2]
+    every = permutations(range(true.shape[1]))
+    orders = [np.linalg.norm(found[..., :2] - true[:, list(order)], axis=2).mean(1) for order in every]
     best: np.ndarray = np.min(orders, axis=0)
     return best
 

@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from jaxeit.contacts import LoadKind
-from jaxeit.contacts.loads.proposal import KINDS, LAYERS, PARAMETERS, SHAPES
+from jaxeit.contacts.loads.proposal import KINDS, LAYERS, PARAMETERS, SHAPES, loads_by_kind
 
 from ..session import replacing
 
@@ -142,15 +142,13 @@ def load_errors(
     found: Float[Array, "n 30"], true: Float[Array, "n 30"], tolerance: Float[Array, " 30"]
 ) -> Float[Array, "n 4"]:
     """Pseudo-Huber errors of the loads of each kind: for any order of the loads, for either end of an edge first."""
-    errors, begin = [], 0
+    errors, apart = [], [loads_by_kind(values) for values in (found, true, tolerance)]
     for kind, (rows, size) in SHAPES.items():
-        part = slice(begin, begin + rows * size)
-        one, other, unit = (values[..., part].reshape(-1, rows, size) for values in (found, true, tolerance))
+        one, other, unit = (values[kind] for values in apart)
         if kind is LoadKind.EDGE:
             orders = [other, other * jnp.where(jnp.arange(size) < 4, 1, -1).astype(other.dtype)]
         else:
             orders = [other[:, list(order)] for order in permutations(range(rows))]
         each = [jnp.mean(jnp.sum(jnp.sqrt(1 + ((one - o) / unit) ** 2) - 1, 2), 1) for o in orders]
         errors.append(jnp.min(jnp.stack(each), 0))
-        begin += rows * size
     return jnp.stack(errors, 1)

@@ -119,6 +119,10 @@ class PlaceSensitivity(eqx.Module):
         found = found / jnp.sqrt(1 + (self.model_error * change) ** 2)
         return found
 
+    def covariance(self, rows: Float[Array, "sites 4 readings"]) -> Float[Array, "sites 4 4"]:
+        """Covariance of the unknowns at each site after the readings of these `rows`."""
+        return inverse_information(jnp.einsum("sai,sbi->sab", rows, rows) + jnp.diag(self.prior))
+
     def errors(
         self, pattern: Integer[ArrayLike, "readings 4"], dead: Integer[ArrayLike, ""] | None = None
     ) -> Float[Array, " sites"]:
@@ -142,8 +146,7 @@ class PlaceSensitivity(eqx.Module):
 def _errors(
     sensitivity: PlaceSensitivity, pattern: Integer[Array, "readings 4"], dead: Integer[Array, ""]
 ) -> Float[Array, " sites"]:
-    rows = jnp.where(jnp.all(pattern != dead, 1), sensitivity.rows(pattern), 0)
-    covariance = inverse_information(jnp.einsum("sai,sbi->sab", rows, rows) + jnp.diag(sensitivity.prior))
+    covariance = sensitivity.covariance(jnp.where(jnp.all(pattern != dead, 1), sensitivity.rows(pattern), 0))
     return sensitivity.width * jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
 
 

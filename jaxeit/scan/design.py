@@ -52,6 +52,11 @@ class AbstractCriterion(eqx.Module):
     def length(self, mean: float) -> float:
         """The mean of h as an error of place, in widths."""
 
+    def mean(self, covariance: Float[Array, "n 4 4"]) -> Float[Array, ""]:
+        """The mean of h over covariances of the unknowns of contacts."""
+        nothing = jnp.zeros(1, covariance.dtype)
+        return jnp.mean(jax.vmap(lambda c: self.after(c[:2, :2], nothing))(covariance))
+
 
 class PlaceError(AbstractCriterion):
     """h is a power of the error of place, the root of the sum of both variances.
@@ -267,8 +272,7 @@ def _forms(
 ) -> tuple[Float[Array, ""], Float[Array, "sites cases 4 4"]]:
     """The mean of h, and the matrices Q with which ``-dh/dw_i = sum over sites and cases of j_i^T Q j_i``."""
     flat = covariance.reshape(-1, UNKNOWNS, UNKNOWNS)
-    nothing = jnp.zeros(1, flat.dtype)
-    mean = jnp.mean(jax.vmap(lambda c: criterion.after(c[:2, :2], nothing))(flat))
+    mean = criterion.mean(flat)
 
     def form(c: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
         factor, metric = criterion.metric(c[:2, :2])

@@ -26,7 +26,7 @@ from ..model.scene import Scene
 from ..skin.description import Skin
 from ..skin.protocol import ProtocolError
 from ..skin.rewriting import with_positions
-from .contact_information import DesignSettings, SiteContacts, inverse_information, sites_of
+from .contact_information import DesignSettings, SiteContacts, sites_of
 from .design import AbstractCriterion, PlaceError
 
 STEP = 0.2  # of an electrode's reach, that it moves at most on one mesh
@@ -148,10 +148,7 @@ class _Objective(eqx.Module):
     def _mean(self, shift: Float[Array, "electrodes 2"]) -> Float[Array, ""]:
         chart = self.model.chart + jnp.einsum("nij,nj->ni", self.motion.chart_step, shift[self.motion.electrode])
         sensitivity = self.contacts.sensitivity(moved(self.model, self.motion, shift), chart)
-        rows = sensitivity.rows(self.pattern)
-        covariance = inverse_information(jnp.einsum("sai,sbi->sab", rows, rows) + jnp.diag(sensitivity.prior))
-        nothing = jnp.zeros(1, rows.dtype)
-        return jnp.mean(jax.vmap(lambda c: self.criterion.after(c[:2, :2], nothing))(covariance))
+        return self.criterion.mean(sensitivity.covariance(sensitivity.rows(self.pattern)))
 
 
 @dataclass(frozen=True, eq=False)

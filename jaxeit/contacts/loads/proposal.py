@@ -32,6 +32,15 @@ LAYERS = 3
 WEIGHTS = tuple(f"{part}{layer}" for layer in range(LAYERS) for part in ("weight", "bias"))
 
 
+def loads_by_kind(values: Any) -> dict[LoadKind, Any]:
+    """Parameters of the loads of all kinds, (n, 30), apart: (n, rows, size) of each kind; NumPy or JAX."""
+    ends = np.cumsum([rows * size for rows, size in SHAPES.values()])
+    return {
+        kind: values[..., end - rows * size : end].reshape(-1, rows, size)
+        for end, (kind, (rows, size)) in zip(ends.tolist(), SHAPES.items(), strict=True)
+    }
+
+
 class Proposed(NamedTuple):
     """What a `Proposal` says of a frame, or of some along leading axes.
 
@@ -162,11 +171,8 @@ class Proposal:
         """Probabilities and loads from what the last layer says."""
         logs = outputs[..., :KINDS] / self.temperature
         odds = np.exp(logs - logs.max(-1, keepdims=True))
-        values, loads, begin = self.offset + self.scale * outputs[..., KINDS:], {}, 0
-        for kind, (rows, size) in SHAPES.items():
-            part = values[..., begin : begin + rows * size]
-            loads[kind.name.lower()] = part.reshape(-1, rows, size)
-            begin += rows * size
+        values = self.offset + self.scale * outputs[..., KINDS:]
+        loads = {kind.name.lower(): part for kind, part in loads_by_kind(values).items()}
         return Proposed(odds / odds.sum(-1, keepdims=True), distance=distance, **loads)
 
     def require_skin(self, skin: Skin) -> None:
