@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import minimize
+from scipy.optimize import nnls
 
 COVERAGE = 0.9  # of the intervals
 NORMAL_MULTIPLE = 1.6449  # half the width of a normal distribution's 90 % interval, in standard deviations
@@ -21,6 +21,7 @@ PRIOR_GROUPS = 5.0
 # Least size of a part of the noise, over that with which the part alone would make all of it. Without a bound, readings
 # that a model meets exactly, such as a force of zero without load, would end as noise of zero.
 LEAST_PART = 0.01
+MOST_STEPS, TOLERANCE = 200, 1e-5  # of the search for the sizes; the tolerance is relative, of a variance
 
 
 class NoiseLaw(eqx.Module):
@@ -111,18 +112,40 @@ def most_likely_sizes(
     if size == 0 or not used.any():
         return out
     terms = terms[:, used]
-    start = np.log(size / np.sqrt(np.average(terms, axis=0, weights=weight)))
-    least = start + np.log(LEAST_PART)
-
-    def cost(logs: np.ndarray) -> float:
-        total = variance + terms @ np.exp(2 * np.maximum(logs, least))
-        return float(weight @ (np.log(total) + residual**2 / total))
-
-    shifts = -3 * (1 - np.eye(len(start)))  # one term holds nearly all of the variance
-    options = {"xatol": 1e-4, "fatol": 1e-6, "maxiter": 2000}
-    tried = [minimize(cost, start + shift, method="Nelder-Mead", options=options) for shift in shifts]
-    out[used] = np.exp(np.maximum(min(tried, key=lambda one: one.fun).x, least))
+    alone = size**2 / np.average(terms, axis=0, weights=weight)  # square of a size that makes all of the variance
+    least = LEAST_PART**2 * alone
+    known = variance + terms @ least
+    starts = np.exp(-6 * (1 - np.eye(len(alone)))) * alone  # one term holds nearly all of the variance
+    tried = [_scored(residual**2, known, weight, terms, start) for start in starts]
+    out[used] = np.sqrt(least + min(tried, key=lambda one: one[1])[0])
     return out
+
+
+def _scored(
+    square: np.ndarray, known: np.ndarray, weight: np.ndarray, terms: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Parts of the variance, not negative, of least -2 log likelihood, and that likelihood up to a constant.
+
+    Fisher scoring: each step is the least-squares fit of the squares of residuals, weighted by their expected
+    variances; it is halved until the likelihood does not fall.
+    """
+
+    def misfit(parts: np.ndarray) -> float:
+        total = known + terms @ parts
+        return float(weight @ (np.log(total) + square / total))
+
+    parts, now = start, misfit(start)
+    for _ in range(MOST_STEPS):
+        row = np.sqrt(weight) / (known + terms @ parts)
+        step = nnls(row[:, None] * terms, row * (square - known))[0] - parts
+        while (after := misfit(parts + step)) > now and np.any(np.abs(step) > TOLERANCE * parts):
+            step = step / 2
+        if after > now:
+            break
+        parts, now = parts + step, after
+        if np.all(np.abs(step) <= TOLERANCE * parts):
+            break
+    return parts, now
 
 
 def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
