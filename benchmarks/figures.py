@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from calib.report.figures import plain_numbers
+from calib.report.figures.parts import plain_numbers
 
 from .rows import Row, grouped
 

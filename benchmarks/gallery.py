@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.tri import Triangulation
 
-from calib.report.figures import write_figure
+from calib.report.figures.parts import write_figure
 
 from .figures import BLUE, GREY, ORANGE, panels
 

@@ -15,7 +15,7 @@ import jax
 from matplotlib.figure import Figure
 
 import jaxeit as je
-from calib.report.figures import write_figure
+from calib.report.figures.parts import write_figure
 from calib.session import replacing
 
 from . import tables

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 import jaxeit as je
-from calib.report.accuracy_figure import ladder_figure
+from calib.report.figures.accuracy import ladder_figure
 from jaxeit.linalg import NestedDissection
 
 from .clock import limits

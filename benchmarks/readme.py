@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 
 import calib
-from calib.report.figures import sensitivity_figure, write_figure
+from calib.report.figures.parts import write_figure
+from calib.report.figures.presses import sensitivity_figure
 from calib.runtime import set_up
 from calib.session import replacing
 

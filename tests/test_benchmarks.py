@@ -21,7 +21,7 @@ from benchmarks import (
 )
 from benchmarks.clock import difference
 from benchmarks.peers import adjoint, cholmod, eidors, pyeit, superlu
-from calib.report.figures import write_figure
+from calib.report.figures.parts import write_figure
 
 from .oracles.rectangle import four_point
 

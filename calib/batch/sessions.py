@@ -25,7 +25,7 @@ from ..calibration.calibration import Calibration, load_calibration
 from ..calibration.procedure import calibrate
 from ..calibration.recipe import Recipe
 from ..report.document import write_report
-from ..report.figures import require_matplotlib
+from ..report.figures.parts import require_matplotlib
 from ..report.log_document import write_log_report
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session

@@ -9,7 +9,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.evaluation import CALIBRATED, METHODS, Evaluation
 from ..calibration.press_examples import PressExamples
 from ..fitting.fields import FIELDS, FittedField
-from .figures import ESTIMATOR_MEANING, sensitivity_maps
+from .figures.presses import ESTIMATOR_MEANING, sensitivity_maps
 from .html_parts import number_text
 
 

@@ -13,7 +13,8 @@ from ..calibration.calibration import Calibration
 from ..calibration.evaluation import METHODS, THIRDS, Evaluation
 from ..fitting.selection import Candidate
 from ..session import replacing
-from .figures import ESTIMATOR_MEANING, require_matplotlib
+from .figures.parts import require_matplotlib
+from .figures.presses import ESTIMATOR_MEANING
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text, with_error
 from .pictures import Picture, calibration_pictures
 

@@ -10,10 +10,10 @@ import numpy as np
 from ..calibration.logs.calibration import LogCalibration
 from ..calibration.logs.evaluation import THIRDS, LogEvaluation
 from ..session import replacing
-from .figures import require_matplotlib
+from .figures.logs import place_panels, residual_figure, scatter_figure, time_figure
+from .figures.panels import inline_svg
+from .figures.parts import require_matplotlib
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text
-from .log_figures import place_panels, residual_figure, scatter_figure, time_figure
-from .panels import inline_svg
 
 _NONE: Mapping[str, LogEvaluation] = MappingProxyType({})
 

@@ -15,15 +15,14 @@ from .captions import (
     about_maps,
     about_sensitivity,
 )
-from .curved_figure import curved_figure, curved_panels
-from .electrode_figures import about_electrodes, electrodes_figure, electrodes_panels
-from .figures import localisation_figure, png, sensitivity_figure
-from .html_parts import html_table
-from .layer_figures import about_layer, layer_figure, layer_panels
-from .map_figures import ExampleMaps, maps_figure
-from .pad_figures import curves_figure, gain_figure, has_loops, loops_figure
-from .panels import Panel
-from .press_panels import (
+from .figures.contact_layer import about_layer, layer_figure, layer_panels
+from .figures.curved_sheet import curved_figure, curved_panels
+from .figures.electrodes import about_electrodes, electrodes_figure, electrodes_panels
+from .figures.maps import ExampleMaps, maps_figure
+from .figures.pads import curves_figure, gain_figure, has_loops, loops_figure
+from .figures.panels import Panel
+from .figures.parts import png
+from .figures.press_panels import (
     curve_panels,
     gain_panels,
     localisation_panels,
@@ -31,6 +30,8 @@ from .press_panels import (
     map_panels,
     sensitivity_panels,
 )
+from .figures.presses import localisation_figure, sensitivity_figure
+from .html_parts import html_table
 
 # The image's estimator nearest to the paper's figure, and the one that the correction by location goes by.
 SHOWN_ESTIMATORS = ("quarter", "fitted")

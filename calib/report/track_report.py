@@ -14,10 +14,10 @@ from ..calibration.localisation.contact_tracks import ABOUT, Rows
 from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..session import open_archive, replacing
 from .example_contacts import LARGER
-from .figures import MM, require_matplotlib
-from .force_series import SERIES
+from .figures.force_series import SERIES
+from .figures.panels import WIDER, Panel, chart_axes, panel, sheet_axes
+from .figures.parts import MM, require_matplotlib
 from .html_parts import PAGE, STYLE, html_table, number_text, with_error
-from .panels import WIDER, Panel, chart_axes, panel, sheet_axes
 
 ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
 MOST_POINTS = 2000  # of a contact's line

@@ -13,7 +13,7 @@ import calib.cli
 import jaxeit as je
 from benchmarks import ladder as benchmark
 from calib.cli.commands.bench_command import bench_scene
-from calib.report.accuracy_figure import ladder_figure
+from calib.report.figures.accuracy import ladder_figure
 from jaxeit.accuracy.image_quality import misplaced
 from jaxeit.accuracy.recommendation import Reference, Times
 from jaxeit.accuracy.settings import default_touches, refined

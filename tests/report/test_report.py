@@ -20,13 +20,15 @@ from calib.fitting.curves import FittedCurve, Linear
 from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, single_places
 from calib.fitting.held_out import Split
 from calib.fitting.selection import Candidate
-from calib.report import figures, pictures
-from calib.report.curved_figure import curved_figure
+from calib.report import pictures
 from calib.report.document import write_report
-from calib.report.figures import ReportError, localisation_figure, png, sensitivity_figure
-from calib.report.force_series import ForceSeries, force_series_figure
-from calib.report.layer_figures import layer_maps
-from calib.report.pad_figures import curves_figure, gain_figure, loops_figure
+from calib.report.figures import parts
+from calib.report.figures.contact_layer import layer_maps
+from calib.report.figures.curved_sheet import curved_figure
+from calib.report.figures.force_series import ForceSeries, force_series_figure
+from calib.report.figures.pads import curves_figure, gain_figure, loops_figure
+from calib.report.figures.parts import ReportError, png
+from calib.report.figures.presses import localisation_figure, sensitivity_figure
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.tracking import GainField, LearnedLayer
 
@@ -429,13 +431,15 @@ def test_missing_folder_is_named(calibration, no_pictures, tmp_path):
 def test_without_matplotlib_the_error_says_what_to_install(calibration, skin, tmp_path, monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.collections", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
-    spec = importlib.util.spec_from_file_location("calib.report._figures_alone", figures.__file__)
+    spec = importlib.util.spec_from_file_location("calib.report.figures._parts_alone", parts.__file__)
     alone = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(alone)
-    for draw in (alone.localisation_figure, alone.sensitivity_figure):
-        with pytest.raises(alone.ReportError, match=r"jaxeit\[report\]"):
+    with pytest.raises(alone.ReportError, match=r"jaxeit\[report\]"):
+        alone.require_matplotlib()
+    monkeypatch.setattr(parts, "Figure", None)
+    for draw in (localisation_figure, sensitivity_figure):
+        with pytest.raises(ReportError, match=r"jaxeit\[report\]"):
             draw(calibration.evaluation, skin)
-    monkeypatch.setattr(figures, "Figure", None)
     with pytest.raises(ReportError, match=r"jaxeit\[report\]"):
         write_report(calibration, tmp_path / "page.html")
     assert list(tmp_path.iterdir()) == []

@@ -12,9 +12,9 @@ from calib.calibration.localisation.ellipses import INSIDE_90, placement_covaria
 from calib.calibration.press_examples import PressExamples
 from calib.report.document import write_report
 from calib.report.example_contacts import LARGER, ExampleContacts, example_contacts, half_axes
+from calib.report.figures.maps import ExampleMaps, draw_contact
+from calib.report.figures.panels import TALLEST, chart_axes, inline_svg, sheet_axes
 from calib.report.html_parts import PAGE, STYLE, html_table
-from calib.report.map_figures import ExampleMaps, draw_contact
-from calib.report.panels import TALLEST, chart_axes, inline_svg, sheet_axes
 from tests.browser import Browser, browser_path
 from tests.report.test_report import calibration, located  # noqa: F401  fixtures
 

@@ -100,7 +100,7 @@ def bench_scene(what: str) -> "Scene":
 
 
 def _write_ladder_figure(found: "Ladder", path: Path) -> None:
-    from ...report.accuracy_figure import ladder_figure
-    from ...report.figures import write_figure
+    from ...report.figures.accuracy import ladder_figure
+    from ...report.figures.parts import write_figure
 
     write_figure(ladder_figure([found.summary()]), path)

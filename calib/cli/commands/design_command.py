@@ -200,8 +200,8 @@ def _write_picture(
 ) -> None:
     import numpy as np
 
-    from ...report.design_figure import ExpectedErrors, design_figure
-    from ...report.figures import write_figure
+    from ...report.figures.designs import ExpectedErrors, design_figure
+    from ...report.figures.parts import write_figure
 
     maps = {
         f"{name}: {skin.protocol.readings} readings": ExpectedErrors(

@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxeit as je
 
-from .figures import BLUE, GREEN, MARKS, MM, RED, bare_figure, draw_sheet
+from .parts import BLUE, GREEN, MARKS, MM, RED, bare_figure, draw_sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

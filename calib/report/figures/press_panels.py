@@ -7,23 +7,14 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration.calibration import Calibration
-from ..calibration.evaluation import Evaluation
-from ..presses.means import dominant_pad
-from .figures import (
-    GREEN,
-    MM,
-    RED,
-    colour_reach,
-    draw_pixels,
-    localisation_panel,
-    sensitivity_maps,
-    sensitivity_title,
-    value_map,
-)
-from .map_figures import ExampleMaps, draw_contact
-from .pad_figures import curve_panel, loop_panel, pad_gain, pad_maps, residuals_by, symmetric_limit
+from ...calibration.calibration import Calibration
+from ...calibration.evaluation import Evaluation
+from ...presses.means import dominant_pad
+from .maps import ExampleMaps, draw_contact
+from .pads import curve_panel, loop_panel, pad_gain, pad_maps, residuals_by, symmetric_limit
 from .panels import WIDER, Panel, chart_axes, panel, share_limits, sheet_axes
+from .parts import GREEN, MM, RED, colour_reach, draw_pixels, value_map
+from .presses import localisation_panel, sensitivity_maps, sensitivity_title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

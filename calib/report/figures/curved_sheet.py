@@ -8,10 +8,10 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration.calibration import Calibration
-from ..calibration.force_maps import force_map
-from .figures import GREEN, GREY, MM, RED, cell_edges, colour_reach, new_figure
+from ...calibration.calibration import Calibration
+from ...calibration.force_maps import force_map
 from .panels import HEIGHT, WIDTH, Panel, panel, panel_figure
+from .parts import GREEN, GREY, MM, RED, cell_edges, colour_reach, new_figure
 
 try:  # an extra, as in `figures`
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection

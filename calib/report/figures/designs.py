@@ -1,20 +1,19 @@
 """The picture of `jaxeit design`: the expected error of place over the sheet, scan by scan."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from contextlib import suppress
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 import jaxeit as je
 
-from .figures import MM, require_matplotlib
+from .parts import MM, bare_figure
 
-try:  # an extra, as for all figures
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+with suppress(ImportError):  # an extra: without it everything but the figures works
     from matplotlib.colors import LogNorm
+if TYPE_CHECKING:
     from matplotlib.figure import Figure
-except ImportError:
-    Figure = None  # type: ignore[assignment,misc]
 
 
 class ExpectedErrors(NamedTuple):
@@ -38,11 +37,9 @@ def design_figure(maps: Mapping[str, ExpectedErrors]) -> "Figure":
     Raises:
         ReportError: where matplotlib is not installed.
     """
-    require_matplotlib()
     low, high = MM * np.asarray(next(iter(maps.values())).skin.domain.bounds)
     height = 4.2 * (high[1] - low[1]) / (high[0] - low[0])
-    figure = Figure(figsize=(4.2 * len(maps) + 1, height + 0.8), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = bare_figure(4.2 * len(maps) + 1, height + 0.8, layout="constrained")
     every = MM * np.concatenate([found.error for found in maps.values()])
     norm = LogNorm(every.min(), max(every.max(), 1.01 * every.min()))
     axes = figure.subplots(1, len(maps), squeeze=False)[0]

@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration import Calibration
-from ..calibration.localisation.electrode_places import PlacedElectrodes
-from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
-from .figures import GREEN, MM, RED, draw_sheet, new_figure
-from .html_parts import number_text
+from ...calibration import Calibration
+from ...calibration.localisation.electrode_places import PlacedElectrodes
+from ...calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
+from ..html_parts import number_text
 from .panels import Panel, panel, sheet_axes
+from .parts import GREEN, MM, RED, draw_sheet, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,11 +7,11 @@ import numpy as np
 import jaxeit as je
 from jaxeit.tracking import LearnedLayer
 
-from ..calibration import Calibration
-from .figures import draw_pixels, draw_sheet, label_y_once, new_figure
-from .html_parts import number_text
-from .pad_figures import symmetric_limit
+from ...calibration import Calibration
+from ..html_parts import number_text
+from .pads import symmetric_limit
 from .panels import Panel, panel, sheet_axes
+from .parts import draw_pixels, draw_sheet, label_y_once, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

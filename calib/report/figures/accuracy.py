@@ -1,18 +1,17 @@
 """The picture of `jaxeit bench`: error against time, one point per fidelity."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
 from jaxeit.accuracy.recommendation import undominated
 
-from .figures import plain_numbers, require_matplotlib
+from .parts import bare_figure, plain_numbers
 
-try:  # an extra, as for all figures
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+with suppress(ImportError):  # an extra: without it everything but the figures works
     from matplotlib.lines import Line2D
-except ImportError:
-    Figure = None  # type: ignore[assignment,misc]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NAMED = ("draft", "standard", "reference")
 _COLOURS = {1: "#d9730d", 2: "#1f5fa8"}
@@ -29,9 +28,7 @@ def ladder_figure(ladders: Sequence[Mapping[str, Any]]) -> "Figure":
     Raises:
         ReportError: where matplotlib is not installed.
     """
-    require_matplotlib()
-    figure = Figure(figsize=(5.2 * len(ladders) + 0.4, 4.9), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = bare_figure(5.2 * len(ladders) + 0.4, 4.9, layout="constrained")
     for axes, found in zip(figure.subplots(1, len(ladders), sharey=True, squeeze=False)[0], ladders, strict=True):
         _panel(axes, found)
     figure.axes[0].set_ylabel("error of the difference data, % of its rms")

@@ -9,11 +9,11 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration.calibration import Calibration
-from ..calibration.evaluation import Evaluation
-from ..fitting.fields import FittedField, log_gain, single_places
-from ..presses.means import dominant_pad
-from .figures import (
+from ...calibration.calibration import Calibration
+from ...calibration.evaluation import Evaluation
+from ...fitting.fields import FittedField, log_gain, single_places
+from ...presses.means import dominant_pad
+from .parts import (
     BLUE,
     GREY,
     MARKS,

@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration.calibration import Calibration
-from ..calibration.force_maps import force_map
-from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
-from .example_contacts import example_contacts, half_axes
-from .figures import MM, RED, draw_pixels, draw_sheet, label_y_once, new_figure
-from .html_parts import number_text
+from ...calibration.calibration import Calibration
+from ...calibration.force_maps import force_map
+from ...calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
+from ..example_contacts import example_contacts, half_axes
+from ..html_parts import number_text
+from .parts import MM, RED, draw_pixels, draw_sheet, label_y_once, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

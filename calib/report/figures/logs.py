@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration.logs.evaluation import LogEvaluation
-from ..fitting.fields import FittedField
-from .figures import BLUE, GREY, MM, RED, bare_figure, cell_edges
-from .pad_figures import pad_gain, symmetric_limit
+from ...calibration.logs.evaluation import LogEvaluation
+from ...fitting.fields import FittedField
+from .pads import pad_gain, symmetric_limit
 from .panels import WIDER, WIDTH, Panel, chart_axes, panel
+from .parts import BLUE, GREY, MM, RED, bare_figure, cell_edges
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .figures import BLUE, GREEN, GREY, RED, new_figure, plain_label
+from .parts import BLUE, GREEN, GREY, RED, new_figure, plain_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
