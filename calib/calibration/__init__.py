@@ -1,9 +1,9 @@
 """Calibrations: made from sessions, evaluated, applied to frames, saved and loaded."""
 
 from .application import apply
+from .archives.opening import load_calibration
 from .calibration import Calibration
 from .evaluation import Evaluation
-from .files import load_calibration
 from .force_maps import ForceEstimate, force_map
 from .layer import learn_layer
 from .localisation.locators import (

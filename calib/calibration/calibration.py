@@ -22,6 +22,7 @@ from ..fitting.selection import Candidate
 from ..presses.crosstalk import Crosstalk
 from ..presses.table import Processing
 from ..session import SessionError, read_archive, write_archive
+from .archives.storage import fields_from_archive, recorded_processing, recorded_recipe, to_archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
 from .localisation.electrode_places import PlacedElectrodes
@@ -29,7 +30,6 @@ from .localisation.locators import AbstractLocator, locate
 from .press_examples import PressExamples
 from .recalibration.changes import Recalibration
 from .recipe import Recipe
-from .storage import fields_from_archive, recorded_processing, recorded_recipe, to_archive
 
 FORMAT = "skin-calibration"
 

@@ -16,6 +16,7 @@ from ..fitting.response import PadResponse, fit_response, fold_presses, hold_out
 from ..presses.pooled import pool_presses
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
+from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
@@ -25,7 +26,6 @@ from .localisation.press_images import Imager, PressImages, prepare_imager
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
 from .recipe import Recipe
-from .storage import describe
 
 STAGES = ("reading", "model and images", "fitting", "holding out")
 # Further stages, if the recipe asks for them.

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known, verb
-from ..imaging.background import sheet_of
+from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError, Whitened, whitened_readings
 from ..model.bases import Elements
 from ..model.discretisation import Model

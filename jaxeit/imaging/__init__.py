@@ -1,6 +1,8 @@
 """Images of the conductivity change: noise, priors, methods, hyperparameters, and the reconstructors made of them."""
 
-from .absolute import (
+from .absolute.background import fit_background
+from .absolute.electrode_fit import ElectrodeFit, ElectrodeFitSettings, KnownPresses, fit_electrodes
+from .absolute.images import (
     AbstractPenalty,
     IsotropicVariation,
     LogConductivity,
@@ -8,8 +10,7 @@ from .absolute import (
     gauss_newton,
     least_squares_image,
 )
-from .background import fit_background
-from .electrode_fit import ElectrodeFit, ElectrodeFitSettings, KnownPresses, fit_electrodes
+from .absolute.reference import ReferenceFit, ReferenceParameters, ReferenceSettings, fit_reference
 from .hyperparameters import (
     HYPERPARAMETERS,
     AbstractFrameChoice,
@@ -51,7 +52,6 @@ from .priors import (
     TotalVariation,
 )
 from .reconstruction import AbstractReconstructor, IterativeReconstructor, Provenance, Reconstructor
-from .reference import ReferenceFit, ReferenceParameters, ReferenceSettings, fit_reference
 from .segmentation import Segmentation, half_height_classes, on_grid, segment
 from .settings import Imaging
 from .storage import (

@@ -16,7 +16,7 @@ from .._compile import is_traced
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
 from ..model.sensitivity import pair_jacobian
-from .background import sheet_of
+from .absolute.background import sheet_of
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
 from .methods.one_step import one_step_image

@@ -16,8 +16,8 @@ from .._compile import require_known
 from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ..model.discretisation import Model
 from ..model.forward_model import forward
-from .absolute import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton
-from .background import require_frame, require_positive
+from .absolute.background import require_frame, require_positive
+from .absolute.images import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton
 from .noise import InverseError
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2

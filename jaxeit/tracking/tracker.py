@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known
-from ..imaging.background import sheet_of
+from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin

@@ -17,11 +17,11 @@ import pytest
 import calib
 import jaxeit as je
 from calib.bench import Bench, Timing, simulate
+from calib.calibration.archives.storage import SEAL, to_archive
 from calib.calibration.evaluation import render_table
 from calib.calibration.force_maps import fused, law_of
 from calib.calibration.localisation.locators import ROWS, CentroidLocator, locate, locator_from_numbers, locator_numbers
 from calib.calibration.localisation.press_images import fit_untouched_sheet
-from calib.calibration.storage import SEAL, to_archive
 from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play, remembered
 from calib.fitting.fields import Places, geometry_of

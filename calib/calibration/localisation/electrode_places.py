@@ -11,7 +11,7 @@ import jaxeit as je
 from jaxeit.imaging import InverseError, KnownPresses, fit_electrodes
 
 from ...presses.pooled import PooledPresses
-from ..stored_arrays import shaped
+from ..archives.arrays import shaped
 from .spread import farthest_first
 
 # The errors of a mesh of first order would be taken for shifts of electrodes.

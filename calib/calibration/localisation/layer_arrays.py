@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxeit.tracking import GainField, LearnedLayer
 
-from ..stored_arrays import shaped
+from ..archives.arrays import shaped
 
 _NUMBERS = {
     "length": ("m", "over which the log gain changes"),

@@ -15,7 +15,7 @@ from ...fitting.fields import FIELDS
 from ...fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise, Travel
 from ...fitting.selection import Candidate
 from ...session import Archive
-from ..storage import SEAL, field_arrays, field_from, seal
+from ..archives.storage import SEAL, field_arrays, field_from, seal
 from .evaluation import LogEvaluation
 from .shift import LogShift
 

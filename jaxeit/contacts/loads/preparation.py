@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..._compile import require_known, verb
-from ...imaging.background import sheet_of
+from ...imaging.absolute.background import sheet_of
 from ...imaging.noise import InverseError, whitened_readings
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import calib
+from calib.calibration.archives.storage import SEAL, seal
 from calib.calibration.logs.calibration import FORMAT
 from calib.calibration.logs.evaluation import log_evaluation
 from calib.calibration.logs.procedure import FORCE_FORMAT, apply_log, calibrate_logs, evaluate_log, render_log
 from calib.calibration.logs.storage import CURVE_FIELDS
-from calib.calibration.storage import SEAL, seal
 from calib.cli import main
 from calib.fitting.curves import Affine, Linear
 from calib.fitting.logs import BestChannel, BlendChannels, LogPrediction, SmoothChannels

@@ -20,15 +20,15 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 from scipy.linalg import block_diag
 
-from ..effects import CommonMode, chosen
-from ..least_squares import ImplicitStep, LevenbergMarquardt
-from ..linalg.lapack import eigh
-from ..model.discretisation import Model
-from ..model.forward_model import forward
-from ..model.motion import Motion, electrode_motion, moved
-from .absolute import reading_weights
+from ...effects import CommonMode, chosen
+from ...least_squares import ImplicitStep, LevenbergMarquardt
+from ...linalg.lapack import eigh
+from ...model.discretisation import Model
+from ...model.forward_model import forward
+from ...model.motion import Motion, electrode_motion, moved
+from ..noise import InverseError
 from .background import frame_error, require_explained, require_frame, sheet_level
-from .noise import InverseError
+from .images import reading_weights
 
 MODEL_ERROR = 3e-3
 """Standard error of a reading, relative, where nothing else is said: that of the mesh and the places of electrodes."""

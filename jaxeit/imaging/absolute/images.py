@@ -13,21 +13,14 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from .._compile import verb
-from ..least_squares import (
-    Cholesky,
-    ImplicitStep,
-    LeastSquaresState,
-    LevenbergMarquardt,
-    normal_equations,
-    quadratic,
-)
-from ..least_squares.searches import Quadratic as HalfSquares
-from ..model.bases import BasisMap, Picture
-from ..model.discretisation import Model
-from ..model.forward_model import forward
-from ..model.sensitivity import scaled_jacobian
-from .priors import AbstractPrecision
+from ..._compile import verb
+from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
+from ...least_squares.searches import Quadratic as HalfSquares
+from ...model.bases import BasisMap, Picture
+from ...model.discretisation import Model
+from ...model.forward_model import forward
+from ...model.sensitivity import scaled_jacobian
+from ..priors import AbstractPrecision
 
 
 class LogConductivity(eqx.Module):

@@ -13,27 +13,27 @@ import numpy as np
 import jaxeit as je
 from jaxeit.toml import TomlTable, parse_toml
 
-from ..fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
-from ..fitting.fields import FIELDS, AbstractField, FittedField, Geometry
-from ..fitting.fields.base import restored
-from ..fitting.intervals import NoiseLaw
-from ..fitting.selection import Candidate, Choice
-from ..presses.crosstalk import Crosstalk
-from ..presses.table import Processing
-from ..session import Archive
-from .evaluation import Evaluation
-from .hysteresis_loops import Loops
-from .localisation.electrode_places import PlacedElectrodes
-from .localisation.layer_arrays import layer_arrays, layer_from
-from .localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
-from .press_examples import PressExamples
-from .recalibration.changes import Recalibration
-from .recipe import Recipe
-from .recipe_text import read_imaging, read_processing
-from .stored_arrays import shaped
+from ...fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
+from ...fitting.fields import FIELDS, AbstractField, FittedField, Geometry
+from ...fitting.fields.base import restored
+from ...fitting.intervals import NoiseLaw
+from ...fitting.selection import Candidate, Choice
+from ...presses.crosstalk import Crosstalk
+from ...presses.table import Processing
+from ...session import Archive
+from ..evaluation import Evaluation
+from ..hysteresis_loops import Loops
+from ..localisation.electrode_places import PlacedElectrodes
+from ..localisation.layer_arrays import layer_arrays, layer_from
+from ..localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
+from ..press_examples import PressExamples
+from ..recalibration.changes import Recalibration
+from ..recipe import Recipe
+from ..recipe_text import read_imaging, read_processing
+from .arrays import shaped
 
 if TYPE_CHECKING:
-    from .calibration import Calibration
+    from ..calibration import Calibration
 
 T = TypeVar("T")
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from ..session.archive import archive_format
-from .calibration import Calibration, load_calibration as load_skin_calibration
-from .logs import calibration as log_calibration
-from .logs.calibration import LogCalibration, load_log_calibration
+from ...session.archive import archive_format
+from ..calibration import Calibration, load_calibration as load_skin_calibration
+from ..logs import calibration as log_calibration
+from ..logs.calibration import LogCalibration, load_log_calibration
 
 
 def load_calibration(path: str | Path) -> Calibration | LogCalibration:

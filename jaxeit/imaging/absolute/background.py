@@ -9,12 +9,12 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..model.bases import BasisMap, Pixels
-from ..model.discretisation import Model
-from ..model.forward_model import forward
-from .absolute import LogConductivity, Quadratic, gauss_newton
-from .noise import InverseError
-from .priors import GaussianSmooth
+from ...model.bases import BasisMap, Pixels
+from ...model.discretisation import Model
+from ...model.forward_model import forward
+from ..noise import InverseError
+from ..priors import GaussianSmooth
+from .images import LogConductivity, Quadratic, gauss_newton
 
 # Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
 ERROR_FLOOR = 1e-3

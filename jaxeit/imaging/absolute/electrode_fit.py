@@ -23,18 +23,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .._compile import require_known, verb
-from ..least_squares import LeastSquaresState, normal_equations, quadratic
-from ..least_squares.searches import Quadratic as HalfSquares, normal_inverse
-from ..model.bases import BasisMap, Pixels
-from ..model.discretisation import Model
-from ..model.forward_model import coefficients, fields, forward, terminal_matrix, voltages
-from ..model.motion import Motion, electrode_motion, field_shift_jacobian, moved
-from ..model.sensitivity import field_jacobian, field_slope, scaled_jacobian
-from .absolute import AbstractPosterior, most_probable, reading_weights
+from ..._compile import require_known, verb
+from ...least_squares import LeastSquaresState, normal_equations, quadratic
+from ...least_squares.searches import Quadratic as HalfSquares, normal_inverse
+from ...model.bases import BasisMap, Pixels
+from ...model.discretisation import Model
+from ...model.forward_model import coefficients, fields, forward, terminal_matrix, voltages
+from ...model.motion import Motion, electrode_motion, field_shift_jacobian, moved
+from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
+from ..noise import InverseError
+from ..priors import GaussianSmooth
 from .background import frame_error, require_frame, sheet_level
-from .noise import InverseError
-from .priors import GaussianSmooth
+from .images import AbstractPosterior, most_probable, reading_weights
 
 STRENGTH_STD = 1.0  # of the logarithm of a press's strength, whose first value comes from its readings
 WIDTH_STD = 0.3  # of the logarithm of a press's width

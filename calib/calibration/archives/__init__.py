@@ -1,0 +1,1 @@
+"""Files of calibrations: written, checked and read back."""
