@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from jaxeit.contacts.loads.proposal import SHAPES, WEIGHTS, Proposal, pad_inputs, skin_hash
+from jaxeit.contacts.loads.proposal import SHAPES, WEIGHTS, Proposal, pad_inputs
+from jaxeit.skin import skin_hash
 
 from ..batch.digests import digest
 from ..batch.random_frames import write_training_frames

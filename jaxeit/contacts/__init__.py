@@ -10,6 +10,7 @@ from .loads import (
     Proposed,
     load_proposal,
     prepare_loads,
+    shipped_proposal,
 )
 from .preparation import prepare_contacts
 from .refinement import refine_contacts
@@ -37,5 +38,6 @@ __all__ = [
     "prepare_contacts",
     "prepare_loads",
     "refine_contacts",
+    "shipped_proposal",
     "strongest",
 ]

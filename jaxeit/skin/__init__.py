@@ -11,6 +11,7 @@ from .description import (
 )
 from .edges import BoundaryPatch
 from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
+from .identity import skin_hash
 from .patterns import adjacent, all_pairs, named_pattern, opposite, skip
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
@@ -45,6 +46,7 @@ __all__ = [
     "reciprocal_rows",
     "rim_electrodes",
     "shipped_skins",
+    "skin_hash",
     "skip",
     "with_positions",
     "with_rows",

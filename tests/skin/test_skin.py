@@ -226,3 +226,23 @@ def test_a_text_whose_rows_cannot_be_replaced_is_refused():
         je.skin.with_rows(je.skin.parse_skin(inline), ROWS)
     with pytest.raises(je.skin.ProtocolError, match="outside 0 to 24"):
         je.skin.with_rows(skin, ROWS + 10)
+
+
+def test_a_skin_is_the_same_whatever_its_text(skin):
+    """Comments, names, the order of keys and the form of numbers do not count; everything of the hardware does."""
+    mark = je.skin.skin_hash(skin)
+    commented = "# mine\n" + TEXT.replace('name = "testbed"', 'name = "mine"')
+    assert je.skin.skin_hash(je.skin.parse_skin(commented)) == mark
+    assert "current = 1e-3" in TEXT
+    assert je.skin.skin_hash(je.skin.parse_skin(TEXT.replace("current = 1e-3", "current = 0.0010"))) == mark
+    listed = je.skin.with_positions(skin, skin.electrode_positions)
+    assert "[electrodes.grid]" not in listed.toml
+    assert je.skin.skin_hash(listed) == mark
+    moved = skin.electrode_positions + np.array([1e-6, 0.0])
+    others = [
+        je.skin.with_positions(skin, moved),
+        je.skin.with_rows(skin, skin.protocol.pattern[::-1]),
+        je.load_skin("chest"),
+        *(je.skin.parse_skin(TEXT.replace(*change)) for change in (("radius = 0.003", "radius = 0.0031"),)),
+    ]
+    assert len({mark, *map(je.skin.skin_hash, others)}) == 1 + len(others)

@@ -2,7 +2,7 @@
 
 from .fitter import LoadFitter
 from .preparation import prepare_loads
-from .proposal import Proposal, Proposed, load_proposal
+from .proposal import Proposal, Proposed, load_proposal, shipped_proposal
 from .result import LoadKind, Loads, LoadShape
 from .settings import LoadSettings
 
@@ -16,4 +16,5 @@ __all__ = [
     "Proposed",
     "load_proposal",
     "prepare_loads",
+    "shipped_proposal",
 ]

@@ -7,7 +7,6 @@ It was trained where coats, gains, shapes, forces and places are drawn at random
 it cannot know; it knows no more than its scenes, and says how far a frame is from these.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from ...files import read_arrays, write_arrays
 from ...imaging.noise import InverseError
-from ...skin import Skin
+from ...skin import Skin, skin_hash
 from .result import LoadKind
 
 FORMAT = "jaxeit proposal 1"
@@ -179,7 +178,7 @@ class Proposal:
         """Raise an error if the proposal was trained for another skin.
 
         Raises:
-            InverseError: if the skin's description differs from that of the training.
+            InverseError: if the skin differs from that of the training in more than names (`jaxeit.skin.skin_hash`).
         """
         if self.about.get("skin_sha256") != skin_hash(skin):
             raise InverseError(
@@ -200,8 +199,14 @@ NUMBERS = tuple(each.name for each in fields(Proposal) if each.name != "about")
 PROPOSALS = Path(__file__).parent / "proposals"
 
 
+def shipped_proposal(skin: Skin) -> Proposal | None:
+    """The shipped proposal that was trained for a skin, whatever its name; None: there is none."""
+    every = (load_proposal(path) for path in sorted(PROPOSALS.glob("*.npz")))
+    return next((found for found in every if found.about.get("skin_sha256") == skin_hash(skin)), None)
+
+
 def load_proposal(path: str | Path) -> Proposal:
-    """Read what `jaxeit train` wrote, or a shipped proposal by the name of its skin, ``"testbed"``.
+    """Read what `jaxeit train` wrote, or a shipped proposal by the name of its skin: ``"testbed"``, ``"chest"``.
 
     Raises:
         InverseError: if the file cannot be read, is damaged or of another kind.
@@ -242,11 +247,6 @@ def _contradiction(found: Proposal) -> str:
     if infinite or min(found.noise, found.temperature, *found.deviation, *found.spread, *found.limits) <= 0:
         return f"{', '.join(infinite) or 'noise, temperature, deviation, spread or limits'} cannot be"
     return ""
-
-
-def skin_hash(skin: Skin) -> str:
-    """SHA-256 of a skin's description."""
-    return hashlib.sha256(skin.toml.encode()).hexdigest()
 
 
 def components(
