@@ -2,14 +2,18 @@
 
 Frames come from the second simulator (`tests/oracles/bench`), which shares no code with the first, on skins of fresh
 seeds: protrusions one by one, Boussinesq's stress, tips of 12 mm, an uneven coat, noise 60 dB below the readings, 20 N.
-The network has the shipped numbers for the testbed and sees neither the untouched frame nor the pads. Fits know the
-sheet from one untouched frame.
+The skins are the testbed and the chest. The network has the shipped numbers for the skin, and sees neither the
+untouched frame nor the pads. Fits know the sheet from one untouched frame.
 
-ways: single tips, equal pairs at 20 and 30 mm, edges of 40 and 60 mm, each with its error of place. "told": the most
-probable kind is the true one, and for two both places are nearer than half their distance. "several": more than one
-load is the most probable. "surprise": mean of minus the log probability of the true kind, at most that of 1e-6.
+ways: single tips, equal pairs at 20 and 30 mm, edges of 40 and 60 mm, three tips, each with its error of place. "told":
+the most probable kind is the true one, and for two both places are nearer than half their distance. "several": more
+than one load is the most probable. "surprise": mean of minus the log probability of the true kind, at most that of
+1e-6. ways_reliability: how often the kinds that each way states are the true ones.
 
-reliability: how often the kinds that network and fits state are the true ones.
+reliability: how often the kinds that the network states are the true ones, on touches of all kinds. Pairs nearer than
+`LoadSettings.nearest` and edges shorter than `LoadSettings.shortest` are one load, as the network and the fits have it.
+
+times: milliseconds a frame of each way.
 
 held_out: figures of the shipped numbers on skins that their training held out.
 
@@ -17,7 +21,7 @@ unlike: frames from outside of the training, and how many of them are announced.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -29,7 +33,7 @@ from tests.oracles.bench import contact
 from tests.oracles.bench.mesh import make_mesh
 from tests.oracles.bench.session import coating, transfer_frames
 from tests.oracles.bench.sheet import make_sheet, readings
-from tests.oracles.bench.skin import read_skin
+from tests.oracles.bench.skin import SKINS, Skin, read_skin
 
 from .bench_loads import Touch, reliability, touches
 from .clock import seconds
@@ -37,9 +41,10 @@ from .harness import Question, Run
 from .problems import BLANKS, matched
 from .rows import Row, grouped
 
-NAMES = ("one", "two, 1:1, 20 mm", "two, 1:1, 30 mm", "edge, 40 mm", "edge, 60 mm")
+NAMES = ("one", "two, 1:1, 20 mm", "two, 1:1, 30 mm", "edge, 40 mm", "edge, 60 mm", "three")
+SHIPPED = ("testbed", "chest")
 TIP, SCATTER, COAT, SPACING = 0.012, 0.1, 0.15, 3e-3
-FIRST_SEED = 4100
+FIRST_SEED = 4300
 DEAD = 7  # electrode
 FITS, NETWORK, BOTH = "fits", "network", "both"
 
@@ -56,9 +61,9 @@ class Recorded(NamedTuple):
         return 1e-3 * float(np.sqrt(np.mean(self.untouched**2)))
 
 
-def recorded(seed: int, given: list[Touch], misplaced: float = 0.0) -> Recorded:
-    """A skin of a seed under touches, by the second simulator."""
-    skin, own = read_skin(), np.random.default_rng([seed, 11])
+def recorded(name: str, seed: int, given: list[Touch], misplaced: float = 0.0) -> Recorded:
+    """A skin of a name and a seed under touches, by the second simulator."""
+    skin, own = described(name), np.random.default_rng([seed, 11])
     bolts = skin.bolts + misplaced * own.standard_normal(skin.bolts.shape)
     layer = contact.make_layer(skin, bolts, SCATTER, own)
     mesh = make_mesh(skin, bolts, SPACING)
@@ -67,6 +72,24 @@ def recorded(seed: int, given: list[Touch], misplaced: float = 0.0) -> Recorded:
     volts = [readings(z, skin.pattern, skin.current) for z in transfer_frames(layer, sheet, _loads(layer, given))]
     untouched = readings(sheet.untouched, skin.pattern, skin.current)
     return Recorded(untouched, np.array(volts) - untouched)
+
+
+def described(name: str) -> Skin:
+    """A shipped skin, as the second simulator reads it."""
+    return read_skin(SKINS / f"{name}.toml")
+
+
+def touched(name: str, rng: np.random.Generator, singles: int, others: int) -> list[Touch]:
+    """Touches of all kinds on a skin of a name."""
+    return list(touches(rng, singles, others, np.zeros(2), described(name).size))
+
+
+def counted(touch: Touch) -> LoadKind:
+    """The kind of a touch; loads too near one another and edges too short are one load, by `LoadSettings`."""
+    usual, there = je.contacts.LoadSettings(), touch.places[touch.loads > 0]
+    length = float(np.linalg.norm(there[-1] - there[0]))
+    least = {LoadKind.TWO: usual.nearest, LoadKind.EDGE: usual.shortest}.get(touch.kind, 0.0)
+    return touch.kind if length >= least else LoadKind.ONE
 
 
 def _loads(layer: contact.Layer, given: list[Touch]) -> np.ndarray:
@@ -80,50 +103,78 @@ def _loads(layer: contact.Layer, given: list[Touch]) -> np.ndarray:
 
 
 class Answer(NamedTuple):
-    """Probabilities (kinds,), places of the loads of each kind, and milliseconds."""
+    """Probabilities (kinds,) of a touch, and places of the loads of each kind."""
 
     probability: np.ndarray
     place: Callable[[LoadKind], np.ndarray]
-    ms: float
+
+
+class Ready(NamedTuple):
+    """A skin whose sheet is known from an untouched frame, and what tells its touches."""
+
+    proposal: Proposal
+    fitter: LoadFitter
+    finder: je.ContactFinder
+
+    def searched(self, frame: np.ndarray) -> Loads:
+        """Loads by a search."""
+        return self.fitter(frame, self.finder(frame))
+
+    def refined(self, frame: np.ndarray) -> Loads:
+        """Loads by the network and fits from where it proposes."""
+        return self.fitter.refine(frame, self.proposal(frame), self.finder(frame))
 
 
 def ways(run: Run) -> Iterator[Row]:
     """Each way to tell what touches the skin, on the same frames."""
-    skins, singles, others = run.sizes((2, 8, 3), (1, 1, 1))
-    proposal = je.contacts.load_proposal("testbed")
-    model, every = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY), []
-    for seed in range(FIRST_SEED, FIRST_SEED + skins):
-        rng = np.random.default_rng(seed)
-        given = [t for t in touches(rng, singles, others, np.zeros(2), np.full(2, 0.2)) if t.name in NAMES]
-        found = recorded(seed, given)
-        blank = found.untouched + found.noise / np.sqrt(BLANKS) * rng.normal(size=found.untouched.size)
-        noise, sheet = np.full(blank.size, found.noise), je.fit_background(model, blank)
-        fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
-        finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
-        for touch, change in zip(given, found.change, strict=True):
-            frame = change + found.noise * rng.normal(size=change.size)
-            for way, answer in _answers(frame, proposal, fitter, finder):
-                every.append({"way": way} | judged(touch, answer))
-        print(f"skin {seed}", flush=True)
-    yield {"rows": list(_means(every))}
+    skins, singles, others = run.sizes((4, 8, 3), (1, 1, 1))
+    for name in SHIPPED:
+        every = []
+        for seed in range(FIRST_SEED, FIRST_SEED + skins):
+            for touch, frame, ready in _frames(name, seed, singles, others):
+                every += [{"way": way} | judged(touch, answer) for way, answer in _answers(frame, ready)]
+            print(f"{name} {seed}", flush=True)
+        yield {"rows": [{"skin": name} | row for row in _means(every)], "ways_reliability": _stated(name, every)}
 
 
-def _answers(frame: np.ndarray, proposal: Proposal, fitter: LoadFitter, finder: Any) -> Iterator[tuple[str, Answer]]:
-    proposal(frame), fitter.refine(frame, proposal(frame))  # what is compiled is compiled
-    spent, searched = seconds(lambda: jax.block_until_ready(fitter(frame, finder(frame))))
-    yield FITS, _fitted(searched, spent)
-    spent, proposed = seconds(lambda: proposal(frame))
-    yield NETWORK, Answer(proposed.probability, lambda kind: proposed.of(kind)[:, :2], 1e3 * spent)
-    spent, refined = seconds(lambda: jax.block_until_ready(fitter.refine(frame, proposal(frame))))
-    yield BOTH, _fitted(refined, spent)
+def _frames(name: str, seed: int, singles: int, others: int) -> Iterator[tuple[Touch, np.ndarray, Ready]]:
+    """Touches of `NAMES` on the skin of a seed, with a noisy frame each."""
+    rng = np.random.default_rng(seed)
+    given = [touch for touch in touched(name, rng, singles, others) if touch.name in NAMES]
+    found, model = recorded(name, seed, given), je.discretise(je.Scene(je.load_skin(name)), FIDELITY)
+    blank = found.untouched + found.noise / np.sqrt(BLANKS) * rng.normal(size=found.untouched.size)
+    noise, sheet = np.full(blank.size, found.noise), je.fit_background(model, blank)
+    fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
+    ready = Ready(je.contacts.load_proposal(name), fitter, je.prepare_contacts(model, noise=noise, sigma=sheet))
+    for touch, change in zip(given, found.change, strict=True):
+        yield touch, change + found.noise * rng.normal(size=change.size), ready
 
 
-def _fitted(found: Loads, spent: float) -> Answer:
+def _answers(frame: np.ndarray, ready: Ready) -> Iterator[tuple[str, Answer]]:
+    proposed = ready.proposal(frame)
+    yield FITS, _fitted(ready.searched(frame))
+    yield NETWORK, Answer(proposed.probability, lambda kind: proposed.of(kind)[:, :2])
+    yield BOTH, _fitted(ready.refined(frame))
+
+
+def _fitted(found: Loads) -> Answer:
     def place(kind: LoadKind) -> np.ndarray:
         shape = found.of(kind) or found.one
         return np.asarray(shape.position)
 
-    return Answer(np.asarray(found.probability), place, 1e3 * spent)
+    return Answer(np.asarray(found.probability), place)
+
+
+def times(run: Run) -> Iterator[Row]:
+    """Milliseconds a frame of each way, on the testbed."""
+    (singles, others), rows = run.sizes((6, 2), (1, 1)), []
+    for touch, frame, ready in _frames("testbed", FIRST_SEED - 1, singles, others):
+        ready.refined(frame)  # what is compiled is compiled
+        for way, tell in ((FITS, ready.searched), (NETWORK, ready.proposal), (BOTH, ready.refined)):
+            spent, _ = seconds(lambda tell=tell, frame=frame: jax.block_until_ready(tell(frame)))
+            rows.append({"touch": touch.name, "way": way, "ms": 1e3 * spent})
+    middle = {way: np.median([row["ms"] for row in mine]) for way, mine in grouped(rows, "way").items()}
+    yield {"times": [{"way": way, "ms": round(float(ms), 4)} for way, ms in middle.items()]}
 
 
 def judged(touch: Touch, answer: Answer) -> Row:
@@ -138,48 +189,62 @@ def judged(touch: Touch, answer: Answer) -> Row:
         "several": several,
         "error_mm": 1e3 * float(away.min(0).mean()),
         "surprise": -float(np.log(max(answer.probability[touch.kind], 1e-6))),
-        "ms": answer.ms,
+        "probability": answer.probability,
+        "true": np.arange(len(LoadKind)) == counted(touch),
     }
+
+
+def _stated(name: str, every: list[Row]) -> list[Row]:
+    """Reliability of what each way states."""
+    return [
+        {"skin": name, "way": way} | row
+        for way, mine in grouped(every, "way").items()
+        for row in reliability(*(np.stack([one[key] for one in mine]) for key in ("probability", "true")))
+    ]
 
 
 def _means(every: list[Row]) -> Iterator[Row]:
     for way, of_way in grouped(every, "way").items():
         for name, mine in grouped(of_way, "name").items():
             means = {key: float(np.mean([row[key] for row in mine])) for key in ("told", "several", "surprise")}
-            middle = {key: float(np.median([row[key] for row in mine])) for key in ("error_mm", "ms")}
-            rounded = {key: round(value, 4) for key, value in (means | middle).items()}
+            means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
+            rounded = {key: round(value, 4) for key, value in means.items()}
             yield {"touch": name, "way": way, "frames": len(mine)} | rounded
 
 
 def stated(run: Run) -> Iterator[Row]:
     """Reliability of the network's probabilities on touches of all kinds, and what it announces."""
-    skins, singles, others = run.sizes((2, 30, 4), (1, 2, 1))
-    proposal, proposed, true, unlike = je.contacts.load_proposal("testbed"), [], [], []
-    for seed in range(FIRST_SEED + 50, FIRST_SEED + 50 + skins):
-        rng = np.random.default_rng(seed)
-        given = list(touches(rng, singles, others, np.zeros(2), np.full(2, 0.2)))
-        found = recorded(seed, given)
-        frames = found.change + found.noise * rng.normal(size=found.change.shape)
-        proposed.append(proposal(frames).probability)
-        true += [np.arange(len(LoadKind)) == touch.kind for touch in given]
-        unlike += [
-            {"frames_are": what, "announced": share} for what, share in _unlike(proposal, seed, given, found, rng)
-        ]
-        print(f"skin {seed}", flush=True)
-    rows = [
-        {"frames_are": what, "announced": round(float(np.mean([row["announced"] for row in mine])), 4)}
+    skins, singles, others = run.sizes((6, 20, 4), (1, 2, 1))
+    for name in SHIPPED:
+        proposal, proposed, true, unlike = je.contacts.load_proposal(name), [], [], []
+        for seed in range(FIRST_SEED + 50, FIRST_SEED + 50 + skins):
+            rng = np.random.default_rng(seed)
+            given = touched(name, rng, singles, others)
+            found = recorded(name, seed, given)
+            frames = found.change + found.noise * rng.normal(size=found.change.shape)
+            proposed.append(proposal(frames).probability)
+            true += [np.arange(len(LoadKind)) == counted(touch) for touch in given]
+            pairs = _unlike(name, proposal, seed, given, found, rng)
+            unlike += [{"frames_are": what, "announced": share} for what, share in pairs]
+            print(f"{name} {seed}", flush=True)
+        told = reliability(np.concatenate(proposed), np.stack(true))
+        yield {"reliability": [{"skin": name} | row for row in told], "unlike": _announced(name, unlike)}
+
+
+def _announced(name: str, unlike: list[Row]) -> list[Row]:
+    return [
+        {"skin": name, "frames_are": what, "announced": round(float(np.mean([row["announced"] for row in mine])), 4)}
         for what, mine in grouped(unlike, "frames_are").items()
     ]
-    yield {"reliability": reliability(np.concatenate(proposed), np.stack(true)), "unlike": rows}
 
 
 def _unlike(
-    proposal: Proposal, seed: int, given: list[Touch], found: Recorded, rng: np.random.Generator
+    name: str, proposal: Proposal, seed: int, given: list[Touch], found: Recorded, rng: np.random.Generator
 ) -> Iterator[tuple[str, float]]:
     """Share of frames that are announced as unlike the training, for several kinds of frames."""
     noise = found.noise * rng.normal(size=found.change.shape)
-    frames, dead = found.change + noise, (read_skin().pattern == DEAD).any(1)
-    aside = recorded(seed, given, 3e-3).change + noise
+    frames, dead = found.change + noise, (described(name).pattern == DEAD).any(1)
+    aside = recorded(name, seed, given, 3e-3).change + noise
     for what, changed in (
         ("of the second simulator", frames),
         ("with noise 50 dB below the readings", found.change + 10**0.5 * noise),
@@ -201,12 +266,13 @@ CASES = {
 
 def shipped(run: Run) -> Iterator[Row]:
     """What the training of the shipped numbers found on skins that it held out."""
-    about = je.contacts.load_proposal("testbed").about
-    kinds = ((case, kind, row) for case in CASES for kind, row in about[case]["kinds"].items() if kind != "none")
-    yield {"held_out": [{"case": CASES[case], "kind": kind} | row for case, kind, row in kinds]}
+    for name in SHIPPED:
+        about = je.contacts.load_proposal(name).about
+        kinds = ((case, kind, row) for case in CASES for kind, row in about[case]["kinds"].items() if kind != "none")
+        yield {"held_out": [{"skin": name, "case": CASES[case], "kind": kind} | row for case, kind, row in kinds]}
 
 
-main = Question("proposal", __doc__, {"stated": stated, "shipped": shipped, "ways": ways})
+main = Question("proposal", __doc__, {"stated": stated, "shipped": shipped, "ways": ways, "times": times})
 
 if __name__ == "__main__":
     main()

@@ -15,11 +15,13 @@ from .force_maps import USED, ForceEstimate
 from .frame_blocks import FrameBlock, FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, quiet_tracker
 from .localisation.load_windows import WindowedFrames, fit_windows
+from .localisation.proposals import ProposalChoice, chosen_proposal
 from .places_in_space import normals_in_space, pad_centres, points_in_space
 from .recalibration.agreement import agreement_of_use
 
 FORMAT = "skin-forcemap"
 TRACKS = "tracks/"  # group of the arrays of contacts that were followed
+LOADS = "loads/"  # group of the arrays of loads in windows
 
 
 def apply(
@@ -31,7 +33,7 @@ def apply(
     ignore_errors: bool = False,
     progress: Progress = iter,
     loads: float | None = None,
-    proposal: je.contacts.Proposal | None = None,
+    proposal: ProposalChoice = je.contacts.shipped_proposal,
     track: bool = False,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
@@ -45,7 +47,8 @@ def apply(
         ignore_errors: apply also to a session in whose skin, frames or pressures `check_session` finds an error; the
             file then names the errors.
         loads: also tell what touches the skin, none, one, two, an edge or more, in windows of so many s; None: do not.
-        proposal: of loads, trained for this skin by ``jaxeit train``, where their fits begin.
+        proposal: of loads, trained for this skin by ``jaxeit train``, where their fits begin; default: the one that is
+            shipped for the skin, and a search where there is none; None: a search.
         track: also follow contacts from frame to frame, each with a number; smoothed over time.
         tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
 
@@ -55,8 +58,7 @@ def apply(
         RecordingError: if `check_session` finds an error in its skin, frames or pressures.
     """
     processing = processing or calibration.processing
-    if proposal is not None:
-        proposal.require_skin(calibration.skin)
+    proposed = chosen_proposal(proposal, calibration.skin, tell) if loads is not None else None
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     calibration, outside = agreement_of_use(calibration, session)
@@ -70,7 +72,7 @@ def apply(
         for name, (dims, units, meaning, dtype) in kinds.items():
             tail = tuple(sizes[dim] for dim in dims)
             writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
-        also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress, proposal)]
+        also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress, proposed)]
         also += [_Tracks(calibration, writer, blocks)] if track else []
         for block, found in estimated(calibration, progress(blocks)):
             _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
@@ -161,7 +163,7 @@ class _Loads:
         self._windows.close()
         seen = fit_windows(self._calibration, self._windows, self._progress, self._proposal)
         for name, about in seen.arrays.items():
-            self._writer.add(name, *about)
+            self._writer.add(LOADS + name, *about)
         return seen.render()
 
 

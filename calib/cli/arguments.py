@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, overload
 if TYPE_CHECKING:
     import jaxeit as je
 
+    from ..calibration.localisation.proposals import ProposalChoice
+
 
 def count(text: str) -> int:
     """A whole number above zero."""
@@ -49,6 +51,24 @@ def prepare_outputs(*paths: str | None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not os.access(path.parent, os.W_OK):
             raise ValueError(f"{path}: the folder cannot be written to; choose another")
+
+
+NO_PROPOSAL = "none"
+
+
+def add_proposal_argument(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add --proposal: `what` a proposal is for."""
+    text = f"{what}; default: the one shipped for the skin, if there is one; {NO_PROPOSAL}: do without"
+    parser.add_argument("--proposal", metavar="PROPOSAL.npz", help=text)
+
+
+def proposal_of(given: str | None) -> "ProposalChoice":
+    """The choice that --proposal names."""
+    from jaxeit.contacts import load_proposal, shipped_proposal
+
+    if given is None:
+        return shipped_proposal
+    return None if given == NO_PROPOSAL else load_proposal(given)
 
 
 def require_optax() -> None:

@@ -15,7 +15,10 @@ from typing import cast
 
 import numpy as np
 
+import jaxeit as je
+
 from ..calibration.calibration import Calibration
+from ..calibration.localisation.proposals import ProposalChoice, chosen_proposal
 from ..calibration.logs.calibration import LogCalibration
 from ..record.intake import NullSink, RecordSink, explain_silence
 from ..record.plan import RecordingPlan, StreamPlan
@@ -127,6 +130,7 @@ class LiveSettings:
     | realtime     | whether to use real-time scheduling once everything is compiled              | False   |      |
     | recalibrate  | whether zero and gains of the pads follow their drift                        | False   |      |
     | track        | whether contacts are followed from frame to frame                            | False   |      |
+    | proposal     | network that tells what touches the skin; None: none                         | shipped |      |
     | moved        | calibration file to which the moved calibration is written; None: none       | None    |      |
     """
 
@@ -136,6 +140,7 @@ class LiveSettings:
     realtime: bool = False
     recalibrate: bool = False
     track: bool = False
+    proposal: ProposalChoice = je.contacts.shipped_proposal
     moved: str | Path | None = None
 
 
@@ -163,6 +168,7 @@ def run_live(
 
     Raises:
         LiveError: if the streams do not fit the calibration, do not begin, or fail.
+        InverseError: if the network was trained for another skin.
         NotFollowed: if contacts are to be followed and the frames at rest do not tell the noise.
         PriorityError: if real-time scheduling is refused.
     """
@@ -178,7 +184,8 @@ def run_live(
         if settings.recalibrate:
             layer = None if follower is None else follower.learned
             recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
-        engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower)
+        proposal = chosen_proposal(settings.proposal, calibration.skin, control.warn)
+        engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower, proposal=proposal)
     queue = FrameQueue(*(source.plan for source in sources))
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
     if settings.event_driven:
@@ -214,6 +221,8 @@ def _check_log(calibration: LogCalibration, sources: Sequence[Source], settings:
         )
     if calibration.needs_place and len(sources) < 2:
         raise LiveError("live: the calibration depends on the place of contact; give --stage, the URL of the stage")
+    if isinstance(settings.proposal, je.contacts.Proposal):
+        raise LiveError("live: --proposal: the calibration of a log has no EIT, which tells what touches the skin")
     if settings.track:
         raise LiveError("live: --track: the calibration of a log has no EIT, which tells where contacts are")
     if settings.recalibrate or settings.event_driven:

@@ -190,6 +190,16 @@ function tableContacts(result) {
     return rowOf(name, note, [...place, ...force], false);
   }));
 }
+const KINDS = { none: "nothing", one: "one contact", two: "two contacts", edge: "an edge", more: "more contacts" };
+function kindsOf(kinds) {  // what touches the skin, the most probable first
+  if (kinds.unlike) return "what touches the skin: unlike all that the network was trained on";
+  const told = Object.keys(KINDS).filter(kind => kinds[kind] >= 0.05).sort((a, b) => kinds[b] - kinds[a]);
+  return `what touches the skin: ${told.map(kind => `${KINDS[kind]} ${(100 * kinds[kind]).toFixed(0)} %`).join(", ")}`;
+}
+function tellKinds(result) {
+  $("kinds").hidden = !result.kinds;
+  if (result.kinds) setText("kinds", kindsOf(result.kinds));
+}
 let worst = 0;  // ms, of the recent results
 function tellPace(result) {
   worst = Math.max(0.99 * worst, result.latency_ms);
@@ -222,7 +232,7 @@ function say() { if (last && !paused && $("say").checked) setText("said", spoken
 
 function show() {  // the newest result
   if (!last || paused) return;
-  if (scene.rows) { drawMap(last); drawMarks(last); tableContacts(last); }
+  if (scene.rows) { drawMap(last); drawMarks(last); tableContacts(last); tellKinds(last); }
   tablePads(last); tellPace(last);
 }
 function refresh() { if (last) { readColours(); if (scene.rows) { drawMap(last); drawMarks(last); } drawHistories(); } }

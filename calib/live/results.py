@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jaxeit.contacts import LoadKind
+
 
 @dataclass(frozen=True, eq=False)
 class TouchEstimates:
@@ -58,6 +60,25 @@ NO_TOUCHES = TouchEstimates(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, b
 
 
 @dataclass(frozen=True, eq=False)
+class KindEstimate:
+    """What touches the skin in a frame, by a network that was trained for the skin.
+
+    | field       | meaning                                                       | shape |
+    |-------------|---------------------------------------------------------------|-------|
+    | probability | of each kind, in the order of `jaxeit.contacts.LoadKind`      | (5,)  |
+    | unlike      | whether the frame is unlike what the network was trained on   | ()    |
+    """
+
+    probability: np.ndarray
+    unlike: bool
+
+    def to_dict(self) -> dict[str, object]:
+        """The probabilities by the names of the kinds, as values for JSON."""
+        names = (kind.name.lower() for kind in LoadKind)
+        return {**dict(zip(names, _json_numbers(self.probability), strict=True)), "unlike": self.unlike}
+
+
+@dataclass(frozen=True, eq=False)
 class FrameResult:
     """Result of one frame.
 
@@ -77,6 +98,7 @@ class FrameResult:
     | dropped        | number of frames that were not processed so far                        | ()        |      |
     | touches        | contacts, if the calibration fits contacts or they are followed        |           |      |
     | unsearched     | number of frames so far for which there was no time to fit contacts    | ()        |      |
+    | kinds          | what touches the skin; None: nothing does, or no network tells it      |           |      |
     """
 
     number: int
@@ -93,6 +115,7 @@ class FrameResult:
     dropped: int
     touches: TouchEstimates = NO_TOUCHES
     unsearched: int = 0
+    kinds: KindEstimate | None = None
 
     def to_json(self, *, image: bool = False) -> str:
         """The result as one line of JSON; ``image`` adds map and image as base64 of little-endian f4."""
@@ -110,6 +133,7 @@ class FrameResult:
             "contacts": self.touches.to_list(),
             "contacts_age": self.touches.age,
             "unsearched": self.unsearched,
+            "kinds": None if self.kinds is None else self.kinds.to_dict(),
         }
         if image:
             out |= {name: base64.b64encode(getattr(self, name).astype("<f4")).decode() for name in ("map", "image")}

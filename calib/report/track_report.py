@@ -1,4 +1,4 @@
-"""The report of contacts that were followed through a recording: paths over the sheet, and forces over time."""
+"""The report of a recording: contacts that were followed, and what touched the skin in each window."""
 
 from collections.abc import Mapping
 from html import escape
@@ -9,7 +9,8 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration.application import FORMAT, TRACKS
+from ..calibration.application import FORMAT, LOADS, TRACKS
+from ..calibration.localisation import load_windows
 from ..calibration.localisation.contact_tracks import ABOUT, Rows
 from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..session import open_archive, replacing
@@ -18,6 +19,7 @@ from .figures.force_series import SERIES
 from .figures.panels import WIDER, Panel, chart_axes, panel, sheet_axes
 from .figures.parts import MM, require_matplotlib
 from .html_parts import PAGE, STYLE, html_table, number_text, with_error
+from .load_report import Windows, load_parts
 
 ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
 MOST_POINTS = 2000  # of a contact's line
@@ -29,11 +31,11 @@ CAPTION = (
 
 
 def write_track_report(path: str | Path, forces: str | Path, skin: je.Skin) -> Path:
-    """Write a page about the contacts that `calib.apply` followed, whole or not at all.
+    """Write a page about the contacts that `calib.apply` followed and the loads that it told, whole or not at all.
 
     Args:
         path: of the page.
-        forces: file of force maps with contacts that were followed.
+        forces: file of force maps with contacts that were followed, with loads in windows, or both.
         skin: that was touched.
 
     Raises:
@@ -45,25 +47,28 @@ def write_track_report(path: str | Path, forces: str | Path, skin: je.Skin) -> P
     with open_archive(forces, FORMAT) as archive:
         attrs, known = archive.attrs, archive.arrays
         rows = {name: known[TRACKS + name].read() for name in ABOUT if TRACKS + name in known}
-    text = _page(rows, attrs, skin)
+        loads = {name: known[LOADS + name].read() for name in load_windows.ABOUT if LOADS + name in known}
+    text = _page(rows, loads, attrs, skin)
     with replacing(page) as temporary:
         temporary.write_bytes(text.encode())
     return page
 
 
-def _page(rows: Rows, attrs: Mapping[str, Any], skin: je.Skin) -> str:
+def _page(rows: Rows, loads: Windows, attrs: Mapping[str, Any], skin: je.Skin) -> str:
     simulated = bool(attrs["simulated"])
     title = f"Contacts in {attrs['session']}"
     parts = [f"<h1>{escape(title)}</h1>"]
     if simulated:
         parts.append('<p class="banner" role="note"><strong>SIMULATED</strong> The recording is simulated.</p>')
+    told = load_parts(loads, simulated=simulated)
     if not rows or not len(rows["time"]):
-        parts.append("<p>No contact was followed.</p>")
+        parts += [] if told else ["<p>No contact was followed.</p>"]
     else:
         panels = "".join(panel.html() for panel in tracks_panels(rows, skin, simulated=simulated))
         alt = "Paths of contacts over the sheet, and their forces over time"
         shown = f"<div class='panels few' role='group' aria-label='{alt}'>{panels}</div>"
         parts += [f"<figure>{shown}<figcaption>{escape(CAPTION)}</figcaption></figure>", _table(rows)]
+    parts += told
     mark = "SIMULATED: " if simulated else ""
     return PAGE.format(title=escape(mark + title), style=STYLE, body="\n".join(parts))
 

@@ -1,5 +1,6 @@
 """Contacts followed through a recording, by `apply --track`: rows of the file, report, and the command line."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
-from calib.calibration.application import FORMAT, TRACKS
+from calib.calibration.application import FORMAT, LOADS, TRACKS
 from calib.calibration.localisation.contact_tracks import ABOUT, MIN_SECONDS, PAD_SHARE, ContactTracks, pad_errors
+from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, MOST
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
@@ -116,6 +118,30 @@ def test_a_report_without_contacts_says_so(tmp_path, skin):
     pytest.importorskip("matplotlib")
     written(tmp_path / "map.h5", 0)
     assert "No contact" in write_track_report(tmp_path / "r.html", tmp_path / "map.h5", skin).read_text()
+
+
+def test_a_report_tells_what_touched_the_skin(tmp_path, skin):
+    """Each window with the probabilities of its kinds, and the loads of the most probable one."""
+    pytest.importorskip("matplotlib")
+    probability = np.array([[0.0, 0.91, 0.05, 0.04, 0.0], [0.0, 0.02, 0.17, 0.81, 0.0]])
+    nothing = np.full((2, MOST, 2), np.nan)
+    nothing[:, 0] = [[0.03, 0.04], [0.123, 0.056]]
+    force = np.array([[5.0, np.nan, np.nan], [7.25, np.nan, np.nan]])
+    windows = {
+        "time": np.array([[1, 2], [2, 3]]) * S,
+        "probability": probability,
+        "distance": np.array([0.3, 1.2]),
+        "position": nothing,
+        "force": force,
+    }
+    arrays = {LOADS + name: (part, *LOAD_ARRAYS[name]) for name, part in windows.items()}
+    write_archive(tmp_path / "map.h5", FORMAT, {"session": "s.h5", "simulated": 1}, arrays)
+    page = write_track_report(tmp_path / "r.html", tmp_path / "map.h5", skin).read_text()
+    assert "No contact" not in page
+    assert page.count("<svg") == 1
+    assert "1 of 2 windows are unlike" in page
+    cells = re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", page[page.index("<tbody>") :])
+    assert cells[10:] == ["2.00", "3.00", "an edge", "0 %", "2 %", "17 %", "81 %", "0 %", "123, 56", "7.2"]
 
 
 def test_what_cannot_be_followed_is_refused_in_one_line(tmp_path, capsys):

@@ -1,5 +1,8 @@
 """What touches the skin over time, by `apply --loads`: windows, shares of the pads' force, and the command line."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +10,9 @@ import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.calibration.localisation.load_windows import WindowedFrames
+from calib.calibration.localisation.proposals import chosen_proposal
 from calib.cli import main
+from jaxeit.imaging import InverseError
 
 from ..place_logs import place_log, write_place_log
 
@@ -45,8 +50,9 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     c, out = str(tmp_path / "c.h5"), tmp_path / "out.h5"
     grid = "data/sessions/testbed_grid.h5"
     assert main(["calibrate", grid, "-o", c, "--fidelity", "draft", "--pixels", "20"]) == 0
-    assert main(["apply", c, str(session), "-o", str(out), "--loads", "0.7"]) == 0
-    assert "loads of " in capsys.readouterr().out
+    searching = ["apply", c, str(session), "-o", str(out), "--loads", "0.7", "--proposal", "none"]
+    assert main(searching) == 0
+    assert re.search(r"loads of \d+ windows: .*two \(\d+% probable\)", capsys.readouterr().out)
     arrays = calib.session.read_archive(out, "skin-forcemap").arrays
     middle = arrays["loads/time"].mean(1) / S
     probability, position, force = (arrays[f"loads/{name}"] for name in ("probability", "position", "force"))
@@ -66,7 +72,8 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     share = np.take_along_axis(force[both, :2], order, 1)[near]
     np.testing.assert_allclose(share, np.tile([15.0, 10.0], (len(share), 1)), rtol=0.25)
     assert np.isnan(arrays["loads/distance"]).all()
-    assert main(["apply", c, str(session), "-o", str(out), "--loads", "0.7", "--proposal", "testbed"]) == 0
+    assert main([*searching[:-2], "--report", str(tmp_path / "r.html")]) == 0  # the shipped network, by default
+    assert "What touched the skin" in (tmp_path / "r.html").read_text()
     proposed = calib.session.read_archive(out, "skin-forcemap").arrays
     assert (proposed["loads/distance"] < 1).all()
     told = both & (proposed["loads/probability"].argmax(1) == 2)
@@ -74,6 +81,23 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     order = np.argsort(proposed["loads/position"][told, :2, 0], axis=1)
     pair = np.take_along_axis(proposed["loads/position"][told, :2], order[..., None], 1)
     assert np.linalg.norm(pair - sites, axis=2).min(0).max() < 0.004
+
+
+def test_the_shipped_network_is_chosen_by_the_skin(skin):
+    """Whatever its name; where none fits, one line names the command that trains one."""
+    lines = []
+    renamed = replace(skin, name="mine", toml="")
+    found = chosen_proposal(je.contacts.shipped_proposal, renamed, lines.append)
+    assert found is not None
+    assert found.about["skin"] == "testbed"
+    assert chosen_proposal(None, skin, lines.append) is None
+    assert lines == []
+    other = replace(skin, sheet_resistance=151.0)
+    assert chosen_proposal(je.contacts.shipped_proposal, other, lines.append) is None
+    assert len(lines) == 1
+    assert "jaxeit train SKIN -o PROPOSAL.npz" in lines[0]
+    with pytest.raises(InverseError, match="trained for another skin"):
+        chosen_proposal(found, other, lines.append)
 
 
 def test_a_log_has_no_loads(tmp_path, capsys):

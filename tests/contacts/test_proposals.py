@@ -11,9 +11,10 @@ import pytest
 
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Proposal, Proposed, load_proposal
-from jaxeit.contacts.loads import fitter as fitting
-from jaxeit.contacts.loads.proposal import KINDS, PARAMETERS, WEIGHTS, components, skin_hash
+from jaxeit.contacts.loads.comparison import Comparison
+from jaxeit.contacts.loads.proposal import KINDS, PARAMETERS, WEIGHTS, components
 from jaxeit.imaging import InverseError
+from jaxeit.skin import skin_hash
 
 from .test_loads import TOUCHES, ready  # noqa: F401  a fixture
 
@@ -163,14 +164,20 @@ def test_a_fit_from_a_proposal_ends_where_a_search_does(ready):  # noqa: F811
 
 def test_a_proposal_that_leads_astray_is_not_followed(ready, monkeypatch):  # noqa: F811
     """Neither outside of its scenes, nor where what it proposes explains nothing."""
-    fitter, _, frames, _ = ready
-    calls, searched = [], fitter.refine(frames[0], proposed(LoadKind.ONE, [(np.array([0.09, 0.12]), 20.0)]))
-    monkeypatch.setattr(fitting._Search, "loads", lambda self: calls.append(self) or searched)
+    fitter, finder, frames, _ = ready
+    contacts, search, calls = finder(frames[0]), Comparison.searched, []
+    searched = fitter(frames[0], contacts)
+    monkeypatch.setattr(Comparison, "searched", lambda self: calls.append(self) or search(self))
     far = proposed(LoadKind.ONE, [(np.array([0.1, 0.1]), 10.0)], distance=1.5)
-    assert fitter.refine(frames[0], far) is searched
+    np.testing.assert_array_equal(fitter.refine(frames[0], far, contacts).probability, searched.probability)
+    right = proposed(LoadKind.ONE, [(np.array([0.09, 0.12]), 20.0)])
+    np.testing.assert_allclose(fitter.refine(frames[0], right, contacts).one.position, searched.one.position, atol=1e-4)
+    assert len(calls) == 1
     wrong = proposed(LoadKind.ONE, [(np.array([0.18, 0.02]), 10.0)])
-    np.testing.assert_allclose(fitter.refine(frames[-1], wrong).one.position, searched.one.position)
+    found = fitter.refine(frames[0], wrong, contacts)
     assert len(calls) == 2
+    np.testing.assert_allclose(found.one.position, searched.one.position, atol=1e-6)
+    assert float(found.one.misfit) <= float(searched.one.misfit) + 1e-6
 
 
 def test_frames_without_a_search_and_without_contact(ready):  # noqa: F811

@@ -104,6 +104,7 @@ def calibration(monkeypatch, skin):
         current=1.0,
         frequency=0.0,
         reading_time=1e-5,
+        mixing=None,
     )
     corners = 0.1 * np.array([[0, 0], [1, 0], [1, 2], [0, 2]])
     pads = [je.Pad("left", corners), je.Pad('<b>"right"', corners + np.array([0.1, 0.0]))]
@@ -121,6 +122,9 @@ def calibration(monkeypatch, skin):
             electrodes=(),
             electrode_positions=positions,
             protocol=protocol,
+            sheet_resistance=150.0,
+            pressure_sensor=je.skin.PressureSensor(),
+            surface=None,
         ),
         recon=recon,
         masks=stand_in(je.PadMasks, weights=weights),
@@ -138,8 +142,8 @@ def arrival(pressure, host=0, voltage=0.0):
     return ReceivedFrame(np.full(READINGS, float(voltage)), np.asarray(pressure, float), host)
 
 
-def rested(calibration, programs=FakePrograms):
-    engine = Engine(calibration, 0.5, programs)
+def rested(calibration, programs=FakePrograms, **how):
+    engine = Engine(calibration, 0.5, programs, **how)
     assert engine.step(arrival([10.0, 20.0], 0)) is None
     assert engine.step(arrival([12.0, 20.0], S)) is None
     assert not engine.resting
@@ -236,7 +240,8 @@ def test_live_that_is_joined_in_mid_press_finds_its_zero(calibration):
             if told and abs(result.force[0]) < 1:
                 show.stop.set()
 
-        run_live(calibration, *sources_of(device, calibration), [publish], show, LiveSettings(rest=0.3))
+        settings = LiveSettings(rest=0.3, proposal=None)
+        run_live(calibration, *sources_of(device, calibration), [publish], show, settings)
     assert results[-1].force[0] == 0.0
     assert min(result.force[0] for result in results) == -10.0
     assert not any(result.valid[0] for result in results if result.force[0] < -2)
@@ -311,6 +316,27 @@ def test_frames_without_time_for_their_contacts_are_counted(calibration, monkeyp
     engine._search_end = 0.0  # long ago: now it is done at the cost of a frame
     engine.use_spare_time(0.005)
     assert len(engine._programs.searched) == 1
+
+
+def test_a_network_tells_what_touches_the_skin(calibration):
+    """It sees the change of the readings that are used and the forces, and nothing of a skin that nothing touches."""
+    seen = []
+
+    class Told(je.contacts.Proposal):
+        def __call__(self, dv, pad_forces=None):
+            seen.append((dv, pad_forces))
+            loads = [np.zeros((rows, size)) for rows, size in ((1, 4), (2, 4), (1, 6), (3, 4))]
+            return je.contacts.Proposed(np.array([0.0, 0.8, 0.15, 0.05, 0.0]), *loads, distance=np.array(1.5))
+
+    tell = stand_in(Told)
+    engine = rested(calibration, proposal=tell)
+    assert engine.step(arrival([11.0, 20.0])).kinds is None
+    result = engine.step(arrival([31.0, np.nan], voltage=3.0))
+    assert len(seen) == 1
+    np.testing.assert_array_equal(seen[0][0], [np.nan, *[3.0] * (READINGS - 1)])
+    np.testing.assert_array_equal(seen[0][1], [20.0, np.nan])
+    expected = {"none": 0.0, "one": 0.8, "two": 0.15, "edge": 0.05, "more": 0.0, "unlike": True}
+    assert json.loads(result.to_json())["kinds"] == expected
 
 
 def test_missing_readings_are_counted_of_those_that_are_used(calibration):

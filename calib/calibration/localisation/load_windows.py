@@ -80,6 +80,7 @@ class SeenLoads:
 
     arrays: dict[str, tuple[Any, str, str]]
     kinds: tuple[LoadKind, ...]
+    stated: tuple[float, ...]  # probability of each of these kinds
     why_none: str = ""
     outside: int = 0  # windows that are unlike the scenes of the proposal
 
@@ -87,10 +88,14 @@ class SeenLoads:
         """What touched the skin, in one line."""
         if self.why_none:
             return f"loads: none fitted: {self.why_none}"
-        counts = ((kind.name.lower(), self.kinds.count(kind)) for kind in LoadKind)
-        seen = ", ".join(f"{count} {name}" for name, count in counts if count)
+        seen = ", ".join(self._told(kind) for kind in LoadKind if kind in self.kinds)
         unlike = f"; {self.outside} are unlike what the proposal was trained on" if self.outside else ""
         return f"loads of {len(self.kinds)} windows: {seen}{unlike}"
+
+    def _told(self, kind: LoadKind) -> str:
+        """How many windows are of a kind, and its mean probability there."""
+        stated = [probability for one, probability in zip(self.kinds, self.stated, strict=True) if one is kind]
+        return f"{len(stated)} {kind.name.lower()} ({np.mean(stated):.0%} probable)"
 
 
 def fit_windows(
@@ -100,41 +105,44 @@ def fit_windows(
     noise = seen.quiet.noise
     if noise is None or not seen.windows:
         why = "no frames without contact tell the noise" if noise is None else "nothing touches the skin for that long"
-        return SeenLoads({}, (), why)
+        return SeenLoads({}, (), (), why)
     sound = np.isfinite([window.frame for window in seen.windows]).all(0)
     channels = np.asarray(calibration.recon.channels) & (noise > 0) & sound
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
     fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels)
-    if proposal is None:
-        finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
-        found = [_searched(fitter, finder, window, channels) for window in progress(seen.windows)]
-    else:
-        found = [_refined(fitter, proposal, window, channels) for window in progress(seen.windows)]
+    finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
+    found = [_found(fitter, finder, proposal, window, channels) for window in progress(seen.windows)]
     loads, distance = zip(*found, strict=True)
     outside = int(np.sum(np.array(distance) > 1))
-    return SeenLoads(_arrays(seen.windows, found), tuple(one.kind for one in loads), outside=outside)
+    kinds, stated = zip(*((one.kind, float(np.max(one.probability))) for one in loads), strict=True)
+    return SeenLoads(_arrays(seen.windows, found), kinds, stated, outside=outside)
 
 
 # Loads of a window, and how far it is from the scenes of a proposal; NaN: there is none.
 Found = tuple[Loads, float]
 
 
-def _searched(fitter: je.contacts.LoadFitter, finder: je.ContactFinder, window: Window, channels: np.ndarray) -> Found:
+def _found(
+    fitter: je.contacts.LoadFitter,
+    finder: je.ContactFinder,
+    proposal: Proposal | None,
+    window: Window,
+    channels: np.ndarray,
+) -> Found:
     frame = np.where(channels, window.frame, 0.0)
-    return fitter(frame, finder(frame)), np.nan
-
-
-def _refined(fitter: je.contacts.LoadFitter, proposal: Proposal, window: Window, channels: np.ndarray) -> Found:
+    contacts = finder(frame)
+    if proposal is None:
+        return fitter(frame, contacts), np.nan
     proposed = proposal(np.where(channels, window.frame, np.nan), window.pads)
-    return fitter.refine(np.where(channels, window.frame, 0.0), proposed), float(proposed.distance)
+    return fitter.refine(frame, proposed, contacts), float(proposed.distance)
 
 
 def _arrays(windows: list[Window], found: list[Found]) -> dict[str, tuple[Any, str, str]]:
     rows = [dict(_row(window, *one)) for window, one in zip(windows, found, strict=True)]
     columns = {name: np.stack([row[name] for row in rows]) for name in ABOUT}
-    return {f"loads/{name}": (columns[name], *about) for name, about in ABOUT.items()}
+    return {name: (columns[name], *about) for name, about in ABOUT.items()}
 
 
 ABOUT = {

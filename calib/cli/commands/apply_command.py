@@ -3,13 +3,11 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
+from ..arguments import above_zero, add_proposal_argument, prepare_outputs, proposal_of, require_matplotlib_for
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar
 
 if TYPE_CHECKING:
-    from jaxeit.contacts import Proposal
-
     from ...calibration import LogCalibration
 
 
@@ -22,11 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help=text)
     text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of so many seconds"
     parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
-    text = "with --loads: begin the fits where a network proposes, from jaxeit train; several times as quick"
-    parser.add_argument("--proposal", metavar="PROPOSAL.npz", help=text)
+    add_proposal_argument(parser, "with --loads: the network of jaxeit train, where fits begin")
     text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
     parser.add_argument("--track", action="store_true", help=text)
-    text = "write an HTML report of the contacts that are followed: paths and forces; needs --track"
+    text = (
+        "write an HTML report: paths and forces of the contacts that are followed (--track), probabilities of --loads"
+    )
     parser.add_argument("--report", metavar="REPORT.html", help=text)
     add_low_pass_argument(parser)
 
@@ -53,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
             ignore_errors=args.force,
             progress=progress_bar("frames"),
             loads=args.loads,
-            proposal=_proposal_of(args),
+            proposal=proposal_of(args.proposal),
             track=args.track,
             tell=print,
         )
@@ -66,18 +65,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _proposal_of(args: argparse.Namespace) -> "Proposal | None":
-    from jaxeit.contacts import load_proposal
-
-    return None if args.proposal is None else load_proposal(args.proposal)
-
-
 def _check_report(args: argparse.Namespace) -> None:
     if args.proposal is not None and args.loads is None:
         raise ValueError("--proposal: it is where fits of loads begin; add --loads SECONDS")
     if args.report is not None:
-        if not args.track:
-            raise ValueError("--report: it is about contacts that are followed; add --track")
+        if not args.track and args.loads is None:
+            raise ValueError("--report: it is about contacts; add --track, which follows them, or --loads SECONDS")
         require_matplotlib_for("--report")
 
 

@@ -5,7 +5,7 @@ import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_outputs
+from ..arguments import above_zero, add_proposal_argument, prepare_outputs, proposal_of
 from ..signals import orderly_end
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--event-driven", action="store_true", help=text)
     text = "follow contacts from frame to frame: each keeps its number, with ellipse and force"
     parser.add_argument("--track", action="store_true", help=text)
+    add_proposal_argument(parser, "the network of jaxeit train that tells what touches the skin, in each frame")
     text = "let zero and relative gains of the pads follow their drift, and write the moved calibration"
     parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
     text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
@@ -84,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
                 rest=args.rest,
                 wait=args.wait,
                 track=args.track,
+                proposal=proposal_of(args.proposal),
                 recalibrate=args.recalibrate is not None,
                 moved=args.recalibrate,
             ),

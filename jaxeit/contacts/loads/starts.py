@@ -13,7 +13,7 @@ from ...effects.material import ContactPiezoresistance
 from ..result import Contacts
 
 if TYPE_CHECKING:
-    from .fitter import Fit
+    from .comparison import Fit
 
 MIN_REACH, MAX_REACH = 0.5, 1.6  # of the halves of a split load from its middle, in its widths
 

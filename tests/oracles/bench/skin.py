@@ -1,6 +1,7 @@
-"""The skin as its TOML text describes it: a rectangle with round bolts on a grid and rectangular pads.
+"""The skin as its TOML text describes it: a rectangle with round bolts and rectangular pads.
 
-Only what the testbed needs is read; anything else raises `KeyError` or `ValueError`.
+Only what the testbed and the chest need is read; anything else raises `KeyError` or `ValueError`. A sheet that is bent
+to a cylinder conducts as it does when flat.
 """
 
 import tomllib
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-TESTBED = Path(__file__).parents[3] / "jaxeit" / "skin" / "skins" / "testbed.toml"
+SKINS = Path(__file__).parents[3] / "jaxeit" / "skin" / "skins"
+TESTBED, CHEST = SKINS / "testbed.toml", SKINS / "chest.toml"
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ def read_skin(path: Path = TESTBED) -> Skin:
     sheet, electrodes, protocol = table["sheet"], table["electrodes"], table["protocol"]
     if (sheet["shape"], electrodes["kind"], protocol["pattern"]) != ("rectangle", "bolt", "adjacent"):
         raise ValueError(f"{path}: this simulator knows rectangles with bolts and the adjacent pattern only")
-    bolts = _grid(**electrodes["grid"])
+    if sheet.get("surface", {"kind": "cylinder"})["kind"] != "cylinder":
+        raise ValueError(f"{path}: this simulator knows sheets that are flat or bent to a cylinder only")
+    bolts = np.array(electrodes["positions"]) if "positions" in electrodes else _grid(**electrodes["grid"])
     return Skin(
         text=text,
         name=table["name"],

@@ -1,0 +1,30 @@
+"""Which network proposes what touches a skin."""
+
+from collections.abc import Callable
+
+import jaxeit as je
+from jaxeit.contacts import Proposal
+
+# A proposal, one that depends on the skin (None: none fits it), or None: none is wanted.
+ProposalChoice = Proposal | Callable[[je.Skin], Proposal | None] | None
+
+
+def chosen_proposal(choice: ProposalChoice, skin: je.Skin, tell: Callable[[str], object]) -> Proposal | None:
+    """The proposal to use for a skin.
+
+    Args:
+        choice: see `ProposalChoice`.
+        tell: called with a line where a proposal is wanted and none fits the skin.
+
+    Raises:
+        InverseError: if the proposal was trained for another skin.
+    """
+    found = choice if choice is None or isinstance(choice, Proposal) else choice(skin)
+    if found is not None:
+        found.require_skin(skin)
+    elif choice is not None:
+        tell(
+            f"note: no network is shipped that proposes what touches the skin {skin.name}; train one with "
+            "`jaxeit train SKIN -o PROPOSAL.npz`, and give it as --proposal PROPOSAL.npz"
+        )
+    return found
