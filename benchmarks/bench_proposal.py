@@ -127,7 +127,7 @@ class Ready(NamedTuple):
 
 def ways(run: Run) -> Iterator[Row]:
     """Each way to tell what touches the skin, on the same frames."""
-    skins, singles, others = run.sizes((4, 8, 3), (1, 1, 1))
+    skins, singles, others = run.sizes((6, 8, 3), (1, 1, 1))
     for name in SHIPPED:
         every = []
         for seed in range(FIRST_SEED, FIRST_SEED + skins):

@@ -13,6 +13,7 @@ from .figures.parts import MM
 from .html_parts import html_table, number_text
 
 MOST_WINDOWS = 60  # in the table
+LEGEND = 0.3  # height of the legend, over that of all probabilities
 NAMES = {
     LoadKind.NONE: "nothing",
     LoadKind.ONE: "one contact",
@@ -59,8 +60,9 @@ def panel_of_kinds(windows: Windows, *, simulated: bool) -> Panel:
         colour = "#9e9e9e" if kind is LoadKind.NONE else SERIES[kind - 1]
         axes.bar(begin, share, end - begin, bottom, align="edge", color=colour, label=name, lw=0)
         bottom += share
-    axes.set(xlabel="time, s", ylabel="probability", ylim=(0, 1), title="What touched the skin")
-    axes.legend(ncols=3, fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.22))
+    axes.set(xlabel="time, s", ylabel="probability", ylim=(0, 1 + LEGEND), title="What touched the skin")
+    axes.set_yticks(np.linspace(0, 1, 6))
+    axes.legend(ncols=3, fontsize=8, frameon=False, loc="upper center")
     return panel(figure, axes, "kinds", "Probabilities of what touched the skin over time")
 
 

@@ -48,6 +48,8 @@ HOST = {
     "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
     "prepare_loads": _PREPARES,
     "load_proposal": _DESCRIBES,
+    "shipped_proposal": _DESCRIBES,
+    "skin_hash": _DESCRIBES,
     "Proposal": "a network in NumPy, on the host",
     "prepare_tracker": _PREPARES,
     "press_evidence": "counts the evaluations of a search on the host, and says so under jit",

@@ -15,7 +15,7 @@ from .bench import Bench, Faults, contact, motion, pads, simulate, write
 from .bench.__main__ import main
 from .bench.mesh import doubled_areas, make_mesh
 from .bench.sheet import assemble, green, make_sheet, mean_potentials, readings, touched
-from .bench.skin import read_skin
+from .bench.skin import CHEST, read_skin
 
 COARSE = 5e-3
 
@@ -43,6 +43,18 @@ def sheet(mesh, testbed):
 def test_the_description_is_read_as_the_library_reads_it(testbed, skin):
     np.testing.assert_array_equal(testbed.pattern, skin.protocol.pattern)
     np.testing.assert_allclose(testbed.bolts, [e.position for e in skin.electrodes], atol=1e-12)
+
+
+def test_a_bent_sheet_with_bolts_in_a_list_is_read_as_the_library_reads_it():
+    chest, ours = read_skin(CHEST), je.load_skin("chest")
+    np.testing.assert_array_equal(chest.pattern, ours.protocol.pattern)
+    np.testing.assert_array_equal(chest.bolts, ours.electrode_positions)
+    mesh = make_mesh(chest, chest.bolts, COARSE)
+    sheet = make_sheet(mesh, uneven(mesh.points[mesh.triangles].mean(1)), chest.contact)
+    found = readings(sheet.untouched, chest.pattern, chest.current)
+    model = je.discretise(je.Scene(ours), je.Fidelity.draft())
+    error = np.asarray(je.forward(model, uneven(model.centroids))) - found
+    assert np.linalg.norm(error) < 2e-2 * np.linalg.norm(found)
 
 
 def test_the_mesh_covers_the_sheet_and_the_bolts(mesh, testbed):
