@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.contacts import LoadKind, Proposal, Proposed, load_proposal
+from jaxeit.contacts import LoadKind, Proposal, Proposed, load_proposal, shipped_proposal
 from jaxeit.contacts.loads.comparison import Comparison
-from jaxeit.contacts.loads.proposal import KINDS, PARAMETERS, WEIGHTS, components
+from jaxeit.contacts.loads.proposal import KINDS, PARAMETERS, PROPOSALS, WEIGHTS, components
 from jaxeit.imaging import InverseError
-from jaxeit.skin import skin_hash
+from jaxeit.skin import parse_skin, skin_hash
 
 from .test_loads import TOUCHES, ready  # noqa: F401  a fixture
 
@@ -103,6 +103,19 @@ def test_a_file_gives_the_same_proposal(proposal, skin, tmp_path):
     found.require_skin(skin)
     with pytest.raises(InverseError, match=r"trained for another skin \(testbed\) than chest; train one"):
         found.require_skin(je.load_skin("chest"))
+
+
+@pytest.mark.parametrize(("name", "other"), [("testbed", "chest"), ("chest", "testbed")])
+def test_shipped_proposals_are_small_and_for_their_skin_alone(name, other):
+    found, ours = load_proposal(name), je.load_skin(name)
+    assert (PROPOSALS / f"{name}.npz").stat().st_size < 600_000
+    commented = parse_skin(f"# mine\n{ours.toml}")
+    found.require_skin(commented)
+    assert shipped_proposal(commented).about == found.about
+    with pytest.raises(InverseError, match=rf"trained for another skin \({name}\) than {other}; train one"):
+        found.require_skin(je.load_skin(other))
+    assert shipped_proposal(replace(ours, sheet_resistance=99.0)) is None
+    assert found(np.zeros(ours.protocol.readings)).kind is LoadKind.NONE
 
 
 def test_what_is_no_proposal_is_refused(proposal, tmp_path):
