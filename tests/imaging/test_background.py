@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxeit.imaging.absolute.background import fit_background
 
 import jaxeit as je
+from jaxeit.imaging.absolute.background import fit_background
 from jaxeit.imaging.noise import InverseError
 
 from ..helpers import square_model

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxeit.imaging.absolute.background import frame_error
 
 import jaxeit as je
 from jaxeit.imaging import InverseError, ReferenceSettings, fit_reference
+from jaxeit.imaging.absolute.background import frame_error
 
 from ..helpers import skin_of
 from ..oracles.disc import even_disc
