@@ -131,13 +131,13 @@ def ways(run: Run) -> Iterator[Row]:
     for name in SHIPPED:
         every = []
         for seed in range(FIRST_SEED, FIRST_SEED + skins):
-            for touch, frame, ready in _frames(name, seed, singles, others):
+            for touch, frame, ready in noisy_frames(name, seed, singles, others):
                 every += [{"way": way} | judged(touch, answer) for way, answer in _answers(frame, ready)]
             print(f"{name} {seed}", flush=True)
         yield {"rows": [{"skin": name} | row for row in _means(every)], "ways_reliability": _stated(name, every)}
 
 
-def _frames(name: str, seed: int, singles: int, others: int) -> Iterator[tuple[Touch, np.ndarray, Ready]]:
+def noisy_frames(name: str, seed: int, singles: int, others: int) -> Iterator[tuple[Touch, np.ndarray, Ready]]:
     """Touches of `NAMES` on the skin of a seed, with a noisy frame each."""
     rng = np.random.default_rng(seed)
     given = [touch for touch in touched(name, rng, singles, others) if touch.name in NAMES]
@@ -168,7 +168,7 @@ def _fitted(found: Loads) -> Answer:
 def times(run: Run) -> Iterator[Row]:
     """Milliseconds a frame of each way, on the testbed."""
     (singles, others), rows = run.sizes((6, 2), (1, 1)), []
-    for touch, frame, ready in _frames("testbed", FIRST_SEED - 1, singles, others):
+    for touch, frame, ready in noisy_frames("testbed", FIRST_SEED - 1, singles, others):
         ready.refined(frame)  # what is compiled is compiled
         for way, tell in ((FITS, ready.searched), (NETWORK, ready.proposal), (BOTH, ready.refined)):
             spent, _ = seconds(lambda tell=tell, frame=frame: jax.block_until_ready(tell(frame)))
