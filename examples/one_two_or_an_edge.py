@@ -32,8 +32,8 @@ v0 = readings(np.array([[-1.0, -1.0]]))  # nothing on the sheet
 noise = 1e-3 * np.sqrt(np.mean(v0**2))
 rng = np.random.default_rng(1)
 
-proposal = je.contacts.load_proposal("testbed")  # `jaxeit train SKIN -o proposal.npz` makes one for another skin
-proposal.require_skin(je.load_skin("testbed"))
+# The shipped network of this skin; `jaxeit train SKIN -o proposal.npz` makes one for another skin.
+proposal = je.contacts.shipped_proposal(je.load_skin("testbed"))
 probabilities, errors = {}, {}
 for name, places in touches.items():
     found = proposal(readings(places) - v0 + noise * rng.normal(size=len(v0)))

@@ -3,4 +3,9 @@
 from .engine import Engine as Engine
 from .loop import LiveControl as LiveControl, LiveError as LiveError, LiveSettings as LiveSettings, run_live as run_live
 from .presentation import Presentation as Presentation, present as present
-from .results import FrameResult as FrameResult, LogResult as LogResult, TouchEstimates as TouchEstimates
+from .results import (
+    FrameResult as FrameResult,
+    KindEstimate as KindEstimate,
+    LogResult as LogResult,
+    TouchEstimates as TouchEstimates,
+)

@@ -1,6 +1,7 @@
 """The live page: its structure, and what it shows and how it is used in a headless browser, where one is installed."""
 
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from calib.calibration.press_examples import PressExamples
 from calib.live.loop import LiveControl
 from calib.live.page import Page, whole_page
 from calib.live.page_scene import full_scales, page_scene, rounded_up
-from calib.live.results import FrameResult, LogResult, TouchEstimates
+from calib.live.results import FrameResult, KindEstimate, LogResult, TouchEstimates
 from tests.browser import Browser, browser_path
 from tests.helpers import stand_in
 
@@ -336,6 +337,17 @@ def test_a_screen_reader_is_told_contacts_forces_and_histories(tab, page):
     shown(tab, page, result(3, force=np.zeros(2), tracked=False))
     tab.value("$('say').checked = false, say()")
     assert tab.value("$('said').textContent") == said
+
+
+@needs_browser
+def test_what_touches_the_skin_is_told_with_probabilities(tab, page):
+    kinds = KindEstimate(np.array([0.0, 0.15, 0.8, 0.04, 0.01]), False)
+    shown(tab, page, replace(result(2), kinds=kinds))
+    assert tab.value("$('kinds').textContent") == "what touches the skin: two contacts 80 %, one contact 15 %"
+    shown(tab, page, replace(result(3), kinds=KindEstimate(kinds.probability, True)))
+    assert "unlike" in tab.value("$('kinds').textContent")
+    shown(tab, page, result(4))
+    assert tab.value("$('kinds').hidden")
 
 
 @needs_browser
