@@ -14,6 +14,7 @@ from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import MOST, SIZE, Form, elongations, line, pressure, shape_directions, spot
 from jaxeit.imaging import InverseError
 from jaxeit.model.forward_model import coefficients, transfer
+from tests.compiled import compiled
 
 TIPS = 9  # that an edge is simulated by
 GAIN = je.effects.ContactGain(0.12, 0.015, seed=71)
@@ -143,21 +144,21 @@ def grid_of_sheet(step=5e-4):
 def test_pressure_of_loads_sums_to_their_force():
     points, area = grid_of_sheet()
     for one in (SPOT, LONG):
-        assert float(jnp.sum(line(one, points)) * area) == pytest.approx(7.0, rel=1e-6)
-    assert float(jnp.sum(pressure(*rows(SPOT, LONG), points)) * area) == pytest.approx(14.0, rel=1e-6)
+        assert float(jnp.sum(compiled(line, one, points)) * area) == pytest.approx(7.0, rel=1e-6)
+    assert float(jnp.sum(compiled(pressure, *rows(SPOT, LONG), points)) * area) == pytest.approx(14.0, rel=1e-6)
     short = SPOT.at[4].set(1e-6)
-    np.testing.assert_allclose(line(short, points), spot(SPOT, points), rtol=1e-4, atol=1.0)
+    np.testing.assert_allclose(compiled(line, short, points), compiled(spot, SPOT, points), rtol=1e-4, atol=1.0)
 
 
 def test_unknown_shapes_change_neither_force_nor_place_nor_width():
     """Moments by quadrature; and they are orthonormal with the Gaussian's inverse as weight."""
     points, area = grid_of_sheet()
-    bent = np.asarray(shape_directions(*rows(SPOT), points))[..., : 2 + 4]
+    bent = np.asarray(compiled(shape_directions, *rows(SPOT), points))[..., : 2 + 4]
     away = (np.asarray(points) - 0.1) / 0.01
     for moment in (np.ones(points.shape[:2]), *np.moveaxis(away, -1, 0), (away**2).sum(-1)):
         total = np.einsum("xyd,xy->d", bent, moment) * area / 7.0
         np.testing.assert_allclose(total, 0, atol=1e-7)
-    product = np.einsum("xyd,xye,xy->de", bent, bent, 1 / np.asarray(spot(SPOT, points))) * area / 7.0
+    product = np.einsum("xyd,xye,xy->de", bent, bent, 1 / np.asarray(compiled(spot, SPOT, points))) * area / 7.0
     np.testing.assert_allclose(product[:4, :4], np.eye(4), atol=1e-6)
     assert product[4, 5] == pytest.approx(0, abs=1e-9)
 
@@ -168,9 +169,9 @@ def test_halves_of_a_split_load_have_the_moments_of_elongations():
     step = 0.15 * 0.01 * jnp.array([np.cos(0.4), np.sin(0.4)])
     width = 0.5 * jnp.log(jnp.exp(2 * SPOT[2]) - 0.5 * step @ step)
     halves = [SPOT.at[:2].add(way * step).at[2].set(width).at[3].add(-np.log(2.0)) for way in (1, -1)]
-    change = np.asarray(pressure(*rows(*halves), points) - spot(SPOT, points))
+    change = np.asarray(compiled(pressure, *rows(*halves), points) - compiled(spot, SPOT, points))
     u = np.asarray(step) / 0.01
-    expected = np.asarray(elongations(SPOT, points)) @ np.array([(u[0] ** 2 - u[1] ** 2) / 2, u[0] * u[1]])
+    expected = np.asarray(compiled(elongations, SPOT, points)) @ np.array([(u[0] ** 2 - u[1] ** 2) / 2, u[0] * u[1]])
     assert np.abs(change - expected).max() < 0.05 * np.abs(expected).max()
 
 
@@ -180,8 +181,10 @@ def test_slopes_are_those_of_the_forward_map(ready, loads):
     sheet = ready[0].sheet
     theta, forms = rows(*loads)
     by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MOST * SIZE)
-    known = sheet.unknowns(theta, forms)
-    np.testing.assert_allclose(known.value, sheet.response(theta, forms), atol=1e-6 * float(jnp.abs(known.value).max()))
+    known = compiled(sheet.unknowns, theta, forms)
+    np.testing.assert_allclose(
+        known.value, compiled(sheet.response, theta, forms), atol=1e-6 * float(jnp.abs(known.value).max())
+    )
     used = np.flatnonzero(np.abs(by_jax).max(0) > 0)
     error = np.linalg.norm(known.loads - by_jax, axis=0)[used] / np.linalg.norm(by_jax, axis=0)[used]
     assert error.max() < 0.03  # elements away from the loads are left out
@@ -193,10 +196,10 @@ def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     model = fitter.sheet.model
     sheet = prepare_loads(model, noise=noise).sheet
     theta, forms = rows(SPOT)
-    white = lambda sigma: sheet.white(transfer(model, coefficients(model, sigma)))  # noqa: E731
+    white = jax.jit(lambda sigma: sheet.white(transfer(model, coefficients(model, sigma))))
     factor = sheet._pressed(theta, forms, jnp.ones_like(sheet.sigma), sheet.points)
     change = lambda mode: (lambda s: white(s * factor) - white(s))(sheet.sigma * jnp.exp(sheet.coat[:, mode]))  # noqa: E731
-    slopes = sheet.unknowns(theta, forms).nuisances[:, -sheet.coat.shape[1] :]
+    slopes = compiled(sheet.unknowns, theta, forms).nuisances[:, -sheet.coat.shape[1] :]
     strongest = int(jnp.argmax(jnp.linalg.norm(slopes, axis=0)))
     seen = change(strongest) - (white(sheet.sigma * factor) - white(sheet.sigma))
     assert np.linalg.norm(seen - slopes[:, strongest]) < 0.25 * np.linalg.norm(seen)

@@ -11,6 +11,7 @@ from jaxeit.model.bases import Elements
 from jaxeit.model.sensitivity import pair_jacobian
 from jaxeit.tracking.reanalysis import prepare_reanalysis
 from jaxeit.tracking.response import load_pressure
+from tests.compiled import compiled
 
 LOADS = jnp.array([[0.07, 0.09, np.log(0.012), np.log(15.0), 0, 0], [0.1, 0.1, np.log(0.01), np.log(8.0), 6e-3, 3e-3]])
 
@@ -46,7 +47,7 @@ def first_order(model, whitened):
 
 def test_with_all_unknowns_reanalysis_is_the_forward_map(model, whitened, sheet, touched, first_order):
     change, elements = touched
-    found = sheet.beyond(elements, _all_unknowns(sheet), change[elements])
+    found = compiled(sheet.beyond, elements, _all_unknowns(sheet), change[elements])
     moved = je.forward(model, model.background + change) - je.forward(model, model.background)
     exact = whitened.compress @ whitened.whitening.sums(moved)
     assert jnp.linalg.norm(exact) > 500
@@ -55,7 +56,7 @@ def test_with_all_unknowns_reanalysis_is_the_forward_map(model, whitened, sheet,
 
 def test_slopes_along_a_coat_are_those_of_the_forward_map(model, whitened, sheet, touched):
     change, elements = touched
-    after = sheet.potential_after(elements, _all_unknowns(sheet), change[elements])
+    after = compiled(sheet.potential_after, elements, _all_unknowns(sheet), change[elements])
     along = model.background * jnp.sin(30 * model.centroids).T
 
     def readings(sigma):
@@ -63,17 +64,21 @@ def test_slopes_along_a_coat_are_those_of_the_forward_map(model, whitened, sheet
 
     pressed = model.background + change
     wanted = (readings(pressed + 1e-5 * along[0]) - readings(pressed - 1e-5 * along[0])) / 2e-5
-    np.testing.assert_allclose(sheet.slopes_along(along, after)[0], wanted, atol=1e-6 * float(jnp.linalg.norm(wanted)))
+    np.testing.assert_allclose(
+        compiled(sheet.slopes_along, along, after)[0], wanted, atol=1e-6 * float(jnp.linalg.norm(wanted))
+    )
 
 
 def test_fewer_unknowns_err_less_than_noise(sheet, touched):
     change, elements = touched
-    every = sheet.beyond(elements, _all_unknowns(sheet), change[elements]).readings
+    every = compiled(sheet.beyond, elements, _all_unknowns(sheet), change[elements]).readings
     around = jnp.zeros(len(sheet.green)).at[sheet.dofs].max(change[:, None])
     errors = []
     for size in (48, 96, 192):
         chosen = jax.lax.top_k(around, size)[1]
-        errors.append(float(jnp.linalg.norm(sheet.beyond(elements, chosen, change[elements]).readings - every)))
+        errors.append(
+            float(jnp.linalg.norm(compiled(sheet.beyond, elements, chosen, change[elements]).readings - every))
+        )
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 1 < jnp.linalg.norm(every)
 
@@ -81,9 +86,9 @@ def test_fewer_unknowns_err_less_than_noise(sheet, touched):
 def test_what_occurs_twice_counts_once(sheet, touched):
     change, elements = touched
     few, unknowns = elements[:150], jnp.unique(sheet.dofs[elements[:150]])
-    once = sheet.beyond(few, unknowns, change[few]).readings
+    once = compiled(sheet.beyond, few, unknowns, change[few]).readings
     both, twice = jnp.concatenate([few, few[:40]]), jnp.concatenate([unknowns, unknowns[:30]])
-    again = sheet.beyond(both, twice, jnp.concatenate([change[few], jnp.zeros(40)])).readings
+    again = compiled(sheet.beyond, both, twice, jnp.concatenate([change[few], jnp.zeros(40)])).readings
     np.testing.assert_allclose(again, once, atol=1e-8)
 
 
@@ -92,9 +97,9 @@ def test_slopes_of_reanalysis_are_differences(sheet, touched):
     few = elements[:150]
     unknowns, size = jnp.unique(sheet.dofs[few]), 1e-5
     direction = jnp.sin(jnp.arange(150.0)) * change[few]
-    sides = [sheet.beyond(few, unknowns, change[few] + s * size * direction).readings for s in (1, -1)]
-    found = sheet.beyond(few, unknowns, change[few])
-    slope = sheet.beyond_slopes(found, direction[None])[0]
+    sides = [compiled(sheet.beyond, few, unknowns, change[few] + s * size * direction).readings for s in (1, -1)]
+    found = compiled(sheet.beyond, few, unknowns, change[few])
+    slope = compiled(sheet.beyond_slopes, found, direction[None])[0]
     np.testing.assert_allclose(slope, (sides[0] - sides[1]) / (2 * size), atol=1e-6 * float(jnp.linalg.norm(slope)))
 
 
@@ -132,14 +137,14 @@ def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, 
     v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
     wanted = tracker.filter.compress @ (v - blank[0])
     gain = jnp.zeros(exact.modes.shape[1])
-    found = exact.shown(LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    found = compiled(exact.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
 def test_single_precision_errs_below_a_tenth_of_the_noise(tracker, exact):
     gain = jnp.zeros(exact.modes.shape[1])
-    single = tracker.filter.sheet.shown(LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
-    double = exact.shown(LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    single = compiled(tracker.filter.sheet.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    double = compiled(exact.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
     assert single.dtype == double.dtype
     assert jnp.max(jnp.abs(single - double)) < 0.1
 
@@ -148,7 +153,7 @@ def test_a_load_on_a_pad_is_felt_by_it(tracker):
     """The pads of the testbed cover its quarters, but for gaps."""
     sheet = tracker.filter.sheet
     load = jnp.array([[0.05, 0.05, np.log(0.008), np.log(10.0), 0, 0]])
-    found = sheet.shown(load, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.near(load))
+    found = compiled(sheet.shown, load, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.near(load))
     np.testing.assert_allclose(sorted(found.pads), [0, 0, 0, 10], atol=0.3)
 
 
