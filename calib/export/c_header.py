@@ -1,9 +1,12 @@
 """A calibration as one C99 header without allocation: one frame to image, force map and pad forces in float32.
 
-The functions are those of `frame.h` beside this file; the tables are written here.
+The functions are those of `frame.h` and, for a correction by location, of `location.h` beside this file; the tables are
+written here.
 """
 
 import re
+import textwrap
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +15,12 @@ from numpy.typing import DTypeLike
 
 from ..calibration import Calibration, LogCalibration
 from ..session import replacing
+from .c_fields import LocationInC
 from .c_numbers import Numbers, numbers_of
 from .errors import ExportError
+from .image_places import consequences, with_image_places
 
-TEMPLATE = Path(__file__).with_name("frame.h")
+TEMPLATE, LOCATION = (Path(__file__).with_name(name) for name in ("frame.h", "location.h"))
 MAX_MISSING = 16  # as in the template
 _PREFIX = re.compile(r"[a-z][a-z0-9_]{0,30}")
 _TYPES: dict[str, tuple[DTypeLike, int]] = {
@@ -60,18 +65,27 @@ class HeaderSizes:
 
 
 def export_c(
-    calibration: Calibration | LogCalibration, path: str | Path, *, prefix: str = "skin", without_location: bool = False
+    calibration: Calibration | LogCalibration,
+    path: str | Path,
+    *,
+    prefix: str = "skin",
+    without_location: bool = False,
+    place: str | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> HeaderSizes:
     """Write a calibration as a C99 header, whole or not at all; returns what the header takes.
 
-    The header does for one frame what `calib.force_map` does, without standard errors, contacts and correction by
-    location. The same calibration gives the same bytes.
+    The header does for one frame what `calib.force_map` does, without standard errors and fitted contacts. The same
+    calibration gives the same bytes.
 
     Args:
         calibration: of a skin, with a linear method of reconstruction and a curve without memory.
         path: of the header.
         prefix: of its names: a lower-case letter, then lower-case letters, digits and underscores.
         without_location: leave out a correction by location: its gain is then 1.
+        place: estimator of `jaxeit.metrics.ESTIMATORS` by which the header finds the place of a contact in the image;
+            default: that of the calibration, which must then be an `ImageCentroid`.
+        tell: called with each line on what another place than that of the calibration changes.
 
     Raises:
         ExportError: if a part of the calibration cannot be exported; the message says which and what to do.
@@ -83,38 +97,73 @@ def export_c(
         )
     if isinstance(calibration, LogCalibration):
         raise ExportError("a log has no EIT and therefore no image; export the calibration of a skin")
-    numbers = numbers_of(calibration, without_location=without_location)
+    if place is not None and without_location:
+        raise ExportError("place: is of no use without the correction by location; give one of the two")
+    chosen = calibration if place is None else with_image_places(calibration, place)
+    numbers = numbers_of(chosen, without_location=without_location)
+    remarks = [] if place is None else consequences(calibration, chosen)
     tables, flash = _tables(numbers)
     sizes = _sizes(numbers, flash)
     parts = {
-        "SIZES": _about(calibration, numbers, sizes),
+        "SIZES": _about(calibration, numbers, sizes, remarks),
         "TABLES": tables,
         "EXACT": _exact(numbers),
-        "CURVE": "\n".join(f"    {line}" for line in numbers.curve.body),
+        "CURVE": _indented(numbers.curve.body),
+        **_location_parts(numbers.location),
     }
-    text = re.sub(r"/\*@(\w+)@\*/", lambda found: parts[found[1]], TEMPLATE.read_text(encoding="ascii"))
+    text = _filled(TEMPLATE, parts)
     text = re.sub(r"\bskin_", f"{prefix}_", text)
     text = re.sub(r"\bSKIN_", f"{prefix.upper()}_", text)
     with replacing(Path(path)) as temporary:
         temporary.write_text(text, encoding="ascii", newline="\n")
+    for remark in remarks:
+        tell(remark)
     return sizes
+
+
+def _filled(template: Path, parts: dict[str, str]) -> str:
+    """The template with its marks replaced; a line that holds nothing but the mark of an empty part is left out."""
+    text = template.read_text(encoding="ascii")
+    text = re.sub(r"(?m)^/\*@(\w+)@\*/\n", lambda found: f"{parts[found[1]]}\n" if parts[found[1]] else "", text)
+    return re.sub(r"/\*@(\w+)@\*/", lambda found: parts[found[1]], text)
+
+
+def _location_parts(location: LocationInC | None) -> dict[str, str]:
+    """What the template holds for a correction by location; all empty without one."""
+    if location is None:
+        return dict.fromkeys(("PLACE", "LOCATION", "LOCATE", "GAIN"), "")
+    inside = {"WEIGHT": location.weight, "FIELD": _indented(location.field.body)}
+    return {
+        "PLACE": "    float place[2];              /* of the contact by the image, x and y in m; NaN: not known */",
+        "LOCATION": _filled(LOCATION, inside).rstrip("\n") + "\n",
+        "LOCATE": "    skin_locate(out);",
+        "GAIN": " * skin_gain(i, out->place)",
+    }
+
+
+def _indented(lines: Sequence[str]) -> str:
+    return "\n".join(f"    {line}" for line in lines)
 
 
 def _sizes(numbers: Numbers, flash: int) -> HeaderSizes:
     (pixels, pairs), readings, pads = numbers.factor.shape, len(numbers.weight), len(numbers.unmix)
-    result = 8 * pixels + 4 * pads + 2 * pads
+    result, location = 8 * pixels + 4 * pads + 2 * pads, numbers.location
     return HeaderSizes(
         flash=flash,
         predict=_TYPES[_exact(numbers)][1] * len(numbers.predict),
         rest=4 * (readings + pads),
         tare=12 * (readings + pads),
-        result=-(-result // 4) * 4 + 4,
+        result=-(-result // 4) * 4 + 4 + (8 if location else 0),
         stack=(4 + _TYPES[_exact(numbers)][1]) * pairs
         + 4 * pads
         + 2 * MAX_MISSING
         + 4 * MAX_MISSING * (MAX_MISSING + 1)
         + 8 * MAX_MISSING,
-        operations=5 * readings + pixels * pairs + pads**2 + 5 * len(numbers.mask_area),
+        operations=5 * readings
+        + pixels * pairs
+        + pads**2
+        + 5 * len(numbers.mask_area)
+        + (location.operations if location else 0),
     )
 
 
@@ -132,6 +181,7 @@ def _tables(numbers: Numbers) -> tuple[str, int]:
         ("uint32_t", "mask_start", "[SKIN_PADS + 1]", "first entry of a pad in the next two", numbers.mask_start),
         ("uint16_t", "mask_pixel", f"[{len(numbers.mask_pixel)}]", "pixel", numbers.mask_pixel),
         ("float", "mask_area", f"[{len(numbers.mask_area)}]", "area of the pad in the pixel, m^2", numbers.mask_area),
+        *_location_tables(numbers.location),
     )  # fmt: skip
     texts, flash = [], 0
     for kind, name, shape, meaning, values in tables:
@@ -140,6 +190,21 @@ def _tables(numbers: Numbers) -> tuple[str, int]:
         text = f"/* {meaning} */\nstatic const {kind} skin_{name}{shape} = {_initialiser(name, values, dtype)};"
         texts.append(f"#if SKIN_MAX_MISSING > 0\n{text}\n#endif" if name == "predict" else text)
     return "\n\n".join(texts), flash
+
+
+def _location_tables(location: LocationInC | None) -> tuple[tuple[str, str, str, str, np.ndarray], ...]:
+    if location is None:
+        return ()
+    field, sides = location.field, location.side
+    count = field.coefficients.shape[1]
+    return (
+        ("float", "pixel", "[SKIN_PIXELS][3]", "centre of the pixel, m, and its area, m^2", location.pixel),
+        ("float", "side", "[SKIN_PADS][SKIN_SIDES][4]", "ends of the sides of the pads, m", sides),
+        ("float", "reach", "[SKIN_PADS][4]", "box in which the field is known, m", location.reach),
+        ("float", "box", "[SKIN_PADS][4]", "lowest corner plus the highest, and their difference, m", location.box),
+        ("float", "rim", "[SKIN_RIM][4]", "ends of the sides of the rim of the sheet, m", location.rim),
+        ("float", "field", f"[SKIN_PADS][{count}]", f"LOCATION: {field.formula}", field.coefficients),
+    )
 
 
 def _exact(numbers: Numbers) -> str:
@@ -152,9 +217,15 @@ def _initialiser(name: str, values: np.ndarray, dtype: DTypeLike) -> str:
         stored = values.astype(dtype)
     if not np.isfinite(stored).all():
         raise ExportError(f"{name}: some numbers are not finite in C; calibrate again, and read its report")
-    if values.ndim == 1:
+    return _braced(stored)
+
+
+def _braced(stored: np.ndarray) -> str:
+    if stored.ndim == 1:
         return "{\n" + _lines(stored) + "\n}"
-    return "{\n" + ",\n".join("{" + _lines(row).lstrip() + "}" for row in stored) + "\n}"
+    if stored.ndim == 2:
+        return "{\n" + ",\n".join("{" + _lines(row).lstrip() + "}" for row in stored) + "\n}"
+    return "{\n" + ",\n".join(map(_braced, stored)) + "\n}"
 
 
 def _lines(row: np.ndarray) -> str:
@@ -165,7 +236,7 @@ def _lines(row: np.ndarray) -> str:
     return ",\n".join(", ".join(words[i : i + 10]) for i in range(0, len(words), 10))
 
 
-def _about(calibration: Calibration, numbers: Numbers, sizes: HeaderSizes) -> str:
+def _about(calibration: Calibration, numbers: Numbers, sizes: HeaderSizes, remarks: Sequence[str]) -> str:
     """The comment of the header, and its sizes as macros."""
     (pixels, pairs), readings, pads = numbers.factor.shape, len(numbers.weight), len(numbers.unmix)
     rows, columns = calibration.recon.shape
@@ -180,7 +251,7 @@ def _about(calibration: Calibration, numbers: Numbers, sizes: HeaderSizes) -> st
         f"pads: {names}",
         f"readings {readings}, pairs of electrodes {pairs}, image {columns} x {rows} pixels",
         f"curve: {numbers.curve.formula}",
-        *([] if calibration.field is None else ["The correction by location is left out: its gain is 1."]),
+        *_about_location(calibration, numbers.location, remarks),
         "",
         f"flash  {sizes.flash:,} bytes of tables, and the code; of these {sizes.predict:,} for missing readings",
         f"RAM    skin_rest {sizes.rest:,}, skin_result {sizes.result:,} bytes; while the skin is at rest "
@@ -189,8 +260,23 @@ def _about(calibration: Calibration, numbers: Numbers, sizes: HeaderSizes) -> st
         f"work   {sizes.operations:,} multiply-adds a frame; {4 * pairs:,} more in double for each missing reading",
     ]
     macros = {"READINGS": readings, "PADS": pads, "ROWS": rows, "COLUMNS": columns, "PIXELS": pixels, "PAIRS": pairs}
+    if numbers.location is not None:
+        macros |= {"SIDES": numbers.location.side.shape[1], "RIM": len(numbers.location.rim)}
     comment = "\n".join(f"   {_plain(line)}".rstrip() for line in lines).lstrip()
     return f"/* {comment} */\n" + "\n".join(f"#define SKIN_{name} {value}" for name, value in macros.items())
+
+
+def _about_location(calibration: Calibration, location: LocationInC | None, remarks: Sequence[str]) -> list[str]:
+    if calibration.field is None:
+        return []
+    if location is None:
+        return ["The correction by location is left out: its gain is 1."]
+    lines = [
+        f"location: {location.field.formula}",
+        f"at the place of the image by the estimator {location.estimator!r}",
+        *remarks,
+    ]
+    return [part for line in lines for part in textwrap.wrap(line, 110)]
 
 
 def _plain(text: str) -> str:

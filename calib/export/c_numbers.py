@@ -14,6 +14,7 @@ from ..calibration import Calibration
 from ..fitting.curves.fitted import RANGE_TOLERANCE
 from ..fitting.results import FitResult
 from .c_curves import CurveInC, curve_in_c
+from .c_fields import LocationInC, location_in_c
 from .errors import ExportError
 
 # Least part of a reading that the image of the others leaves open (`_open_part`): with less, single precision would
@@ -36,6 +37,7 @@ class Numbers(NamedTuple):
     | range: lowest and highest pressure that count as calibrated                      | (pads, 2)       | Pa    |
     | mask_start: first entry of each pad in the next two                              | (pads + 1,)     |       |
     | mask_pixel, mask_area: pixels of each pad, and the area of their share           | (entries,)      | , m^2 |
+    | location: correction by location; None: not exported                             |                 |       |
     """
 
     pairs: np.ndarray
@@ -49,6 +51,7 @@ class Numbers(NamedTuple):
     mask_start: np.ndarray
     mask_pixel: np.ndarray
     mask_area: np.ndarray
+    location: LocationInC | None = None
 
 
 def numbers_of(calibration: Calibration, *, without_location: bool = False) -> Numbers:
@@ -71,17 +74,13 @@ def numbers_of(calibration: Calibration, *, without_location: bool = False) -> N
             "noise: the covariance between readings needs tables of readings squared, which are not exported; "
             "calibrate with --noise equal or --noise measured"
         )
-    if calibration.field is not None and not without_location:
-        raise ExportError(
-            "location: the correction by location needs the place of each contact, which is not exported; calibrate "
-            "with --location none, or export with --without-location: the gain is then 1 at every place"
-        )
     pairs, weight = np.asarray(recon.whitening.pairs), np.asarray(recon.whitening.weight, float)
     if max(len(weight), recon.predict.shape[0], len(calibration.masks.areas)) > np.iinfo(np.uint16).max:
         raise ExportError("more than 65,535 readings, pairs of electrodes or pixels; calibrate with fewer --pixels")
     current = float(recon.whitening.current)
     predict = current**2 * np.asarray(recon.predict, float)
     predict = (predict + predict.T) / 2
+    located = calibration.field is not None and not without_location
     start, pixel, area = _masks(calibration.masks)
     return Numbers(
         pairs=pairs,
@@ -95,6 +94,7 @@ def numbers_of(calibration: Calibration, *, without_location: bool = False) -> N
         mask_start=start,
         mask_pixel=pixel,
         mask_area=area,
+        location=location_in_c(calibration) if located else None,
     )
 
 

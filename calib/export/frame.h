@@ -52,6 +52,7 @@ typedef struct {
     uint8_t in_range[SKIN_PADS]; /* 1: the pressure is within the calibrated range */
     uint8_t shaped[SKIN_PADS];   /* 1: the image gives the shape of the map; 0: the force is spread evenly */
     uint32_t missing;            /* readings that were not finite */
+/*@PLACE@*/
 } skin_result;
 
 static inline void skin_tare_start(skin_tare *tare)
@@ -199,6 +200,7 @@ static inline int skin_imaged(const skin_rest *rest, const float *readings, skin
     return !known;
 }
 
+/*@LOCATION@*/
 /* Force of a pad, N, at its own pressure, Pa; see CURVE above. */
 static inline float skin_curve(uint32_t pad, float pressure)
 {
@@ -221,7 +223,7 @@ static inline void skin_pad_forces(const skin_rest *rest, const float *pressures
         for (uint32_t j = 0; j < SKIN_PADS; j++)
             if (isfinite(change[j]))
                 own += skin_unmix[i][j] * change[j];
-        out->force[i] = skin_curve(i, own);
+        out->force[i] = skin_curve(i, own)/*@GAIN@*/;
         out->in_range[i] = own >= skin_range[i][0] && own <= skin_range[i][1];
     }
 }
@@ -263,6 +265,7 @@ static inline void skin_fuse(skin_result *out)
 static inline int skin_frame(const skin_rest *rest, const float *readings, const float *pressures, skin_result *out)
 {
     const int unknown = skin_imaged(rest, readings, out);
+/*@LOCATE@*/
     skin_pad_forces(rest, pressures, out);
     skin_fuse(out);
     return unknown;

@@ -14,13 +14,16 @@ import pytest
 import calib
 import jaxeit as je
 from benchmarks import bench_firmware
+from calib.calibration.localisation.locators import AbstractLocator, CentroidLocator
+from calib.calibration.press_examples import PressExamples
 from calib.calibration.recalibration.changes import Recalibration
 from calib.cli import main
 from calib.export import ExportError
 from calib.export.c_curves import FORMULAS
+from calib.export.c_fields import FORMULAS as FIELD_FORMULAS
 from calib.fitting import Play
 from calib.fitting.curves import CURVES
-from calib.fitting.fields import FittedField
+from calib.fitting.fields import FIELDS, FittedField, geometry_of, single_places
 from calib.fitting.pad_gains import PadGains
 from calib.presses.crosstalk import Crosstalk
 from tests.helpers import stand_in
@@ -30,6 +33,7 @@ STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler: there is no program cc")
 TARE, FRAMES = 20, 1000
 ROUNDING = 300 * 6e-8  # of sums of 300 products in single precision
+STEEPEST = 300  # 1/m: change of the log-gain with the place, of the fields drawn here
 LOST_DIGIT = 10  # a frame without a reading and its partner, which are predicted in single precision
 
 # Frames from standard input: the first 20 for the tare, then results to standard output.
@@ -70,6 +74,7 @@ int main(int argc, char **argv)
         put(out.shaped, sizeof out.shaped);
         put(&out.missing, sizeof out.missing);
         put(&unknown, 1);
+        PUT_PLACE
     }
     return 0;
 }
@@ -123,17 +128,21 @@ def recorded(model, pixels, recon):
 
 def built(folder, prefix="skin", flags=STRICT, source=DRIVER):
     """The program of a header in a folder."""
+    if "PUT_PLACE" in source:
+        located = "float place[2]" in (folder / f"{prefix}.h").read_text()
+        source = source.replace("PUT_PLACE", "put(out.place, sizeof out.place);" if located else "")
     (folder / "main.c").write_text(source.replace("PREFIX", prefix).replace("UPPER", prefix.upper()))
     done = subprocess.run([CC, *flags, "main.c", "-o", "program", "-lm"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return folder / "program"
 
 
-def run_c(program, recorded, readings, pads, pixels):
+def run_c(program, recorded, readings, pads, pixels, located=False):
     """Rest of the tare, and a structured array of the results."""
     out = subprocess.run([program], input=recorded.tobytes(), capture_output=True, check=True).stdout
     fields = [("image", "f4", pixels), ("map", "f4", pixels), ("force", "f4", pads), ("in_range", "u1", pads)]
-    row = np.dtype([*fields, ("shaped", "u1", pads), ("missing", "u4"), ("unknown", "u1")])
+    fields += [("shaped", "u1", pads), ("missing", "u4"), ("unknown", "u1")]
+    row = np.dtype([*fields, *([("place", "f4", 2)] if located else [])])
     first = 4 * (readings + pads)
     return np.frombuffer(out[:first], "f4"), np.frombuffer(out[first:], row)
 
@@ -141,7 +150,8 @@ def run_c(program, recorded, readings, pads, pixels):
 def compare(calibration, recorded, program, exact=False):
     """Run the program, and compare each frame with Python."""
     readings, pads, pixels = calibration.recon.readings, 4, len(calibration.masks.areas)
-    rest, found = run_c(program, recorded, readings, pads, pixels)
+    located = calibration.field is not None
+    rest, found = run_c(program, recorded, readings, pads, pixels, located)
     np.testing.assert_allclose(rest, np.nanmean(recorded[:TARE].astype(float), 0), rtol=1e-7)
     change = recorded[TARE:].astype(float) - rest
     change[:, readings:][~np.isfinite(change[:, readings:])] = np.nan
@@ -157,7 +167,11 @@ def compare(calibration, recorded, program, exact=False):
     assert not found["unknown"].any()
 
     np.testing.assert_array_equal(np.isnan(found["force"]), np.isnan(change[:, readings:]))
-    np.testing.assert_allclose(found["force"], force, rtol=3e-6, atol=3e-6)
+    placed, tolerance = np.ones(len(found), bool), np.full(len(found), 3e-6)
+    if located:
+        placed, tolerance = compare_places(calibration, found, image, rounding)
+    error = np.abs(found["force"] - force) - 3e-6
+    assert (np.nanmax(error / (np.abs(force) + 1e-9), 1, initial=0) < tolerance)[placed].all(), np.nanmax(error[placed])
     own = np.asarray(calibration.own_pressures(change[:, readings:]))
     low, high = np.asarray(calibration.curves.pressure_range).T
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
@@ -170,12 +184,54 @@ def compare(calibration, recorded, program, exact=False):
     np.testing.assert_array_equal((found["shaped"] > 0)[clear], np.asarray(wanted.map.valid)[clear])
     sure = clear.all(1)
     assert sure.mean() > 0.95
+    sure &= placed
     silent = np.asarray(calibration.masks.weights)[None] * np.isnan(force)[..., None] > 0
     np.testing.assert_array_equal(np.isnan(found["map"]), silent.any(1))
     scale = np.maximum(np.nanmax(np.abs(np.asarray(wanted.map.force)), 1, keepdims=True), 1e-6)  # N
     error = np.abs(found["map"] - np.asarray(wanted.map.force)) / scale
     assert (np.nanmax(error, 1, initial=0) < 5 * rounding)[sure].all(), np.nanmax(error[sure])
     assert {0, 1} == set(found["shaped"].ravel())
+
+
+def compare_places(calibration, found, image, rounding):
+    """Compare the places of frames. Returns where rounding cannot decide which pixels count, and bounds of the error
+    of the forces: that of the formulas, and that of places that follow the values of the image."""
+    name = calibration.locator.estimator
+    wanted = np.asarray(je.metrics.ESTIMATORS[name](image, calibration.recon))
+    largest = image.max(1, keepdims=True)
+    level = {"half": 0.5, "quarter": 0.25, "peak": 1.0}.get(name)
+    edge = largest * (level or 0)
+    near = (np.abs(image - edge) < 2 * rounding[:, None] * np.abs(image).max(1, keepdims=True)).sum(1)
+    clear = (near <= (name == "peak")) if level else np.ones(len(image), bool)
+    assert clear.mean() > 0.8
+    error = np.linalg.norm(found["place"] - wanted, axis=1)
+    moved = 0 if level else rounding
+    assert (error < 1e-6 + 0.2 * moved)[clear].all(), error[clear].max()  # m, on a sheet of 0.2 m
+    return clear, 2e-5 + STEEPEST * (1e-6 + 0.2 * moved)
+
+
+def gain_field(field, skin, rng):
+    """The field with coefficients and levels drawn at random, known in a box within each pad."""
+    geometry = geometry_of(skin)
+    size = field.size(4)
+    low, high = np.asarray(geometry.start).min(1), np.asarray(geometry.start).max(1)
+    zero = jnp.zeros(())
+    return FittedField(
+        field=field,
+        geometry=geometry,
+        coefficients=jnp.asarray(rng.normal(0, 0.3, size)),
+        covariance=jnp.zeros((size, size)),
+        reach=jnp.asarray(np.stack([low + 0.012, high - 0.007], 1)),
+        centre=jnp.asarray(rng.normal(0, 0.3, (4, size))),
+        **dict.fromkeys(("noise", "spread", "evidence", "effective", "n"), zero),
+        result=jnp.zeros((), int),
+    )
+
+
+def located(calibration, field, place):
+    """The calibration with a correction by location, at places of the image."""
+    gains = gain_field(field, calibration.skin, np.random.default_rng(2))
+    return replace(calibration, field=gains, locator=CentroidLocator(place))
 
 
 def variants(calibration):
@@ -201,6 +257,67 @@ def test_a_thousand_frames_are_those_of_python(case, calibration, recorded, tmp_
     compare(chosen, recorded, program)
     told = subprocess.run([program, "sizes"], capture_output=True, text=True, check=True).stdout
     assert told.split() == [str(n) for n in (sizes.rest, sizes.tare, sizes.result)]
+
+
+PLACED_CASES = [*((name, "half") for name in FIELD_FORMULAS), *(("edge", n) for n in ("peak", "quarter", "positive"))]
+
+
+@needs_compiler
+@pytest.mark.parametrize(("field", "place"), PLACED_CASES)
+def test_a_correction_by_location_is_that_of_python(field, place, calibration, recorded, tmp_path):
+    chosen = located(calibration, FIELDS.make(field), place)
+    sizes = calib.export_c(chosen, tmp_path / "skin.h")
+    program = built(tmp_path)
+    compare(chosen, recorded, program)
+    told = subprocess.run([program, "sizes"], capture_output=True, text=True, check=True).stdout
+    assert told.split() == [str(n) for n in (sizes.rest, sizes.tare, sizes.result)]
+    plain = calib.export_c(calibration, tmp_path / "plain.h")
+    sides, rim, numbers = 4, 4, chosen.field.field.shapes().shape[1] - (field == "edge-size") + 1
+    assert sizes.flash - plain.flash == 4 * (3 * 400 + 4 * 4 * sides + 2 * 4 * 4 + 4 * rim + 4 * numbers)
+
+
+@needs_compiler
+@pytest.mark.parametrize("field", ["edge", "rbf", "gp"])
+def test_a_field_with_other_settings_is_that_of_python(field, calibration, recorded, tmp_path):
+    """Coefficients of all pads together or of each, other numbers of them, no corners."""
+    settings = {"edge": "corners=false,width=0.011,bumps=3,shared=false", "rbf": "nodes=3,shared=true"}
+    chosen = located(calibration, FIELDS.make(f"{field}:{settings.get(field, 'modes=3,shared=true')}"), "half")
+    calib.export_c(chosen, tmp_path / "skin.h")
+    compare(chosen, recorded, built(tmp_path))
+
+
+class InTheMiddle(AbstractLocator):
+    """Finds every contact in the middle of the sheet, by no image."""
+
+    def __call__(self, dv, image, recon, masks):
+        return single_places(jnp.full((len(dv), 2), 0.1), masks.weights.shape[0])
+
+
+@needs_compiler
+def test_places_of_the_image_stand_in_for_fits_and_what_it_changes_is_told(calibration, recorded, tmp_path):
+    by_image = located(calibration, FIELDS.make("edge"), "half")
+    rest = np.nanmean(recorded[:TARE].astype(float), 0)
+    seen = recorded[TARE + 1 :: 40].astype(float) - rest
+    seen = seen[np.isfinite(seen).all(1)]
+    force = np.random.default_rng(3).uniform(5, 40, len(seen))
+    probes = PressExamples(seen[:, :550], seen[:, 550:], np.zeros((len(seen), 2)), force)
+    fitted = replace(by_image, locator=InTheMiddle(), probes=probes)
+    refused(fitted, tmp_path, r"location: contacts are fitted.*--place half.*--without-location")
+    told = []
+    calib.export_c(fitted, tmp_path / "skin.h", place="half", tell=told.append)
+    compare(by_image, recorded, built(tmp_path))
+
+    own, theirs, plain = (
+        calib.force_map(which, probes.dv, probes.pressure).force.sum(1)
+        for which in (fitted, by_image, replace(by_image, field=None, locator=None))
+    )
+    assert f"{len(seen)} presses" in told[0]
+    assert f"by {np.abs(own - theirs).max():.2g} N at most" in told[0]
+    rms = [f"{np.sqrt(np.mean((found - force) ** 2)):.2g} N" for found in (own, theirs, plain)]
+    assert re.findall(r"[\d.e+]+ N", told[1]) == rms
+    header = " ".join((tmp_path / "skin.h").read_text().split())
+    assert " ".join(told) in header
+    assert "at the place of the image by the estimator 'half'" in header
 
 
 @needs_compiler
@@ -301,7 +418,16 @@ def test_what_cannot_be_exported_is_refused(calibration, model, tmp_path):
     refused(replace(calibration, recon=correlated), tmp_path, r"covariance between readings.*--noise measured")
     refused(stand_in(calib.LogCalibration), tmp_path, "a log has no EIT")
     located = replace(calibration, field=stand_in(FittedField))
+    own = type("Own", (calib.fitting.PadEdge,), {"name": "own"})()
+    refused(
+        replace(located, field=stand_in(FittedField, field=own), locator=CentroidLocator("half")),
+        tmp_path,
+        "location .*: has no formula in C",
+    )
     refused(located, tmp_path, r"location.*--without-location")
+    refused(located, tmp_path, "of no use", without_location=True, place="half")
+    refused(calibration, tmp_path, "has no correction by location", place="half")
+    refused(located, tmp_path, "place 'middle': no such estimator.*half", place="middle")
     assert calib.export_c(located, tmp_path / "skin.h", without_location=True).flash > 0
     assert "correction by location is left out" in (tmp_path / "skin.h").read_text()
 
@@ -330,6 +456,8 @@ def test_the_command(calibration, tmp_path, capsys, monkeypatch):
     (tmp_path / "folder.h").mkdir()
     assert main(["export", "c", "calibration.h5", "-o", str(tmp_path / "folder.h")]) == 2
     assert "is a folder" in capsys.readouterr().err
+    assert main(["export", "c", "calibration.h5", "-o", str(tmp_path / "x.h"), "--place", "half"]) == 2
+    assert "no correction by location" in capsys.readouterr().err
     assert main(["export", "c", "calibration.h5", "-o", str(tmp_path / "x.h"), "--prefix", "X"]) == 2
     assert "lower-case" in capsys.readouterr().err
     assert not (tmp_path / "x.h").exists()

@@ -1,6 +1,7 @@
 """`jaxeit export`."""
 
 import argparse
+import sys
 
 from ..arguments import prepare_outputs
 from ..terminal import progress_bar
@@ -15,8 +16,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     header.add_argument("-o", "--output", required=True, metavar="SKIN.h")
     text = "prefix of the names in the header, in lower case (default: %(default)s)"
     header.add_argument("--prefix", default="skin", help=text)
-    text = "leave out a correction by location, which a header cannot hold: its gain is then 1"
+    text = "leave out a correction by location: its gain is then 1"
     header.add_argument("--without-location", action="store_true", help=text)
+    text = "place of the contact by this estimator of the image, in place of the fits of the calibration; such as half"
+    header.add_argument("--place", metavar="ESTIMATOR", help=text)
     header.set_defaults(export=_write_header)
     text = "a force map or a session as a bag of ROS 2 (MCAP) for ros2 bag play and Foxglove, with jaxeit[tables]"
     bag = kinds.add_parser("mcap", help=text, description=text[0].upper() + text[1:] + ".")
@@ -44,7 +47,12 @@ def _write_header(args: argparse.Namespace) -> object:
 
     prepare_outputs(args.output)
     calibration = load_calibration(args.calibration)
-    return export_c(calibration, args.output, prefix=args.prefix, without_location=args.without_location)
+    options = {"prefix": args.prefix, "without_location": args.without_location, "place": args.place}
+    return export_c(calibration, args.output, **options, tell=_tell)
+
+
+def _tell(line: str) -> None:
+    print(f"jaxeit: {line}", file=sys.stderr)
 
 
 def _write_bag(args: argparse.Namespace) -> object:
