@@ -2,7 +2,7 @@
 
 import heapq
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from ..session.errors import printable, problem
 from ..session.reader import epoch_nanoseconds
 from ..session.tables import FORMAT as SESSION
 from . import mcap_messages as ros
+from .force_map_topics import PAD_COLUMNS, PICTURES, PLACE_COLUMNS, TRACK_COLUMNS, ForceMapTopics, SkinLayout
 from .mcap_writer import Bag, require_frame, require_stamps, topic_names, topic_prefix, writing_bag
 
 BLOCK = 256
@@ -25,33 +26,6 @@ BLOCK = 256
 
 BLOCK_BYTES = 4 << 20
 """Bytes of a stream of a session that are read at once."""
-
-PAD_COLUMNS = {
-    "pad_force": "force_N",
-    "pad_force_se": "standard_error_N",
-    "pad_force_half": "half_90_percent_N",
-    "pad_valid": "pressure_valid",
-    "shape_valid": "shape_valid",
-}
-"""Arrays of a force map with a row of pads for each frame, and what the raw message calls them."""
-
-PLACE_COLUMNS = {"contact_position": ("x_m y_m", (2,)), "contact_force": ("force_N", ())}
-"""The same for contacts that a correction by location finds in each frame alone, with the shape of an entry."""
-
-TRACK_COLUMNS = {
-    "number": ("number", ()),
-    "position": ("x_m y_m", (2,)),
-    "position_covariance": ("xx_m2 xy_m2 yx_m2 yy_m2", (2, 2)),
-    "width": ("width_m", ()),
-    "force": ("force_N", ()),
-    "force_se": ("standard_error_N", ()),
-    "half": ("half_x_m half_y_m", (2,)),
-    "velocity": ("velocity_x_m_s velocity_y_m_s", (2,)),
-}
-"""The same for contacts that were followed (`apply --track`)."""
-
-PICTURES = ("force", "force_se")
-POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "force", "force_se", "pressure")])
 
 
 @dataclass(frozen=True)
@@ -120,7 +94,7 @@ class _ForceMapBag:
     """The topics of a force map. Its arrays are checked before the first message is written."""
 
     def __init__(self, bag: Bag, archive: ArchiveReader, prefix: str, frame: str):
-        self._bag, self._archive, self._frame = bag, archive, frame
+        self._archive = archive
         self._rows, self._columns = (self._whole(name) for name in ("image_rows", "image_columns"))
         pixels, frames = self._rows * self._columns, self._frames()
         self._require({"areas": (pixels,), "points": (pixels, 3)})
@@ -129,16 +103,9 @@ class _ForceMapBag:
         self._require(dict.fromkeys(PAD_COLUMNS, (frames, len(pads))))
         self._contacts = self._contact_arrays(frames)
         self._tracks = self._track_times()
-        areas, points = archive.arrays["areas"].read(), archive.arrays["points"].read()
-        self._on = areas > 0
-        self._areas, self._cloud = areas[self._on], np.zeros(int(self._on.sum()), POINT)
-        for name, values in zip("xyz", points[self._on].T, strict=True):
-            self._cloud[name] = values
-        self._topics = {
-            name: f"{prefix}/{name}" for name in ("force_map", "taxels", "pad_forces", "contacts", "tracks")
-        }
-        self._wrenches = [f"{prefix}/pads/{pad}/wrench" for pad in pads]
-        self._frame_names = [f"{frame}_{pad}" for pad in pads]
+        areas, *places = (archive.arrays[name].read() for name in ("areas", "points", "pad_points", "pad_normals"))
+        layout = SkinLayout(self._rows, self._columns, areas, places[0], pads, *places[1:])
+        self._topics = ForceMapTopics(bag, layout, prefix, frame)
 
     def _whole(self, name: str) -> int:
         value = self._archive.attrs.get(name)
@@ -154,11 +121,11 @@ class _ForceMapBag:
         return int(shape[0])
 
     def _pads(self) -> list[str]:
-        """Parts of topics of the pads."""
+        """Names of the pads."""
         self._require({"pad_names": None})
         count = self._archive.arrays["pad_names"].shape[0]
         self._require({"pad_points": (count, 3), "pad_normals": (count, 3)})
-        return topic_names(self._archive.arrays["pad_names"].read().tolist(), "pad")
+        return [str(name) for name in self._archive.arrays["pad_names"].read().tolist()]
 
     def _contact_arrays(self, frames: int) -> list[str]:
         """Arrays of the contacts that were found in each frame alone; none if they were not looked for."""
@@ -195,11 +162,8 @@ class _ForceMapBag:
         epoch = _epoch(self._archive)
         first, last = (epoch + int(arrays["time"].read(*rows)[0]) for rows in ((0, 1), (self._frames() - 1, None)))
         require_stamps(path, first, last)
-        self._declare()
-        points, normals = arrays["pad_points"].read(), arrays["pad_normals"].read()
-        head = ros.header(self._bag, first, self._frame)
-        message = ros.frames(self._bag, head, self._frame_names, points, normals)
-        self._bag.write("/tf_static", first, message)
+        self._topics.declare(contacts=bool(self._contacts), tracks=self._tracks is not None)
+        self._topics.write_places(first)
         for start in progress(range(0, self._frames(), BLOCK)):
             block = {
                 name: arrays[name].read(start, start + BLOCK) for name in (*PICTURES, *PAD_COLUMNS, *self._contacts)
@@ -211,52 +175,19 @@ class _ForceMapBag:
                 self._write_tracks(time, since)
         return first, last
 
-    def _declare(self) -> None:
-        self._bag.topic("/tf_static", ros.FRAMES, latched=True)
-        kinds = {"force_map": ros.IMAGE, "taxels": ros.POINTS, "pad_forces": ros.NUMBERS}
-        kinds |= {"contacts": ros.NUMBERS} if self._contacts else {}
-        kinds |= {} if self._tracks is None else {"tracks": ros.NUMBERS}
-        for name, kind in kinds.items():
-            self._bag.topic(self._topics[name], kind)
-        for name in self._wrenches:
-            self._bag.topic(name, ros.WRENCH)
-
     def _write_frame(self, time: int, values: dict[str, np.ndarray]) -> None:
-        bag, head = self._bag, ros.header(self._bag, time, self._frame)
-        # Rows of the file go along +y, rows of a picture downwards: +y is up on the screen.
-        picture = values["force"].reshape(self._rows, self._columns)[::-1]
-        bag.write(self._topics["force_map"], time, ros.image(bag, head, picture))
-        cloud = self._cloud
-        for name in PICTURES:
-            cloud[name] = values[name][self._on]
-        cloud["pressure"] = values["force"][self._on] / self._areas
-        bag.write(self._topics["taxels"], time, ros.point_cloud(bag, head, cloud))
-        table = _table([values[name] for name in PAD_COLUMNS])
-        self._write_table("pad_forces", time, table, "pad", PAD_COLUMNS.values())
+        self._topics.write_pictures(time, values)
+        self._topics.write_pads(time, values)
         if self._contacts:
-            found = _table([values[name] for name in PLACE_COLUMNS])
-            self._write_table("contacts", time, found, "contact", [label for label, _ in PLACE_COLUMNS.values()])
-        for topic, frame, force in zip(self._wrenches, self._frame_names, table[:, 0].tolist(), strict=True):
-            bag.write(topic, time, ros.wrench(bag, ros.header(bag, time, frame), force))
+            self._topics.write_contacts(time, values)
 
     def _write_tracks(self, time: int, since: int) -> None:
         """Write the contacts of a frame that were followed; a table without rows says that there is none."""
         if self._tracks is None:
             return
         first, stop = (int(np.searchsorted(self._tracks, since, side)) for side in ("left", "right"))
-        table = _table([self._archive.arrays[TRACKS + name].read(first, stop) for name in TRACK_COLUMNS])
-        self._write_table("tracks", time, table, "contact", [label for label, _ in TRACK_COLUMNS.values()])
-
-    def _write_table(self, name: str, time: int, table: np.ndarray, rows: str, columns: Iterable[str]) -> None:
-        axes = (ros.Axis(rows, len(table)), ros.Axis(" ".join(columns), table.shape[1]))
-        self._bag.write(self._topics[name], time, ros.numbers(self._bag, table, *axes))
-
-
-def _table(columns: list[np.ndarray]) -> np.ndarray:
-    """Arrays (rows, ...) side by side as float64 (rows, columns)."""
-    rows = len(columns[0])
-    parts = [column.astype(np.float64).reshape(rows, int(np.prod(column.shape[1:]))) for column in columns]
-    return np.concatenate(parts, 1)
+        arrays = self._archive.arrays
+        self._topics.write_tracks(time, {name: arrays[TRACKS + name].read(first, stop) for name in TRACK_COLUMNS})
 
 
 def _epoch(archive: ArchiveReader) -> int:

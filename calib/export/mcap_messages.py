@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .mcap_writer import Bag, stamp_of
+from .mcap_writer import stamp_of
+from .message_sink import AbstractMessageSink
 
 IMAGE = "sensor_msgs/msg/Image"
 POINTS = "sensor_msgs/msg/PointCloud2"
@@ -22,59 +23,59 @@ class Axis(NamedTuple):
     size: int
 
 
-def header(bag: Bag, time: int, frame: str) -> Any:
+def header(sink: AbstractMessageSink, time: int, frame: str) -> Any:
     """Stamp, from ns since 1970, and frame of coordinates."""
-    return bag.types["std_msgs/msg/Header"](stamp_of(bag, time), frame)
+    return sink.types["std_msgs/msg/Header"](stamp_of(sink, time), frame)
 
 
-def image(bag: Bag, head: Any, values: Float[np.ndarray, "rows columns"]) -> Any:
+def image(sink: AbstractMessageSink, head: Any, values: Float[np.ndarray, "rows columns"]) -> Any:
     """A picture of the encoding 32FC1, the first row on top."""
     data = np.ascontiguousarray(values, "<f4")
     rows, columns = data.shape
-    return bag.types[IMAGE](head, rows, columns, "32FC1", 0, 4 * columns, data.view(np.uint8).ravel())
+    return sink.types[IMAGE](head, rows, columns, "32FC1", 0, 4 * columns, data.view(np.uint8).ravel())
 
 
-def point_cloud(bag: Bag, head: Any, points: np.ndarray) -> Any:
+def point_cloud(sink: AbstractMessageSink, head: Any, points: np.ndarray) -> Any:
     """Points from an array of records (n,) whose fields are all float32; NaN is allowed."""
-    field = bag.types["sensor_msgs/msg/PointField"]
+    field = sink.types["sensor_msgs/msg/PointField"]
     names = points.dtype.names or ()
     fields = [field(name, 4 * place, field.FLOAT32, 1) for place, name in enumerate(names)]
     step, data = points.dtype.itemsize, points.view(np.uint8)
-    return bag.types[POINTS](head, 1, len(points), fields, False, step, step * len(points), data, False)
+    return sink.types[POINTS](head, 1, len(points), fields, False, step, step * len(points), data, False)
 
 
-def wrench(bag: Bag, head: Any, push: float) -> Any:
+def wrench(sink: AbstractMessageSink, head: Any, push: float) -> Any:
     """A load of so many N that pushes into the sheet: against z of its frame, which points out of the sheet."""
-    vector = bag.types["geometry_msgs/msg/Vector3"]
-    load = bag.types["geometry_msgs/msg/Wrench"](vector(0.0, 0.0, -push), vector(0.0, 0.0, 0.0))
-    return bag.types[WRENCH](head, load)
+    vector = sink.types["geometry_msgs/msg/Vector3"]
+    load = sink.types["geometry_msgs/msg/Wrench"](vector(0.0, 0.0, -push), vector(0.0, 0.0, 0.0))
+    return sink.types[WRENCH](head, load)
 
 
-def numbers(bag: Bag, values: np.ndarray, *axes: Axis) -> Any:
+def numbers(sink: AbstractMessageSink, values: np.ndarray, *axes: Axis) -> Any:
     """Float64 numbers with a label for each axis, the last of which runs fastest."""
-    kind, stride = bag.types["std_msgs/msg/MultiArrayDimension"], 1
+    kind, stride = sink.types["std_msgs/msg/MultiArrayDimension"], 1
     dims: list[Any] = []
     for axis in reversed(axes):
         stride *= axis.size
         dims.insert(0, kind(axis.label, axis.size, stride))
-    layout = bag.types["std_msgs/msg/MultiArrayLayout"](dims, 0)
-    return bag.types[NUMBERS](layout, np.ascontiguousarray(values, np.float64).ravel())
+    layout = sink.types["std_msgs/msg/MultiArrayLayout"](dims, 0)
+    return sink.types[NUMBERS](layout, np.ascontiguousarray(values, np.float64).ravel())
 
 
-def flags(bag: Bag, value: int) -> Any:
+def flags(sink: AbstractMessageSink, value: int) -> Any:
     """Flags of a sample."""
-    return bag.types[FLAGS](value)
+    return sink.types[FLAGS](value)
 
 
-def frames(bag: Bag, head: Any, names: list[str], points: np.ndarray, normals: np.ndarray) -> Any:
+def frames(sink: AbstractMessageSink, head: Any, names: list[str], points: np.ndarray, normals: np.ndarray) -> Any:
     """Frames of coordinates at points (n, 3) m, z along the normals (n, 3)."""
-    vector, turn = bag.types["geometry_msgs/msg/Vector3"], bag.types["geometry_msgs/msg/Quaternion"]
-    kind, place = bag.types["geometry_msgs/msg/TransformStamped"], bag.types["geometry_msgs/msg/Transform"]
+    vector, turn = sink.types["geometry_msgs/msg/Vector3"], sink.types["geometry_msgs/msg/Quaternion"]
+    kind, place = sink.types["geometry_msgs/msg/TransformStamped"], sink.types["geometry_msgs/msg/Transform"]
     found = [
         kind(head, name, place(vector(*point.tolist()), turn(*turn_to(normal).tolist())))
         for name, point, normal in zip(names, points, normals, strict=True)
     ]
-    return bag.types[FRAMES](found)
+    return sink.types[FRAMES](found)
 
 
 def turn_to(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:

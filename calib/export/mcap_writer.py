@@ -12,6 +12,7 @@ from typing import Any
 from ..session.errors import printable, problem
 from ..session.hdf5.storage import sync
 from ..session.importers.child import library
+from .message_sink import AbstractMessageSink
 
 EXTRA = "tables"
 SUFFIX = ".mcap"
@@ -21,7 +22,7 @@ _TOKEN = r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*"
 _TOPIC, _FRAME = re.compile(rf"(/{_TOKEN})+"), re.compile(rf"{_TOKEN}(/{_TOKEN})*")
 
 
-class Bag:
+class Bag(AbstractMessageSink):
     """A bag that is being written: `topic` declares a topic and `write` adds a message to it."""
 
     def __init__(self, writer: Any, rosbag2: Any, interfaces: Any, store: Any):
@@ -31,18 +32,12 @@ class Bag:
         self.counts: dict[str, int] = {}
 
     def topic(self, name: str, kind: str, *, latched: bool = False) -> str:
-        """Declare a topic of messages such as ``sensor_msgs/msg/Image``; returns its name.
-
-        Args:
-            latched: whether whoever subscribes later still receives the last message, as of /tf_static.
-        """
         profiles = [self._latched()] if latched else []
         connection = self._writer.add_connection(name, kind, typestore=self._store, offered_qos_profiles=profiles)
         self._connections[name], self.counts[name] = connection, 0
         return name
 
     def write(self, topic: str, time: int, message: Any) -> None:
-        """Add a message at a time, ns since 1970."""
         connection = self._connections[topic]
         self._writer.write(connection, time, self._store.serialize_cdr(message, connection.msgtype))
         self.counts[topic] += 1
@@ -137,9 +132,9 @@ def topic_names(names: list[str], otherwise: str) -> list[str]:
     return found
 
 
-def stamp_of(bag: Bag, time: int) -> Any:
+def stamp_of(sink: AbstractMessageSink, time: int) -> Any:
     """A stamp of ROS, from ns since 1970."""
-    return bag.types["builtin_interfaces/msg/Time"](time // 10**9, time % 10**9)
+    return sink.types["builtin_interfaces/msg/Time"](time // 10**9, time % 10**9)
 
 
 def require_stamps(path: Path, first: int, last: int) -> None:

@@ -3,13 +3,17 @@
 import argparse
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..arguments import above_zero, add_proposal_argument, prepare_outputs, proposal_of
 from ..signals import orderly_end
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from contextlib import AbstractContextManager
+
     from ...calibration import Calibration, LogCalibration
+    from ...live.loop import LiveControl
     from ...record.plan import RecordingPlan
     from ...record.sources import Source
 
@@ -36,6 +40,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
     text = "send results to the rerun viewer at HOST:PORT (default: 127.0.0.1:9876), or write them to FILE.rrd"
     parser.add_argument("--rerun", nargs="?", const="127.0.0.1:9876", metavar="HOST:PORT|FILE.rrd", help=text)
+    text = "publish the topics of docs/ros.md as a node of ROS 2; needs ROS"
+    parser.add_argument("--ros2", nargs="?", const="jaxeit", metavar="NODE", help=text)
+    text = "serve the same topics to the Foxglove app on this port (default: 8766; 0: any free port)"
+    parser.add_argument("--foxglove", nargs="?", type=int, const=8766, metavar="PORT", help=text)
+    text = "first part of the topics of --ros2 and --foxglove (default: %(default)s)"
+    parser.add_argument("--prefix", default="/skin", help=text)
+    text = "frame of coordinates in which the skin lies, for --ros2 and --foxglove (default: %(default)s)"
+    parser.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record the streams at the same time")
     text = "request the next readings from the device: few at rest, those around the contact during a contact"
     parser.add_argument("--event-driven", action="store_true", help=text)
@@ -67,10 +79,7 @@ def run(args: argparse.Namespace) -> int:
     timer = Timer(args.seconds or 0.0, orders.stop_recording)
     timer.daemon = True
     with orderly_end(orders, planned=False), ExitStack() as stack:
-        if args.rerun is not None:
-            from ...live.rerun_view import RerunView
-
-            also.append(stack.enter_context(RerunView(calibration, show, args.rerun)).show_result)
+        also += [stack.enter_context(viewer).show_result for viewer in _viewers(args, calibration, show)]
         if args.seconds is not None:
             timer.start()
         count = present(
@@ -95,6 +104,27 @@ def run(args: argparse.Namespace) -> int:
         timer.cancel()
     _tell(f"{count} frames")
     return orders.status
+
+
+def _viewers(
+    args: argparse.Namespace, calibration: "Calibration | LogCalibration", show: "LiveControl"
+) -> "Iterator[AbstractContextManager[Any]]":
+    """Further programs that see the results; each is opened before the next one is made."""
+    if args.rerun is not None:
+        from ...live.rerun_view import RerunView
+
+        yield RerunView(calibration, show, args.rerun)
+    if args.ros2 is None and args.foxglove is None:
+        return
+    from ...live.bridges import Bridge, FoxgloveServer, RosNode
+
+    options = {"prefix": args.prefix, "frame_id": args.frame_id, "track": args.track, "warn": _tell}
+    if args.ros2 is not None:
+        yield Bridge(calibration, RosNode(args.ros2), **options)
+    if args.foxglove is not None:
+        server = FoxgloveServer(args.host, args.foxglove)
+        yield Bridge(calibration, server, **options)
+        _tell(f"open {server.address} in Foxglove")
 
 
 def _planned(
