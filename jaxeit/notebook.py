@@ -125,9 +125,14 @@ def png(values: np.ndarray) -> bytes:
     pixels = np.empty((*known.shape, 4), np.uint8)
     pixels[..., :3] = TINT
     pixels[..., 3] = np.rint(255 * np.clip(known / top, 0, 1)) if top > 0 else 0
-    rows, columns = known.shape
+    return png_of(pixels)
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """A PNG file of pixels (rows, columns, 3 or 4) uint8, colour and perhaps opacity, the first row on top."""
+    rows, columns, channels = pixels.shape
     raw = b"".join(b"\0" + row.tobytes() for row in pixels)  # each row begins with the number of its filter, none
-    header = struct.pack(">IIBBBBB", columns, rows, 8, 6, 0, 0, 0)  # 8 bits, colour and opacity
+    header = struct.pack(">IIBBBBB", columns, rows, 8, {3: 2, 4: 6}[channels], 0, 0, 0)  # 8 bits a channel
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(raw)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
 

@@ -13,6 +13,7 @@ from ..record.recorder import session_journal
 from ..record.sources import Source
 from .loop import LiveControl, LiveSettings, Publish, run_live
 from .page import LOOPBACK, Page
+from .results import Result
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,14 @@ class Presentation:
     | host     | address that the page and the lines of JSON listen on; default: this machine only           |
     | port     | port of the page; 0: any free port                                                        |
     | publish  | port of the lines of JSON, 0: any free port; None: no lines                                |
+    | maps     | whether the lines of JSON hold map and image                                              |
     | output   | session file to which the streams are recorded at the same time; None: no recording        |
     """
 
     host: str = "127.0.0.1"
     port: int = 8765
     publish: int | None = None
+    maps: bool = False
     output: str | Path | None = None
 
 
@@ -64,8 +67,13 @@ def present(
         if where.publish is not None:
             lines = stack.enter_context(Broadcaster(where.host, where.publish))
             tell(f"lines of JSON at {lines.address[0]}:{lines.address[1]}")
-            viewers.append(lambda result: lines.publish([result.to_json().encode() + b"\n"]))
+            shape = calibration.recon.shape if where.maps and isinstance(calibration, Calibration) else ()
+            viewers.append(lambda result: lines.publish([_line(result, shape)]))
         if where.host not in LOOPBACK:
             tell("anyone who can reach this machine can view the page and measure the rest levels again")
         log = None if where.output is None else stack.enter_context(session_journal(where.output, tell))
         return run_live(calibration, plan, sources, viewers, control, settings, log=log)
+
+
+def _line(result: Result, shape: tuple[int, ...]) -> bytes:
+    return result.to_json(image=bool(shape), shape=shape).encode() + b"\n"

@@ -117,8 +117,11 @@ class FrameResult:
     unsearched: int = 0
     kinds: KindEstimate | None = None
 
-    def to_json(self, *, image: bool = False) -> str:
-        """The result as one line of JSON; ``image`` adds map and image as base64 of little-endian f4."""
+    def to_json(self, *, image: bool = False, shape: tuple[int, ...] = ()) -> str:
+        """The result as one line of JSON; ``image`` adds map and image as base64 of little-endian f4.
+
+        ``shape`` adds the rows and columns of both.
+        """
         out: dict[str, object] = {
             "number": self.number,
             "host_ns": self.host,
@@ -137,6 +140,7 @@ class FrameResult:
         }
         if image:
             out |= {name: base64.b64encode(getattr(self, name).astype("<f4")).decode() for name in ("map", "image")}
+        out |= {"shape": list(shape)} if shape else {}
         return json.dumps(out, allow_nan=False)
 
 
@@ -168,9 +172,9 @@ class LogResult:
     missing: int
     dropped: int
 
-    def to_json(self, *, image: bool = False) -> str:
+    def to_json(self, *, image: bool = False, shape: tuple[int, ...] = ()) -> str:
         """The result as one line of JSON; there is no ``image``."""
-        del image
+        del image, shape
         out: dict[str, object] = {
             "number": self.number,
             "host_ns": self.host,

@@ -30,6 +30,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "frame of coordinates in which the skin lies (default: %(default)s)"
     bag.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
     bag.set_defaults(export=_write_bag)
+    text = "force maps as a LeRobot dataset of version 3.0, each force map an episode, with jaxeit[tables]"
+    dataset = kinds.add_parser("lerobot", help=text, description=text[0].upper() + text[1:] + ".")
+    dataset.add_argument("sources", nargs="+", metavar="FORCEMAP.h5", help="force maps of jaxeit apply")
+    dataset.add_argument("-o", "--output", required=True, metavar="DATASET", help="a new folder")
+    text = "what was done, in words (default: %(default)s)"
+    dataset.add_argument("--task", default="touch the skin", help=text)
+    text = "frames a second (default: the lowest rate of the force maps, rounded)"
+    dataset.add_argument("--fps", type=int, help=text)
+    text = "force on a pixel that is white in an image (default: the largest one, rounded up)"
+    dataset.add_argument("--full-scale", type=float, metavar="N", help=text)
+    dataset.set_defaults(export=_write_dataset)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,3 +71,10 @@ def _write_bag(args: argparse.Namespace) -> object:
 
     progress = progress_bar("blocks")
     return export_mcap(args.source, args.output, prefix=args.prefix, frame_id=args.frame_id, progress=progress)
+
+
+def _write_dataset(args: argparse.Namespace) -> object:
+    from ...export import export_lerobot
+
+    options = {"task": args.task, "fps": args.fps, "full_scale": args.full_scale}
+    return export_lerobot(args.sources, args.output, **options, progress=progress_bar("episodes"))

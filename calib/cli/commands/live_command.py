@@ -37,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8765, help="port of the page; 0: any free port; default: 8765")
     text = "send results as lines of JSON to programs that connect to this port; 0: any free port"
     parser.add_argument("--publish", type=int, metavar="PORT", help=text)
+    text = "with map and image in the lines of --publish, as base64 of little-endian float32"
+    parser.add_argument("--publish-maps", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
     text = "send results to the rerun viewer at HOST:PORT (default: 127.0.0.1:9876), or write them to FILE.rrd"
     parser.add_argument("--rerun", nargs="?", const="127.0.0.1:9876", metavar="HOST:PORT|FILE.rrd", help=text)
@@ -87,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
             plan,
             sources,
             show,
-            Presentation(host=args.host, port=args.port, publish=args.publish, output=args.output),
+            Presentation(args.host, args.port, args.publish, args.publish_maps, args.output),
             LiveSettings(
                 event_driven=args.event_driven,
                 realtime=args.realtime,

@@ -1,0 +1,240 @@
+"""Force maps as a LeRobot dataset: each force map is an episode, at a constant rate."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxeit.notebook import png_of
+
+from ..calibration.application import FORMAT
+from ..calibration.frame_blocks import Progress
+from ..session import ArchiveReader, open_archive
+from ..session.errors import problem
+from .errors import ExportError
+from .lerobot_files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata
+from .lerobot_stats import FeatureStats, Stats, aggregated, flat
+
+BLOCK = 256  # frames that are written at once
+ROBOT = "jaxeit_skin"
+STATE, VALID, MAP, IMAGE, AGE = (
+    f"observation.{name}" for name in ("state", "pad_valid", "force_map", "images.skin", "frame_age")
+)
+MAX_STRETCH = 100  # of a recording by gaps, which become repeated frames
+ROUND_SCALES = (1.0, 2.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class DatasetSummary:
+    """What a LeRobot dataset holds.
+
+    | meaning                                                | unit |
+    |--------------------------------------------------------|------|
+    | episodes, frames                                       |      |
+    | fps: rate of the frames                                | Hz   |
+    | full_scale: force on a pixel that is white in an image | N    |
+    """
+
+    episodes: int
+    frames: int
+    fps: int
+    full_scale: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.episodes} episode{'s' * (self.episodes != 1)}, {self.frames:,} frames at {self.fps} Hz; "
+            f"white in an image is {self.full_scale:g} N on a pixel"
+        )
+
+
+def export_lerobot(
+    sources: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    *,
+    task: str = "touch the skin",
+    fps: int | None = None,
+    full_scale: float | None = None,
+    progress: Progress = iter,
+) -> DatasetSummary:
+    """Write force maps of `calib.apply` as a LeRobot dataset of version 3.0; it appears only when complete.
+
+    ``docs/lerobot.md`` lists the features. Each source is an episode. Its frames are at even distances of 1 / fps, and
+    each is the last frame of the force map that had arrived by then.
+
+    Args:
+        output: a folder that does not exist.
+        task: what was done, in words.
+        fps: frames a second; default: the lowest rate of the force maps, rounded.
+        full_scale: force on a pixel that is white in an image, N; default: the largest one, rounded up to 1, 2 or 5.
+        progress: wraps what is written piece by piece, as `tqdm.tqdm` does.
+
+    Raises:
+        SessionError: for another kind of file, or one without frames.
+        ExportError: if the force maps are of different skins, an option is out of range, or the output exists.
+        ImportError: without the library `pyarrow`, of the extra ``tables``.
+    """
+    output = Path(output)
+    if not sources:
+        raise ExportError("lerobot: no force map; name one or more, each of which becomes an episode")
+    if output.exists():
+        raise ExportError(f"{output}: exists; name another folder, or remove it first")
+    if (fps is not None and fps < 1) or (full_scale is not None and not 0 < full_scale < np.inf):
+        raise ExportError("lerobot: --fps is a whole number from 1 on, and --full-scale a force above zero, N")
+    skins = [_skin_of(Path(source)) for source in sources]
+    for source, skin in zip(sources, skins, strict=True):
+        if skin[:3] != skins[0][:3]:
+            raise ExportError(
+                f"{Path(source).name}: another skin than that of {Path(sources[0]).name}; export it alone"
+            )
+    rows, columns, pads, *_ = skins[0]
+    fps = fps or max(1, round(min(skin[3] for skin in skins)))
+    full_scale = full_scale or rounded_up(max(skin[4] for skin in skins))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
+    try:
+        features = features_of(rows, columns, list(pads), full_scale)
+        episodes, stats = _write_frames([*map(Path, sources)], temporary, features, fps, full_scale, task, progress)
+        frames = sum(row["length"] for row in episodes)
+        info = info_of(features, fps, len(episodes), frames, ROBOT)
+        write_metadata(temporary, info, flat(stats), episodes, task)
+        os.rename(temporary, output)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return DatasetSummary(len(episodes), frames, fps, full_scale)
+
+
+def features_of(rows: int, columns: int, pads: list[str], full_scale: float) -> dict[str, dict[str, Any]]:
+    """The features of a dataset, as ``meta/info.json`` states them."""
+    number = {"dtype": "float32", "shape": [1], "names": None}
+    picture = {"dtype": "image", "shape": [rows, columns, 3], "names": ["height", "width", "channels"]}
+    return {
+        STATE: number | {"shape": [len(pads)], "names": pads},
+        VALID: {"dtype": "bool", "shape": [len(pads)], "names": pads},
+        MAP: number | {"shape": [rows, columns], "names": ["height", "width"]},
+        IMAGE: picture | {"info": {"is_depth_map": False, "newtons_of_255": full_scale}},
+        AGE: number,
+        **DEFAULT_FEATURES,
+    }
+
+
+def grey_images(maps: np.ndarray, full_scale: float) -> np.ndarray:
+    """Maps (n, rows, columns) N as grey values uint8: 255 is the full scale, and what is not known is 0."""
+    part = np.clip(np.nan_to_num(maps, nan=0.0) / full_scale, 0, 1)
+    grey: np.ndarray = np.rint(255 * part).astype(np.uint8)
+    return grey
+
+
+def rounded_up(value: float) -> float:
+    """The next number of the form 1, 2 or 5 times a power of ten; 1 for zero."""
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(min(scale * power for scale in ROUND_SCALES if scale * power >= value * (1 - 1e-9)))
+
+
+Skin = tuple[int, int, tuple[str, ...], float, float]
+
+
+def _skin_of(path: Path) -> Skin:
+    """Rows and columns of a map, names of the pads, rate of the frames (Hz), and the largest force on a pixel (N)."""
+    with open_archive(path, FORMAT) as archive:
+        rows, columns = (archive.attrs.get(name) for name in ("image_rows", "image_columns"))
+        names = ("time", "force", "pad_force", "pad_valid", "pad_names")
+        missing = next((name for name in names if name not in archive.arrays), "")
+        if missing or not isinstance(rows, int) or not isinstance(columns, int):
+            raise problem(path, missing or "image_rows", "missing", "write the force map again with `jaxeit apply`")
+        frames, pixels = archive.arrays["force"].shape
+        if pixels != rows * columns or frames != len(archive.arrays["time"].read()):
+            raise problem(path, "force", "has another shape than time and image", "write the force map again")
+        if frames < 1:
+            raise problem(path, "time", "holds no frame", "apply the calibration to a longer session")
+        rate = _rate(path, archive.arrays["time"].read())
+        blocks = (archive.arrays["force"].read(at, at + BLOCK) for at in range(0, frames, BLOCK))
+        largest = max(float(np.nanmax(block, initial=0.0)) for block in blocks)
+        pads = tuple(str(name) for name in archive.arrays["pad_names"].read().tolist())
+        return rows, columns, pads, rate, largest
+
+
+def _rate(path: Path, times: np.ndarray) -> float:
+    """The rate of frames with times in ns, Hz."""
+    steps = np.diff(times)
+    if not len(steps):
+        return 1.0
+    if (steps <= 0).any() or times[-1] - times[0] > MAX_STRETCH * len(steps) * np.median(steps):
+        raise problem(path, "time", "is not in order, or has long gaps", "cut the session, and apply the calibration")
+    return 1e9 / float(np.median(steps))
+
+
+def _write_frames(
+    sources: list[Path],
+    folder: Path,
+    features: dict[str, dict[str, Any]],
+    fps: int,
+    full_scale: float,
+    task: str,
+    progress: Progress,
+) -> tuple[list[dict[str, Any]], dict[str, Stats]]:
+    """Write the frames of all episodes; returns the rows of the table of episodes, and statistics of all."""
+    episodes: list[dict[str, Any]] = []
+    every: list[dict[str, Stats]] = []
+    first = 0
+    with FrameFiles(folder, features) as files:
+        for number, source in enumerate(progress(sources)):
+            with open_archive(source, FORMAT) as archive:
+                rows = held_rows(archive.arrays["time"].read(), fps)
+                stats = {name: FeatureStats(len(rows), channels=name == IMAGE) for name in features}
+                place = files.begin_episode()
+                for columns in _blocks(archive, rows, fps, full_scale, first, number, features[MAP]["shape"]):
+                    for name, part in stats.items():
+                        part.add(columns[name] / 255 if name == IMAGE else columns[name])
+                    pictures = [png_of(np.repeat(grey[..., None], 3, -1)) for grey in columns[IMAGE]]
+                    files.append(columns | {IMAGE: pictures})
+            every.append({name: part.result() for name, part in stats.items()})
+            last = first + len(rows)
+            row = {"episode_index": number, "tasks": [task], "length": len(rows)} | place
+            row |= {"dataset_from_index": first, "dataset_to_index": last}
+            episodes.append(row | flat(every[-1], "stats/"))
+            first = last
+    return episodes, {name: aggregated([one[name] for one in every]) for name in features}
+
+
+def held_rows(times: np.ndarray, fps: int) -> np.ndarray:
+    """Rows of the frames, with times in ns, that are the last to have arrived at even distances from the first on."""
+    steps = int((times[-1] - times[0]) * fps // 10**9) + 1
+    due = times[0] + (np.arange(steps) * 10**9) // fps
+    rows: np.ndarray = np.searchsorted(times, due, "right") - 1
+    return rows
+
+
+def _blocks(
+    archive: ArchiveReader, rows: np.ndarray, fps: int, full_scale: float, first: int, episode: int, shape: list[int]
+) -> Iterator[dict[str, Any]]:
+    """Columns of frames, block by block; images as grey values."""
+    arrays = archive.arrays
+    times = arrays["time"].read()
+    for start in range(0, len(rows), BLOCK):
+        chosen = rows[start : start + BLOCK]
+        low, high, count = int(chosen[0]), int(chosen[-1]) + 1, len(chosen)
+        force, pads, valid = (
+            arrays[name].read(low, high)[chosen - low] for name in ("force", "pad_force", "pad_valid")
+        )
+        number = np.arange(start, start + count)
+        # The lowest row of the map has the smallest y; pictures have +y upwards, as those of ROS.
+        maps = force.reshape(count, *shape)[:, ::-1]
+        yield {
+            STATE: pads.astype(np.float32),
+            VALID: valid > 0,
+            MAP: np.ascontiguousarray(maps, np.float32),
+            IMAGE: grey_images(maps, full_scale),
+            AGE: (number / fps - (times[chosen] - times[0]) / 1e9).astype(np.float32),
+            "timestamp": (number / fps).astype(np.float32),
+            "frame_index": number,
+            "episode_index": np.full(count, episode),
+            "index": first + number,
+            "task_index": np.zeros(count, int),
+        }
