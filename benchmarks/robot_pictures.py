@@ -24,7 +24,7 @@ import jaxeit as je
 from calib.calibration.localisation.locators import CentroidLocator
 from calib.live.bridges import Bridge, FoxgloveServer
 from calib.live.results import FrameResult
-from calib.report.figures import write_figure
+from calib.report.figures.parts import write_figure
 from calib.runtime import set_up
 
 from .bench_live import made_up
