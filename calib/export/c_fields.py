@@ -78,8 +78,8 @@ def location_in_c(calibration: Calibration) -> LocationInC:
     assert fitted is not None
     if not isinstance(locator, CentroidLocator):
         raise ExportError(
-            "location: contacts are fitted to each frame, which is not exported; export with --place half, which takes "
-            "the place from the image, or with --without-location: the gain is then 1 at every place"
+            "location: contacts are fitted to each frame, which is not exported; calibrate with --locator "
+            "image-centroid, or export with --place half or --without-location, which are less accurate"
         )
     name = FIELDS.name_of(fitted.field)
     if name not in FORMULAS:
