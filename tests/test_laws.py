@@ -209,6 +209,16 @@ def test_models_hold_arrays_of_one_precision_only(skin, order):
     assert jnp.float64 not in {leaf.dtype for leaf in jax.tree.leaves(model)}
 
 
+def test_libraries_of_other_projects_are_imported_when_they_are_asked_for():
+    code = (
+        "import sys, calib.export, calib.live.bridges, calib.cli\n"
+        "theirs = {'foxglove', 'lerobot', 'mujoco', 'pyarrow', 'rclpy', 'rerun', 'rosbags', 'websockets'}\n"
+        "sys.exit(f'imported {found}' if (found := theirs & set(sys.modules)) else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; from calib.cli import main\n"

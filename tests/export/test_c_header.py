@@ -489,3 +489,11 @@ def test_the_benchmark_runs(root):
         assert re.search(
             rf"^\| 10 \| 928 \| {part} \| [\d.]*[1-9][\d.]* \| [\d.]*[1-9][\d.]* \|$", printed, re.MULTILINE
         )
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_places_runs(root):
+    command = [sys.executable, "-m", "benchmarks.bench_firmware_places", "--smoke"]
+    printed = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
+    errors = dict(re.findall(r"^\| (none|image-centroid, half) \| [^|]* \| ([\d.]+) \|", printed, re.MULTILINE))
+    assert 0 < float(errors["image-centroid, half"]) < float(errors["none"])

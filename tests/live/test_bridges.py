@@ -1,6 +1,7 @@
 """Live results as messages of ROS 2: decoded by the authors of MCAP, and received over the websocket of Foxglove."""
 
 import json
+import os
 import re
 import struct
 import sys
@@ -17,6 +18,8 @@ from calib.cli import main
 from calib.live.bridges import AbstractLiveSink, Bridge, BridgeError, FoxgloveServer, RosNode
 from calib.live.results import FrameResult, TouchEstimates
 from tests.helpers import stand_in
+
+from .test_live import listening
 
 pytest.importorskip("rosbags.typesys")
 ROWS, COLUMNS = 3, 4
@@ -299,6 +302,15 @@ def test_what_cannot_be_sent_is_refused(calibration):
 
 
 # --- Foxglove --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs Linux")
+def test_the_server_listens_on_this_machine_only():
+    pytest.importorskip("foxglove")
+    before = set(listening())
+    with FoxgloveServer(port=0):
+        (address,) = set(listening()) - before
+    assert address.startswith("0100007F:")
 
 
 def test_the_foxglove_app_receives_topics_schemas_and_messages(calibration, decoded):

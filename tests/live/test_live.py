@@ -927,6 +927,27 @@ def test_results_are_published_as_lines_and_a_warning_precedes_an_open_door(cali
     assert set(lines[0]) >= {"force", "standard_error", "valid", "centre", "latency_ms", "dropped"}
 
 
+def test_lines_hold_the_maps_where_they_are_asked_for(calibration):
+    show, lines = LiveControl(), []
+
+    def tell(line):
+        if line.startswith("lines"):
+            threading.Thread(target=listen, args=(int(line.rpartition(":")[2]),), daemon=True).start()
+
+    def listen(port):
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as link, link.makefile("rb") as file:
+            lines.append(json.loads(file.readline()))
+        show.stop.set()
+
+    with small_device() as device:
+        where = Presentation(port=0, publish=0, maps=True)
+        present(calibration, *sources_of(device, calibration), show, where, LiveSettings(rest=0.1), tell=tell)
+    assert lines[0]["shape"] == [2, 2]
+    maps, images = (np.frombuffer(base64.b64decode(lines[0][name]), "<f4") for name in ("map", "image"))
+    np.testing.assert_allclose(maps.reshape(2, 2).sum(1), lines[0]["force"], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(images, 1e-3 * maps, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_an_event_driven_scan_of_the_testbed_finds_the_contact_with_a_fraction_of_the_readings(model, skin, pixels):
     """A press appears where the whole scan sees it, from the readings of the director's own choice."""
