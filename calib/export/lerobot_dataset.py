@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -79,33 +79,52 @@ def export_lerobot(
         ImportError: without the library `pyarrow`, of the extra ``tables``.
     """
     output = Path(output)
+    _require(sources, output, fps, full_scale)
+    skins = _skins_of([*map(Path, sources)])
+    fps = fps or max(1, round(min(skin.rate for skin in skins)))
+    full_scale = full_scale or rounded_up(max(skin.largest for skin in skins))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
+    try:
+        folder = temporary / output.name  # the temporary folder itself is closed to other users
+        folder.mkdir()
+        features = features_of(skins[0].rows, skins[0].columns, list(skins[0].pads), full_scale)
+        episodes, stats = _write_frames([*map(Path, sources)], folder, features, fps, full_scale, task, progress)
+        frames = sum(row["length"] for row in episodes)
+        info = info_of(features, fps, len(episodes), frames, ROBOT)
+        write_metadata(folder, info, flat(stats), episodes, task)
+        os.rename(folder, output)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return DatasetSummary(len(episodes), frames, fps, full_scale)
+
+
+class _Source(NamedTuple):
+    """What a force map says before its frames are read: rate of the frames (Hz), largest force on a pixel (N)."""
+
+    rows: int
+    columns: int
+    pads: tuple[str, ...]
+    rate: float
+    largest: float
+
+
+def _require(sources: Sequence[object], output: Path, fps: int | None, full_scale: float | None) -> None:
     if not sources:
         raise ExportError("lerobot: no force map; name one or more, each of which becomes an episode")
     if output.exists():
         raise ExportError(f"{output}: exists; name another folder, or remove it first")
     if (fps is not None and fps < 1) or (full_scale is not None and not 0 < full_scale < np.inf):
         raise ExportError("lerobot: --fps is a whole number from 1 on, and --full-scale a force above zero, N")
-    skins = [_skin_of(Path(source)) for source in sources]
+
+
+def _skins_of(sources: list[Path]) -> list[_Source]:
+    """What `_skin_of` tells of each force map; all must be of one skin."""
+    skins = [_skin_of(source) for source in sources]
     for source, skin in zip(sources, skins, strict=True):
         if skin[:3] != skins[0][:3]:
-            raise ExportError(
-                f"{Path(source).name}: another skin than that of {Path(sources[0]).name}; export it alone"
-            )
-    rows, columns, pads, *_ = skins[0]
-    fps = fps or max(1, round(min(skin[3] for skin in skins)))
-    full_scale = full_scale or rounded_up(max(skin[4] for skin in skins))
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
-    try:
-        features = features_of(rows, columns, list(pads), full_scale)
-        episodes, stats = _write_frames([*map(Path, sources)], temporary, features, fps, full_scale, task, progress)
-        frames = sum(row["length"] for row in episodes)
-        info = info_of(features, fps, len(episodes), frames, ROBOT)
-        write_metadata(temporary, info, flat(stats), episodes, task)
-        os.rename(temporary, output)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return DatasetSummary(len(episodes), frames, fps, full_scale)
+            raise ExportError(f"{source.name}: another skin than that of {sources[0].name}; export it alone")
+    return skins
 
 
 def features_of(rows: int, columns: int, pads: list[str], full_scale: float) -> dict[str, dict[str, Any]]:
@@ -137,11 +156,8 @@ def rounded_up(value: float) -> float:
     return float(min(scale * power for scale in ROUND_SCALES if scale * power >= value * (1 - 1e-9)))
 
 
-Skin = tuple[int, int, tuple[str, ...], float, float]
-
-
-def _skin_of(path: Path) -> Skin:
-    """Rows and columns of a map, names of the pads, rate of the frames (Hz), and the largest force on a pixel (N)."""
+def _skin_of(path: Path) -> _Source:
+    """What a force map says; raises `SessionError` for a file that is none, or without frames."""
     with open_archive(path, FORMAT) as archive:
         rows, columns = (archive.attrs.get(name) for name in ("image_rows", "image_columns"))
         names = ("time", "force", "pad_force", "pad_valid", "pad_names")
@@ -157,7 +173,7 @@ def _skin_of(path: Path) -> Skin:
         blocks = (archive.arrays["force"].read(at, at + BLOCK) for at in range(0, frames, BLOCK))
         largest = max(float(np.nanmax(block, initial=0.0)) for block in blocks)
         pads = tuple(str(name) for name in archive.arrays["pad_names"].read().tolist())
-        return rows, columns, pads, rate, largest
+        return _Source(rows, columns, pads, rate, largest)
 
 
 def _rate(path: Path, times: np.ndarray) -> float:
