@@ -228,9 +228,9 @@ def gain_field(field, skin, rng):
     )
 
 
-def located(calibration, field, place):
-    """The calibration with a correction by location, at places of the image."""
-    gains = gain_field(field, calibration.skin, np.random.default_rng(2))
+def located(calibration, field, place, skin=None):
+    """The calibration with a correction by location, at places of the image; a skin other than its own tells sides."""
+    gains = gain_field(field, skin or calibration.skin, np.random.default_rng(2))
     return replace(calibration, field=gains, locator=CentroidLocator(place))
 
 
@@ -283,6 +283,20 @@ def test_a_field_with_other_settings_is_that_of_python(field, calibration, recor
     settings = {"edge": "corners=false,width=0.011,bumps=3,shared=false", "rbf": "nodes=3,shared=true"}
     chosen = located(calibration, FIELDS.make(f"{field}:{settings.get(field, 'modes=3,shared=true')}"), "half")
     calib.export_c(chosen, tmp_path / "skin.h")
+    compare(chosen, recorded, built(tmp_path))
+
+
+@needs_compiler
+def test_pads_of_other_shapes_on_a_round_sheet(calibration, recorded, tmp_path):
+    """A triangle, whose fourth side has no length, a pad with a notch, and a rim of 128 sides."""
+    skin = calibration.skin
+    triangle = np.array([[0.1, 0.0], [0.2, 0.0], [0.13, 0.1]])
+    notched = np.array([[0.0, 0.1], [0.1, 0.1], [0.1, 0.2], [0.04, 0.13], [0.0, 0.2]])
+    pads = (skin.pads[0], je.Pad("triangle", triangle), je.Pad("notched", notched), skin.pads[3])
+    odd = je.Skin("odd", je.Disc(0.3), 1.0, skin.electrodes, skin.protocol, pads)
+    chosen = located(calibration, FIELDS.make("edge"), "positive", odd)
+    calib.export_c(chosen, tmp_path / "skin.h")
+    assert "#define SKIN_SIDES 5\n#define SKIN_RIM 128\n" in (tmp_path / "skin.h").read_text()
     compare(chosen, recorded, built(tmp_path))
 
 
