@@ -77,8 +77,7 @@ class Peak(AbstractEstimator):
     """The pixel with the largest value."""
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
-        found = recon.centres[jnp.argmax(image, -1)]
-        return jnp.where(jnp.max(image, -1, keepdims=True) > 0, found, jnp.nan)
+        return _peak(jnp.asarray(image), recon.centres)
 
 
 class LevelCentroid(AbstractEstimator):
@@ -91,21 +90,43 @@ class LevelCentroid(AbstractEstimator):
     level: float = 0.25
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
-        top = jnp.max(image, -1, keepdims=True)
-        inside = jnp.where((image >= self.level * top) & (top > 0), recon.areas, 0)
-        return _centroid(inside, recon)
+        image = jnp.asarray(image)
+        return _level_centroid(image, recon.centres, recon.areas, jnp.asarray(self.level, image.dtype))
 
 
 class PositiveCentroid(AbstractEstimator):
     """The centroid of the positive part, weighted by its value."""
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
-        return _centroid(jnp.maximum(image, 0) * recon.areas, recon)
+        return _positive_centroid(jnp.asarray(image), recon.centres, recon.areas)
 
 
-def _centroid(weight: Float[Array, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
+@verb
+def _peak(image: Float[Array, "... pixels"], centres: Float[Array, "pixels 2"]) -> Float[Array, "... 2"]:
+    return jnp.where(jnp.max(image, -1, keepdims=True) > 0, centres[jnp.argmax(image, -1)], jnp.nan)
+
+
+@verb
+def _level_centroid(
+    image: Float[Array, "... pixels"],
+    centres: Float[Array, "pixels 2"],
+    areas: Float[Array, " pixels"],
+    level: Float[Array, ""],
+) -> Float[Array, "... 2"]:
+    top = jnp.max(image, -1, keepdims=True)
+    return _centroid(jnp.where((image >= level * top) & (top > 0), areas, 0), centres)
+
+
+@verb
+def _positive_centroid(
+    image: Float[Array, "... pixels"], centres: Float[Array, "pixels 2"], areas: Float[Array, " pixels"]
+) -> Float[Array, "... 2"]:
+    return _centroid(jnp.maximum(image, 0) * areas, centres)
+
+
+def _centroid(weight: Float[Array, "... pixels"], centres: Float[Array, "pixels 2"]) -> Float[Array, "... 2"]:
     total = weight.sum(-1, keepdims=True)
-    return jnp.where(total > 0, weight @ recon.centres / jnp.where(total > 0, total, 1), jnp.nan)
+    return jnp.where(total > 0, weight @ centres / jnp.where(total > 0, total, 1), jnp.nan)
 
 
 ESTIMATORS: dict[str, AbstractEstimator] = {
