@@ -16,6 +16,7 @@ from . import (
     simulators as simulators,
     tanks as tanks,
 )
+from .batch.parquet_frames import export_training_frames as export_training_frames
 from .batch.random_frames import write_training_frames as write_training_frames
 from .batch.sessions import calibrate_many as calibrate_many
 from .bench import (

@@ -8,6 +8,8 @@ from concurrent.futures import Executor, Future
 import h5py
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.dataset
+import pyarrow.parquet
 import pytest
 from scipy.special import ndtr
 
@@ -359,3 +361,51 @@ def test_too_little_disk_is_said_before_the_work(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(random_frames.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 10**6}))
     with pytest.raises(BenchError, match=r"take up to \d+\.\d GB, and 0\.0 GB are free"):
         calib.write_training_frames(calib.load_bench(scene), tmp_path / "out", 10**6)
+
+
+# --- Parquet ---
+
+
+@pytest.fixture(scope="module")
+def tables(folder):
+    out = folder.parent / "tables"
+    assert main(["export", "parquet", str(folder), "-o", str(out)]) == 0
+    return out
+
+
+def test_all_arrays_are_there_as_they_were(folder, tables):
+    frames = calib.open_training_frames(folder)
+    rows = pyarrow.dataset.dataset(sorted(map(str, tables.glob("shard-*.parquet")))).to_table()
+    skins = pyarrow.parquet.read_table(tables / "skins.parquet")
+    assert {*rows.column_names, *skins.column_names} == {"shard", *frames.card["arrays"]}
+    for name, about in frames.card["arrays"].items():
+        column = (rows if about["axes"][0] == "frame" else skins)[name]
+        values = column.combine_chunks()
+        while hasattr(values, "flatten") and pyarrow.types.is_fixed_size_list(values.type):
+            values = values.flatten()
+        np.testing.assert_array_equal(values.to_numpy().reshape(frames[name].shape), frames[name])
+        assert values.to_numpy().dtype == frames[name].dtype
+    np.testing.assert_array_equal(np.bincount(rows["shard"]), [SHARD_FRAMES, FRAMES - SHARD_FRAMES])
+    field = pyarrow.parquet.read_schema(tables / "shard-000000.parquet").field("contact_place")
+    assert field.metadata[b"unit"] == b"m"
+    assert json.loads(field.metadata[b"axes"]) == ["frame", "contact", "axis"]
+
+
+def test_a_writing_goes_on_and_files_that_are_whole_stay(folder, tables):
+    first, second = sorted(tables.glob("shard-*.parquet"))
+    kept, lost = first.stat().st_mtime_ns, second.read_bytes()
+    second.unlink()
+    summary = calib.export_training_frames(folder, tables)
+    assert (first.stat().st_mtime_ns, second.read_bytes()) == (kept, lost)
+    assert (summary.frames, summary.skins) == (FRAMES, 2)
+
+
+def test_what_cannot_be_written_is_refused(folder, tables, tmp_path, capsys):
+    assert main(["export", "parquet", str(folder), "-o", str(folder)]) == 2
+    assert "holds the frames themselves" in capsys.readouterr().err
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(BenchError, match=r"holds other files and no card\.json"):
+        calib.export_training_frames(folder, tmp_path)
+    with pytest.raises(BenchError, match="write frames with jaxeit simulate"):
+        calib.export_training_frames(tmp_path, tmp_path / "new")
+    assert not (tmp_path / "new").exists()

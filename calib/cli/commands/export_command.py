@@ -41,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "force on a pixel that is white in an image (default: the largest one, rounded up)"
     dataset.add_argument("--full-scale", type=float, metavar="N", help=text)
     dataset.set_defaults(export=_write_dataset)
+    text = "frames of jaxeit simulate --random-scenes as Parquet, a file for each shard, with jaxeit[tables]"
+    table = kinds.add_parser("parquet", help=text, description=text[0].upper() + text[1:] + ".")
+    table.add_argument("source", metavar="FRAMES", help="the folder of the frames")
+    table.add_argument("-o", "--output", required=True, metavar="FOLDER", help="an empty or a new folder")
+    table.set_defaults(export=_write_table)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -78,3 +83,9 @@ def _write_dataset(args: argparse.Namespace) -> object:
 
     options = {"task": args.task, "fps": args.fps, "full_scale": args.full_scale}
     return export_lerobot(args.sources, args.output, **options, progress=progress_bar("episodes"))
+
+
+def _write_table(args: argparse.Namespace) -> object:
+    from ...batch.parquet_frames import export_training_frames
+
+    return export_training_frames(args.source, args.output, progress=progress_bar("shards"))
