@@ -44,6 +44,10 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 MOST_MAPS = 40_000
 
 
+def pytest_runtest_setup():
+    tests.annotations.begin_test()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _bounded_maps():
     """A compiled program takes some 14 memory maps, of which Linux allows a process 65,530; beyond them XLA crashes."""

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, TypeCheckError
 
 import calib
 import jaxeit as je
-from tests.annotations import after_the_call, checked_when_called
+from tests.annotations import MOST_CHECKS, after_the_call, begin_test, checked_when_called
 
 pytestmark = pytest.mark.skipif(jaxtyping.config.jaxtyping_disable, reason="the check is left out")
 
@@ -34,6 +34,15 @@ def test_an_argument_that_is_not_as_annotated_is_found_unless_the_function_refus
         checked(jnp.ones(1, int))
     with pytest.raises(ValueError, match="one axis"):
         checked(jnp.ones((2, 2)))
+
+
+def test_a_loop_is_checked_a_few_times_and_each_test_anew(checked):
+    for _ in range(MOST_CHECKS):
+        checked(jnp.ones(1))
+    assert checked(jnp.ones(4)).shape == (2,)
+    begin_test()
+    with pytest.raises(TypeCheckError, match="return value"):
+        checked(jnp.ones(4))
 
 
 def test_functions_and_dataclasses_of_the_packages_are_checked():

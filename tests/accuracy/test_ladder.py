@@ -50,6 +50,7 @@ def found(scene):
     return je.ladder(scene, choices, touches=TOUCHES, reference=(fidelity(1.7), fidelity(2.2)), budget=0.0)
 
 
+@pytest.mark.slow
 def test_errors_fall_at_least_with_the_square_of_the_edge(found):
     coarse, middle = found.rungs[:2]
     for name in ("voltage_error", "difference_error"):

@@ -33,6 +33,7 @@ def _fit(shift, misfit):
     return fit, given
 
 
+@pytest.mark.slow
 def test_a_calibration_keeps_the_skin_with_its_electrodes_where_they_sit(session, skin, tmp_path, monkeypatch):
     shift = jnp.zeros((25, 2)).at[12, 0].set(1e-3)
     fit, given = _fit(shift, 0.8)

@@ -75,10 +75,11 @@ def commands(bundled, calibrated, tmp_path_factory):
 
 
 QUICK = [(name, fault) for name in ("import", "recover", "apply") for fault in FAULTS]
-LONG = [(name, fault) for name in ("simulate", "calibrate", "report") for fault in ("SIGTERM", "disk full")]
+LONG = [(name, fault) for name in ("simulate", "calibrate") for fault in ("SIGTERM", "disk full")]
+REPORT = [("report", "disk full"), pytest.param("report", "SIGTERM", marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize(("name", "fault"), QUICK + LONG)
+@pytest.mark.parametrize(("name", "fault"), QUICK + LONG + REPORT)
 def test_a_command_that_is_cut_short_leaves_what_was_there(name, fault, commands, tmp_path, monkeypatch, capsys):
     cause, status, words = FAULTS[fault]
     arguments, option, output = commands[name]

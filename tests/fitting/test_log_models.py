@@ -92,6 +92,7 @@ def test_a_log_that_begins_under_load_holds_its_unknown_history_in_its_interval(
     assert max(under_load) > 3 * np.median(whole.high - whole.low)
 
 
+@pytest.mark.slow
 def test_a_soft_sensor_that_was_in_use_before_the_log_is_told_by_its_like():
     """Channels that creep by 30 % with 30 s, and loads at random: the interval holds what is unknown."""
     rng = np.random.default_rng(0)

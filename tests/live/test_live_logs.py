@@ -112,6 +112,7 @@ def test_the_page_of_a_log_has_no_map(files):
     }
 
 
+@pytest.mark.slow
 def test_a_curve_with_hysteresis_follows_one_reading_after_the_other_in_bounded_time(files, log):
     """What is remembered does not grow with the time that has passed."""
     found = calibrated(files / "log.h5", calib.Recipe(curve=AffinePlay()))

@@ -105,6 +105,7 @@ def test_a_design_for_a_dead_electrode_loses_less_without_it(sensitivity):
     assert careful.bound <= careful.error
 
 
+@pytest.mark.slow
 def test_a_hundred_readings_tell_more_than_the_whole_adjacent_scan(testbed, skin):
     """Of a seventh of all, which takes less time; each change of drive at the cost of ten readings: few drives."""
     adjacent = testbed.errors(skin.protocol.pattern)

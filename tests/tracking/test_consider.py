@@ -14,6 +14,7 @@ from jaxeit.contacts.loads.pressure import Form, line_shapes, shape_directions
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.consider import ConsiderErrors
 from jaxeit.tracking.response import SHORTEST, load_pressure
+from tests.compiled import compiled
 
 from .conftest import SECONDS, SETTINGS, load
 
@@ -111,7 +112,7 @@ def test_slopes_in_the_coat_are_those_of_the_forward_map(model, even_tracker, co
     """But for the few unknowns that are solved anew."""
     sheet, one = even_tracker.filter.sheet, jnp.array(load(0.08, 0.11, 15.0))
     gain = jnp.zeros(len(even_tracker.filter.places))
-    found = sheet.coat_slopes(one[None], gain, sheet.near(one[None]))
+    found = compiled(sheet.coat_slopes, one[None], gain, sheet.near(one[None]))
     drawn = coats @ np.random.default_rng(1).normal(size=coats.shape[1])
     pressure = load_pressure(one, model.centroids)
 

@@ -17,6 +17,7 @@ FORCES = np.array([10.0, 0.0, 0.0, 0.0])  # N on the pads under a press at (0.05
 PLACES = [(0.05, 0.06), (0.06, 0.05), (0.045, 0.045)]
 
 
+@pytest.mark.slow
 def test_a_gain_beyond_all_belief_is_forgotten_and_the_contacts_stay(tracker, frame_of):
     now = tracker.start()
     for _ in range(3):

@@ -101,6 +101,7 @@ def test_the_command_line_takes_a_location_and_the_file_keeps_it(pressed, tmp_pa
     np.testing.assert_allclose(read_archive(out, "log-forces").arrays["force"], back.predict(time, values, place).force)
 
 
+@pytest.mark.slow
 def test_places_decide_between_gain_inputs_and_nothing(tmp_path):
     """A pad of one channel whose gain depends on the place, and one whose gain does not."""
     either = calib.Recipe(curve=MonotonePolynomial(), location=[None, RadialBasis(), TensorSpline()])
