@@ -44,7 +44,7 @@ def files(tmp_path_factory, log):
 
 @pytest.mark.parametrize("name", ["plain", "placed"])
 def test_forces_from_the_command_line_are_those_of_the_calibration(files, log, name, capsys):
-    url = f"replay://{files / 'log.h5'}?speed=20"
+    url = f"replay://{files / 'log.h5'}?speed={20 if name == 'plain' else 8}"
     words = ["--pressure", url, "--json", "--port", "0", "--seconds", "3"]
     words += ["--stage", url] if name == "placed" else []
     assert main(["live", "--calibration", str(files / f"{name}.h5"), *words]) == 0
