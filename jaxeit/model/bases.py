@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
 from ..budget import require
+from ..linalg.base import on_device
 from ..registry import Registry
 from .discretisation import Model
 from .stiffness import Stiffness, stiffness
@@ -267,17 +268,17 @@ def _basis_map(
     system = model.system
     with jax.ensure_compile_time_eval():  # so that the values of the basis are known inside a compiled function too
         return BasisMap(
-            element=jnp.asarray(element, jnp.int32),
-            weight=jnp.asarray(weight, model.dtype),
-            coefficient=jnp.asarray(coefficient, jnp.int32),
+            element=on_device(element, jnp.int32),
+            weight=on_device(weight, model.dtype),
+            coefficient=on_device(coefficient, jnp.int32),
             stiffness=stiffness(
                 element, weight, _host(system.dofs), _host(system.slopes), system.unknowns, model.dtype
             ),
             picture=Picture(
-                centres=jnp.asarray(centres, model.dtype),
-                areas=jnp.asarray(areas, model.dtype),
-                edges=jnp.asarray(neighbours[0], jnp.int32),
-                edge_length=jnp.asarray(neighbours[1], model.dtype),
+                centres=on_device(centres, model.dtype),
+                areas=on_device(areas, model.dtype),
+                edges=on_device(neighbours[0], jnp.int32),
+                edge_length=on_device(neighbours[1], model.dtype),
                 shape=shape,
                 extent=(x0, x1, y0, y1),
             ),

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from .._compile import is_traced, require_known, verb
 from ..geometry.shapes import cross
+from ..linalg.base import on_device
 from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.triangles import Mesh
 from .discretisation import Model
@@ -81,12 +82,12 @@ def electrode_motion(model: Model) -> Motion:
     np.add.at(tangents, mesh.triangles, slope[:, None])
     np.add.at(around, mesh.triangles, 1.0)
     return Motion(
-        jnp.asarray(electrode, jnp.int32),
-        jnp.asarray(step, model.dtype),
-        jnp.asarray(tangents / around @ step, model.dtype),
-        jnp.asarray(reach, model.dtype),
-        tuple(jnp.asarray(table, jnp.int32) for table in stiffness_places(model.system)),
-        jnp.asarray(_corners_of_pieces(model, unknown), jnp.int32),
+        on_device(electrode, jnp.int32),
+        on_device(step, model.dtype),
+        on_device(tangents / around @ step, model.dtype),
+        on_device(reach, model.dtype),
+        tuple(on_device(table, jnp.int32) for table in stiffness_places(model.system)),
+        on_device(_corners_of_pieces(model, unknown), jnp.int32),
     )
 
 

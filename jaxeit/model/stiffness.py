@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 from scipy import sparse
 
+from ..linalg.base import on_device
 from ..linalg.small_matrices import stacked_product
 
 BATCH_ROWS = 4096  # rows of H in a batch, whose potentials fit in a core's cache
@@ -111,7 +112,8 @@ def stiffness(
         table[cut] = np.pad(part.dofs, ((0, 0), (0, nodes - part.dofs.shape[1])), mode="edge")
         at = cut.start + part.line, part.row, part.slot
         column[at], entry[at] = part.column, part.entry
-    return Stiffness(jnp.asarray(table), jnp.asarray(column), jnp.asarray(entry), unknowns)
+    indices = on_device(table, table.dtype), on_device(column, column.dtype)
+    return Stiffness(*indices, on_device(entry, dtype), unknowns)
 
 
 class _Halves(NamedTuple):
