@@ -231,7 +231,14 @@ def test_what_cannot_be_fitted_is_refused(ready):
         je.prepare_contacts(fitter.sheet.model, noise=noise, untouched=np.ones(5))
     with pytest.raises(InverseError, match="reading 3 is not finite"):
         fitter(np.where(np.arange(550) == 3, np.nan, frames[0]), contacts)
-    for bad in ({"width": 0.0}, {"gain": -1.0}, {"coat": -1.0}, {"prior": (1.0, 0.0, 0.0)}, {"prior": (0.5,) * 5}):
+    for bad in (
+        {"width": 0.0},
+        {"shapes": (0.5,)},
+        {"gain": -1.0},
+        {"coat": -1.0},
+        {"prior": (1.0, 0.0, 0.0)},
+        {"prior": (0.5,) * 5},
+    ):
         with pytest.raises(InverseError, match=next(iter(bad))):
             LoadSettings(**bad)
 

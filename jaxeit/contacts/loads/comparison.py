@@ -10,8 +10,9 @@ from scipy.linalg import solve_triangular
 from scipy.stats import norm
 
 from ..result import Contacts
+from .considered import Known, inverse_of, mean_square_error
 from .pressure import MOST, SIZE, Form
-from .programs import Problem, fit_loads, unknowns_of, unusual
+from .programs import Problem, before, fit_loads, unknowns_of
 from .proposal import Proposed
 from .result import LoadKind, Loads, LoadShape
 from .sheet import Unknowns
@@ -212,13 +213,9 @@ class Comparison:
         return free_parameters(padded(fit.loads[: len(FORMS[kind])], kind)[1]).ravel()
 
     def covariance(self, kind: LoadKind, fit: Fit) -> np.ndarray:
-        """Covariance of the parameters that are fitted."""
+        """Covariance of the parameters that are fitted, with the shapes that the fit marginalises."""
         free = self.free(kind, fit)
-        normal = fit.normal[np.ix_(free, free)]
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
-        inverse = np.linalg.pinv(scale[:, None] * normal * scale, hermitian=True)
-        found: np.ndarray = scale[:, None] * inverse * scale
-        return found
+        return inverse_of(fit.normal[np.ix_(free, free)])[0]
 
     def evidence(self, kind: LoadKind, fit: Fit) -> float:
         """Logarithm of the evidence of a kind of loads, up to a constant that all kinds share."""
@@ -244,9 +241,12 @@ class Comparison:
 
     def shape(self, kind: LoadKind, fit: Fit) -> LoadShape:
         """Loads as they are handed out."""
-        rows = fit.loads[: len(FORMS[kind])]
-        parts = rows[:, :2], np.exp(rows[:, 2]), np.exp(rows[:, 3]), rows[:, 4:], self.covariance(kind, fit)
-        y, forms, root, flat = self.put(self.y, padded(rows, kind)[1], fit.root, fit.loads.ravel())
-        surprise = np.asarray(unusual(flat, Problem(self.fitter, y, forms, root)))
+        rows, free = fit.loads[: len(FORMS[kind])], self.free(kind, fit)
+        y, forms, root, loads = self.put(self.y, padded(rows, kind)[1], fit.root, fit.loads)
+        surprise, slopes = map(np.asarray, before(Problem(self.fitter, y, forms, root), loads))
         misfit = np.array((fit.square - surprise @ surprise) / len(self.y))
+        end = unknowns_of(self.fitter, loads, forms)
+        known = Known(self.y, end, self.errors(end), surprise, slopes[:, free])
+        covariance = mean_square_error(known, free, np.asarray(self.fitter.shapes, float))
+        parts = rows[:, :2], np.exp(rows[:, 2]), np.exp(rows[:, 3]), rows[:, 4:], covariance
         return LoadShape(*self.put(*parts, misfit))

@@ -9,7 +9,8 @@ bends it and splits it; the coat of the sheet; and the shape of a load. All of i
 the slopes of the r whitened readings y in these unknowns, each of standard deviation one, and e the part of the signal
 by which all else errs, errors have the covariance (1 + e^2 |y|^2 / r) I + N N'. Kinds are compared by their evidence in
 Laplace's approximation (MacKay 1992, Neural Comput. 4), so that probabilities and covariances hold the model's error as
-well as the noise.
+well as the noise. The covariance that is handed out also holds that shapes may be larger, and that slopes are those of
+the fit's end (`considered`).
 
 The host decides what is fitted next; JAX runs two compiled programs, which serve all kinds (`pressure`).
 """
@@ -43,7 +44,7 @@ class LoadFitter(eqx.Module):
     | usual, spread: mean and standard deviation of log width, log force  | (2,)             |      |
     | difference: standard deviation of their differences between loads   | (2,)             |      |
     | least: distance of two loads, length of an edge, that is not one load | (2,)           | m    |
-    | length, prior, model_error: see `LoadSettings`                      | (), (5,), ()     |      |
+    | length, prior, model_error, shapes: see `LoadSettings`              | (), (5,), (), (k,) |    |
     """
 
     sheet: PressedSheet
@@ -59,6 +60,7 @@ class LoadFitter(eqx.Module):
     length: Float[Array, ""]
     prior: Float[Array, "5"]
     model_error: Float[Array, ""]
+    shapes: Float[Array, " k"]
 
     def __call__(self, dv: Float[ArrayLike, " readings"], contacts: Contacts) -> Loads:
         """Loads of one difference frame (readings,) V, from the contacts that a `ContactFinder` saw in it.

@@ -67,6 +67,7 @@ def prepare_loads(
         least=put([settings.nearest, settings.shortest]),
         prior=put(settings.prior),
         model_error=put(settings.model_error),
+        shapes=put(settings.shapes),
     )
 
 

@@ -6,6 +6,7 @@ and how, is an array of `Form`.
 """
 
 import math
+from collections.abc import Callable
 from enum import IntEnum
 
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float, Int
 MOST, SIZE = 3, 6  # loads, and parameters of each
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
-SQRT_2 = math.sqrt(2)
+SQRT_2, SQRT_3 = math.sqrt(2), math.sqrt(3)
 ELONGATION = 0.3  # standard deviation of second moments over that of the others
 
 
@@ -73,10 +74,31 @@ def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 
     ``u_x u_y`` (tilted or elliptic tip), which each load has of its own. A flat disc has moments of -1/3 in L2 and L3,
     a ring -1/2 and -2/3; what the pad spreads has less.
     """
-    row = [(form, one.at[:2].add(t * one[4:]) - LOG_ROW) for form, one in zip(forms, loads, strict=True) for t in ROW]
-    found = [jnp.where(form > Form.ABSENT, _bent(one, points), 0) for form, one in row]
-    by_load = jnp.stack(found).reshape(len(loads), len(ROW), *found[0].shape).sum(1)
+    by_load = _rows_of_round(_bent, loads, forms, points)
     return jnp.concatenate([by_load[..., :2].sum(0), *by_load[..., 2:]], -1)
+
+
+def tilt_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "... d"]:
+    """Change of pressure by the moments of next order by which a tilted tip differs from a Gaussian, two for each load.
+
+    They are the Gaussian times ``u (3 - 3 r + r^2 / 2) / sqrt(3)``, in the notation of `shape_directions`.
+    """
+    return jnp.concatenate([*_rows_of_round(_tilted, loads, forms, points)], -1)
+
+
+def _rows_of_round(
+    change: Callable[[Array, Array], Array], loads: Parameters, forms: Forms, points: Float[Array, "... 2"]
+) -> Float[Array, "n ... d"]:
+    """Changes of pressure by each load; an edge is a row of round loads."""
+    row = [(form, one.at[:2].add(t * one[4:]) - LOG_ROW) for form, one in zip(forms, loads, strict=True) for t in ROW]
+    found = [jnp.where(form > Form.ABSENT, change(one, points), 0) for form, one in row]
+    return jnp.stack(found).reshape(len(loads), len(ROW), *found[0].shape).sum(1)
+
+
+def _tilted(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    u = (points - one[:2]) * jnp.exp(-one[2])
+    r = 0.5 * jnp.sum(u**2, -1, keepdims=True)
+    return spot(one, points)[..., None] * u * (3 - 3 * r + r**2 / 2) / SQRT_3
 
 
 def _bent(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 6"]:

@@ -66,6 +66,12 @@ def fit_loads(
     return found.value.reshape(start.shape), found.state.square, found.state.quadratic.hessian.matrix
 
 
+@verb
+def before(problem: Problem, loads: Parameters) -> tuple[Float[Array, " s"], Float[Array, "s m"]]:
+    """What is unusual of loads, and its slopes in their parameters; see `unusual`."""
+    return unusual(loads.ravel(), problem), jax.jacfwd(unusual)(loads.ravel(), problem)
+
+
 def _residual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " n"]:
     left = problem.y - problem.fitter.sheet.response(flat.reshape(MOST, SIZE), problem.forms)
     return jnp.append(lapack.solve_triangular(problem.root, left, lower=True), unusual(flat, problem))

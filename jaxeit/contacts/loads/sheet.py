@@ -10,13 +10,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...effects.material import ContactPiezoresistance
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, fields, series_resistance, transfer
 from ...model.sensitivity import element_slopes
-from .pressure import Forms, Parameters, elongations, pressure, shape_directions
+from .pressure import Forms, Parameters, elongations, pressure, shape_directions, tilt_directions
 
 MODES = 72  # of the gain that loads reach, of those on the whole sheet
 
@@ -37,11 +38,21 @@ class Linearised(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """Whitened readings (r,), and their slopes in what is not known: unknowns of standard deviation one (r, n), the
-    parameters of all loads (r, 6 n), and second moments of the first load (r, 2)."""
+    """Whitened readings (r,), and their slopes.
+
+    | meaning: in what the slopes are                                                   | shape    |
+    |-----------------------------------------------------------------------------------|----------|
+    | nuisances: unknowns of standard deviation one, which fits marginalise             | (r, n)   |
+    | shapes: moments of the shapes of loads, which are among these                     | (r, s)   |
+    | tilts: further moments of shapes, which are not                                   | (r, t)   |
+    | loads: all parameters of all loads                                                | (r, 6 k) |
+    | elongation: second moments of the first load                                      | (r, 2)   |
+    """
 
     value: Float[Array, " r"]
     nuisances: Float[Array, "r n"]
+    shapes: Float[Array, "r s"]
+    tilts: Float[Array, "r t"]
     loads: Float[Array, "r m"]
     elongation: Float[Array, "r 2"]
 
@@ -107,13 +118,16 @@ class PressedSheet(eqx.Module):
         by_gain = jnp.sum(by_pressure * here, 1)
         there = jax.lax.top_k(by_gain @ self.gain[at.near], min(MODES, self.gain.shape[1]))[1]
         gain = by_gain[:, None] * self.gain[at.near[:, None], there]
-        bent = jnp.concatenate([self.shape * shape_directions(loads, forms, points), elongations(loads[0], points)], -1)
+        shapes, tilts = shape_directions(loads, forms, points), tilt_directions(loads, forms, points)
+        bent = jnp.concatenate([self.shape * shapes, self.shape * tilts, elongations(loads[0], points)], -1)
         mixed = self._mixed(at, jnp.concatenate([gain, jnp.einsum("eq,eqd->ed", by_pressure, bent)], 1))
-        nuisances = mixed[:, :-2]
+        ends = np.cumsum([gain.shape[1], shapes.shape[-1], tilts.shape[-1]])
+        _, by_shapes, by_tilts, elongation = jnp.split(mixed, ends, 1)
+        nuisances = mixed[:, : ends[1]]
         if self.coat.shape[1]:
             by_coat = self.coat_slopes(self._pressed(loads, forms, self.sigma, self.points)) - self.by_coat
             nuisances = jnp.concatenate([nuisances, by_coat], 1)
-        return Unknowns(at.value, nuisances, self.slopes(at, loads, forms), mixed[:, -2:])
+        return Unknowns(at.value, nuisances, by_shapes, by_tilts, self.slopes(at, loads, forms), elongation)
 
     def coat_slopes(self, sigma: Float[Array, " elements"]) -> Float[Array, "r c"]:
         """Slopes of the readings of a sheet in its log conductivity."""
