@@ -44,7 +44,7 @@ class LoadFitter(eqx.Module):
     | usual, spread: mean and standard deviation of log width, log force  | (2,)             |      |
     | difference: standard deviation of their differences between loads   | (2,)             |      |
     | least: distance of two loads, length of an edge, that is not one load | (2,)           | m    |
-    | length, prior, model_error, shapes: see `LoadSettings`              | (), (5,), (), (k,) |    |
+    | length, prior, model_error, shapes: see `LoadSettings`              | (), (5,), (), (factors,) | |
     """
 
     sheet: PressedSheet
@@ -60,7 +60,7 @@ class LoadFitter(eqx.Module):
     length: Float[Array, ""]
     prior: Float[Array, "5"]
     model_error: Float[Array, ""]
-    shapes: Float[Array, " k"]
+    shapes: Float[Array, " factors"]
 
     def __call__(self, dv: Float[ArrayLike, " readings"], contacts: Contacts) -> Loads:
         """Loads of one difference frame (readings,) V, from the contacts that a `ContactFinder` saw in it.
