@@ -16,7 +16,7 @@ from public_names import identifiers, public_names, room_page
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "*/README.md", "data/schema/README.md")
 FILES = ("docs/**/*.png", "docs/site/*.css", "docs/site/*.js", "jaxeit/skin/skins/*.toml", "calib/bench/scenes/*.toml",
-         "data/sessions/*.toml")  # fmt: skip
+         "data/sessions/*.toml", "examples/notebooks/*.ipynb")  # fmt: skip
 CODE = re.compile(r"^( *)```.*?^\1```|`[^`\n]+`(?!\])", re.DOTALL | re.MULTILINE)
 NAME = re.compile(r"`(?:je|jaxeit|calib)\.([\w.]+)(?:\(.*\))?`", re.DOTALL)
 EXAMPLE = re.compile(r"\]\((\w+)\.py\)")
