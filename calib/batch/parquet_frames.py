@@ -54,22 +54,23 @@ def export_training_frames(
         BenchError: the folder has no frames, or the output holds other files.
         ImportError: without the library `pyarrow`, of the extra ``tables``.
     """
-    parquet, frames, output = library("pyarrow.parquet", EXTRA), open_training_frames(folder), Path(output)
+    library("pyarrow.parquet", EXTRA)
+    frames, output = open_training_frames(folder), Path(output)
     if output.resolve() == Path(folder).resolve():
         raise BenchError(f"{output}: holds the frames themselves; give another folder")
     claim_folder(output, (Path(folder) / CARD).read_text(encoding="utf-8"))
-    names = {kind: [n for n, about in frames.card["arrays"].items() if (about["axes"][0] == "frame") == kind]
-             for kind in (True, False)}  # fmt: skip
+    by_frame = [name for name, about in frames.card["arrays"].items() if about["axes"][0] == "frame"]
+    by_skin = [name for name in frames.card["arrays"] if name not in by_frame]
     for skin in progress(list(frames.skins())):
         path = output / f"shard-{skin.shards[0]:06d}.parquet"
         if not _is_whole(path, skin):
-            columns = {"shard": np.full(len(skin), skin.shards[0], "i4")} | {name: skin[name] for name in names[True]}
-            _write(path, columns, frames.card)
-    columns = {"shard": np.arange(len(frames.shards), dtype="i4")} | {name: frames[name] for name in names[False]}
+            (arrays,) = skin.batches(len(skin), *by_frame)
+            columns = {"shard": np.full(len(skin), skin.shards[0], "i4")}
+            _write(path, columns | dict(zip(by_frame, arrays, strict=True)), frames.card)
+    columns = {"shard": np.arange(len(frames.shards), dtype="i4")} | {name: frames[name] for name in by_skin}
     _write(output / SKINS, columns, frames.card)
-    files = list(output.glob("*.parquet"))
-    rows = sum(parquet.read_metadata(path).num_rows for path in files if path.name != SKINS)
-    return ParquetSummary(rows, len(frames.shards), sum(path.stat().st_size for path in files))
+    size = sum(path.stat().st_size for path in output.glob("*.parquet"))
+    return ParquetSummary(len(frames), len(frames.shards), size)
 
 
 def _is_whole(path: Path, skin: TrainingFrames) -> bool:

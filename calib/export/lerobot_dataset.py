@@ -1,8 +1,6 @@
 """Force maps as a LeRobot dataset: each force map is an episode, at a constant rate."""
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from ..calibration.application import FORMAT
 from ..calibration.frame_blocks import Progress
 from ..session import ArchiveReader, open_archive
 from ..session.errors import problem
+from ..session.hdf5.storage import folder_beside
 from .errors import ExportError
 from .lerobot_files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata
 from .lerobot_stats import FeatureStats, Stats, aggregated, flat
@@ -83,10 +82,8 @@ def export_lerobot(
     skins = _skins_of([*map(Path, sources)])
     fps = fps or max(1, round(min(skin.rate for skin in skins)))
     full_scale = full_scale or rounded_up(max(skin.largest for skin in skins))
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
-    try:
-        folder = temporary / output.name  # the temporary folder itself is closed to other users
+    with folder_beside(output) as temporary:
+        folder = temporary / output.name
         folder.mkdir()
         features = features_of(skins[0].rows, skins[0].columns, list(skins[0].pads), full_scale)
         episodes, stats = _write_frames([*map(Path, sources)], folder, features, fps, full_scale, task, progress)
@@ -94,8 +91,6 @@ def export_lerobot(
         info = info_of(features, fps, len(episodes), frames, ROBOT)
         write_metadata(folder, info, flat(stats), episodes, task)
         os.rename(folder, output)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return DatasetSummary(len(episodes), frames, fps, full_scale)
 
 
@@ -165,11 +160,12 @@ def _skin_of(path: Path) -> _Source:
         if missing or not isinstance(rows, int) or not isinstance(columns, int):
             raise problem(path, missing or "image_rows", "missing", "write the force map again with `jaxeit apply`")
         frames, pixels = archive.arrays["force"].shape
-        if pixels != rows * columns or frames != len(archive.arrays["time"].read()):
+        times = archive.arrays["time"].read()
+        if pixels != rows * columns or frames != len(times):
             raise problem(path, "force", "has another shape than time and image", "write the force map again")
         if frames < 1:
             raise problem(path, "time", "holds no frame", "apply the calibration to a longer session")
-        rate = _rate(path, archive.arrays["time"].read())
+        rate = _rate(path, times)
         blocks = (archive.arrays["force"].read(at, at + BLOCK) for at in range(0, frames, BLOCK))
         largest = max(float(np.nanmax(block, initial=0.0)) for block in blocks)
         pads = tuple(str(name) for name in archive.arrays["pad_names"].read().tolist())
@@ -202,10 +198,11 @@ def _write_frames(
     with FrameFiles(folder, features) as files:
         for number, source in enumerate(progress(sources)):
             with open_archive(source, FORMAT) as archive:
-                rows = held_rows(archive.arrays["time"].read(), fps)
+                times = archive.arrays["time"].read()
+                rows = held_rows(times, fps)
                 stats = {name: FeatureStats(len(rows), channels=name == IMAGE) for name in features}
                 place = files.begin_episode()
-                for columns in _blocks(archive, rows, fps, full_scale, first, number, features[MAP]["shape"]):
+                for columns in _blocks(archive, times, rows, fps, full_scale, first, number, features[MAP]["shape"]):
                     for name, part in stats.items():
                         part.add(columns[name] / 255 if name == IMAGE else columns[name])
                     pictures = [png_of(np.repeat(grey[..., None], 3, -1)) for grey in columns[IMAGE]]
@@ -228,11 +225,17 @@ def held_rows(times: np.ndarray, fps: int) -> np.ndarray:
 
 
 def _blocks(
-    archive: ArchiveReader, rows: np.ndarray, fps: int, full_scale: float, first: int, episode: int, shape: list[int]
+    archive: ArchiveReader,
+    times: np.ndarray,
+    rows: np.ndarray,
+    fps: int,
+    full_scale: float,
+    first: int,
+    episode: int,
+    shape: list[int],
 ) -> Iterator[dict[str, Any]]:
     """Columns of frames, block by block; images as grey values."""
     arrays = archive.arrays
-    times = arrays["time"].read()
     for start in range(0, len(rows), BLOCK):
         chosen = rows[start : start + BLOCK]
         low, high, count = int(chosen[0]), int(chosen[-1]) + 1, len(chosen)

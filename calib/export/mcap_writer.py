@@ -2,15 +2,13 @@
 
 import os
 import re
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ..session.errors import printable, problem
-from ..session.hdf5.storage import sync
+from ..session.hdf5.storage import folder_beside, sync
 from ..session.importers.child import library
 from .message_sink import AbstractMessageSink
 
@@ -73,12 +71,9 @@ def writing_bag(output: Path) -> Iterator[Bag]:
     rosbag2, typesys = library("rosbags.rosbag2", EXTRA), library("rosbags.typesys", EXTRA)
     interfaces = library("rosbags.interfaces", EXTRA)
     _require_free(output)
-    output.parent.mkdir(parents=True, exist_ok=True)
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    # Beside the output, so that the bag can be renamed. Its own name, because the file in it is named after it.
-    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
-    try:
-        folder = temporary / output.name.removesuffix(SUFFIX)
+    with folder_beside(output) as temporary:
+        folder = temporary / output.name.removesuffix(SUFFIX)  # its own name: the file in it is named after it
         plugin = rosbag2.StoragePlugin.MCAP
         writer = rosbag2.Writer(folder, version=METADATA_VERSION, storage_plugin=plugin)
         writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
@@ -88,8 +83,6 @@ def writing_bag(output: Path) -> Iterator[Bag]:
             sync(path)
         _require_free(output)
         os.rename(folder / f"{folder.name}{SUFFIX}" if output.suffix == SUFFIX else folder, output)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _require_free(output: Path) -> None:

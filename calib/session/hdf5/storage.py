@@ -13,7 +13,9 @@ import hashlib
 import io
 import os
 import re
+import shutil
 import stat
+import tempfile
 import uuid
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -49,6 +51,20 @@ def file_hash(path: str | os.PathLike[str]) -> str:
         while piece := stream.read(1 << 20):
             digest.update(piece)
     return digest.hexdigest()
+
+
+@contextlib.contextmanager
+def folder_beside(output: Path) -> Iterator[Path]:
+    """A temporary folder beside an output, so that what is complete in it can be renamed to the output.
+
+    It is closed to other users, and removed in the end.
+    """
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
+    try:
+        yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextlib.contextmanager

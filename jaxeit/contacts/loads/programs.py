@@ -83,7 +83,7 @@ def _quadratic(flat: Float[Array, " m"], problem: Problem) -> Quadratic:
     at = sheet.linearised(loads, problem.forms)
     both = jnp.concatenate([(problem.y - at.value)[:, None], -sheet.slopes(at, loads, problem.forms)], 1)
     both = lapack.solve_triangular(problem.root, both, lower=True)
-    surprise, by_loads = unusual(flat, problem), jax.jacfwd(unusual)(flat, problem)
+    surprise, by_loads = before(problem, loads)
     return normal_equations(jnp.append(both[:, 0], surprise), jnp.concatenate([both[:, 1:], by_loads]))
 
 

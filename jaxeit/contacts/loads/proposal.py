@@ -201,8 +201,8 @@ PROPOSALS = Path(__file__).parent / "proposals"
 
 def shipped_proposal(skin: Skin) -> Proposal | None:
     """The shipped proposal that was trained for a skin, whatever its name; None: there is none."""
-    every = (load_proposal(path) for path in sorted(PROPOSALS.glob("*.npz")))
-    return next((found for found in every if found.about.get("skin_sha256") == skin_hash(skin)), None)
+    every, wanted = (load_proposal(path) for path in sorted(PROPOSALS.glob("*.npz"))), skin_hash(skin)
+    return next((found for found in every if found.about.get("skin_sha256") == wanted), None)
 
 
 def load_proposal(path: str | Path) -> Proposal:
