@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -132,9 +133,11 @@ class Question:
 
 
 def machine() -> str:
-    """A neutral name: cores and kind of processor."""
+    """A neutral name: cores and kind of processor, and the GPU that JAX uses."""
     kind = {"x86_64": "x86", "AMD64": "x86", "aarch64": "arm", "arm64": "arm"}
-    return f"{os.cpu_count()}-core-{kind.get(platform.machine(), platform.machine())}"
+    device = jax.devices()[0]
+    gpu = "" if device.platform == "cpu" else "-" + re.sub(r"\W+", "-", device.device_kind.lower())
+    return f"{os.cpu_count()}-core-{kind.get(platform.machine(), platform.machine())}{gpu}"
 
 
 def circumstances() -> Row:

@@ -36,16 +36,31 @@ def verb(function: F) -> F:
     A call outside other compiled functions uses the compiler options that suit its gathers best (`compiler_options`);
     JAX accepts options for whole programs only.
     """
-    inner = eqx.filter_jit(function)
+    exact = full_precision(function)
+    inner = eqx.filter_jit(exact)
 
     @cache
     def outer() -> Any:
         jit: Any = eqx.filter_jit  # its type leaves out what it hands on to jax.jit
-        return jit(function, compiler_options=compiler_options())
+        return jit(exact, compiler_options=compiler_options())
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         return (inner if _is_transformed(args, kwargs) else outer())(*args, **kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+def full_precision(function: F) -> F:
+    """``function``, whose products in single precision a GPU does not round to TF32, of 10 bits, as JAX lets it.
+
+    Verbs are so. JAX traces rules of derivatives and of batches later, when the verb that they belong to is done.
+    """
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
 
@@ -80,6 +95,7 @@ def _bound(
     """The program of `bind`, which models that differ in their numbers only share."""
 
     @partial(jax.jit, compiler_options=dict(flags))
+    @full_precision
     def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
         leaves, static = (
             jax.tree.unflatten(structure, layout.unpack(packs)),
@@ -230,6 +246,7 @@ def sequential_on_cpu(function: Callable[..., T]) -> Callable[..., T]:
     each sample does only its own work. Other devices, and derivatives, use the batched program. Arguments and results
     are pytrees of arrays.
     """
+    function = full_precision(function)
     single = custom_vmap(function)
 
     @single.def_vmap

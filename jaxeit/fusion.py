@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
-from ._compile import is_traced, require_known
+from ._compile import full_precision, is_traced, require_known
 from .model.bases import AbstractPictured, overlap_areas
 from .notebook import card, picture
 from .skin.description import Skin
@@ -151,6 +151,7 @@ LOG_OF_ZERO = -1e30
 
 
 @eqx.filter_jit
+@full_precision
 def contact_shares(
     position: Float[Array, "... K 2"],
     width: Float[Array, "... K"],
@@ -186,6 +187,7 @@ def contact_shares(
 
 
 @eqx.filter_jit
+@full_precision
 def fuse(
     image: Float[Array, "... pixels"],
     masks: PadMasks,

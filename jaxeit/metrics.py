@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
-from ._compile import is_traced, verb
+from ._compile import full_precision, is_traced, verb
 
 __all__ = [
     "ESTIMATORS",
@@ -159,6 +159,7 @@ def inward_bias(
     return localisation_error(true, centre) - localisation_error(estimated, centre)
 
 
+@full_precision
 def image_sum(image: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " pixels"]) -> Float[Array, "..."]:
     """Integral of the image over the sheet, S m^2."""
     return jnp.asarray(image) @ jnp.asarray(areas)

@@ -11,13 +11,14 @@ from functools import partial, wraps
 from inspect import isclass
 from typing import Any, Self, get_args, get_origin
 
+import jax
 import jaxtyping
 import numpy as np
 from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.roar import BeartypeDecorHintPepUnsupportedException
 from numpy.typing import ArrayLike
 
-_AS = {
+_AS: dict[Any, Any] = {
     # The functions that jaxtyping checks are in no class that Self could stand for.
     Self: Any,
     # A session's mapping reads an array from the file when asked for it, and the file may be damaged there.
@@ -25,6 +26,8 @@ _AS = {
     # The sequences in NumPy's ArrayLike are a protocol; tuples lack one of its methods and are sequences all the same.
     **{part: Sequence for part in get_args(ArrayLike) if "_NestedSequence" in repr(get_origin(part))},
 }
+if hasattr(ArrayLike, "__value__"):  # an alias since NumPy 2.5
+    _AS[ArrayLike] = np.ndarray | np.generic | jax.Array | Sequence | complex
 # An int is a float, as for mypy.
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict(_AS)))
 

@@ -1,13 +1,15 @@
 import gc
 import os
 import signal
+from importlib.metadata import version
 from pathlib import Path
 
 # Before JAX is imported, and for the processes that tests start: half of the suite's time was XLA at work on programs
 # that run once. `make slow` compiles as users do.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # The verbs of jaxeit are compiled without fusion emitters. What the tests compile themselves takes half the time so.
-if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1":
+# XLA ends the process for a flag that it does not know, and jaxlib 0.11 knows this one no more.
+if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and version("jaxlib").startswith("0.10."):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 # Nobody reads where in Python each operation of a program comes from: 100 frames of every one, unless told otherwise.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
@@ -36,6 +38,9 @@ gc.freeze()
 gc.set_threshold(100_000, 50, 100)
 
 jax.config.update("jax_enable_x64", True)
+# Tests call parts of verbs by themselves. That whole verbs ask for this precision is tested in hard/.
+if jax.devices()[0].platform != "cpu":
+    jax.config.update("jax_default_matmul_precision", "highest")
 # Programs compiled once serve all later tests, and the next run.
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

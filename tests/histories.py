@@ -1,6 +1,7 @@
 """Series handed to an effect block by block."""
 
 from functools import partial
+from importlib.metadata import version
 
 import equinox as eqx
 import jax
@@ -9,8 +10,12 @@ import numpy as np
 
 from jaxeit import effects as fx
 
-# With the fusion emitters that other tests do without, by which blocks of another length are rounded alike.
-_as_the_bench_does = partial(eqx.filter_jit, compiler_options={"xla_cpu_use_fusion_emitters": True})
+# With the fusion emitters that other tests do without, by which blocks of another length are rounded alike. jaxlib 0.11
+# knows no other way.
+_as_the_bench_does = partial(
+    eqx.filter_jit,
+    compiler_options={"xla_cpu_use_fusion_emitters": True} if version("jaxlib").startswith("0.10.") else {},
+)
 
 
 def after(effect, series, *, interval=0.005, cuts=(), temperature=None, barometer=None, pattern=()):

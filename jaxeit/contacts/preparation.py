@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import require_known, verb
+from .._compile import full_precision, require_known, verb
 from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError, Whitened, whitened_readings
 from ..model.bases import Elements
@@ -27,6 +27,7 @@ NOISE_FRAMES = 512
 ATOM_WIDTHS = (0.35, 0.6, 0.85)
 
 
+@full_precision
 def prepare_contacts(
     model: Model,
     settings: ContactSettings | None = None,

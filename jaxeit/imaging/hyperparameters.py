@@ -15,6 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._compile import full_precision
 from ..linalg.lapack import eigh
 from ..registry import Registry
 from .methods import Problem
@@ -51,6 +52,7 @@ class Spectrum(eqx.Module):
 
 
 @eqx.filter_jit
+@full_precision
 def spectrum(problem: Problem) -> Spectrum:
     """The eigenvectors and eigenvalues that all choices use."""
     gained = problem.precision().solve(problem.jacobian.T)

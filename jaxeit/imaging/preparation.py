@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import is_traced
+from .._compile import full_precision, is_traced
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
 from ..model.sensitivity import pair_jacobian
@@ -70,6 +70,7 @@ def prepare(
 ) -> Reconstructor | IterativeReconstructor: ...
 
 
+@full_precision
 def prepare(
     model: Model,
     prior: AbstractPrior | None = None,
@@ -156,6 +157,7 @@ def prepare(
 
 
 @eqx.filter_jit
+@full_precision
 def _build(
     problem: Problem,
     method: AbstractLinearMethod,

@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import compiler_options, is_traced, require_known
+from .._compile import compiler_options, full_precision, is_traced, require_known
 from ..linalg.array_libraries import JAX
 from ..model.bases import AbstractPictured, Picture
 from ..notebook import card, picture
@@ -141,6 +141,7 @@ class AbstractReconstructor(AbstractPictured):
 
 
 @partial(jax.jit, static_argnames="whole")
+@full_precision
 def _imaged(
     recon: AbstractReconstructor, dv: Float[ArrayLike, "... readings"], whole: bool
 ) -> Float[Array, "... basis"]:
@@ -219,6 +220,7 @@ class Reconstructor(AbstractReconstructor):
 
 
 @eqx.filter_jit
+@full_precision
 def _without(recon: Reconstructor, used: Bool[Array, " readings"]) -> Reconstructor:
     found, gram = without_readings(recon.whitening, used)
     predict, factor = removed(JAX, gram, recon.predict, recon.factor)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Int
 
+from .._compile import full_precision
 from .levenberg_marquardt import quadratic_at
 from .searches import Parameters, Scalar, free_parameters, normal_inverse
 
@@ -48,6 +49,7 @@ def _attached(root: Parameters, gradient_of: Callable[..., Parameters], inputs: 
     return root
 
 
+@full_precision
 def _attached_jvp(
     primals: tuple[Parameters, Callable[..., Parameters], Any], tangents: tuple[Any, Any, Any]
 ) -> tuple[Parameters, Parameters]:

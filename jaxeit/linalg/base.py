@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
+from .._compile import full_precision
+
 
 class PatternError(ValueError):
     """A sparsity pattern that does not describe a symmetric positive definite matrix."""
@@ -190,6 +192,7 @@ def _columns(
     return solver.columns(factor).astype(values.dtype)  # a solver may compute in lower precision
 
 
+@full_precision
 def _columns_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     values, factor, plan, solver = primals
     x = _columns(values, factor, plan, solver)

@@ -27,11 +27,15 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Integer
 
-from .._compile import by_platform
+from .._compile import by_platform, full_precision
 from .fronts import LevelPlan
 
-# Bytes of the numbers of all lanes at one place: two cache lines. With more, the fronts of a level leave the cache.
+# On a CPU, bytes of the numbers of all lanes at one place: two cache lines. With more, the fronts of a level leave the
+# cache.
 LANE_BYTES = 128
+
+# Elsewhere, bytes of the values of all matrices that are eliminated together. Their fronts take about 16 times as much.
+PORTION_BYTES = 1 << 27
 
 # Smallest batch that is eliminated in lanes; for fewer, the program takes longer to compile than it saves.
 MIN_BATCH = 32
@@ -74,18 +78,21 @@ class LanePlan(NamedTuple):
 
 
 def lane_count(dtype: np.dtype) -> int:
-    """Number of matrices that are eliminated together."""
+    """Number of matrices that are eliminated together on a CPU."""
     return LANE_BYTES // dtype.itemsize
 
 
 def lanewise(
-    function: Callable[[P, Array], T], lanes: Callable[[P], Callable[[Array], T]], suits: Callable[[P], bool]
+    function: Callable[[P, Array], T], lanes: Callable[[P, bool], Callable[[Array], T]], suits: Callable[[P], bool]
 ) -> Callable[[P, Array], T]:
-    """``function(plan, values)``, whose `jax.vmap` over values calls ``lanes(plan)`` for `lane_count` values at a time.
+    """``function(plan, values)``, whose `jax.vmap` over values calls ``lanes(plan, apart)`` for portions of the values.
 
-    That function gets and returns arrays with one more axis, in front. Batches of fewer than `MIN_BATCH`, plans that
-    do not suit, batches of plans and other devices than CPUs use `jax.vmap` of ``function``.
+    That function gets and returns arrays with one more axis, in front. A portion has `lane_count` values on a CPU,
+    where ``apart`` is true: subtrees follow one another, so that their fronts stay in the cache. It has up to
+    `PORTION_BYTES` on other devices. Batches of fewer than `MIN_BATCH`, plans that do not suit and batches of plans use
+    `jax.vmap` of ``function``.
     """
+    function = full_precision(function)
     single = custom_vmap(function)
 
     @custom_vmap
@@ -93,7 +100,14 @@ def lanewise(
         plainly: Callable[[P, Array], T] = jax.vmap(function, (None, 0))
         if len(values) < MIN_BATCH or not suits(plan):
             return plainly(plan, values)
-        return by_platform(plan, values, cpu=partial(_in_portions, lanes), default=plainly)
+        portions = -(-values.size * values.dtype.itemsize // PORTION_BYTES)
+        width = -(-len(values) // portions)
+        return by_platform(
+            plan,
+            values,
+            cpu=partial(_in_portions, lanes, True, lane_count(values.dtype)),
+            default=partial(_in_portions, lanes, False, width),
+        )
 
     @single.def_vmap
     def _(size: int, batched: Sequence[Any], plan: P, values: Array) -> tuple[T, Any]:
@@ -125,12 +139,18 @@ def _mapped(function: Callable[[P, Array], T], batched: Sequence[Any], plan: P, 
     return found
 
 
-def _in_portions(lanes: Callable[[P], Callable[[Array], T]], plan: P, values: Float[Array, "batch nnz"]) -> T:
-    """``lanes(plan)`` of one portion after another; the last matrix fills up the last portion."""
-    batch, width = len(values), lane_count(values.dtype)
+def _in_portions(
+    lanes: Callable[[P, bool], Callable[[Array], T]],
+    apart: bool,
+    width: int,
+    plan: P,
+    values: Float[Array, "batch nnz"],
+) -> T:
+    """``lanes(plan, apart)`` of ``width`` values, one portion after another; the last value fills up the last one."""
+    batch = len(values)
     count = -(-batch // width)
     filled = jnp.concatenate([values, jnp.broadcast_to(values[-1], (count * width - batch, values.shape[1]))])
-    found = lax.map(lanes(plan), filled.reshape(count, width, -1))
+    found = lax.map(full_precision(lanes(plan, apart)), filled.reshape(count, width, -1))
     whole: T = jax.tree.map(lambda a: a.reshape(count * width, *a.shape[2:])[:batch], found)
     return whole
 
@@ -141,16 +161,20 @@ def written_levels(levels: Sequence[LevelPlan]) -> int:
     return max([0, *wide]) + 1
 
 
-def lane_plan(levels: Sequence[LevelPlan], unknowns: int) -> LanePlan:
-    """What `swept_lanes` needs for all levels from `written_levels` on."""
+def lane_plan(levels: Sequence[LevelPlan], unknowns: int, apart: bool = True) -> LanePlan:
+    """What `swept_lanes` needs for all levels from `written_levels` on.
+
+    Args:
+        apart: whether subtrees that fit in a processor's cache follow one another; else all are eliminated at once.
+    """
     top = written_levels(levels)
-    depth = round(np.log2(max(1, unknowns / SUBTREE_UNKNOWNS)))
+    depth = round(np.log2(max(1, unknowns / SUBTREE_UNKNOWNS))) if apart else 0
     cut = min(max(depth, top), len(levels) - 1) if depth > 0 else len(levels)
     above, below = tuple(levels[top:cut]), tuple(levels[cut:])
     count = 1 << cut
-    apart = jax.tree.map(lambda a: a.reshape(count, a.shape[0] // count, *a.shape[1:]), below)
+    subtrees = jax.tree.map(lambda a: a.reshape(count, a.shape[0] // count, *a.shape[1:]), below)
     tables = _gather_tables((*above, *below[:1]))[: len(above)]
-    return LanePlan(above, tables, apart, jax.vmap(_gather_tables)(apart) if below else [])
+    return LanePlan(above, tables, subtrees, jax.vmap(_gather_tables)(subtrees) if below else [])
 
 
 def _gather_tables(levels: Sequence[LevelPlan]) -> list[Tables]:

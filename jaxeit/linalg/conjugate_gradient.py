@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
+from .._compile import full_precision
 from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, matvec, unit_columns
 
 # Step, solution, residual, direction, and energy of the residual.
@@ -57,18 +58,22 @@ class ConjugateGradient(AbstractLinearSolver):
         inner = None if self.preconditioner is None else self.preconditioner.analyse(pattern)
         return ConjugateGradientPlan(**index_arrays(pattern), inner=inner, n=pattern.n)
 
+    @full_precision
     def factor(self, plan: ConjugateGradientPlan, values: Float[Array, " nnz"]) -> ConjugateGradientFactor:
         scale, scaled = jacobi_scale(plan, values)
         inner = None if self.preconditioner is None else self.preconditioner.factor(plan.inner, scaled)
         return ConjugateGradientFactor(scaled, scale, inner, plan)
 
+    @full_precision
     def solve(self, factor: ConjugateGradientFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         scale = factor.scale[:, None]
         return scale * self._iterate(factor, scale * rhs)
 
+    @full_precision
     def columns(self, factor: ConjugateGradientFactor) -> Float[Array, "n r"]:
         return self.solve(factor, unit_columns(factor.plan, factor.values.dtype))
 
+    @full_precision
     def corner(self, plan: ConjugateGradientPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
         return self.columns(self.factor(plan, values))[plan.root]
 
@@ -109,14 +114,18 @@ class Single(AbstractLinearSolver):
     def analyse(self, pattern: SparsityPattern) -> AbstractPlan:
         return self.solver.analyse(pattern)
 
+    @full_precision
     def factor(self, plan: AbstractPlan, values: Float[Array, " nnz"]) -> Any:
         return self.solver.factor(plan, values.astype(jnp.float32))
 
+    @full_precision
     def solve(self, factor: Any, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         return self.solver.solve(factor, rhs.astype(jnp.float32)).astype(rhs.dtype)
 
+    @full_precision
     def columns(self, factor: Any) -> Float[Array, "n r"]:
         return self.solver.columns(factor)
 
+    @full_precision
     def corner(self, plan: AbstractPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
         return self.solver.corner(plan, values.astype(jnp.float32)).astype(values.dtype)

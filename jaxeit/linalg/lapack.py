@@ -28,7 +28,7 @@ from jax.custom_batching import custom_vmap
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .._compile import by_platform
+from .._compile import by_platform, full_precision
 
 Stacks = tuple[Array, ...]
 Linear = Callable[[Array], Array]
@@ -173,6 +173,7 @@ def _lower(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 @_lower.defjvp
+@full_precision
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     """Murray, Differentiation of the Cholesky decomposition (arXiv 1602.07527), forward mode."""
     lower = _lower(*primals)
@@ -188,6 +189,7 @@ def _eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n
 
 
 @_eigh.defjvp
+@full_precision
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     left, vectors = _eigh(*primals)
     turned = vectors.T @ tangents[0] @ vectors
@@ -201,6 +203,7 @@ def _svd(a: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"
 
 
 @_svd.defjvp
+@full_precision
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Townsend (2016), Differentiating the singular value decomposition, of a square matrix."""
     u, s, vt = _svd(*primals)
@@ -218,6 +221,7 @@ def _qr(a: Float[Array, "m n"]) -> tuple[Array, Array]:
 
 
 @_qr.defjvp
+@full_precision
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Walter and Lehmann, Algorithmic differentiation of linear algebra functions (arXiv 1001.1654)."""
     q, r = _qr(*primals)

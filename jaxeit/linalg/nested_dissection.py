@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Integer
 
-from .._compile import by_platform
+from .._compile import by_platform, full_precision
 from .base import AbstractLinearSolver, SparsityPattern, index_arrays, jacobi_scale, on_device
 from .batches import lane_plan, lanewise, swept_lanes, written_levels
 from .dissection import dissect
@@ -70,10 +70,12 @@ class NestedDissection(AbstractLinearSolver):
             subtrees=max(0, min(depth, round(np.log2(pattern.n / SUBTREE_UNKNOWNS)))),
         )
 
+    @full_precision
     def factor(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> NestedDissectionFactor:
         scale, scaled = jacobi_scale(plan, values)
         return NestedDissectionFactor(_eliminated(plan, scaled, keep=True), scale, plan)
 
+    @full_precision
     def solve(self, factor: NestedDissectionFactor, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
         plan, scale = factor.plan, factor.scale[:, None]
         padded = jnp.concatenate([scale * rhs, jnp.zeros_like(rhs, shape=(1, rhs.shape[1]))])
@@ -81,12 +83,14 @@ class NestedDissection(AbstractLinearSolver):
         x = _backward(factor, _forward(factor, loads))
         return scale * x[plan.scatter]
 
+    @full_precision
     def columns(self, factor: NestedDissectionFactor) -> Float[Array, "n r"]:
         plan, scale = factor.plan, factor.scale[:, None]
         ys = [y * scale[plan.root].T for y in _root_loads(plan, factor.levels[0])]
         x = _backward(factor, [ys, *[None] * (len(plan.levels) - 1)])
         return scale * x[plan.scatter]
 
+    @full_precision
     def corner(self, plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
         found: Array = _root_corner(plan, values)
         return found
@@ -107,10 +111,12 @@ def _suits_lanes(plan: NestedDissectionPlan) -> bool:
     return written_levels(plan.levels) < len(plan.levels)
 
 
-def _root_corner_lanes(plan: NestedDissectionPlan) -> Callable[[Float[Array, "lanes nnz"]], Float[Array, "lanes r r"]]:
+def _root_corner_lanes(
+    plan: NestedDissectionPlan, apart: bool
+) -> Callable[[Float[Array, "lanes nnz"]], Float[Array, "lanes r r"]]:
     """`_root_corner` of many matrices: lanes are the last axis of narrow fronts (`batches`), the first of wide ones."""
     top = written_levels(plan.levels)
-    narrow = lax.optimization_barrier(lane_plan(plan.levels, plan.n))
+    narrow = lax.optimization_barrier(lane_plan(plan.levels, plan.n, apart))
 
     def several(values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
         scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)

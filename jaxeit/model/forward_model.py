@@ -22,7 +22,7 @@ from jax.scipy.special import i0e, i1e
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .._compile import verb
+from .._compile import full_precision, verb
 from ..effects import (
     AbstractContactEffect,
     AbstractLoadEffect,
@@ -312,6 +312,7 @@ def _transfer(theta: Coefficients, model: Model) -> Float[Array, "electrodes ele
     return corner[model.system.electrode_root][:, model.system.electrode_root]
 
 
+@full_precision
 def _transfer_jvp(
     primals: tuple[Coefficients, Model], tangents: tuple[Coefficients | None, Any]
 ) -> tuple[Float[Array, "electrodes electrodes"], Float[Array, "electrodes electrodes"]]:

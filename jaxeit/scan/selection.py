@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 
-from .._compile import is_traced, require_known
+from .._compile import full_precision, is_traced, require_known
 from ..skin.protocol import Protocol, ProtocolError
 
 # A gain below this part of the largest one is rounding error: the readings taken before span the range of K.
@@ -133,6 +133,7 @@ def drives(pattern: Integer[ArrayLike, "readings 4"]) -> Int[np.ndarray, " readi
 
 
 @eqx.filter_jit
+@full_precision
 def _chosen(
     selection: AbstractSelection,
     signal: Float[Array, "readings readings"],

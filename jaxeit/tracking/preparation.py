@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
-from .._compile import verb
+from .._compile import full_precision, verb
 from ..contacts.bump_responses import points_of
 from ..contacts.loads.preparation import field_modes
 from ..contacts.preparation import prepare_contacts
@@ -36,6 +36,7 @@ COAT_VARIANCE = 0.99
 COAT_PLACES = 5
 
 
+@full_precision
 def prepare_filter(
     model: Model,
     skin: Skin,

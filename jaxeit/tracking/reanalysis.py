@@ -25,6 +25,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse.linalg import splu
 
+from .._compile import full_precision
 from ..linalg import lapack
 from ..model.discretisation import Model
 from ..model.forward_model import Coefficients, assemble, coefficients, fields
@@ -127,6 +128,7 @@ class BeyondFirstOrder(NamedTuple):
     products: Float[Array, "e p"]
 
 
+@full_precision
 def prepare_reanalysis(
     model: Model,
     sigma: Float[Array, " elements"],

@@ -21,7 +21,9 @@ import pytest
 import jaxeit as je
 from jaxeit.model import DerivativeError
 
-from ..helpers import skin_of, spread_stacks, square_model
+from ..helpers import products, skin_of, spread_stacks, square_model
+
+HIGHEST = jax.lax.Precision.HIGHEST
 
 _DESCRIBES = "describes hardware, or reads or writes files: on the host"
 _GEOMETRY = "geometry, on the host: its arrays are constants of a model"
@@ -534,11 +536,16 @@ def test_jit_vmap_and_plain_python_agree(tiny, name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_float32_stays_float32(single, name):
-    """Through every step, since a step in float64 would be refused where it meets float32: promotion is strict."""
+    """Through every step, since a step in float64 would be refused where it meets float32: promotion is strict.
+
+    And no product asks for less than full precision, by which a GPU would round its factors to ten bits.
+    """
     case = CASES[name](single)
     x = case.smooth[0].astype("float32")
-    for found in (jax.eval_shape(case.function, x), *jax.eval_shape(_program(case), x, x)):
-        assert found.dtype == "float32"
+    program, found = jax.make_jaxpr(_program(case), return_shape=True)(x, x)
+    for one in (jax.eval_shape(case.function, x), *found):
+        assert one.dtype == "float32"
+    assert all(product.params["precision"] == (HIGHEST, HIGHEST) for product in products(program.jaxpr))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -20,7 +20,7 @@ from jaxeit.model.forward_model import coefficients, transfer
 
 from ..hard_sheet import MESH, paired, sheet_model
 from ..hard_strip import PLACES as STRIP_PLACES, STRIP, Unchecked, strip_error
-from ..helpers import skin_of
+from ..helpers import require_identical, skin_of
 from ..session.test_session import options
 
 examples = settings(max_examples=25, deadline=None, derandomize=True, database=None)
@@ -56,7 +56,7 @@ def test_readings_scale_with_resistance(seed, spread, resistances, power):
     """U(c sigma, z / c) = U / c, and in powers of two to the last digit."""
     theta = _theta(seed, spread, resistances)
     scaled = jax.tree.map(lambda leaf: leaf * 2.0 ** (2 * power), theta)
-    np.testing.assert_array_equal(2.0 ** (2 * power) * paired(_z(scaled)), paired(_z(theta)))
+    require_identical(2.0 ** (2 * power) * paired(_z(scaled)), paired(_z(theta)))
 
 
 @examples

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.backend import backends
 
 import jaxeit as je
 from jaxeit._compile import compiler_options
@@ -52,6 +53,7 @@ def sheet(contrast=1.0, side=8):
 def sweeps(monkeypatch):
     """Numbers of lanes of the sweeps that have been traced."""
     lanes = []
+    jax.clear_caches()
 
     def recorded(plan, values):
         lanes.append(values.shape[1])
@@ -71,7 +73,8 @@ def trace(plan, values):
 def test_a_batch_is_its_matrices(contrast, sweeps):
     plan, values = sheet(contrast)
     trace(plan, values)
-    assert sweeps == [lane_count(values.dtype)]
+    assert lane_count(values.dtype) in sweeps
+    assert len(sweeps) == len(backends())
     assert written_levels(plan.levels) == 1
     assert relative(corners(plan, values), one_by_one(plan, values)) < 1e-9 * 10**contrast
 

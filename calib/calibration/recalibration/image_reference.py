@@ -102,7 +102,7 @@ def _fitted(
     """Log marginal likelihood, signal, scatter, factor and solution of one choice."""
     signal, scatter = total * np.sqrt(share), total * np.sqrt(1 - share)
     matrix = _covariance(near, level, level, signal) + scatter**2 * np.eye(len(level))
-    factor = cho_factor(matrix, lower=True)
+    factor = cho_factor(matrix, lower=True)[0], True
     solved = cho_solve(factor, values)
     likelihood = -0.5 * values @ solved - np.log(np.diag(factor[0])).sum()
     return float(likelihood), float(signal), float(scatter), factor, solved

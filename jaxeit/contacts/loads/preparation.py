@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..._compile import require_known, verb
+from ..._compile import full_precision, require_known, verb
 from ...imaging.absolute.background import sheet_of
 from ...imaging.noise import InverseError, whitened_readings
 from ...model.discretisation import Model
@@ -24,6 +24,7 @@ from .starts import Starts
 REACH = 2.5  # widths from the middle of a usual load within which elements count
 
 
+@full_precision
 def prepare_loads(
     model: Model,
     settings: LoadSettings | None = None,

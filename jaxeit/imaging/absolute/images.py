@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ..._compile import verb
+from ..._compile import full_precision, verb
 from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
 from ...least_squares.searches import Quadratic as HalfSquares
 from ...model.bases import BasisMap, Picture
@@ -95,6 +95,7 @@ class IsotropicVariation(AbstractPenalty):
     beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.05)
     ridge: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1e-3)
 
+    @full_precision
     def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
         weight, size, _ = self._jumps(picture, x)
         return weight * jnp.sum(size) + 0.5 * self.ridge.astype(x.dtype) * x @ x
@@ -266,6 +267,7 @@ def _voltages(x: Float[Array, " basis"], physics: LogConductivity) -> Float[Arra
     return physics.voltages(x)
 
 
+@full_precision
 def _voltages_jvp(
     primals: tuple[Float[Array, " basis"], LogConductivity], tangents: tuple[Float[Array, " basis"] | None, Any]
 ) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:

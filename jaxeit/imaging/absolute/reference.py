@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer
 from scipy.linalg import block_diag
 
+from ..._compile import full_precision
 from ...effects import CommonMode, chosen
 from ...least_squares import ImplicitStep, LevenbergMarquardt
 from ...linalg.lapack import eigh
@@ -119,6 +120,7 @@ class ReferenceFit(eqx.Module):
         return [_parts(jnp.asarray(direction), electrodes, channels) for direction in found]
 
 
+@full_precision
 def fit_reference(
     model: Model,
     frame: Float[ArrayLike, " readings"],
@@ -266,6 +268,7 @@ class _Problem(eqx.Module):
 
 
 @eqx.filter_jit
+@full_precision
 def _fitted(
     problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"]
 ) -> tuple[ReferenceFit, Float[Array, " readings"]]:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..._compile import full_precision
 from ...linalg.lapack import qr, svd
 from .base import AbstractLinearMethod, Problem
 
@@ -32,6 +33,7 @@ def _truncated_inverse(
 
 
 @_truncated_inverse.defjvp
+@full_precision
 def _(
     primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
 ) -> tuple[Float[Array, "n ..."], Float[Array, "n ..."]]:

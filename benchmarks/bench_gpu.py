@@ -1,0 +1,239 @@
+"""A GPU at forward solves, Jacobians, gradients and training, in both precisions, alone and in batches.
+
+Conductivities lie on the device before a call, and results stay there. Before a clock is read, voltages are compared
+with those of SuperLU in float64 on the host; Jacobians and gradients with ours in float64 on the CPU. Beside ours stand
+cuDSS, NVIDIA's direct solver for sparse matrices, which factors a batch of one pattern (where it is installed:
+``pip install nvidia-cudss-cu13``), and dense matrices factored by the libraries that JAX calls (cuSOLVER, cuBLAS).
+
+Without a GPU it says so. With ``--smoke`` it runs on a CPU as well.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from calib.learning import training
+from jaxeit.linalg import Dense
+
+from .clock import Program, difference, in_turns, program, seconds
+from .harness import Question, Run
+from .peers import cudss, superlu
+from .problems import SMOKE, Problem
+from .rows import Row
+from .tools import MAX_FLOAT32_DIFFERENCE, basis_of
+
+LOOSE = {"float32": MAX_FLOAT32_DIFFERENCE, "float64": 1e-8}
+CHECKED = 3  # conductivities of a batch whose voltages are compared
+LARGEST_DENSE = 30  # cells a side
+
+
+@cache
+def problem_of(cells: int) -> Problem:
+    return Problem(cells)
+
+
+@cache
+def model_of(cells: int, dtype: str, dense: bool = False) -> je.Model:
+    problem = problem_of(cells)
+    if not dense:
+        return problem.model(dtype)
+    return je.discretise(je.Scene(problem.skin), je.Fidelity(dtype=dtype, solver=Dense()), mesh=problem.mesh)
+
+
+def conductivities(cells: int, batch: int, dtype: str) -> jax.Array:
+    """(batch, elements); no two are alike."""
+    problem = problem_of(cells)
+    x, y = (problem.mesh.chart_centroids / 0.2).T
+    rng = np.random.default_rng(batch)
+    centre = rng.uniform(0.1, 0.9, (batch, 2, 1))
+    press = np.exp(-((x - centre[:, 0]) ** 2 + (y - centre[:, 1]) ** 2) / 0.01)
+    return jnp.asarray(problem.sigma * (1 + 0.5 * press), dtype)
+
+
+def row(found: Program, dtype: str, cells: int, batch: int, off: float, repeats: int) -> Row:
+    """Times and memory of a program."""
+    if not off <= LOOSE[dtype]:
+        raise SystemExit(f"{dtype} is off by {off:.1e} of the largest value: nothing is timed")
+    ms = 1e3 * float(np.median(in_turns({0: found.call}, repeats, budget=2.0)[0]))
+    memory = found.compiled.memory_analysis()
+    return {
+        "dtype": dtype,
+        "nodes": len(problem_of(cells).mesh.nodes),
+        "batch": batch,
+        "median_ms": ms,
+        "per_s": 1e3 * batch / ms,
+        "compile_s": found.compile_s,
+        "memory_mb": (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 1e6,
+        "difference": off,
+    }
+
+
+# --- what is computed: for a model, and one conductivity
+
+
+def gradient(model: je.Model, sigma: jax.Array) -> jax.Array:
+    """Of half the sum of squared voltages."""
+    return jax.grad(lambda s: 0.5 * jnp.sum(je.forward(model, s) ** 2))(sigma)
+
+
+def pixel_jacobian(model: je.Model, sigma: jax.Array, basis: je.model.BasisMap) -> jax.Array:
+    return je.jacobian(model, sigma, basis)
+
+
+def exact(what: str, cells: int, sigma: np.ndarray) -> np.ndarray:
+    """The result for one conductivity, in float64 on the host."""
+    if what == "forward":
+        return superlu.prepare(problem_of(cells))(sigma)
+    with jax.default_device(jax.devices("cpu")[0]):
+        model = Problem(cells).model()  # its arrays lie on the CPU
+        extra = (basis_of(model, True),) if what == "Jacobian" else ()
+        return np.asarray(WHAT[what](model, jnp.asarray(sigma), *extra))
+
+
+WHAT: dict[str, Callable] = {"forward": je.forward, "Jacobian": pixel_jacobian, "gradient": gradient}
+
+
+def measured(what: str, cells: int, dtype: str, batch: int, repeats: int, dense: bool = False) -> Row:
+    model = model_of(cells, dtype, dense)
+    sigma = conductivities(cells, batch, dtype)
+    extra = (basis_of(model, True),) if what == "Jacobian" else ()
+
+    def several(model: je.Model, sigma: jax.Array, *extra: Any) -> jax.Array:
+        one = lambda s: WHAT[what](model, s, *extra)  # noqa: E731
+        return one(sigma[0])[None] if batch == 1 else jax.vmap(one)(sigma)
+
+    found = program(several, (model, sigma, *extra))
+    out = found.call()
+    chosen = np.unique(np.linspace(0, batch - 1, CHECKED).astype(int)) if what == "forward" else [batch - 1]
+    off = max(difference(np.asarray(out[k], float), exact(what, cells, np.asarray(sigma[k], float))) for k in chosen)
+    return {"what": what} | row(found, dtype, cells, batch, off, repeats)
+
+
+# --- parts
+
+
+def limits(run: Run) -> Iterator[Row]:
+    """What the device reaches: flop/s of a product in full precision, byte/s of a copy; best of five."""
+    device = jax.devices()[0]
+    if device.platform == "cpu" and not run.smoke:
+        raise SystemExit('JAX has no other device than CPUs; on a machine with a GPU, pip install "jax[cuda13]"')
+    found: Row = {}
+    size = 256 if run.smoke else 8192
+    for dtype in LOOSE:
+        a = jax.random.normal(jax.random.key(0), (size, size), dtype)
+        product = jax.jit(partial(jnp.matmul, precision="highest"))
+        found[f"{dtype}_flop_per_s"] = 2 * size**3 / best(lambda product=product, a=a: product(a, a))
+    copied = jax.random.normal(jax.random.key(0), (size * size * 4,), "float32")
+    copy = jax.jit(lambda x: x + 1)
+    found["byte_per_s"] = 2 * copied.nbytes / best(lambda: copy(copied))
+    yield {"device": device.device_kind, "limits": found}
+
+
+def best(call: Callable[[], jax.Array]) -> float:
+    jax.block_until_ready(call())
+    return min(seconds(lambda: jax.block_until_ready(call()))[0] for _ in range(5))
+
+
+def singles(run: Run) -> Iterator[Row]:
+    """One conductivity at a time."""
+    yield {"singles": []}
+    for cells in run.sizes((30, 60, 120), (SMOKE,)):
+        for what in WHAT:
+            for dtype in LOOSE:
+                yield {"singles": [measured(what, cells, dtype, 1, 20)]}
+
+
+def batches(run: Run) -> Iterator[Row]:
+    yield {"batches": []}
+    for cells in run.sizes((30, 60, 120), (SMOKE,)):
+        for dtype in LOOSE:
+            for batch in run.sizes((64, 1024, 4096) if cells < 120 else (1024,), (1, 32)):
+                yield {"batches": [measured("forward", cells, dtype, batch, 10)]}
+
+
+def gradients(run: Run) -> Iterator[Row]:
+    yield {"gradients": []}
+    for cells in run.sizes((30, 60), (SMOKE,)):
+        for what in ("gradient", "Jacobian"):
+            for dtype in LOOSE:
+                yield {"gradients": [measured(what, cells, dtype, run.sizes((256,), (32,))[0], 5)]}
+
+
+def peers(run: Run) -> Iterator[Row]:
+    """Other solvers at the same batches."""
+    yield {"peers": []}
+    if reason := cudss.missing():
+        print(f"{cudss.NAME} left out: {reason}")
+    for cells in run.sizes((30, 60), (SMOKE,)):
+        for dtype in LOOSE:
+            for batch in run.sizes((64, 1024, 4096), (32,)):
+                if not cudss.missing():
+                    yield {"peers": [by_cudss(cells, dtype, batch)]}
+                if cells <= LARGEST_DENSE and batch <= 1024:
+                    yield {"peers": [{"tool": "dense, cuSOLVER"} | measured("forward", cells, dtype, batch, 5, True)]}
+
+
+def by_cudss(cells: int, dtype: str, batch: int) -> Row:
+    sigma = conductivities(cells, batch, dtype)
+    prepare_s, tool = seconds(cudss.Forward, problem_of(cells), batch, dtype)
+    out = tool(sigma)
+    off = difference(np.asarray(out[-1], float), exact("forward", cells, np.asarray(sigma[-1], float)))
+    if not off <= LOOSE[dtype]:
+        raise SystemExit(f"{cudss.NAME} is off by {off:.1e} of the largest value: nothing is timed")
+    ms = 1e3 * float(np.median(in_turns({0: lambda: tool(sigma)}, 10, budget=3.0)[0]))
+    solver = 1e3 * float(np.median(in_turns({0: partial(tool.batch.solve, tool.assembled(sigma))}, 10, 3.0)[0]))
+    tool.batch.close()
+    return {
+        "tool": cudss.NAME,
+        "what": "forward",
+        "dtype": dtype,
+        "nodes": len(problem_of(cells).mesh.nodes),
+        "batch": batch,
+        "median_ms": ms,
+        "solver_ms": solver,
+        "per_s": 1e3 * batch / ms,
+        "prepare_s": prepare_s,
+        "difference": off,
+    }
+
+
+def learning(run: Run) -> Iterator[Row]:
+    """Steps of training a proposal (`jaxeit train`) on random numbers, an epoch each."""
+    count = training.BATCH * (200 if not run.smoke else 2)
+    rng = np.random.default_rng(0)
+    inputs, pads = 60, 4
+    shapes = {"whole": (inputs,), "damaged": (inputs,), "pads": (pads,), "loads": (30,), "known": (4,)}
+    drawn = {name: jnp.asarray(rng.normal(size=(count, *shape)), jnp.float32) for name, shape in shapes.items()}
+    kind = jnp.asarray(rng.integers(0, training.KINDS, count))
+    examples = training.Examples(kind=kind, **drawn)
+    optimiser = training.optax.adamw(1e-3)
+    network = training.new_network(inputs + 2 * pads, jax.random.key(0))
+    state = training.State(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
+    epoch = eqx.filter_jit(training.epoch)
+    with jax.numpy_dtype_promotion("standard"):
+        call = partial(epoch, state, optimiser, examples, jnp.ones(30), jax.random.key(1))
+        first, _ = seconds(lambda: jax.block_until_ready(call()[1]))
+        times = [seconds(lambda: jax.block_until_ready(call()[1]))[0] for _ in range(3)]
+    steps = count // training.BATCH
+    spent = float(np.median(times))
+    yield {"training": [{"steps_per_s": steps / spent, "frames_per_s": count / spent, "first_epoch_s": first}]}
+
+
+PARTS = {
+    "limits": limits,
+    "singles": singles,
+    "batches": batches,
+    "gradients": gradients,
+    "peers": peers,
+    "training": learning,
+}
+main = Question("gpu", __doc__, PARTS)
+
+if __name__ == "__main__":
+    main()
