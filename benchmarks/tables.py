@@ -90,6 +90,36 @@ def _speed(forward: Row, jacobian: Row) -> list[Row]:
     return [row | {"tool": label} for (kind, tool), label in SPEED.items() for row in runs[kind] if row["tool"] == tool]
 
 
+def _gpu_batches(results: Row) -> Iterator[Row]:
+    """Ours and those of other solvers, then memory and compilation of ours."""
+    for row in [{"tool": "jaxeit"} | row for row in results["batches"]] + results["peers"]:
+        yield row | {"line": f"{row['tool']}, batches of {row['batch']:,}", "shown": f"{row['per_s']:,.0f}"}
+    for row in results["batches"]:
+        if row["batch"] == 1024:
+            yield row | {"line": "memory for a batch of 1,024, GB", "shown": f"{1e-3 * row['memory_mb']:.2f}"}
+            yield row | {"line": "compilation, s", "shown": f"{row['compile_s']:.1f}"}
+
+
+def _gpu_verbs(results: Row) -> Iterator[Row]:
+    """Single calls, then batches of derivatives."""
+    for row in results["singles"]:
+        yield row | {"line": f"{row['what']}, one call, ms", "shown": f"{row['median_ms']:.2f}"}
+    for row in results["gradients"]:
+        yield row | {
+            "line": f"{row['what']}s a second, batches of {row['batch']:,}",
+            "shown": f"{row['per_s']:,.0f}",
+        }
+
+
+def _gpu_training(results: Row) -> str:
+    (row,) = results["training"]
+    return (
+        f"Training of a proposal (`jaxeit train`) takes {row['steps_per_s']:,.0f} steps a second there, of "
+        f"{row['frames_per_s'] / row['steps_per_s']:.0f} random frames each; the first epoch,\nwith compilation, takes "
+        f"{row['first_epoch_s']:.1f} s.\n"
+    )
+
+
 def _onto(results: Row) -> list[Row]:
     """Tools onto "pixels" and "elements", which say so in full."""
     return [row | {"tool": re.sub(", (?=pixels|elements)", ", onto ", row["tool"])} for row in results["rows"]]
@@ -256,6 +286,9 @@ ROWS: dict[str, Callable] = {
     "evaluation": _evaluation,
     "speed": _speed,
     "onto": _onto,
+    "gpu_batches": _gpu_batches,
+    "gpu_verbs": _gpu_verbs,
+    "gpu_training": _gpu_training,
     "repeat": _repeat,
     "images": _images,
     "priors": _priors,

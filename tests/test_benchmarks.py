@@ -11,6 +11,7 @@ from benchmarks import (
     bench_accuracy,
     bench_batch,
     bench_forward,
+    bench_gpu,
     bench_inverse,
     bench_jacobian,
     clock,
@@ -274,6 +275,15 @@ def test_frames_follow_one_another_or_other_work():
     counted = bench_inverse.latencies(ways, 2, 1, 60.0, between=partial(done.append, " "))
     assert "".join(done) == " a b" * 2
     assert [len(times) for times in counted.values()] == [2, 2]
+
+
+@pytest.mark.slow
+def test_smoke_of_a_gpu_without_one(capsys):
+    """Its parts on a CPU; in earnest they ask for a GPU."""
+    data = bench_gpu.main(["--smoke"])
+    assert all(row["per_s"] > 0 for part in ("singles", "batches", "gradients", "peers") for row in data[part])
+    with pytest.raises(SystemExit, match=r"jax\[cuda13\]"):
+        bench_gpu.main([])
 
 
 @pytest.mark.slow

@@ -421,6 +421,14 @@ def test_tables_of_the_pages(root):
         "rates": [run | {"rate_hz": hz, "sustained": ok} for hz, ok in ((100, True), (400, False), (400, True))],
         "highest_hz": 400,
     }
+    one = {"what": "forward", "dtype": "float32", "nodes": 961, "batch": 1024, "median_ms": 2.0, "per_s": 512e3}
+    results["gpu"] = {
+        "singles": [one | {"batch": 1}],
+        "batches": [one | {"compile_s": 6.25, "memory_mb": 240.0}],
+        "gradients": [one | {"what": "gradient", "batch": 256}],
+        "peers": [one | {"tool": "cuDSS", "per_s": 15e3}],
+        "training": [{"steps_per_s": 100.0, "frames_per_s": 25600.0, "first_epoch_s": 4.5}],
+    }
     pages = [(root / "docs" / name).read_text() for name in ("costs.md", "live.md")]
     marks = re.findall(r"<!-- end of ([\w-]+) -->", "".join(pages))
     assert set(marks) <= set(tables.FORMATS)
@@ -431,6 +439,10 @@ def test_tables_of_the_pages(root):
     assert "| **standard** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 | 1.23 | 0.06 |" in text["ladder"]
     assert "| **P1, 2 mm** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 |  |  |" in text["ladder"]
     assert "behind the front" not in text["ladder"]
+    for line in ("jaxeit, batches of 1,024 | 512,000", "cuDSS, batches of 1,024 | 15,000", "compilation, s | 6.2"):
+        assert f"| {line} |" in text["gpu-batches"]
+    assert "| forward, one call, ms | 2.00 |" in text["gpu-verbs"]
+    assert "100 steps a second there, of 256 random frames" in text["gpu-training"]
     assert "| bundled | no | later | 0.12 | 0.12 | 0.12 | 0.12 | 0.12 |" in text["calibration-seconds"]
     assert "| **standard** |" in text["ladder-chest"]
     assert "| at rest | 24 |  |  | 4,000 | 2,000 |" in text["event-scan"]

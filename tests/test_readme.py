@@ -1,12 +1,11 @@
 """The README's program runs, and its commands and links exist."""
 
-import json
 import re
 
 import numpy as np
 import pytest
 
-from benchmarks.readme import MEASURED, PAGES
+from benchmarks.readme import PAGES, measured
 from benchmarks.tables import filled
 from calib.cli import COMMANDS
 
@@ -41,4 +40,4 @@ def test_results_table_is_filled(root):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_tables_are_those_of_the_stored_results(page):
     text = page.read_text(encoding="utf-8")
-    assert filled(text, json.loads(MEASURED.read_text(encoding="utf-8"))) == text
+    assert filled(text, measured()) == text

@@ -10,7 +10,7 @@ from jax.extend.backend import backends
 
 import jaxeit as je
 from jaxeit._compile import compiler_options
-from jaxeit.linalg import NestedDissection, SparsityPattern, nested_dissection
+from jaxeit.linalg import NestedDissection, SparsityPattern, batches, nested_dissection
 from jaxeit.linalg.batches import MIN_BATCH, lane_count, lane_plan, swept_lanes, written_levels
 
 from ..helpers import skin_of
@@ -244,3 +244,14 @@ def test_single_precision_of_a_model():
     assert together.dtype == np.float32
     expected = np.stack([je.forward(double, s) for s in uneven(double, 33)])
     assert relative(np.asarray(together), expected) < 1e-4
+
+
+def test_other_devices_eliminate_portions_of_bounded_memory(monkeypatch, sweeps):
+    """The program that they get, on this one: no subtrees apart, and portions of equal width."""
+    plan, values = sheet()
+    expected = one_by_one(plan, values)
+    monkeypatch.setattr(batches, "by_platform", lambda *args, cpu, default: default(*args))
+    monkeypatch.setattr(batches, "PORTION_BYTES", values.nbytes // 2)
+    found = jax.jit(jax.vmap(partial(SOLVER.corner, plan)))(values)
+    assert sweeps == [-(-COUNT // 2)]
+    assert relative(found, expected) < 1e-9
