@@ -21,10 +21,12 @@ import numpy as np
 import jaxeit as je
 
 from ..bench import Bench, BenchError, RandomScenes
+from ..bench.frame_shards import EXTRA, SHARDS, Shard
 from ..bench.scene_frames import SceneFrames
-from ..bench.training_frames import VERSION, FrameSet, card_of, claim_folder, is_whole, shard_path, write_shard
+from ..bench.training_frames import VERSION, FrameSet, card_of, claim_folder
 from ..runtime import settings, take_over
 from ..session import file_hash, replacing
+from ..session.importers.child import library
 from .digests import describe, digest
 from .workers import ONE_AT_A_TIME, spawned_pool
 
@@ -69,6 +71,7 @@ def write_training_frames(
     scenes: RandomScenes | None = None,
     fidelity: je.Fidelity | None = None,
     pixels: je.Pixels | None = None,
+    file_format: str = "hdf5",
     executor: Executor | None = None,
     jobs: int = 1,
     begin: Callable[[int, int], object] = lambda frames, nbytes: None,
@@ -90,6 +93,8 @@ def write_training_frames(
         scenes: distributions that contacts are drawn from; default `calib.bench.RandomScenes()`.
         fidelity: of the simulation; default `jaxeit.Fidelity.standard()`.
         pixels: of the force maps; default `jaxeit.Pixels()`, as those of a calibration.
+        file_format: of the shards: ``hdf5``, or ``parquet`` for pandas, Polars, DuckDB and Hugging Face datasets, with
+            ``skins.parquet`` beside the shards, which needs the extra ``tables``.
         executor: default: a pool of spawned processes with one thread of computation each. Another example is
             `distributed.Client(address).get_executor(pure=False)`; its workers must see the same folder.
         jobs: number of processes of the default pool.
@@ -99,6 +104,7 @@ def write_training_frames(
     Raises:
         BenchError: nothing can be simulated so; the folder holds something else; the disk has too little space; a
             process died.
+        ImportError: ``parquet`` without the library `pyarrow`.
     """
     if jobs < 1:
         raise BenchError(f"{jobs} jobs; give one or more")
@@ -109,13 +115,17 @@ def write_training_frames(
         fidelity or je.Fidelity.standard(),
         _with_rows(pixels or je.Pixels(), bench.scene.skin),
         scenes or RandomScenes(),
+        file_format,
     )
     folder = Path(folder)
     versions = {"jaxeit": metadata.version("jaxeit"), "jax": jax.__version__, "numpy": np.__version__}
+    if file_format == "parquet":
+        versions["pyarrow"] = library("pyarrow", EXTRA).__version__
     # A folder may get more frames, so that the number of frames is no part of the mark.
     mark = digest(describe(replace(made, frames=1)), str(VERSION), *versions.values())
     claim_folder(folder, card_of(made, mark, versions))
-    left = [n for n in range(made.shards) if not is_whole(shard_path(folder, n), mark, made.rows(n))]
+    files = SHARDS[file_format]
+    left = [n for n in range(made.shards) if not files.is_whole(files.path(folder, n), mark, made.rows(n))]
     to_make = sum(map(made.rows, left))
     _require_space(folder, made.nbytes(left))
     begin(to_make, made.nbytes(left))
@@ -126,7 +136,8 @@ def write_training_frames(
             executor = stack.enter_context(spawned_pool(min(jobs, len(tasks))))
         if executor is not None:
             _run(executor, tasks, lambda number: tell(made.rows(number)))
-    paths = [shard_path(folder, number) for number in range(made.shards)]
+    files.finish(folder, range(made.shards), made.described)
+    paths = [files.path(folder, number) for number in range(made.shards)]
     _write_hashes(folder, paths)
     return WrittenFrames(folder, frames, to_make, sum(path.stat().st_size for path in paths))
 
@@ -178,8 +189,9 @@ def make_shard(task: _Task) -> None:
         take_over(task.settings)
         made, simulator = _simulator(task.choices)
         arrays = simulator.simulate(task.number, made.seed, made.rows(task.number))
-        path = shard_path(Path(task.folder), task.number)
-        write_shard(path, made, task.mark, task.number, arrays, simulator.pixels)
+        files, skin = SHARDS[made.file_format], made.bench.scene.skin.name
+        shard = Shard(task.number, arrays, made.described, task.mark, skin, made.seed, made.sizes, simulator.pixels)
+        files.write(files.path(Path(task.folder), task.number), shard)
 
 
 @lru_cache(maxsize=1)

@@ -1,7 +1,6 @@
-"""Files of frames for training: shards in HDF5, and a card that describes them.
+"""Folders of frames for training: shards, and a card that describes them.
 
-A folder holds ``card.json`` and one shard per drawn skin, ``shard-000000.h5``. The shards have named axes, so that h5py
-and xarray open them too.
+A folder holds ``card.json`` and one shard per drawn skin, such as ``shard-000000.h5`` (`frame_shards`).
 """
 
 import dataclasses
@@ -17,14 +16,14 @@ from numpy.typing import DTypeLike
 import jaxeit as je
 from jaxeit.budget import require
 
-from ..session import ArchiveWriter, SessionError, open_archive, replacing
+from ..session import replacing
 from .bench import Bench, BenchError
+from .frame_shards import SHARDS, AbstractShards
 from .random_scenes import MAX_CONTACTS, Footprint, RandomScenes
 from .scene_frames import SHARD_FRAMES
 
 FORMAT = "jaxeit-training-frames"
 VERSION = 2  # of the content: equal seeds give equal frames within a version
-SHARD_FORMAT = "skin-training-frames"
 CARD = "card.json"
 COUNTS = ("frames", "shards", "arrays")  # entries of a card that change where frames are added
 FIXED_BYTES = 1 << 16  # of a shard: headers
@@ -70,6 +69,7 @@ class FrameSet:
     | fidelity of the simulation                                   |
     | pixels of the force maps, with their number of rows          |
     | scenes: what contacts are drawn from                         |
+    | file_format of the shards, of `frame_shards.SHARDS`          |
 
     Raises:
         BenchError: for less than one frame, or a seed below 0 or beyond 2^63 - 1.
@@ -81,8 +81,11 @@ class FrameSet:
     fidelity: je.Fidelity
     pixels: je.Pixels
     scenes: RandomScenes
+    file_format: str = "hdf5"
 
     def __post_init__(self) -> None:
+        if self.file_format not in SHARDS:
+            raise BenchError(f"file format {self.file_format!r}: no such format; give {' or '.join(SHARDS)}")
         if self.frames < 1:
             raise BenchError(f"{self.frames} frames make no data set; give one or more")
         if not 0 <= self.seed < 2**63:
@@ -112,6 +115,20 @@ class FrameSet:
         """The arrays of a shard."""
         return {name: about for name, about in ARRAYS.items() if {*about.dims} <= {*self.sizes, "frame"}}
 
+    @property
+    def described(self) -> dict[str, dict[str, Any]]:
+        """What the arrays are, as in the card."""
+        return {
+            name: {
+                "meaning": about.meaning,
+                "axes": about.dims,
+                "shape": [self.frames if dim == "frame" else self.sizes[dim] for dim in about.dims],
+                "dtype": np.dtype(about.dtype).name,
+                "unit": about.units,
+            }
+            for name, about in self.arrays.items()
+        }
+
     def nbytes(self, numbers: Collection[int]) -> int:
         """Upper bound of the bytes of some shards."""
         each = [a for a in self.arrays.values() if a.dims[0] == "frame"]
@@ -126,63 +143,9 @@ def _rows(frames: int, number: int) -> int:
     return min(SHARD_FRAMES, frames - number * SHARD_FRAMES)
 
 
-def shard_path(folder: Path, number: int) -> Path:
-    """Path of a shard."""
-    return folder / f"shard-{number:06d}.h5"
-
-
-def is_whole(path: Path, mark: str, rows: int) -> bool:
-    """Whether a shard has all its frames and was made for a card with this mark."""
-    if not path.is_file():
-        return False
-    try:
-        with open_archive(path, SHARD_FORMAT) as shard:
-            return shard.attrs.get("mark") == mark and shard.arrays["frame"].shape == (rows,)
-    except SessionError:
-        return False
-
-
-def write_shard(
-    path: Path, made: FrameSet, mark: str, number: int, arrays: Mapping[str, np.ndarray], pixels: je.model.BasisMap
-) -> None:
-    """Write one shard, whole or not at all; equal arrays give equal bytes."""
-    skin = made.bench.scene.skin
-    attrs: dict[str, str | bool | int] = {
-        "title": f"frames of random contacts on {skin.name}",
-        "skin": skin.name,
-        "simulated": True,
-        "shard": number,
-        "seed": made.seed,
-        "mark": mark,
-        "image_rows": pixels.shape[0],
-        "image_columns": pixels.shape[1],
-        "coordinates": "x y",
-    }
-    first, rows = number * SHARD_FRAMES, made.rows(number)
-    with ArchiveWriter(path, SHARD_FORMAT, attrs) as writer:
-        writer.add("frame", np.arange(first, first + rows, dtype="i8"), "1", "number of the frame", ("frame",))
-        for name, size in made.sizes.items():
-            writer.add(name, np.arange(size, dtype="i4"), "1", f"number of the {name}", (name,))
-        for name, values in zip("xy", np.asarray(pixels.centres).T, strict=True):
-            writer.add(name, values, "m", f"centres of the pixels along {name}", ("pixel",))
-        writer.add("areas", np.asarray(pixels.areas), "m2", "areas of the pixels", ("pixel",))
-        for name, about in made.arrays.items():
-            writer.add(name, arrays[name].astype(about.dtype), about.units, about.meaning, about.dims)
-
-
 def card_of(made: FrameSet, mark: str, versions: Mapping[str, str]) -> str:
     """The card: what the frames are, what they were drawn from, and how to draw them again; JSON."""
-    skin, sizes = made.bench.scene.skin, made.sizes
-    arrays = {
-        name: {
-            "meaning": about.meaning,
-            "axes": about.dims,
-            "shape": [made.frames if dim == "frame" else sizes[dim] for dim in about.dims],
-            "dtype": np.dtype(about.dtype).name,
-            "unit": about.units,
-        }
-        for name, about in made.arrays.items()
-    }
+    skin = made.bench.scene.skin
     card = {
         "format": FORMAT,
         "version": VERSION,
@@ -201,10 +164,12 @@ def card_of(made: FrameSet, mark: str, versions: Mapping[str, str]) -> str:
         "drawn_from": dataclasses.asdict(made.scenes),
         "drawn_once_per_shard": "seeds and strengths of all effects, places of the electrodes, temperature and air "
         "pressure within those of the bench",
-        "arrays": arrays,
+        "arrays": made.described,
         "mark": mark,
         **versions,
     }
+    if made.file_format != "hdf5":  # which cards written before this entry have
+        card["file_format"] = made.file_format
     return json.dumps(card, indent=2) + "\n"
 
 
@@ -235,7 +200,7 @@ def claim_folder(folder: Path, card: str) -> None:
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """Names of the entries by which a card differs from that of a folder, besides the number of frames."""
-    names = [name for name in new if name not in COUNTS and old.get(name) != new[name]]
+    names = [name for name in {**new, **old} if name not in COUNTS and old.get(name) != new.get(name)]
     return ", ".join([name for name in names if name != "mark"] or names)
 
 
@@ -246,7 +211,8 @@ def _read_card(path: Path) -> dict[str, Any]:
         raise BenchError(f"{path}: is no card of a data set ({error}); give another folder") from error
     types = {"frames": int, "arrays": dict, "mark": str}
     typed = isinstance(card, dict) and all(isinstance(card.get(name), kind) for name, kind in types.items())
-    if not typed or card.get("format") != FORMAT or card.get("version") != VERSION or card["frames"] < 1:
+    known = typed and card.get("format") == FORMAT and card.get("version") == VERSION
+    if not known or card["frames"] < 1 or card.get("file_format", "hdf5") not in SHARDS:
         raise BenchError(f"{path}: is no card of {FORMAT} version {VERSION}; give another folder")
     return card
 
@@ -341,13 +307,12 @@ class TrainingFrames:
     def _read(self, number: int, names: Any) -> dict[str, np.ndarray]:
         for name in names:
             self._about(name)
-        path = shard_path(self.folder, number)
-        with open_archive(path, SHARD_FORMAT) as shard:
-            if shard.attrs.get("mark") != self.card["mark"]:
-                raise BenchError(f"{path}: belongs to another card; write the frames again in a new folder")
-            if shard.arrays["frame"].shape != (self._rows(number),):
-                raise BenchError(f"{path}: frames are missing; give the command that writes them again")
-            return {name: shard.arrays[name].read() for name in names}
+        files = _shards_of(self.card)
+        return files.read(files.path(self.folder, number), names, self.card["mark"], self._rows(number))
+
+
+def _shards_of(card: Mapping[str, Any]) -> AbstractShards:
+    return SHARDS[card.get("file_format", "hdf5")]
 
 
 def open_training_frames(folder: str | os.PathLike[str]) -> TrainingFrames:
@@ -360,8 +325,8 @@ def open_training_frames(folder: str | os.PathLike[str]) -> TrainingFrames:
     if not (where / CARD).is_file():
         raise BenchError(f"{where}: has no {CARD}; write frames with jaxeit simulate SCENE --random-scenes N -o FOLDER")
     card = _read_card(where / CARD)
-    shards = range(-(-card["frames"] // SHARD_FRAMES))
-    missing = sum(not shard_path(where, number).is_file() for number in shards)
+    shards, files = range(-(-card["frames"] // SHARD_FRAMES)), _shards_of(card)
+    missing = sum(not files.path(where, number).is_file() for number in shards)
     if missing:
         what = f"{missing} of {len(shards)} shards are missing"
         raise BenchError(f"{where}: {what}; the command that began them goes on from here")

@@ -386,9 +386,35 @@ def test_all_arrays_are_there_as_they_were(folder, tables):
         np.testing.assert_array_equal(values.to_numpy().reshape(frames[name].shape), frames[name])
         assert values.to_numpy().dtype == frames[name].dtype
     np.testing.assert_array_equal(np.bincount(rows["shard"]), [SHARD_FRAMES, FRAMES - SHARD_FRAMES])
+    again = calib.open_training_frames(tables)
+    for name in ("frames", "untouched", "contacts"):
+        np.testing.assert_array_equal(again[name], frames[name])
     field = pyarrow.parquet.read_schema(tables / "shard-000000.parquet").field("contact_place")
     assert field.metadata[b"unit"] == b"m"
     assert json.loads(field.metadata[b"axes"]) == ["frame", "contact", "axis"]
+
+
+def test_frames_are_written_as_parquet_at_once(scene, tmp_path, monkeypatch, capsys):
+    """The arrays of HDF5; the same command goes on, and gives the same bytes again."""
+    monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here())
+    words = ["simulate", str(scene), "--random-scenes", "96", *WORDS, "-o"]
+    assert main([*words, str(tmp_path / "h5")]) == 0
+    assert main([*words, str(tmp_path / "tables"), "--format", "parquet"]) == 0
+    before = _bytes(tmp_path / "tables")
+    assert set(before) == {"card.json", "shard-000000.parquet", "skins.parquet", "SHA256SUMS"}
+    expected, found = (calib.open_training_frames(tmp_path / name) for name in ("h5", "tables"))
+    for name in expected.card["arrays"]:
+        np.testing.assert_array_equal(found[name], expected[name])
+        assert found[name].dtype == expected[name].dtype
+    (batch,) = found.batches(96, "contact_place")
+    np.testing.assert_array_equal(batch[0], expected["contact_place"])
+    path = tmp_path / "tables" / "shard-000000.parquet"
+    path.write_bytes(before[path.name][:-9])
+    assert main([*words, str(tmp_path / "tables"), "--format", "parquet"]) == 0
+    assert _bytes(tmp_path / "tables") == before
+    capsys.readouterr()
+    assert main([*words, str(tmp_path / "tables")]) == 2
+    assert "file_format" in capsys.readouterr().err
 
 
 def test_a_writing_goes_on_and_files_that_are_whole_stay(folder, tables):

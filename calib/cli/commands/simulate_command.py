@@ -45,6 +45,8 @@ def _add_random_scenes(parser: argparse.ArgumentParser) -> None:
     action = group.add_argument("--fidelity", metavar="NAME", help=text)
     action.suggestions = ("draft", "standard", "reference")  # type: ignore[attr-defined]
     group.add_argument("--pixels", type=count, metavar="N", help="pixels of the force map along x; default: 40")
+    text = "of the shards: hdf5 (default), or parquet for pandas, Polars, DuckDB, datasets; needs jaxeit[tables]"
+    group.add_argument("--format", choices=("hdf5", "parquet"), help=text)
     many = group.add_mutually_exclusive_group()
     many.add_argument(
         "--jobs", type=count, metavar="N", help="number of processes, on which the bytes do not depend; default: 1"
@@ -146,7 +148,7 @@ def _simulate_data_set(args: argparse.Namespace) -> int:
 
 
 _OPTIONS_OF = {
-    "--random-scenes FRAMES": ("seed", "fidelity", "pixels", "jobs", "scheduler"),
+    "--random-scenes FRAMES": ("seed", "fidelity", "pixels", "format", "jobs", "scheduler"),
     "--mujoco MODEL.xml": ("geom", "site", "seconds", "fidelity"),
 }
 _OTHERS = ("data_set", "random_scenes", "mujoco", "explain", "serve")
@@ -226,6 +228,7 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
                 seed=args.seed,
                 fidelity=_fidelity_of(args),
                 pixels=None if args.pixels is None else je.Pixels(args.pixels),
+                file_format=args.format or "hdf5",
                 executor=executor,
                 jobs=args.jobs or 1,
                 begin=begin,
