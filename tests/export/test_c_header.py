@@ -19,8 +19,8 @@ from calib.calibration.press_examples import PressExamples
 from calib.calibration.recalibration.changes import Recalibration
 from calib.cli import main
 from calib.export import ExportError
-from calib.export.c_curves import FORMULAS
-from calib.export.c_fields import FORMULAS as FIELD_FORMULAS
+from calib.export.c.curves import FORMULAS
+from calib.export.c.fields import FORMULAS as FIELD_FORMULAS
 from calib.fitting import Play
 from calib.fitting.curves import CURVES
 from calib.fitting.fields import FIELDS, FittedField, geometry_of, single_places

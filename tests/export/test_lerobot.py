@@ -9,8 +9,9 @@ import pytest
 
 import calib
 from calib.cli import main
-from calib.export import ExportError, export_lerobot, lerobot_dataset, lerobot_files
-from calib.export.lerobot_stats import FeatureStats, aggregated
+from calib.export import ExportError, export_lerobot
+from calib.export.lerobot import dataset as lerobot_dataset, files as lerobot_files
+from calib.export.lerobot.stats import FeatureStats, aggregated
 from calib.session import ArchiveWriter, SessionError
 
 parquet = pytest.importorskip("pyarrow.parquet")

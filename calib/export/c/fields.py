@@ -11,11 +11,11 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration import Calibration
-from ..calibration.localisation.locators import CentroidLocator
-from ..fitting.fields import FIELDS, FittedField, PadEdge
-from ..fitting.fields.tensor_products import BOX_HALF_WIDTH
-from .errors import ExportError
+from ...calibration import Calibration
+from ...calibration.localisation.locators import CentroidLocator
+from ...fitting.fields import FIELDS, FittedField, PadEdge
+from ...fitting.fields.tensor_products import BOX_HALF_WIDTH
+from ..errors import ExportError
 
 Statements = Callable[[FittedField], tuple[str, ...]]
 

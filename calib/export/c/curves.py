@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..fitting.curves import CURVES, FittedCurve
-from ..fitting.curves.elementary import ZERO_LOAD
-from ..fitting.pads import REST_FRACTION
-from .errors import ExportError
+from ...fitting.curves import CURVES, FittedCurve
+from ...fitting.curves.elementary import ZERO_LOAD
+from ...fitting.pads import REST_FRACTION
+from ..errors import ExportError
 
 
 class CurveInC(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..session.importers.child import library
+from ...session.importers.child import library
 
 EXTRA = "tables"
 VERSION = "v3.0"

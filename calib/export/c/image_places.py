@@ -6,9 +6,9 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration import Calibration, force_map
-from ..calibration.localisation.locators import CentroidLocator
-from .errors import ExportError
+from ...calibration import Calibration, force_map
+from ...calibration.localisation.locators import CentroidLocator
+from ..errors import ExportError
 
 
 def with_image_places(calibration: Calibration, estimator: str) -> Calibration:

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..calibration import Calibration, LogCalibration
-from ..session import replacing
-from .c_fields import LocationInC
-from .c_numbers import Numbers, numbers_of
-from .errors import ExportError
+from ...calibration import Calibration, LogCalibration
+from ...session import replacing
+from ..errors import ExportError
+from .fields import LocationInC
 from .image_places import consequences, with_image_places
+from .numbers import Numbers, numbers_of
 
 TEMPLATE, LOCATION = (Path(__file__).with_name(name) for name in ("frame.h", "location.h"))
 MAX_MISSING = 16  # as in the template

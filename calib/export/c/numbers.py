@@ -10,12 +10,12 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration import Calibration
-from ..fitting.curves.fitted import RANGE_TOLERANCE
-from ..fitting.results import FitResult
-from .c_curves import CurveInC, curve_in_c
-from .c_fields import LocationInC, location_in_c
-from .errors import ExportError
+from ...calibration import Calibration
+from ...fitting.curves.fitted import RANGE_TOLERANCE
+from ...fitting.results import FitResult
+from ..errors import ExportError
+from .curves import CurveInC, curve_in_c
+from .fields import LocationInC, location_in_c
 
 # Least part of a reading that the image of the others leaves open (`_open_part`): with less, single precision would
 # lose more than two of its seven digits in the image of a frame without these readings.

@@ -10,14 +10,14 @@ import numpy as np
 
 from jaxeit.notebook import png_of
 
-from ..calibration.application import FORMAT
-from ..calibration.frame_blocks import Progress
-from ..session import ArchiveReader, open_archive
-from ..session.errors import problem
-from ..session.hdf5.storage import folder_beside
-from .errors import ExportError
-from .lerobot_files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata
-from .lerobot_stats import FeatureStats, Stats, aggregated, flat
+from ...calibration.application import FORMAT
+from ...calibration.frame_blocks import Progress
+from ...session import ArchiveReader, open_archive
+from ...session.errors import problem
+from ...session.hdf5.storage import folder_beside
+from ..errors import ExportError
+from .files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata
+from .stats import FeatureStats, Stats, aggregated, flat
 
 BLOCK = 256  # frames that are written at once
 ROBOT = "jaxeit_skin"
