@@ -149,8 +149,10 @@ def test_pictures_are_the_maps(plugin, skin):
     np.testing.assert_array_equal(camera.read_latest(), seen)
     with pytest.raises(TimeoutError, match="ms old"):
         camera.read_latest(max_age_ms=0)
-    threading.Timer(0.1, skin.send, [line(4)]).start()
+    later = threading.Timer(0.1, skin.send, [line(4)])
+    later.start()
     np.testing.assert_array_equal(camera.read()[..., 0], picture(4, 20.0))
+    later.join()  # a frame may arrive before its sender is done
     camera.disconnect()
     assert not camera.is_connected
     with pytest.raises(ConnectionError, match="not connected"):
