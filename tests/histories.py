@@ -1,20 +1,20 @@
 """Series handed to an effect block by block."""
 
 from functools import partial
-from importlib.metadata import version
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxeit as je
 from jaxeit import effects as fx
 
 # With the fusion emitters that other tests do without, by which blocks of another length are rounded alike. jaxlib 0.11
 # knows no other way.
 _as_the_bench_does = partial(
     eqx.filter_jit,
-    compiler_options={"xla_cpu_use_fusion_emitters": True} if version("jaxlib").startswith("0.10.") else {},
+    compiler_options={name: True for name in je.compiler_options() if name == "xla_cpu_use_fusion_emitters"},
 )
 
 

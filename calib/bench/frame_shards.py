@@ -147,12 +147,15 @@ class ParquetShards(AbstractShards):
         _write_table(path, columns, shard.about, {MARK: shard.mark.encode(), SKIN: json.dumps(skin).encode()})
 
     def read(self, path: Path, names: Collection[str], mark: str, rows: int) -> dict[str, np.ndarray]:
-        table = library("pyarrow.parquet", EXTRA).read_table(path, columns=[])
-        metadata = table.schema.metadata or {}
-        _require(path, metadata.get(MARK) == mark.encode(), table.num_rows == rows)
-        skin = json.loads(metadata[SKIN])
-        kept = [name for name in names if name not in skin]
-        columns = library("pyarrow.parquet", EXTRA).read_table(path, columns=kept)
+        try:
+            with library("pyarrow.parquet", EXTRA).ParquetFile(path) as file:
+                metadata = file.metadata.metadata or {}
+                _require(path, metadata.get(MARK) == mark.encode(), file.metadata.num_rows == rows)
+                skin = json.loads(metadata[SKIN])
+                kept = [name for name in names if name not in skin]
+                columns = file.read(columns=kept)
+        except library("pyarrow", EXTRA).ArrowException as error:
+            raise BenchError(f"{path}: is damaged ({error}); give the command that writes it again") from error
         found = {name: _array(columns[name]) for name in kept}
         return found | {name: np.asarray(skin[name], float) for name in names if name in skin}
 

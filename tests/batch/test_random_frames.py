@@ -410,6 +410,8 @@ def test_frames_are_written_as_parquet_at_once(scene, tmp_path, monkeypatch, cap
     np.testing.assert_array_equal(batch[0], expected["contact_place"])
     path = tmp_path / "tables" / "shard-000000.parquet"
     path.write_bytes(before[path.name][:-9])
+    with pytest.raises(BenchError, match=r"shard-000000\.parquet: is damaged .* give the command"):
+        calib.open_training_frames(tmp_path / "tables")["contacts"]
     assert main([*words, str(tmp_path / "tables"), "--format", "parquet"]) == 0
     assert _bytes(tmp_path / "tables") == before
     capsys.readouterr()
