@@ -3,6 +3,7 @@
 import platform
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,8 +13,15 @@ import jaxeit as je
 from ..check.acceptance import accept
 from ..fitting.fields import single_places
 from ..fitting.pads import PadModel
-from ..fitting.response import PadResponse, fit_response, fold_presses, hold_out_response, require_every_pad_pressed
-from ..presses.pooled import pool_presses
+from ..fitting.response import (
+    HeldOutForces,
+    PadResponse,
+    fit_response,
+    fold_presses,
+    hold_out_response,
+    require_every_pad_pressed,
+)
+from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
 from .archives.storage import describe
@@ -21,7 +29,7 @@ from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
-from .localisation.electrode_places import place_electrodes
+from .localisation.electrode_places import PlacedElectrodes, place_electrodes
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
@@ -64,6 +72,27 @@ def calibrate(
     presses = pool_presses(sessions, skin, recipe.processing)
     ignored = accept(sessions, skin, ignore_errors=ignore_errors)
     require_every_pad_pressed(skin, presses.data)
+    calibration = _calibration(sessions, _found(skin, presses, recipe, progress), recipe, ignored)
+    if recipe.learn_layer:
+        progress(LEARNING)
+        for session in sessions:
+            calibration = learn_layer(calibration, session, ignore_errors=ignore_errors)
+    return calibration
+
+
+class _Found(NamedTuple):
+    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`."""
+
+    skin: je.Skin
+    placed: PlacedElectrodes | None
+    presses: PooledPresses
+    imager: Imager
+    images: PressImages
+    response: PadResponse
+    held_out: HeldOutForces
+
+
+def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Callable[[str], object]) -> _Found:
     placed = None
     if recipe.fit_electrodes:
         progress(PLACING)
@@ -77,54 +106,59 @@ def calibrate(
     progress("holding out")
     true_position = presses.position if presses.true_place else None
     held_out = hold_out_response(folds, response, presses.groups, images.integral, true_position)
+    return _Found(skin, placed, presses, imager, images, response, held_out)
+
+
+def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
+    presses, imager, response = found.presses, found.imager, found.response
     choice, model = response.choice, response.model
-    calibration = Calibration(
-        skin=skin,
+    return Calibration(
+        skin=found.skin,
         recon=imager.recon,
         masks=imager.masks,
         curves=model.curves,
-        evaluation=Evaluation(
-            position=presses.position,
-            estimated=images.estimated,
-            force=presses.data.force,
-            pressure=presses.data.pressure,
-            pad_force=held_out.pad_force,
-            half_width=held_out.half_width,
-            image_sum=images.integral,
-            centre=centre_of(skin),
-            held_out_by="location",
-            others=held_out.others,
-            recipe=choice.title,
-            splits=held_out.splits,
-        ),
+        evaluation=_held_out_evaluation(found),
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
         notes=(
             *ignored,
             *presses.notes,
-            *([placed.note] if placed else []),
+            *([found.placed.note] if found.placed else []),
             *([f"chosen: {choice.why}"] if choice.why else []),
             *imager.notes,
         ),
         field=model.field,
         crosstalk=presses.crosstalk,
-        noise=held_out.noise,
-        hold_noise=held_out.hold_noise,
+        noise=found.held_out.noise,
+        hold_noise=found.held_out.hold_noise,
         locator=imager.locator if model.field is not None else None,
         baseline=response.baseline,
-        image_gain=float(presses.data.force.sum() / images.integral.sum()),
-        loops=typical_loops(presses, _gains(model, images)),
+        image_gain=float(presses.data.force.sum() / found.images.integral.sum()),
+        loops=typical_loops(presses, _gains(model, found.images)),
         tried=choice.tried,
-        examples=press_examples(presses, skin),
+        examples=press_examples(presses, found.skin),
         probes=press_probes(presses),
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
-        electrodes=placed,
+        electrodes=found.placed,
     )
-    if recipe.learn_layer:
-        progress(LEARNING)
-        for session in sessions:
-            calibration = learn_layer(calibration, session, ignore_errors=ignore_errors)
-    return calibration
+
+
+def _held_out_evaluation(found: _Found) -> Evaluation:
+    presses, held_out = found.presses, found.held_out
+    return Evaluation(
+        position=presses.position,
+        estimated=found.images.estimated,
+        force=presses.data.force,
+        pressure=presses.data.pressure,
+        pad_force=held_out.pad_force,
+        half_width=held_out.half_width,
+        image_sum=found.images.integral,
+        centre=centre_of(found.skin),
+        held_out_by="location",
+        others=held_out.others,
+        recipe=found.response.choice.title,
+        splits=held_out.splits,
+    )
 
 
 def _gains(model: PadModel, images: PressImages) -> np.ndarray | None:
