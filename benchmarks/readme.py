@@ -1,10 +1,7 @@
-"""Write the tables of the README and of docs/: the accuracy from the bundled session, the others from results/.
+"""Write the tables of the README and of docs/, and their pictures: from the bundled session, and from results/.
 
 python -m benchmarks.readme
 """
-
-import json
-from pathlib import Path
 
 import calib
 from calib.report.figures.parts import write_figure
@@ -12,19 +9,12 @@ from calib.report.figures.presses import sensitivity_figure
 from calib.runtime import set_up
 from calib.session import replacing
 
+from .cost_pictures import draw
+from .harness import ROOT, measured
 from .markdown import replaced
-from .rows import Row
 from .tables import filled, table
 
-ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-MAIN = "2-core-x86"  # the machine of all sections that it has measured
-
-
-def measured() -> Row:
-    """The sections of all machines."""
-    files = sorted((ROOT / "benchmarks" / "results").glob("*.json"), key=lambda file: file.stem == MAIN)
-    return {name: data for file in files for name, data in json.loads(file.read_text(encoding="utf-8")).items()}
 
 
 def main() -> None:
@@ -36,6 +26,7 @@ def main() -> None:
         text = filled(replaced(page.read_text(encoding="utf-8"), "results", results), measured())
         with replacing(page) as new:
             new.write_text(text, encoding="utf-8")
+    draw(measured())
     figure = sensitivity_figure(calibration.evaluation, calibration.skin, simulated=True)
     write_figure(figure, ROOT / "docs" / "sensitivity.png")
 

@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from benchmarks.readme import PAGES, measured
+from benchmarks.harness import measured
+from benchmarks.readme import PAGES
 from benchmarks.tables import filled
 from calib.cli import COMMANDS
 
