@@ -5,6 +5,7 @@ The report of each test carries its rows, so that rows from parallel workers are
 
 import math
 import os
+import re
 import tempfile
 from collections import defaultdict
 from dataclasses import dataclass
@@ -13,12 +14,17 @@ from pathlib import Path
 import pytest
 
 PROPERTY = "hard case"
+Cells = tuple[str, ...]  # of a row of a table
 INTRODUCTION = """\
 # Hard cases
 
-Each row is an extreme input that the tests compute with: how extreme it was, the largest error, and what a user sees
-at that severity or beyond it. Rows "fault" are faults of devices, disks and processes. Rows "lie" are recordings with
-wrong data, and quote the message of `jaxeit check`. The tests write this table; the command runs the slow ones too:
+What happens where a problem is as hard as it gets? Each chapter has one answer and a table, a row for each extreme
+that the tests go to: how extreme it was, and what a user sees at that severity or beyond it.
+
+<details markdown="1">
+<summary>How the tables are written</summary>
+
+The tests write them; the command runs the slow ones too:
 
     python -m pytest --hard-cases docs/hard-cases.md
 
@@ -27,12 +33,58 @@ run one at a time. A run that selects tests by `-m` or `-k` only adds rows of ne
 of a known case. `python -m tests.mutations` removes the checks behind these rows one at a time, in a copy of the
 repository, and names those whose removal no test detects.
 
-Each error is the largest over all severities reached, relative to the largest of the compared values unless the case
-says otherwise. "Naive" is the textbook form of the same computation; the test keeps it to show that it fails. A dash
-means that this error is not measured.
-
+</details>
 """
 HEADER = ("case", "severity reached", "error, float64", "error, float32", "error, naive form", "what the user sees")
+NONE = "–"  # an error that is not measured
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A question that cases answer whose names begin so, without the columns of errors if they have none."""
+
+    text: str
+    beginnings: tuple[str, ...]
+    errors: bool = False
+
+
+CHAPTERS = (
+    Chapter(
+        """
+## Are numbers right where problems are hardest?
+
+To rounding times the condition of the problem. Where most digits are lost, an error or `je.model.rounding` says so. The
+picture shows error against severity, beside the textbook form of the same computation, which the tests keep to show that
+it fails ("naive"). Each error is the largest over all severities reached, relative to the largest of the compared values
+unless the case says otherwise.
+
+![Error against severity for nine hard axes: float64, float32 and the naive form](stability.png)
+
+""",
+        (),
+        errors=True,
+    ),
+    Chapter(
+        """
+## Is wrong data noticed?
+
+Spoilt files are refused. Recordings whose numbers are well formed but cannot be true are refused, or named by
+`jaxeit check`, whose message the rows quote. No generated lie that changed a result went through in silence.
+
+""",
+        ("a campaign", "hostile files", "lie:", "lies:", "spoilt input:", "unsound meshes"),
+    ),
+    Chapter(
+        """
+## What survives a fault of a device, a disk or a process?
+
+Recordings, up to the last moments before a crash or a power cut; the rows say how long these are. What a device loses is
+counted and flagged.
+
+""",
+        ("fault", "no network", "two threads"),
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -90,12 +142,12 @@ class _Collector:
         if exitstatus != pytest.ExitCode.OK:
             self.said = f"hard cases: {self.path} is left as it was, as not all tests passed"
             return
-        lines = lines_of(table(merge(self.rows)))
-        known = lines_of(self.path.read_text()) if self.path.exists() else {}
+        rows = cells_of(table(merge(self.rows)))
+        known = cells_of(self.path.read_text()) if self.path.exists() else {}
         if self.picked:
-            lines = {case: line for case, line in lines.items() if case not in known}
-        replace(self.path, INTRODUCTION + table([]) + "".join(line for _, line in sorted((known | lines).items())))
-        self.said = f"hard cases: {len(lines)} written to {self.path}"
+            rows = {case: cells for case, cells in rows.items() if case not in known}
+        replace(self.path, document(known | rows))
+        self.said = f"hard cases: {len(rows)} written to {self.path}"
 
     def pytest_terminal_summary(self, terminalreporter) -> None:
         terminalreporter.write_line(self.said)
@@ -123,25 +175,44 @@ def worst(errors: list[float | None]) -> float | None:
 
 def table(rows: list[Row]) -> str:
     """The rows as a table in Markdown."""
-    lines = [HEADER, ("---",) * len(HEADER)]
-    lines += [(r.case, r.reached, *map(_number, (r.float64, r.float32, r.naive)), r.beyond) for r in rows]
-    return "".join("| " + " | ".join(_cell(text) for text in line) + " |\n" for line in lines)
+    return _markdown(
+        [(r.case, r.reached, *map(_number, (r.float64, r.float32, r.naive)), r.beyond) for r in rows], errors=True
+    )
 
 
-def lines_of(text: str) -> dict[str, str]:
-    """The rows of a table in Markdown, by the text of their first cell."""
-    lines = [line for line in text.splitlines(keepends=True) if line.startswith("| ")][2:]
-    return {line.split(" | ")[0]: line for line in lines}
+def document(rows: dict[str, Cells]) -> str:
+    """The page of the tables: each row in the first chapter that its case belongs to, the first chapter if none."""
+    chapters = defaultdict(list)
+    for case, cells in sorted(rows.items()):
+        found = (chapter for chapter in CHAPTERS if case.startswith(chapter.beginnings))
+        chapters[next(found, CHAPTERS[0])].append(cells)
+    return INTRODUCTION + "".join(
+        chapter.text + _markdown(chapters[chapter], chapter.errors) for chapter in CHAPTERS if chapters[chapter]
+    )
+
+
+def _markdown(rows: list[Cells], errors: bool) -> str:
+    lines = [HEADER, ("---",) * len(HEADER), *rows]
+    kept = [line if errors else (*line[:2], line[-1]) for line in lines]
+    return "".join("| " + " | ".join(_cell(text) for text in line) + " |\n" for line in kept)
+
+
+def cells_of(text: str) -> dict[str, Cells]:
+    """The rows of all tables in Markdown by the text of their first cell, with all columns."""
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    rows = [tuple(line[2:-2].split(" | ")) for line in lines]
+    every = [row if len(row) == len(HEADER) else (*row[:2], NONE, NONE, NONE, row[-1]) for row in rows]
+    return {row[0]: row for row in every if row[0] not in (HEADER[0], "---")}
 
 
 def _number(error: float | None) -> str:
     if error is None:
-        return "–"
+        return NONE
     return f"{error:.0e}" if math.isfinite(error) else "not finite"
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.replace("|", "\\|").split())
+    return " ".join(re.sub(r"(?<!\\)\|", r"\\|", text).split())
 
 
 def replace(path: Path, text: str) -> None:

@@ -15,7 +15,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from ..hard_cases import Row, lines_of, replace, table
+from ..hard_cases import Row, cells_of, document, replace, table
 
 CASE = "a campaign of lies"
 
@@ -57,10 +57,8 @@ def write(path: Path, found: dict[str, Any]) -> None:
     if found["failures"]:
         raise ValueError(f"{len(found['failures'])} lies were silent or broke a command; the table is left as it was")
     reached, beyond = texts(found)
-    text = path.read_text(encoding="utf-8")
-    head = text[: text.index("| case |")]
-    lines = lines_of(text) | lines_of(table([Row(CASE, reached, None, None, None, beyond)]))
-    replace(path, head + table([]) + "".join(line for _, line in sorted(lines.items())))
+    row = cells_of(table([Row(CASE, reached, None, None, None, beyond)]))
+    replace(path, document(cells_of(path.read_text(encoding="utf-8")) | row))
 
 
 if __name__ == "__main__":

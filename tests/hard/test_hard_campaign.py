@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from ..campaign.joined import CASE, joined, texts, write
-from ..hard_cases import Row, table
+from ..hard_cases import Row, cells_of, document, table
 
 KINDS = 5  # of input, told in turn
 
@@ -54,17 +54,13 @@ def part(seed, first, lies, **changes):
 def test_campaigns_are_joined_to_one_row(tmp_path):
     found = joined([part(1, 0, 100), part(1, 100, 50), part(2, 0, 30)])
     path = tmp_path / "table.md"
-    path.write_text(
-        "before\n\n" + table([Row("a", "b", None, None, None, "c"), Row(CASE, "old", 1.0, None, None, "x")])
-    )
+    old = [Row("a", "b", 1e-9, None, None, "c"), Row(CASE, "old", None, None, None, "x")]
+    path.write_text(document(cells_of(table(old))))
     write(path, found)
-    assert path.read_text() == "before\n\n" + table([
-        Row("a", "b", None, None, None, "c"),
-        Row(
-            CASE, "180 generated: 180 tables", None, None, None, "171 refused, 6 named, 3 without effect, none silent; "
-            "slowest 1.0 s of the processor, largest growth of memory 100 MB",
-        ),
-    ])  # fmt: skip
+    seen = "171 refused, 6 named, 3 without effect, none silent; slowest 1.0 s of the processor"
+    new = Row(CASE, "180 generated: 180 tables", None, None, None, f"{seen}, largest growth of memory 100 MB")
+    assert path.read_text() == document(cells_of(table([old[0], new])))
+    assert path.read_text().endswith(f"| {new.case} | {new.reached} | {new.beyond} |\n")
 
 
 def test_no_lie_is_counted_twice_and_no_failure_is_written(tmp_path):
