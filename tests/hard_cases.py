@@ -53,10 +53,10 @@ CHAPTERS = (
         """
 ## Are numbers right where problems are hardest?
 
-To rounding times the condition of the problem. Where most digits are lost, an error or `je.model.rounding` says so. The
-picture shows error against severity, beside the textbook form of the same computation, which the tests keep to show that
-it fails ("naive"). Each error is the largest over all severities reached, relative to the largest of the compared values
-unless the case says otherwise.
+To rounding times the condition of the problem. Where most digits are lost, an error or `je.model.rounding` says so.
+The picture shows error against severity, beside the textbook form of the same computation, which the tests keep to show
+that it fails ("naive"). Each error is the largest over all severities reached, relative to the largest of the compared
+values unless the case says otherwise.
 
 ![Error against severity for nine hard axes: float64, float32 and the naive form](stability.png)
 
@@ -78,8 +78,8 @@ Spoilt files are refused. Recordings whose numbers are well formed but cannot be
         """
 ## What survives a fault of a device, a disk or a process?
 
-Recordings, up to the last moments before a crash or a power cut; the rows say how long these are. What a device loses is
-counted and flagged.
+Recordings, up to the last moments before a crash or a power cut; the rows say how long these are. What a device loses
+is counted and flagged.
 
 """,
         ("fault", "no network", "two threads"),
