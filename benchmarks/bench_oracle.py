@@ -2,7 +2,8 @@
 
 A session of 100 places at 5, 10 and 20 N is calibrated with `--location edge --curve polynomial`; another session of
 the same skin (other places, order and noise) is predicted.  Rows of the first kind have the fault in both sessions.  In
-rows of the second kind the calibration is that without faults, and only the predicted session has the fault.
+rows of the second kind the calibration is that without faults, and only the predicted session has the fault.  Rows are
+means over skins.
 
 CV is that of estimated over true force, bias their mean ratio less one; `rmse_scaled_n` is the error that is left after
 division by that ratio.  Coverage is the share of presses within their 90 % interval.
@@ -28,7 +29,6 @@ from calib.calibration import Calibration, KnownForces, OrdinaryUse, learn_layer
 from calib.calibration.application import FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.localisation.ellipses import INSIDE_90
-from calib.fitting import FitError
 from calib.fitting.validation import rmse
 from calib.session import Session, open_archive
 from tests.oracles.bench import Bench, Faults, simulate, write
@@ -61,6 +61,7 @@ LATER = {
     "10 mm tip": Faults(tip=0.01),
     "pads moved, 5 % and 50 Pa": Faults(moved_gain=0.05, moved_offset=50.0),
 }
+SKINS = (51, 52, 53, 54)
 FULL, SMOKE = Bench(), Bench(places=16, levels=(10.0, 20.0), spacing=6e-3)
 RECIPE = calib.Recipe(location=calib.PadEdge(), curve=calib.MonotonePolynomial())
 DRAFT = replace(
@@ -69,22 +70,28 @@ DRAFT = replace(
 
 
 def measure(run: Run) -> Iterator[Row]:
-    """A row for each fault."""
+    """A row for each fault, means over the skins."""
     bench, recipe = (SMOKE, DRAFT) if run.smoke else (FULL, RECIPE)
-    sound: Calibration | None = None
+    benches = [replace(bench, skin_seed=seed) for seed in run.sizes(SKINS, SKINS[:1])]
+    sound: list[Calibration] = []
     for name, faults in run.sizes(list(BOTH.items()), [("none", Faults())]):
-        row: Row = {"fault": name, "in": "both"}
-        try:
-            with _recorded(bench, faults, seed=bench.seed) as session:
-                calibration = calib.calibrate([session], recipe=recipe)
-            sound = sound or calibration
-            row |= predicted(calibration, bench, faults)
-        except FitError as error:
-            row["refused"] = str(error)
-        yield {"rows": [row]}
+        calibrations = [_calibrated(skin, faults, recipe) for skin in benches]
+        sound = sound or calibrations
+        yield _row(name, "both", calibrations, benches, faults)
     for name, faults in run.sizes(list(LATER.items()), []):
-        assert sound is not None, "the bench without faults was refused"
-        yield {"rows": [{"fault": name, "in": "the second"} | predicted(sound, bench, faults)]}
+        yield _row(name, "the second", sound, benches, faults)
+
+
+def _calibrated(bench: Bench, faults: Faults, recipe: calib.Recipe) -> Calibration:
+    with _recorded(bench, faults, seed=bench.seed) as session:
+        return calib.calibrate([session], recipe=recipe)
+
+
+def _row(name: str, where: str, calibrations: list[Calibration], benches: list[Bench], faults: Faults) -> Row:
+    each = [predicted(*pair, faults) for pair in zip(calibrations, benches, strict=True)]
+    row = {"fault": name, "in": where} | averaged(each, sd_of="coverage") | {"skins": len(each)}
+    print(row, flush=True)
+    return {"rows": [row]}
 
 
 @contextmanager
