@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..bench import BenchError, open_training_frames
-from ..bench.frame_shards import EXTRA, SHARDS, Shard
+from ..bench.frame_shards import EXTRA, SHARDS, Shard, by_frame
 from ..bench.training_frames import TrainingFrames, claim_folder
 from ..session.importers.child import library
 
@@ -56,13 +56,13 @@ def export_training_frames(
     card = {**frames.card, "file_format": "parquet"}
     claim_folder(output, json.dumps(card, indent=2) + "\n")
     files, about, mark = SHARDS["parquet"], frames.card["arrays"], frames.card["mark"]
-    by_frame = [name for name in about if about[name]["axes"][0] == "frame"]
+    rows = by_frame(about)
     for skin in progress(list(frames.skins())):
         path = files.path(output, skin.shards[0])
         if not files.is_whole(path, mark, len(skin)):
-            (arrays,) = skin.batches(len(skin), *by_frame)
-            of_skin = {name: skin[name][0] for name in about if name not in by_frame}
-            shard = dict(zip(by_frame, arrays, strict=True)) | of_skin
+            (arrays,) = skin.batches(len(skin), *rows)
+            of_skin = {name: skin[name][0] for name in about if name not in rows}
+            shard = dict(zip(rows, arrays, strict=True)) | of_skin
             files.write(path, Shard(skin.shards[0], shard, about, mark))
     files.finish(output, frames.shards, about)
     size = sum(path.stat().st_size for path in output.glob("*.parquet"))

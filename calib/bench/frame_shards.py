@@ -27,6 +27,11 @@ Arrays = Mapping[str, np.ndarray]
 Descriptions = Mapping[str, Mapping[str, Any]]  # "meaning", "unit", "axes", "shape" and "dtype" of each array
 
 
+def by_frame(about: Descriptions) -> list[str]:
+    """Names of the arrays with a row for each frame; the others belong to the skin of a shard."""
+    return [name for name, each in about.items() if each["axes"][0] == "frame"]
+
+
 class Shard(NamedTuple):
     """A shard to write: its number, the arrays and what they are, and facts about all shards of the folder."""
 
@@ -139,11 +144,11 @@ class ParquetShards(AbstractShards):
         return bool(about.num_rows == rows and (about.metadata or {}).get(MARK) == mark.encode())
 
     def write(self, path: Path, shard: Shard) -> None:
-        by_frame = [name for name, about in shard.about.items() if about["axes"][0] == "frame"]
         kinds = {name: about["dtype"] for name, about in shard.about.items()}
         columns = {"shard": np.full(len(shard.arrays["frames"]), shard.number, "i4")}
-        columns |= {name: shard.arrays[name].astype(kinds[name]) for name in by_frame}
-        skin = {name: shard.arrays[name].astype(kinds[name]).tolist() for name in kinds if name not in by_frame}
+        rows = by_frame(shard.about)
+        columns |= {name: shard.arrays[name].astype(kinds[name]) for name in rows}
+        skin = {name: shard.arrays[name].astype(kinds[name]).tolist() for name in kinds if name not in rows}
         _write_table(path, columns, shard.about, {MARK: shard.mark.encode(), SKIN: json.dumps(skin).encode()})
 
     def read(self, path: Path, names: Collection[str], mark: str, rows: int) -> dict[str, np.ndarray]:

@@ -9,8 +9,8 @@ from scipy.stats import t as student_t
 from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, most_likely_sizes
 
 STRETCHES = 0.75  # share of the stretches of time in which the interval covers the readings
-# s before and after a sample, over which the rate of its force is taken. It is as long as the lags of sensors: one that is
-# longer spreads the error of a sudden change over readings that do not have it.
+# s before and after a sample, over which the rate of its force is taken. It is as long as the lags of sensors are: a
+# longer one spreads the error of a sudden change over readings that do not have it.
 WINDOW = 0.05
 
 
