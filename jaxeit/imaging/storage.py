@@ -226,7 +226,12 @@ _POSITIVE = ("current", "count", "hyperparameter")
 
 
 def _require_possible(numbers: Mapping[str, np.ndarray]) -> None:
-    """Refuse numbers that no reconstructor has: areas below zero, a current of zero, noise without a covariance."""
+    """Refuse numbers that no reconstructor has: of two precisions, areas below zero, a current of zero, noise without a
+    covariance."""
+    precision = {name: array.dtype.itemsize for name, array in numbers.items() if array.dtype.kind == "f"}
+    if unlike := [name for name in precision if precision[name] != precision["predict"]]:
+        kinds = numbers[unlike[0]].dtype, numbers["predict"].dtype
+        raise StorageError(f"{unlike[0]}: is of type {kinds[0]}, and predict of type {kinds[1]}; they must be of one")
     for name, array in numbers.items():
         if (name in _NOT_NEGATIVE and not (array >= 0).all()) or (name in _POSITIVE and not (array > 0).all()):
             least = "zero or more" if name in _NOT_NEGATIVE else "above zero"

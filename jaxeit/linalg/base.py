@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
 
 from .._compile import full_precision
@@ -64,7 +65,7 @@ def index_arrays(pattern: SparsityPattern) -> dict[str, Integer[Array, "..."]]:
     return {name: on_device(array, np.uint32) for name, array in arrays.items()}
 
 
-def on_device(values: np.ndarray | Array | float, dtype: Any) -> Array:
+def on_device(values: ArrayLike | list[float], dtype: Any) -> Array:
     """An array of this type; `jnp.asarray` would compile a program for nearly every shape.
 
     Indices should be unsigned: for signed indices XLA adds code to every lookup that handles negative values.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
+from .._compile import verb
 from ..budget import require
 from ..linalg.base import on_device
 from ..registry import Registry
@@ -100,11 +101,13 @@ class BasisMap(AbstractPictured):
     elements: int = eqx.field(static=True)
     single: bool = eqx.field(static=True)
 
+    @verb
     def expand(self, image: Float[Array, " basis"]) -> Float[Array, " elements"]:
         """Values on the elements, (elements,), from the coefficients of an image, (basis,)."""
         spread = self.weight * image[self.coefficient][:, None]
         return jnp.zeros(self.elements, spread.dtype).at[self.element].add(spread)
 
+    @verb
     def restrict(self, values: Float[Array, " elements"]) -> Float[Array, " basis"]:
         """The transpose of `expand`: weighted sums over the elements of each coefficient."""
         sums = jnp.sum(self.weight * values[self.element], 1)

@@ -16,6 +16,7 @@ from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
 from ..imaging.noise import whitened_readings
+from ..linalg.base import on_device
 from ..model.bases import Pixels
 from ..model.discretisation import Model, discretise
 from ..model.forward_model import conductivity
@@ -51,11 +52,11 @@ def prepare_filter(
     finder = prepare_contacts(model, ContactSettings(most=1), noise=noise, sigma=sigma, channels=channels)
     # E C^T = 1, so that the directions which the finder kept are its rows times C^T.
     kept = np.asarray(finder.compress, float) @ found.factor.T
-    put = partial(jnp.asarray, dtype=model.dtype)
+    put = partial(on_device, dtype=model.dtype)
     whole = conductivity(model) if sigma is None else sigma
     coat = loads.coat_spread(sigma is not None)
     field, sheet = _loaded_sheet(model, skin, settings, whole, coat, found.electrodes, kept @ found.factor)
-    unit = jnp.eye(len(finder.whitening.channels), dtype=model.dtype)
+    unit = put(np.eye(len(finder.whitening.channels)))
     tracker = ContactFilter(
         finder=finder,
         compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
@@ -82,7 +83,7 @@ def _loaded_sheet(
     mixing: np.ndarray,
 ) -> tuple[GainField, LoadedSheet]:
     """The gain before any contact, and what contacts show."""
-    loads, light = settings.loads, partial(jnp.asarray, dtype=np.dtype(settings.dtype))
+    loads, light = settings.loads, partial(on_device, dtype=np.dtype(settings.dtype))
     coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(settings.columns).on(model)
     response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
     background = np.asarray(fine.restrict(sigma)) / np.asarray(fine.restrict(jnp.ones_like(sigma)))
@@ -121,11 +122,13 @@ def _coat_share(sheet: LoadedSheet, settings: TrackerSettings) -> float:
     The filter takes it for an error of the model, like noise: it then holds to what is known of widths and of the gain
     where it would otherwise explain the coat by them. What contacts err by even so is a consider covariance.
     """
-    low, high = sheet.pixels.min(0), sheet.pixels.max(0)
-    along = (jnp.arange(COAT_PLACES, dtype=low.dtype) + 0.5) / COAT_PLACES
-    places = jnp.stack(jnp.meshgrid(*(low + (high - low) * along[:, None]).T), -1).reshape(-1, 2)
-    usual = jnp.log(jnp.asarray([settings.loads.width, settings.loads.force], low.dtype))
-    return float(jnp.sqrt(jnp.mean(_coat_shares(sheet, places, usual))))
+    pixels = np.asarray(sheet.pixels)
+    low, high = pixels.min(0), pixels.max(0)
+    along = (np.arange(COAT_PLACES) + 0.5) / COAT_PLACES
+    places = np.stack(np.meshgrid(*(low + (high - low) * along[:, None]).T), -1).reshape(-1, 2)
+    usual = np.log([settings.loads.width, settings.loads.force])
+    shares = _coat_shares(sheet, *(on_device(values, pixels.dtype) for values in (places, usual)))
+    return float(np.sqrt(np.mean(shares)))
 
 
 @verb
@@ -174,11 +177,11 @@ def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: Tracke
         squares = np.full((along.shape[1], len(cells), len(places)), np.inf, np.float32)
         for part in along:
             squares = np.minimum(squares, _squares(cells + part, places))
-        return jnp.asarray(np.argpartition(squares, count - 1, -1)[..., :count], jnp.int32)
+        return on_device(np.argpartition(squares, count - 1, -1)[..., :count], np.int32)
 
     return Neighbours(
-        low=jnp.asarray(low, settings.dtype),
-        pitch=jnp.asarray(pitch, settings.dtype),
+        low=on_device(low, settings.dtype),
+        pitch=on_device(pitch, settings.dtype),
         elements=nearest(middles, 2 * settings.unknowns),
         unknowns=nearest(unknowns, settings.unknowns),
         pixels=nearest(pixels, settings.pixels),

@@ -25,8 +25,9 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse.linalg import splu
 
-from .._compile import full_precision
+from .._compile import full_precision, verb
 from ..linalg import lapack
+from ..linalg.base import on_device
 from ..model.discretisation import Model
 from ..model.forward_model import Coefficients, assemble, coefficients, fields
 
@@ -93,6 +94,7 @@ class Reanalysis(eqx.Module):
         _, _, y, _ = self._solved(elements, unknowns, change)
         return self.potential - self.green[:, unknowns] @ y
 
+    @verb
     def slopes_along(
         self, directions: Float[Array, "d elements"], potential: Float[Array, "n electrodes"]
     ) -> Float[Array, "d r"]:
@@ -143,15 +145,18 @@ def prepare_reanalysis(
         pairs, mixing: as in `Reanalysis`.
     """
     theta = coefficients(model, sigma)
-    put = partial(jnp.asarray, dtype=dtype)
+    put = partial(on_device, dtype=dtype)
     return Reanalysis(
         green=put(_green(model, theta)),
         potential=put(fields(model, theta).potential),
-        dofs=jnp.asarray(model.system.dofs, jnp.int32),
+        dofs=on_device(model.system.dofs, np.int32),
         slopes=put(model.system.slopes),
-        pairs=jnp.asarray(pairs, jnp.int32),
+        pairs=on_device(pairs, np.int32),
         mixing=put(mixing.T),
     )
+
+
+_assembled = verb(assemble)
 
 
 def _green(model: Model, theta: Coefficients) -> Float[np.ndarray, "n n"]:
@@ -159,7 +164,7 @@ def _green(model: Model, theta: Coefficients) -> Float[np.ndarray, "n n"]:
 
     The unknowns of the matrix are potentials but for a share of the electrode's above them (`Unknowns`).
     """
-    system, matrix = model.system, assemble(model.system, theta)
+    system, matrix = model.system, _assembled(model.system, theta)
     count, under = system.unknowns, np.asarray(system.under)
     share = np.append(np.asarray(matrix.share, float), 0.0)[under]
     electrode = np.append(np.asarray(system.electrode_dof), 0)[under]

@@ -205,7 +205,7 @@ def test_a_slope_that_the_samples_want_just_below_zero_is_fitted_as_next_to_noth
     assert wanted[0] < 0 == best[0]
     np.testing.assert_allclose(one.parameters, best, atol=1e-4)
     assert np.isfinite(one.covariance).all()
-    assert abs(wanted[0]) < 6 * one.standard_errors[0] < 1
+    assert abs(wanted[0]) < 6 * float(one.standard_errors[0]) < 1
     assert one.predict(np.array([100.0, 3000.0])).valid.all()
 
 

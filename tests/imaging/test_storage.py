@@ -92,6 +92,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     ("name", "value", "message"),
     [
         ("factor", None, "factor: missing"),
+        ("areas", np.ones(144, "f4"), "areas: is of type float32, and predict of type float64"),
         ("factor", np.ones((144, 299)), "predict: has shape"),
         ("predict", np.full((300, 300), np.nan), "predict: holds values that are not finite"),
         ("pairs", np.full((550, 4), 300), "pairs: must count the 300"),
