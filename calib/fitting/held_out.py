@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..presses.means import DOMINANT_SHARE
@@ -287,6 +286,7 @@ def _levelled(field: FittedField | None, empty: np.ndarray) -> FittedField | Non
     """The field, with the mean features of the other pads taken for the `empty` pads, which have no presses."""
     if field is None:
         return None
-    centre = field.centre.at[empty].set(jnp.mean(jnp.delete(field.centre, empty, axis=0), 0))
-    found: FittedField | None = eqx.tree_at(lambda f: f.centre, field, centre)
+    centre = np.array(field.centre)
+    centre[empty] = np.delete(centre, empty, axis=0).mean(0)
+    found: FittedField | None = eqx.tree_at(lambda f: f.centre, field, jax.device_put(centre))
     return found

@@ -1,14 +1,15 @@
 """Places of contacts, as the images of frames tell them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Integer
+
+import jaxeit as je
 
 
 class Places(eqx.Module):
@@ -32,10 +33,16 @@ class Places(eqx.Module):
         """Whether the place of a contact on each pad is known."""
         return jnp.sum(self.weight, 1) > 0
 
-    def __getitem__(self, rows: Any) -> "Places":
-        """The places of some frames."""
-        found: Places = jax.tree.map(lambda leaf: leaf[rows], self)
+    def __getitem__(self, rows: Integer[ArrayLike, " m"]) -> "Places":
+        """The places of the frames of these numbers."""
+        found: Places = _of_rows(self, rows)
         return found
+
+
+@je.verb
+def _of_rows(places: Places, rows: Integer[ArrayLike, " m"]) -> Places:
+    found: Places = jax.tree.map(lambda leaf: leaf[rows], places)
+    return found
 
 
 def single_places(

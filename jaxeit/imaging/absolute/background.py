@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from ..._compile import verb
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
 from ...model.forward_model import forward
@@ -109,6 +110,7 @@ def sheet_level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) 
     return level
 
 
+@verb
 def frame_error(v0: Float[Array, " readings"], model_error: Float[ArrayLike, ""]) -> Float[Array, " readings"]:
     """Standard error of each reading of an untouched frame: a part of itself, and a thousandth of their rms."""
     there = jnp.isfinite(v0)
