@@ -186,6 +186,8 @@ def compiler_options() -> dict[str, Any]:
         "xla_cpu_experimental_ynn_fusion_type": "",  # small products wait for its threads
         "xla_cpu_enable_concurrency_optimized_scheduler": False,  # the levels are one chain
     }
+    if _is_known(options):
+        return options
     return {name: value for name, value in options.items() if _is_known({name: value})}
 
 
