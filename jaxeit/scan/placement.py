@@ -115,7 +115,7 @@ def move_electrodes(
     """
     criterion, limits = criterion or PlaceError(), limits or PlacementLimits()
     settings, fidelity = settings or DesignSettings(), fidelity or Fidelity.draft()
-    pattern = np.asarray(skin.protocol.pattern if pattern is None else pattern)
+    pattern = np.asarray(skin.protocol.rows("move_electrodes") if pattern is None else pattern)
     search = _Search.begin(skin, criterion, limits, settings, pattern, fidelity)
     first, share, made = search.error, STEP, 1
     for _ in progress(range(meshes - 1)):

@@ -128,7 +128,7 @@ class Protocol:
         if self.mixing is not None:
             raise ProtocolError(
                 f"{what} needs one pair that drives and one that senses for each reading, with one current for all; "
-                "this protocol of matrices has others"
+                'this protocol of matrices has others; give the skin rows, or a pattern such as "adjacent"'
             )
         return self.pattern
 

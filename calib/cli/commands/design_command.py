@@ -71,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
         skin_of(args.skin),
         je.scan.CRITERIA.make(args.criterion, allow_import=True),
     )
+    skin.protocol.rows("jaxeit design")
     limits, readings = _limits(args), _readings(args, skin)
     settings = je.scan.DesignSettings(width=args.width, noise=args.noise, relative=args.relative_noise)
     announce_model(skin, je.Fidelity.draft())
