@@ -27,7 +27,7 @@ from ..skin.description import Skin
 from ..skin.protocol import ProtocolError
 from ..skin.rewriting import with_positions
 from .contact_information import DesignSettings, SiteContacts, sites_of
-from .design import AbstractCriterion, PlaceError
+from .criteria import AbstractCriterion, PlaceError
 
 STEP = 0.2  # of an electrode's reach, that it moves at most on one mesh
 LEAST_STEP = 0.02  # likewise, below which the search ends

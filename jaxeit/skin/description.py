@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 
@@ -194,14 +194,16 @@ def _protocol(table: TomlTable, electrodes: int) -> Protocol:
     current = table.positive("current", "the amplitude in A")
     frequency = table.number("frequency", "Hz, zero or more", 0.0)
     reading_time = table.number("reading_time", "s, zero or more", 1e-5)
+    channels = table.count("sense_channels") if table.has("sense_channels") else 1
     if table.has("rows"):
         rows = table.array("rows", 4, "[[drive+, drive-, sense+, sense-], ...]")
         table.done()
-        return Protocol(rows, current, frequency, reading_time)
+        return Protocol(rows, current, frequency, reading_time, sense_channels=channels)
     name = table.get("pattern", lambda v: isinstance(v, str), NAMES)
     table.done()
     try:
-        return named_protocol(name, electrodes, current, frequency, reading_time)
+        named = named_protocol(name, electrodes, current, frequency, reading_time)
+        return replace(named, sense_channels=channels)
     except ProtocolError as error:
         raise table.error("pattern", str(error)) from None
 

@@ -201,6 +201,29 @@ def test_a_skin_file_names_the_trigonometric_pattern(tmp_path):
         je.skin.named_pattern("trigonometric", 25)
 
 
+def test_readings_of_one_drive_are_taken_at_once(tmp_path):
+    """22 readings of each of 25 drives, eight at once: three slots, the last with six; the hash counts them."""
+    text = TEXT.replace('"adjacent"', '"adjacent"\nsense_channels = 8  # amplifiers', 1)
+    skin = je.skin.parse_skin(text)
+    slots = skin.protocol.slots.reshape(25, 22)
+    np.testing.assert_array_equal(slots[0], [*8 * [0], *8 * [1], *6 * [2]])
+    np.testing.assert_array_equal(slots, slots[0] + 3 * np.arange(25)[:, None])
+    assert skin.protocol.frame_time == pytest.approx(75e-5)
+    assert je.scan.scan_time(skin.protocol, 2.0) == pytest.approx((75 + 50) * 1e-5)
+    np.testing.assert_allclose(skin.protocol.reading_offsets, 1e-5 * slots.ravel())
+    path = tmp_path / "other.toml"
+    path.write_text(je.skin.with_rows(skin, skin.protocol.pattern).toml)
+    assert je.skin.skin_hash(je.load_skin(path)) == je.skin.skin_hash(skin)
+    assert je.skin.skin_hash(skin) != je.skin.skin_hash(je.skin.parse_skin(TEXT))
+    one = je.skin.with_rows(skin, skin.protocol.pattern, 1)
+    assert je.skin.skin_hash(one) == je.skin.skin_hash(je.skin.parse_skin(TEXT))
+    assert "amplifiers" not in one.toml
+    with pytest.raises(je.toml.TomlError, match="a protocol of matrices has no driven pairs"):
+        je.skin.parse_skin(text.replace("adjacent", "trigonometric", 1))
+    with pytest.raises(je.toml.TomlError, match="sense_channels: is 0"):
+        je.skin.parse_skin(text.replace("channels = 8", "channels = 0"))
+
+
 @pytest.mark.parametrize("electrodes", [4, 9, 16])
 def test_trigonometric_currents_are_orthogonal(electrodes):
     """They span all currents that sum to zero."""
