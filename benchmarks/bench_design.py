@@ -110,6 +110,12 @@ class Bench:
         found: Row = {f"{name}_{figure}": float(of(fitted)) for figure, of in figures.items()}
         return found | {f"{name}_lost": float(np.mean(np.isnan(fitted)))}
 
+    def at_once(self, way: str, pattern: np.ndarray, channels: int, certificate: float | None = None) -> Row:
+        """Errors of the contacts fitted to a scan of several sense channels, and its rate."""
+        protocol = je.Protocol(pattern, reading_time=self.skin.protocol.reading_time, sense_channels=channels)
+        found = self.row(way, pattern)
+        return found | {"channels": channels, "frames_per_s": 1 / protocol.frame_time, "certificate": certificate}
+
     def designed(self, way: str, count: int, **how: Any) -> Row:
         began = perf_counter()
         found = je.scan.design_scan(self.sensitivity, count, **how)
@@ -146,7 +152,19 @@ def without(run: Run) -> Iterator[Row]:
             yield {"without": [{"electrode": electrode, "readings": count, "bound_mm": 1e3 * found.error}]}
 
 
-main = Question("design", __doc__, {"rows": measure, "without": without})
+def channels(run: Run) -> Iterator[Row]:
+    """Scans of hardware that takes several readings of a drive at once."""
+    bench = Bench(run.smoke)
+    adjacent = bench.skin.protocol.pattern
+    yield {"channels": []}
+    for count, times in run.sizes(((8, (75, 20)), (22, (25, 5))), ((22, (5,)),)):
+        yield {"channels": [bench.at_once("adjacent", adjacent, count)]}
+        for time in times:
+            found = je.scan.design_scan(bench.sensitivity, time, sense_channels=count)
+            yield {"channels": [bench.at_once(DESIGNED, found.pattern, count, found.bound / found.error)]}
+
+
+main = Question("design", __doc__, {"rows": measure, "without": without, "channels": channels})
 
 if __name__ == "__main__":
     main()

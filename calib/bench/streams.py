@@ -345,7 +345,7 @@ def _offsets(bench: Bench) -> Float[np.ndarray, " readings_or_one"]:
     if not effects:
         return np.zeros(1)
     protocol = bench.scene.skin.protocol
-    nominal = jnp.arange(protocol.readings, dtype=float) * protocol.reading_time
+    nominal = jnp.asarray(protocol.reading_offsets)
     return np.asarray(fx.fold(effects, fx.AbstractScanEffect, jnp.zeros_like(nominal), nominal))
 
 

@@ -120,6 +120,26 @@ class ChannelTable:
 
 
 @dataclass(frozen=True)
+class ElectrodeRow:
+    """How far an electrode seems to sit from its place in the skin's file, by the untouched frame.
+
+    | field        | meaning                                                                 | unit |
+    |--------------|-------------------------------------------------------------------------|------|
+    | x, y         | shift                                                                   | m    |
+    | error        | standard error of the shift, along it                                   | m    |
+    | significance | distance of the shift from zero, in standard errors of both coordinates |      |
+    | elsewhere    | whether the shift is significant and not small                          |      |
+    """
+
+    electrode: int
+    x: float
+    y: float
+    error: float
+    significance: float
+    elsewhere: bool
+
+
+@dataclass(frozen=True)
 class PressSummary:
     """Source of the presses ("table", "force" or "none"), number of usable ones, and reasons of the rejected ones."""
 
@@ -130,7 +150,10 @@ class PressSummary:
 
 @dataclass(frozen=True, eq=False)
 class CheckReport:
-    """Result of `check_session`. ``ok`` is False if any finding is an error."""
+    """Result of `check_session`. ``ok`` is False if any finding is an error.
+
+    ``electrodes`` is empty unless their places were asked for and could be checked.
+    """
 
     name: str
     title: str
@@ -144,6 +167,7 @@ class CheckReport:
     order: OrderCheck | None
     presses: PressSummary
     onsets: tuple[tuple[str, OnsetDelay], ...]
+    electrodes: tuple[ElectrodeRow, ...] = ()
 
     @property
     def ok(self) -> bool:

@@ -11,6 +11,7 @@ from ..record.journal.records import EventCode
 from ..session import Session
 from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit
+from .electrodes import check_electrodes
 from .evidence import PressEvidence
 from .force import force_findings
 from .pads import check_pads
@@ -31,6 +32,7 @@ def check_session(
     skin: je.Skin | None = None,
     *,
     transfer: np.ndarray | None = None,
+    electrodes: bool = False,
     progress: Progress = iter,
 ) -> CheckReport:
     """Search a session for everything that would spoil a calibration.
@@ -38,6 +40,8 @@ def check_session(
     Args:
         skin: the skin that was recorded; default: the one described in the file.
         transfer: result of `transfer_matrix` for that skin, to check many sessions; default: computed here.
+        electrodes: also fit the places of the electrodes to the untouched frame, which takes some ten seconds, and a
+            minute where the programs have to be compiled.
         progress: wraps the iteration over blocks of each stream, such as `tqdm.tqdm`.
 
     Returns:
@@ -56,6 +60,7 @@ def check_session(
     presses = presses if evidence is None else evidence.presses
     channels, order = check_eit(session, statistics.get("eit"), presses, skin, transfer, findings)
     pads = check_pads(statistics, skin, findings)
+    places = check_electrodes(skin, channels, order, findings) if electrodes else ()
     onsets = _compare(session, statistics, evidence, skin, channels, order, findings)
     return CheckReport(
         name=session.name,
@@ -70,6 +75,7 @@ def check_session(
         order=order,
         presses=press_summary(presses, source),
         onsets=onsets,
+        electrodes=places,
     )
 
 

@@ -22,6 +22,7 @@ def render(report: CheckReport, verbose: bool = False) -> str:
         _pads(report.pads),
         _presses(report),
         _channels(report, verbose),
+        _electrodes(report, verbose),
         _conclusion(report),
     ]
     texts = ["\n".join(lines) for lines in parts]
@@ -159,6 +160,16 @@ def _channels(report: CheckReport, verbose: bool) -> Iterator[str]:
     rows = np.arange(len(table)) if verbose else worst(table)
     title = "  all readings" if verbose else f"  the worst {len(rows)} of the working ones (all: --all)"
     yield from _table(title, CHANNEL_COLUMNS, [_channel(table, int(i)) for i in rows])
+
+
+def _electrodes(report: CheckReport, verbose: bool) -> Iterator[str]:
+    rows = [row for row in report.electrodes if verbose or row.elsewhere]
+    cells = [
+        (str(row.electrode), *(f"{1e3 * value:+.2f}" for value in (row.x, row.y)), f"{1e3 * row.error:.2f}")
+        for row in rows
+    ]
+    title = "Electrodes, from their places in the skin's file"
+    yield from _table(title, ("electrode", "x mm", "y mm", "standard error mm"), cells)
 
 
 def _reciprocity(table: ChannelTable) -> str:

@@ -43,10 +43,10 @@ def plan_recording(
         title=title,
         skin_name=skin.name if skin is not None else "",
         skin_toml=skin.toml if skin is not None else "",
-        pattern=None if eit is None else tuple(tuple(map(int, row)) for row in eit.pattern),
+        pattern=None if eit is None else tuple(tuple(map(int, row)) for row in eit.rows("a session")),
         current=None if eit is None else float(eit.current),
         frequency=None if eit is None else float(eit.frequency),
-        offset=None if eit is None else tuple(n * float(eit.reading_time) for n in range(eit.readings)),
+        offset=None if eit is None else tuple(map(float, eit.reading_offsets)),
     )
     return plan, sources
 

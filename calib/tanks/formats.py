@@ -19,13 +19,17 @@ from .texts import pyeidors_tank, sciospec_tank
 Rim = Sequence[AbstractElectrode]
 
 
-def load_tank(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+def load_tank(
+    path: str | Path, domain: Domain | None = None, rim: Rim | None = None, *, skin: je.Skin | None = None
+) -> Tank:
     """A tank and its frames, from any file that this room reads.
 
     Args:
         path: .mat (EIDORS or the Kuopio challenge), .csv (PyEIDORS), .eit (Sciospec), .npz, or a folder of .eit files.
         domain: shape of the tank, where the file has none (all but .mat), such as ``je.Disc(0.03)``.
         rim: its electrodes; default: `je.skin.rim_electrodes`, electrode 0 at +x, counter-clockwise.
+        skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone; in place of ``domain`` and
+            ``rim``.
 
     Raises:
         TankError, OSError: naming the file and what is wrong with it.
@@ -33,6 +37,8 @@ def load_tank(path: str | Path, domain: Domain | None = None, rim: Rim | None = 
     path = Path(path)
     if not path.exists():
         raise TankError(f"{path}: does not exist; check the name and the folder")
+    if skin is not None:
+        return _frames_of(skin, path)
     if path.is_dir():
         return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
     kind = path.suffix.lower()
@@ -110,10 +116,25 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
     else:
         protocol = je.Protocol.from_matrices(arrays["current"], arrays["measurement"])
         electrodes = len(arrays["current"])
-    frames = np.atleast_2d(arrays["frames"])
+    return _tank(tank_of(path.stem, protocol, electrodes, domain, rim), arrays["frames"])
+
+
+def _frames_of(skin: je.Skin, path: Path) -> Tank:
+    """The frames of an .npz that holds nothing else, as readings of this skin."""
+    arrays = _npz(path) if path.suffix.lower() == ".npz" else {}
+    if set(arrays) != {"frames"}:
+        raise TankError(
+            f"{path.name}: a file of frames that a skin's TOML describes is an .npz with frames (frames, readings) V "
+            "and nothing else; other files have a scan of their own: leave the skin out"
+        )
+    return _tank(skin, arrays["frames"])
+
+
+def _tank(skin: je.Skin, frames: np.ndarray) -> Tank:
+    frames = np.atleast_2d(frames)
     quadrature = frames.imag if np.iscomplexobj(frames) else None
     names = tuple(f"frame {k}" for k in range(len(frames)))
-    return Tank(tank_of(path.stem, protocol, electrodes, domain, rim), frames.real.astype(float), names, quadrature)
+    return Tank(skin, frames.real.astype(float), names, quadrature)
 
 
 def _npz(path: Path) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 from .contact_information import DesignSettings, PlaceSensitivity, place_sensitivity
 from .covariance import around, signal_covariance
-from .design import CRITERIA, AbstractCriterion, PlaceError, PlaceVolume, ScanDesign, design_scan
+from .criteria import CRITERIA, AbstractCriterion, PlaceError, PlaceVolume
+from .design import ScanDesign, design_scan
 from .event_driven import EventScan, EventScanSettings, ScanState, prepare_event_scan
 from .placement import Placement, PlacementLimits, move_electrodes
 from .selection import (

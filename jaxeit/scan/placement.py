@@ -27,7 +27,7 @@ from ..skin.description import Skin
 from ..skin.protocol import ProtocolError
 from ..skin.rewriting import with_positions
 from .contact_information import DesignSettings, SiteContacts, sites_of
-from .design import AbstractCriterion, PlaceError
+from .criteria import AbstractCriterion, PlaceError
 
 STEP = 0.2  # of an electrode's reach, that it moves at most on one mesh
 LEAST_STEP = 0.02  # likewise, below which the search ends
@@ -115,7 +115,7 @@ def move_electrodes(
     """
     criterion, limits = criterion or PlaceError(), limits or PlacementLimits()
     settings, fidelity = settings or DesignSettings(), fidelity or Fidelity.draft()
-    pattern = np.asarray(skin.protocol.pattern if pattern is None else pattern)
+    pattern = np.asarray(skin.protocol.rows("move_electrodes") if pattern is None else pattern)
     search = _Search.begin(skin, criterion, limits, settings, pattern, fidelity)
     first, share, made = search.error, STEP, 1
     for _ in progress(range(meshes - 1)):

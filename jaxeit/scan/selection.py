@@ -183,6 +183,8 @@ def shortened(protocol: Protocol, rows: Integer[ArrayLike, " count"] | Bool[Arra
 def scan_time(protocol: Protocol, switch: float = 0.0) -> float:
     """Seconds per frame when scans follow each other.
 
+    Readings that several sense channels take at once count as one.
+
     Args:
         protocol: the scan.
         switch: cost of a change of the driven pair, in readings.
@@ -192,7 +194,7 @@ def scan_time(protocol: Protocol, switch: float = 0.0) -> float:
     """
     drive = drives(protocol.rows("scan_time"))
     changes = int(np.sum(drive != np.roll(drive, 1)))
-    return (protocol.readings + switch * changes) * protocol.reading_time
+    return float((protocol.slots[-1] + 1 + switch * changes) * protocol.reading_time)
 
 
 def in_frame(

@@ -12,7 +12,7 @@ from .description import (
 from .edges import BoundaryPatch
 from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
 from .identity import skin_hash
-from .patterns import adjacent, all_pairs, named_pattern, opposite, skip
+from .patterns import adjacent, all_pairs, named_pattern, named_protocol, opposite, skip, trigonometric
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
 from .protocol import Protocol, ProtocolError, reciprocal_rows
@@ -41,6 +41,7 @@ __all__ = [
     "all_pairs",
     "load_skin",
     "named_pattern",
+    "named_protocol",
     "opposite",
     "parse_skin",
     "reciprocal_rows",
@@ -48,6 +49,7 @@ __all__ = [
     "shipped_skins",
     "skin_hash",
     "skip",
+    "trigonometric",
     "with_positions",
     "with_rows",
 ]

@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
 from .electrodes import ELECTRODES, AbstractElectrode
-from .patterns import NAMES, named_pattern
+from .patterns import NAMES, named_protocol
 from .protocol import Protocol, ProtocolError
 
 
@@ -191,19 +191,21 @@ def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ..
 
 
 def _protocol(table: TomlTable, electrodes: int) -> Protocol:
-    if table.has("rows"):
-        rows = table.array("rows", 4, "[[drive+, drive-, sense+, sense-], ...]")
-    else:
-        name = table.get("pattern", lambda v: isinstance(v, str), NAMES)
-        try:
-            rows = named_pattern(name, electrodes)
-        except ProtocolError as error:
-            raise table.error("pattern", str(error)) from None
     current = table.positive("current", "the amplitude in A")
     frequency = table.number("frequency", "Hz, zero or more", 0.0)
     reading_time = table.number("reading_time", "s, zero or more", 1e-5)
+    channels = table.count("sense_channels") if table.has("sense_channels") else 1
+    if table.has("rows"):
+        rows = table.array("rows", 4, "[[drive+, drive-, sense+, sense-], ...]")
+        table.done()
+        return Protocol(rows, current, frequency, reading_time, sense_channels=channels)
+    name = table.get("pattern", lambda v: isinstance(v, str), NAMES)
     table.done()
-    return Protocol(rows, current, frequency, reading_time)
+    try:
+        named = named_protocol(name, electrodes, current, frequency, reading_time)
+        return replace(named, sense_channels=channels)
+    except ProtocolError as error:
+        raise table.error("pattern", str(error)) from None
 
 
 _PAD_REACH = 1.0  # of the sheet's width and height: a pad may jut out, but not by a sheet's size

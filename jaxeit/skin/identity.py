@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from .description import Skin
+from .protocol import Protocol
 
 SIGNIFICANT_DIGITS = 12  # of numbers: the places of a grid and those of a list differ in the last digits
 NO_HARDWARE = ("name", "toml")  # fields of skins and pads
@@ -39,4 +40,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Sequence):
         return [_plain(part) for part in value]
     names = [each.name for each in fields(value)] if is_dataclass(value) else list(vars(value))
-    return [type(value).__name__, {name: _plain(getattr(value, name)) for name in names if name not in NO_HARDWARE}]
+    plain = {name: _plain(getattr(value, name)) for name in names if name not in NO_HARDWARE}
+    if isinstance(value, Protocol) and value.sense_channels == 1:  # as before there were several
+        del plain["sense_channels"]
+    return [type(value).__name__, plain]

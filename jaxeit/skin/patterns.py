@@ -1,13 +1,64 @@
-"""Four-terminal patterns by name, and the set of all four-terminal readings, from which a design chooses."""
+"""Patterns by name, and the set of all four-terminal readings, from which a design chooses."""
 
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
-from .protocol import ProtocolError
+from .protocol import Protocol, ProtocolError
 
-NAMES = '"adjacent", "opposite" or "skip-1", "skip-2", ...'
+ROW_NAMES = '"adjacent", "opposite" or "skip-1", "skip-2", ...'
 """What `named_pattern` knows, in words."""
+
+NAMES = f'"trigonometric", {ROW_NAMES}'
+"""What `named_protocol` knows, in words."""
+
+
+def named_protocol(
+    name: str, electrodes: int, current: float = 1e-3, frequency: float = 0.0, reading_time: float = 1e-5
+) -> Protocol:
+    """The protocol of a pattern's name: "trigonometric", or one of `named_pattern`.
+
+    In the "trigonometric" protocol all electrodes drive at once, with the currents of `trigonometric`, and each drive
+    has a reading of every pair of neighbours, electrode n less electrode n + 1, the last pair (last, 0):
+    ``electrodes * (electrodes - 1)`` readings, all of the first drive first. ``current`` is that of the electrode which
+    carries most. Electrodes are meant to lie around a rim at equal angles in the order of their numbers.
+
+    Args:
+        name, electrodes: as in `named_pattern`.
+        current, frequency, reading_time: as in `Protocol`.
+
+    Raises:
+        ProtocolError: for another name, too few electrodes, or a current that is not positive.
+    """
+    if name != "trigonometric":
+        return Protocol(named_pattern(name, electrodes), current, frequency, reading_time)
+    if not (np.isfinite(current) and current > 0):
+        raise ProtocolError(f"the current is {current} A; give a positive number")
+    senses = np.eye(electrodes) - np.roll(np.eye(electrodes), 1, 0)
+    return Protocol.from_matrices(
+        current * trigonometric(electrodes), senses, frequency=frequency, reading_time=reading_time
+    )
+
+
+def trigonometric(electrodes: int) -> Float[np.ndarray, "electrodes drives"]:
+    """Currents cos(k theta), then sin(k theta), at electrodes theta = 2 pi n / electrodes around a rim.
+
+    k runs from 1 to ``electrodes / 2``; the sine that is zero at all electrodes is left out, so that there are
+    ``electrodes - 1`` drives. They are the currents that tell a round tank's interior best from an even one (Isaacson
+    1986, doi:10.1109/TMI.1986.4307752).
+
+    Returns:
+        (electrodes, electrodes - 1), of amplitude 1; each column sums to zero.
+
+    Raises:
+        ProtocolError: for fewer than four electrodes.
+    """
+    if electrodes < 4:
+        raise ProtocolError(f"the trigonometric pattern needs four electrodes; got {electrodes}")
+    angle = 2 * np.pi / electrodes * np.outer(np.arange(electrodes), np.arange(1, electrodes // 2 + 1))
+    sines = (electrodes - 1) // 2
+    return np.concatenate([np.cos(angle), np.sin(angle[:, :sines])], 1)
 
 
 def named_pattern(name: str, electrodes: int) -> np.ndarray:
@@ -19,6 +70,8 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
     Raises:
         ProtocolError: for another name, or too few electrodes.
     """
+    if name == "trigonometric":
+        raise ProtocolError("the trigonometric pattern has no rows of four electrodes; use named_protocol")
     kind, _, number = name.partition("-")
     if name == "adjacent":
         return adjacent(electrodes)
@@ -26,7 +79,7 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
         return opposite(electrodes)
     if kind == "skip" and number.isascii() and number.isdecimal() and len(number) < 6:
         return skip(electrodes, int(number))
-    raise ProtocolError(f"{name!r} is no pattern; give {NAMES}")
+    raise ProtocolError(f"{name!r} is no pattern; give {ROW_NAMES}")
 
 
 def adjacent(electrodes: int) -> np.ndarray:

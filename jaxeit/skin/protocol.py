@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float, Int, Integer
 
 from ..budget import require
 
@@ -29,13 +29,14 @@ class Protocol:
     | frequency of the stimulation (0: direct current)     | ()            | Hz   |
     | reading_time: from one reading to the next           | ()            | s    |
     | mixing: each reading as a sum of rows of the pattern | (readings, rows) |   |
+    | sense_channels: readings of one drive taken at once  | ()            |      |
 
     Without ``mixing``, each row of the pattern is one reading. `from_matrices` makes protocols in which many electrodes
     drive or sense at once, or drives have currents of their own: their pattern has pairs, and ``mixing`` their shares.
 
     Raises:
         ProtocolError: if a row names an electrode twice in one pair, the current is not one positive number, or
-            ``mixing`` does not fit the pattern.
+            ``mixing`` does not fit the pattern or is given with several sense channels.
     """
 
     pattern: np.ndarray
@@ -43,6 +44,7 @@ class Protocol:
     frequency: float = 0.0
     reading_time: float = 1e-5
     mixing: sp.csr_array | None = None
+    sense_channels: int = 1
 
     def __post_init__(self) -> None:
         pattern = np.asarray(self.pattern)
@@ -64,6 +66,11 @@ class Protocol:
             raise ProtocolError(f"the current has shape {np.shape(self.current)}; give one number, A, for all readings")
         if not (np.isfinite(self.current) and self.current > 0):
             raise ProtocolError(f"the current is {self.current} A; give a positive number")
+        if not (isinstance(self.sense_channels, int | np.integer) and self.sense_channels >= 1):
+            raise ProtocolError(f"sense_channels is {self.sense_channels}; give how many readings are taken at once")
+        if self.mixing is not None and self.sense_channels > 1:
+            raise ProtocolError("a protocol of matrices has no driven pairs; leave sense_channels out")
+        object.__setattr__(self, "sense_channels", int(self.sense_channels))
         object.__setattr__(self, "pattern", pattern.astype(np.int32))
         if self.mixing is not None:
             object.__setattr__(self, "mixing", _checked_mixing(self.mixing, len(pattern)))
@@ -128,14 +135,33 @@ class Protocol:
         if self.mixing is not None:
             raise ProtocolError(
                 f"{what} needs one pair that drives and one that senses for each reading, with one current for all; "
-                "this protocol of matrices has others"
+                'this protocol of matrices has others; give the skin rows, or a pattern such as "adjacent"'
             )
         return self.pattern
 
     @property
+    def slots(self) -> Int[np.ndarray, " readings"]:
+        """Number of the slot in which each reading is taken.
+
+        Slots follow each other, each as long as ``reading_time``. With several sense channels, readings that follow
+        each other and have the same drive are taken at once, as many as there are channels.
+        """
+        readings = np.arange(self.readings)
+        if self.sense_channels == 1:
+            return readings
+        switched = np.append(True, np.any(np.diff(self.pattern[:, :2], axis=0), axis=1))
+        since = readings - np.maximum.accumulate(np.where(switched, readings, 0))
+        return np.cumsum(since % self.sense_channels == 0) - 1
+
+    @property
+    def reading_offsets(self) -> Float[np.ndarray, " readings"]:
+        """When each reading is taken, in seconds after the first."""
+        return self.slots * self.reading_time
+
+    @property
     def frame_time(self) -> float:
         """Duration of one scan in seconds."""
-        return self.readings * self.reading_time
+        return float((self.slots[-1] + 1) * self.reading_time)
 
     def check(self, electrodes: int) -> "Protocol":
         """This protocol; raises ProtocolError if a row names an electrode outside 0 to ``electrodes`` - 1."""

@@ -19,6 +19,8 @@ def _table(name: str) -> re.Pattern[str]:
 _TABLE, _ELECTRODES, _GRID = _table("protocol"), _table("electrodes"), _table(r"electrodes[ \t]*\.[ \t]*grid")
 _ROWS = r"\[(?:[^\[\]#]|#[^\n]*|\[(?:[^\[\]#]|#[^\n]*)*\])*\]"
 _KEY = re.compile(rf"""^[ \t]*(?:pattern[ \t]*=[ \t]*["'][^\n"']*["']|rows[ \t]*=[ \t]*{_ROWS})[^\n]*$""", re.M)
+_CHANNELS = re.compile(r"^[ \t]*sense_channels[ \t]*=[^\n]*\n", re.M)
+SCAN_KEYS = ("pattern", "rows", "sense_channels")
 _POSITIONS = re.compile(rf"""^[ \t]*positions[ \t]*=[ \t]*{_ROWS}[^\n]*\n""", re.M)
 
 
@@ -56,32 +58,38 @@ def with_positions(skin: Skin, positions: Float[np.ndarray, "electrodes 2"]) -> 
     return parse_skin(text, skin.name)
 
 
-def with_rows(skin: Skin, rows: Integer[np.ndarray, "readings 4"]) -> Skin:
+def with_rows(skin: Skin, rows: Integer[np.ndarray, "readings 4"], sense_channels: int | None = None) -> Skin:
     """The skin with other readings; all other lines of its text stay as they are.
 
     Args:
         skin: from `load_skin`, with its text.
         rows: drive+, drive-, sense+, sense- of each reading, counted from 0.
+        sense_channels: readings of one drive that are taken at once; default: as the skin has it.
 
     Raises:
         ProtocolError: for rows that the skin cannot take.
         TomlError: if the skin has no text, or its text gives the scan in another way than by ``pattern`` or ``rows`` on
             lines of a table ``[protocol]``.
     """
-    protocol = dataclasses.replace(skin.protocol, pattern=rows, mixing=None).check(len(skin.electrodes))
-    pattern = protocol.pattern.tolist()
+    channels = skin.protocol.sense_channels if sense_channels is None else sense_channels
+    protocol = dataclasses.replace(skin.protocol, pattern=rows, mixing=None, sense_channels=channels)
+    pattern = protocol.check(len(skin.electrodes)).pattern.tolist()
     lines = [", ".join(map(str, pattern[k : k + 6])) for k in range(0, len(pattern), 6)]
     value = "rows = [  # drive+, drive-, sense+, sense-\n" + "".join(f"    {line},\n" for line in lines) + "]"
+    wanted = {"rows": pattern} | ({"sense_channels": channels} if channels > 1 else {})
+    value += f"\nsense_channels = {channels}" if channels > 1 else ""
     table = _TABLE.search(skin.toml)
     key = _KEY.search(skin.toml, *table.span("body")) if table else None
-    if key is None:
+    if table is None or key is None:
         raise TomlError(
             f'{skin.name}: the skin has no text with a table [protocol] and lines "pattern" or "rows" in it'
         )
-    text = skin.toml[: key.start()] + value + skin.toml[key.end() :]
+    begin, end = table.span("body")
+    ahead, behind = (_CHANNELS.sub("", part) for part in (skin.toml[begin : key.start()], skin.toml[key.end() : end]))
+    text = skin.toml[:begin] + ahead + value + behind + skin.toml[end:]
     before, after = parse_values(skin.toml, skin.name), parse_values(text, skin.name)
-    scan = {name: given for name, given in before["protocol"].items() if name not in ("pattern", "rows")}
-    if after != before | {"protocol": scan | {"rows": pattern}}:
+    scan = {name: given for name, given in before["protocol"].items() if name not in SCAN_KEYS}
+    if after != before | {"protocol": scan | wanted}:
         raise TomlError(
             f"{skin.name}: the lines of [protocol] cannot be replaced; write pattern or rows on lines alone"
         )

@@ -85,6 +85,25 @@ def test_a_designed_skin_is_simulated_and_checked(tmp_path, monkeypatch, capsys)
         np.testing.assert_array_equal(je.skin.parse_skin(session.skin_toml).protocol.pattern, better.protocol.pattern)
 
 
+def test_a_design_for_several_sense_channels(tmp_path, monkeypatch, capsys):
+    """Six times of a reading, three readings at once; the session's readings have the times that the skin says."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(SKIN)
+    assert main(["design", "mine.toml", "-o", "better.toml", "--readings", "6", "--sense-channels", "3"]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"times of reading, 3 at once +6 +6\n", told)
+    assert re.search(r"frames per second +16,667 +16,667\n", told)
+    better = je.load_skin("better.toml")
+    assert (better.protocol.sense_channels, better.protocol.readings) == (3, 18)
+    assert better.protocol.frame_time == pytest.approx(6e-5)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    assert main(["simulate", "scene.toml", "-o", "session.h5"]) == 0
+    with calib.open_session("session.h5") as session:
+        np.testing.assert_allclose(session.offset, np.repeat(np.arange(6) * 1e-5, 3))
+    assert main(["design", "better.toml", "-o", "again.toml", "--sense-channels", "1", "--readings", "12"]) == 0
+    assert "sense_channels" not in (tmp_path / "again.toml").read_text()
+
+
 def test_a_design_moves_electrodes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text(SKIN)

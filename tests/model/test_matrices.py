@@ -13,6 +13,7 @@ from jaxeit.linalg import Dense
 from jaxeit.skin import ElectrodeError, ProtocolError
 
 from ..helpers import skin_of
+from ..oracles.disc import even_disc
 
 COUNT = 6
 DISC = je.Disc(0.1)
@@ -116,6 +117,24 @@ def test_jacobian_and_image_are_those_of_the_dense_formula(trigonometric):
         found = np.asarray(recon(jnp.asarray(frame)))
         np.testing.assert_allclose(found[inside], expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
         np.testing.assert_allclose(recon.on_host()(frame), found, rtol=1e-8, atol=1e-10 * np.abs(found).max())
+
+
+def test_the_named_scan_against_the_disc_in_closed_form():
+    """Against the semi-analytic disc; by symmetry, the potentials of a drive are in proportion to its currents."""
+    z, count, current = 0.05, 16, 2e-3
+    rim = je.skin.rim_electrodes(je.Disc(1.0), count, contact=z)
+    protocol = je.skin.named_protocol("trigonometric", count, current)
+    tank = je.Skin("tank", je.Disc(1.0), 1.0, rim, protocol)
+    found = je.forward(je.discretise(je.Scene(tank), je.Fidelity(edge_length=0.04, order=2, solver=Dense())))
+    angle = 2 * np.pi * np.arange(count) / count
+    waves = np.array([np.cos(k * angle) for k in range(1, 9)] + [np.sin(k * angle) for k in range(1, 8)])
+    exact = even_disc(count)(np.full(count, z), current * waves.T)
+    expected = (exact - np.roll(exact, -1, 0)).T  # electrode n less electrode n + 1
+    np.testing.assert_allclose(np.reshape(found, (15, 16)), expected, atol=2e-3 * np.abs(expected).max())
+    steps = waves - np.roll(waves, -1, 1)
+    resistance = np.sum(np.reshape(found, (15, 16)) * steps, 1) / np.sum(steps**2, 1)
+    np.testing.assert_allclose(resistance[:7], resistance[8:], rtol=1e-3)  # a cosine as its sine
+    assert (np.diff(resistance[:8]) < 0).all()
 
 
 def test_contacts_are_found(trigonometric):

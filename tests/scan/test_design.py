@@ -1,7 +1,8 @@
 """Designs of scans: sensitivities against the forward map, designs against all subsets, and what the testbed gains."""
 
+from collections import Counter
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 
 import jax.numpy as jnp
 import numpy as np
@@ -96,6 +97,37 @@ def test_a_design_is_near_the_best_of_all_subsets_and_its_bound_holds(sensitivit
     assert found.error < 1.05 * best
 
 
+def _least_time(pattern, channels, switch):
+    """The least time of a frame, over all ways in which each reading is driven by one of its two pairs."""
+    ends = [[tuple(sorted(row[:2])), tuple(sorted(row[2:]))] for row in pattern.tolist()]
+    counts = (Counter(drives) for drives in product(*ends))
+    return min(sum(-(-n // channels) + switch for n in count.values()) for count in counts)
+
+
+@pytest.mark.parametrize(("time", "channels", "switch"), [(2, 2, 0.0), (2, 3, 0.0), (3, 2, 0.0), (5, 2, 1.5)])
+def test_a_design_with_sense_channels_is_near_the_best_of_all_that_fit(sensitivity, time, channels, switch):
+    """All subsets of the readings of five electrodes which so many channels can take in the time, by brute force."""
+    candidates = EVERY[(EVERY < 5).all(1)]
+    rows = np.asarray(sensitivity.rows(candidates))
+    best, most = np.inf, 0
+    for size in range(1, int(time - switch) * channels + 1):
+        for part in combinations(range(len(candidates)), size):
+            if _least_time(candidates[list(part)], channels, switch) <= time:
+                place = _covariances(sensitivity, rows[:, :, list(part)])
+                best, most = min(best, SETTINGS.width * FIGURES["place-error"](place)), size
+    found = design_scan(sensitivity, time, candidates=candidates, sense_channels=channels, switch=switch)
+    protocol = je.Protocol(found.pattern, sense_channels=channels)
+    own = SETTINGS.width * FIGURES["place-error"](
+        _covariances(sensitivity, np.asarray(sensitivity.rows(found.pattern)))
+    )
+    assert je.scan.scan_time(protocol, switch) <= time * protocol.reading_time * (1 + 1e-9)
+    assert len(found.pattern) == most
+    assert found.error == pytest.approx(own, rel=1e-6)
+    assert best * (1 - 1e-9) <= found.error < 1.06 * best
+    if not switch:
+        assert found.bound <= best * (1 + 1e-9)
+
+
 def test_a_design_for_a_dead_electrode_loses_less_without_it(sensitivity):
     whole, careful = (design_scan(sensitivity, 12, A_OPTIMAL, any_dead=dead) for dead in (False, True))
     assert sensitivity.worst_dead(careful.pattern)[1] < sensitivity.worst_dead(whole.pattern)[1]
@@ -123,12 +155,28 @@ def test_a_hundred_readings_tell_more_than_the_whole_adjacent_scan(testbed, skin
     assert few == pytest.approx((len(slow.pattern) + 10 * slow.drives) * 1e-5)
 
 
+@pytest.mark.slow
+def test_many_channels_at_once_lose_little(testbed):
+    """Slots of eight readings of one drive each, against the bound of any scan of so many readings."""
+    found = design_scan(testbed, 20, candidates=je.skin.all_pairs(25)[::7], sense_channels=8)
+    protocol = je.Protocol(found.pattern, sense_channels=8)
+    assert (protocol.readings, protocol.slots[-1] + 1) == (160, 20)
+    assert found.bound <= found.error < 1.1 * found.bound
+    assert len(np.unique(_unordered(found.pattern), axis=0)) == 160
+
+
+def _unordered(pattern):
+    pairs = np.sort(pattern.reshape(-1, 2, 2), 2)
+    return np.sort(pairs @ [100, 1], 1)
+
+
 @pytest.mark.parametrize(
     ("call", "said"),
     [
         (lambda s: design_scan(s, 46), "readings is 46, and there are 45 candidates"),
         (lambda s: design_scan(s, 10, switch=-1.0), "switch is -1.0; give"),
         (lambda s: design_scan(s, 10, switch=20.0), "over before one drive has settled"),
+        (lambda s: design_scan(s, 10, sense_channels=0), "sense_channels is 0; give how many"),
         (lambda s: PlaceError(0.0), "power is 0.0; give a number"),
         (lambda s: DesignSettings(width=0.0), "width is 0.0; give a number above 0"),
         (lambda s: DesignSettings(noise=0.0), "noise is 0 V"),

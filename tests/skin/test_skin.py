@@ -43,6 +43,7 @@ def test_a_copied_and_edited_file(tmp_path):
         ('kind = "bolt"', 'kind = "screw"', 'give one of "bolt"'),
         ('pattern = "adjacent"', "rows = [[0, 1, 2, 99]]", "names an electrode outside 0 to 24"),
         ('pattern = "adjacent"', 'pattern = "adjacnt"', r"\[protocol\]: pattern: 'adjacnt' is no pattern; give \"adj"),
+        ('pattern = "adjacent"', 'pattern = "trig"', "pattern: 'trig' is no pattern; give"),
         ('pattern = "adjacent"', 'pattern = "skip-12"', "pattern: pairs of 25 electrodes can skip 0 to 11, got 12"),
         ('pattern = "adjacent"', "pattern = 3", "pattern: is 3; give"),
         ('pattern = "adjacent"', "rows = [[0, 0, 2, 3]]", "uses one electrode twice"),
@@ -181,6 +182,57 @@ def test_all_pairs_are_every_reading_once():
 def test_a_skin_file_names_its_pattern():
     skin = je.skin.parse_skin(TEXT.replace('"adjacent"', '"skip-3"', 1))
     np.testing.assert_array_equal(skin.protocol.pattern, je.skin.skip(25, 3))
+
+
+def test_a_skin_file_names_the_trigonometric_pattern(tmp_path):
+    """It keeps its scan when its electrodes are moved and the text is read again, and gives it up for rows."""
+    text = TEXT.replace('"adjacent"', '"trigonometric"', 1)
+    skin = je.skin.parse_skin(text)
+    assert (skin.protocol.readings, skin.protocol.current) == (24 * 25, 1e-3)
+    path = tmp_path / "other.toml"
+    path.write_text(je.skin.with_positions(skin, skin.electrode_positions).toml)
+    marks = {je.skin.skin_hash(je.load_skin(path)), je.skin.skin_hash(skin)}
+    assert len(marks) == 1
+    assert marks.isdisjoint({je.skin.skin_hash(je.skin.parse_skin(TEXT))})
+    assert je.skin.with_rows(skin, ROWS).protocol.mixing is None
+    with pytest.raises(je.skin.ProtocolError, match=r"a session needs one pair .* or a pattern such as"):
+        skin.protocol.rows("a session")
+    with pytest.raises(je.skin.ProtocolError, match="no rows of four electrodes; use named_protocol"):
+        je.skin.named_pattern("trigonometric", 25)
+
+
+def test_readings_of_one_drive_are_taken_at_once(tmp_path):
+    """22 readings of each of 25 drives, eight at once: three slots, the last with six; the hash counts them."""
+    text = TEXT.replace('"adjacent"', '"adjacent"\nsense_channels = 8  # amplifiers', 1)
+    skin = je.skin.parse_skin(text)
+    slots = skin.protocol.slots.reshape(25, 22)
+    np.testing.assert_array_equal(slots[0], [*8 * [0], *8 * [1], *6 * [2]])
+    np.testing.assert_array_equal(slots, slots[0] + 3 * np.arange(25)[:, None])
+    assert skin.protocol.frame_time == pytest.approx(75e-5)
+    assert je.scan.scan_time(skin.protocol, 2.0) == pytest.approx((75 + 50) * 1e-5)
+    np.testing.assert_allclose(skin.protocol.reading_offsets, 1e-5 * slots.ravel())
+    path = tmp_path / "other.toml"
+    path.write_text(je.skin.with_rows(skin, skin.protocol.pattern).toml)
+    assert je.skin.skin_hash(je.load_skin(path)) == je.skin.skin_hash(skin)
+    assert je.skin.skin_hash(skin) != je.skin.skin_hash(je.skin.parse_skin(TEXT))
+    one = je.skin.with_rows(skin, skin.protocol.pattern, 1)
+    assert je.skin.skin_hash(one) == je.skin.skin_hash(je.skin.parse_skin(TEXT))
+    assert "amplifiers" not in one.toml
+    with pytest.raises(je.toml.TomlError, match="a protocol of matrices has no driven pairs"):
+        je.skin.parse_skin(text.replace("adjacent", "trigonometric", 1))
+    with pytest.raises(je.toml.TomlError, match="sense_channels: is 0"):
+        je.skin.parse_skin(text.replace("channels = 8", "channels = 0"))
+
+
+@pytest.mark.parametrize("electrodes", [4, 9, 16])
+def test_trigonometric_currents_are_orthogonal(electrodes):
+    """They span all currents that sum to zero."""
+    current = je.skin.trigonometric(electrodes)
+    assert current.shape == (electrodes, electrodes - 1)
+    gram = current.T @ current
+    np.testing.assert_allclose(gram, np.diag(np.diag(gram)), atol=1e-12)
+    np.testing.assert_allclose(current.sum(0), 0, atol=1e-12)
+    assert np.linalg.matrix_rank(current) == electrodes - 1
 
 
 @pytest.mark.parametrize("current", [np.full(8, 1e-3), [1e-3]])

@@ -188,6 +188,29 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
         load_tank(tmp_path / "no.csv", je.Disc(RADIUS))
 
 
+def test_a_tank_whose_scan_is_named(bench, tmp_path, root, capsys):
+    """The file of the page, with frames of all electrodes driven at once; another rod than the reference's place."""
+    text = next(text for _, title, text in blocks(root / "docs" / "tanks.md") if title == "tank.toml")
+    (tmp_path / "tank.toml").write_text(text.replace("0.14", str(RADIUS)).replace("width = 0.02", "width = 0.005"))
+    skin = je.load_skin(tmp_path / "tank.toml")
+    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.06))
+    rod = jnp.linalg.norm(model.centroids - PLACE, axis=1) < 0.004
+    frames = np.array([je.forward(model, jnp.where(rod, gain, 1.0) * model.background) for gain in (1.0, 5.0)])
+    path = tmp_path / "frames.npz"
+    np.savez(path, frames=frames)
+    tank = load_tank(path, skin=skin)
+    assert tank.frames.shape == (2, 240)
+    _sees_the_rod(tank)
+    words = ["image", str(path), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "picture.png")]
+    assert main(words) == 0
+    assert "16 electrodes, 240 readings" in capsys.readouterr().out
+    assert main([*words, "--radius", "1"]) == 2
+    assert "leave out --radius" in capsys.readouterr().err
+    np.savez(path, frames=frames, pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
+    with pytest.raises(TankError, match="other files have a scan of their own: leave the skin out"):
+        load_tank(path, skin=skin)
+
+
 def test_potentials_of_sciospec(bench, tmp_path):
     """Potentials above an unknown ground; two frequencies, of which the first is taken."""
     mean = je.Protocol.from_matrices(CURRENT * RING, np.eye(COUNT) - 1 / COUNT)

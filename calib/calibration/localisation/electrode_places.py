@@ -10,15 +10,12 @@ import numpy as np
 import jaxeit as je
 from jaxeit.imaging import InverseError, KnownPresses, fit_electrodes
 
+from ...check.electrodes import FIDELITY, LARGEST_MISFIT
 from ...presses.pooled import PooledPresses
 from ..archives.arrays import shaped
 from .spread import farthest_first
 
-# The errors of a mesh of first order would be taken for shifts of electrodes.
-FIDELITY = je.Fidelity(order=2, edge_length=je.Fidelity.draft().edge_length)
 MOST_PRESSES = 16  # more tell little more, and each costs as long
-# Of the root mean square misfit in stated errors: beyond it, the skin is another one than its file says.
-LARGEST_MISFIT = 3.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
     text = "also print how far the session is off this calibration, and whether to recalibrate"
     parser.add_argument("--calibration", metavar="CALIBRATION.h5", help=text)
-    parser.add_argument("--all", action="store_true", help="print every channel")
+    text = "also tell from the untouched frame whether electrodes sit where the skin's file says; takes up to a minute"
+    parser.add_argument("--electrodes", action="store_true", help=text)
+    parser.add_argument("--all", action="store_true", help="print every channel and electrode")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
@@ -36,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
     for path in args.sessions:
         try:
             with open_session(path) as session:
-                report = check_session(session, skin, progress=progress_bar(session.name))
+                bar = progress_bar(session.name)
+                report = check_session(session, skin, electrodes=args.electrodes, progress=bar)
                 report = report if health is None else with_health(report, health(session))
         except SessionError as error:
             print(f"jaxeit: {one_line(error)}", file=sys.stderr)

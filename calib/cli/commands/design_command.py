@@ -20,11 +20,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("skin", metavar="SKIN", help="a shipped skin by its name, or the TOML file of your own")
     parser.add_argument("-o", "--output", required=True, metavar="BETTER.toml", help="the skin with the designed scan")
     time = parser.add_mutually_exclusive_group()
-    text = "time of a frame in readings; default: that of the skin's scan"
+    text = "time of a frame over that of a reading; default: that of the skin's scan"
     time.add_argument("--readings", type=count, metavar="N", help=text)
     time.add_argument("--rate", type=above_zero, metavar="HZ", help="frames per second")
     text = "time that a change of the driven pair takes, in readings; default: 0"
     parser.add_argument("--switch", type=above_zero, default=0.0, metavar="READINGS", help=text)
+    text = "readings of one drive that are taken at once, in the time of one; default: as the skin's file says, or 1"
+    parser.add_argument("--sense-channels", type=count, metavar="N", help=text)
     text = f"{', '.join(CRITERIA)}; place-error:power=8 looks at the worst places; default: place-error"
     parser.add_argument("--criterion", default="place-error", metavar="NAME", help=text)
     text = "also count the cases in which any one electrode is dead; takes minutes"
@@ -71,6 +73,9 @@ def run(args: argparse.Namespace) -> int:
         skin_of(args.skin),
         je.scan.CRITERIA.make(args.criterion, allow_import=True),
     )
+    skin.protocol.rows("jaxeit design")
+    if args.sense_channels is not None:
+        skin = replace(skin, protocol=replace(skin.protocol, sense_channels=args.sense_channels))
     limits, readings = _limits(args), _readings(args, skin)
     settings = je.scan.DesignSettings(width=args.width, noise=args.noise, relative=args.relative_noise)
     announce_model(skin, je.Fidelity.draft())
@@ -79,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
         readings=readings,
         criterion=criterion,
         switch=args.switch,
+        sense_channels=skin.protocol.sense_channels,
         any_dead=args.electrode_dead,
         progress=progress_bar("design"),
     )
@@ -90,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         better = je.scan.move_electrodes(skin, criterion, limits, settings, pattern=found.pattern, progress=bar).skin
         after = _sensitivity(better, settings)
         found = scan(after)
-    better = je.skin.with_rows(better, found.pattern)
+    better = je.skin.with_rows(better, found.pattern, skin.protocol.sense_channels)
     with replacing(Path(args.output)) as new:
         new.write_text(better.toml, encoding="utf-8")
     print("\n".join(_report((skin, better), (before, after), found, args.switch)))
@@ -139,7 +145,7 @@ def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
     if protocol.reading_time == 0:
         if args.rate is not None:
             raise ValueError(f"--rate: the readings of {skin.name} take no time; give reading_time, or --readings")
-        return protocol.readings
+        return int(protocol.slots[-1]) + 1
     time = je.scan.scan_time(protocol, args.switch) if args.rate is None else 1 / args.rate
     found = int(time / protocol.reading_time * (1 + 1e-9))
     if found < 1:
@@ -183,8 +189,11 @@ def _figures(skin: "je.Skin", sensitivity: "PlaceSensitivity", switch: float) ->
     error = 1e3 * np.asarray(sensitivity.errors(pattern))
     electrode, dead = sensitivity.worst_dead(pattern)
     time = je.scan.scan_time(skin.protocol, switch)
+    channels = skin.protocol.sense_channels
+    at_once = {f"times of reading, {channels} at once": f"{skin.protocol.slots[-1] + 1:,}"} if channels > 1 else {}
     return {
         "readings": f"{len(pattern):,}",
+        **at_once,
         "driven pairs": f"{len(np.unique(pattern[:, :2], axis=0))}",
         "frames per second": f"{1 / time:,.0f}" if time else "no time given",
         "error of place, mean, mm": f"{np.mean(error):.3g}",

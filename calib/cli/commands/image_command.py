@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
+from ..arguments import above_zero, prepare_outputs, require_matplotlib_for, skin_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=int, default=0, metavar="N", help="frame it is compared with; default: 0")
     text = "radius in m of a round tank; needed where the file does not describe its tank (all but .mat)"
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
+    text = "shape, electrodes and scan of the tank, for an .npz of frames alone: a TOML file, or a shipped skin's name"
+    parser.add_argument("--skin", metavar="TANK.toml", help=text)
     parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
     text = "fit conductivity and contact resistances (one, or one of each electrode) to the reference; image with them"
@@ -131,7 +133,10 @@ def _tank(args: argparse.Namespace) -> "Tank":
 
     from ...tanks import load_tank
 
-    tank = load_tank(args.tank, None if args.radius is None else je.Disc(args.radius))
+    if args.skin is not None and (args.radius is not None or args.start or args.clockwise):
+        raise ValueError("--skin says where electrodes sit: leave out --radius, --start and --clockwise")
+    domain = None if args.radius is None else je.Disc(args.radius)
+    tank = load_tank(args.tank, domain, skin=skin_of(args.skin))
     if not (args.start or args.clockwise):
         return tank
     if args.radius is None:

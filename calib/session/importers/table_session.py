@@ -219,14 +219,18 @@ def _described(files: Sequence[FileSpec], skin: "je.Skin | None") -> dict[str, A
     if not any(s.name == "eit" for f in files for s in f.streams):
         raise SessionError("--skin: no stream is called eit; name the readings' columns, as --stream eit=1-550:V")
     protocol = skin.protocol
-    scan = {"pattern": protocol.pattern, "current": float(protocol.current), "frequency": float(protocol.frequency)}
+    scan = {
+        "pattern": protocol.rows("a session"),
+        "current": float(protocol.current),
+        "frequency": float(protocol.frequency),
+    }
     return {"skin_name": skin.name, "skin_toml": skin.toml, **scan}
 
 
 def _check_columns(loaded: Sequence[_Loaded], skin: "je.Skin | None") -> None:
     if skin is None:
         return
-    wanted = {"eit": (len(skin.protocol.pattern), "readings a scan"), "pressure": (len(skin.pads), "pads")}
+    wanted = {"eit": (skin.protocol.readings, "readings a scan"), "pressure": (len(skin.pads), "pads")}
     for one in loaded:
         for stream in one.spec.streams:
             there = one.channels(stream.name)

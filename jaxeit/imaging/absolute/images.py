@@ -203,8 +203,8 @@ def most_probable(
 
 
 def reading_weights(
-    readings: Float[Array, " readings"], std: Float[Array, " readings"]
-) -> tuple[Float[Array, " readings"], Float[Array, " readings"]]:
+    readings: Float[Array, "*frames readings"], std: Float[Array, "*frames readings"]
+) -> tuple[Float[Array, "*frames readings"], Float[Array, "*frames readings"]]:
     """One over the noise, and the readings; both 0 where a reading or its noise is not finite."""
     used = jnp.isfinite(readings) & jnp.isfinite(std)
     return jnp.where(used, 1 / jnp.where(used, std, 1), 0), jnp.where(used, readings, 0)

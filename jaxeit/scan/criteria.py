@@ -1,0 +1,84 @@
+"""What a scan is judged by: functions of the covariance of the place of a contact."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..registry import Registry
+from ..skin.protocol import ProtocolError
+
+
+class AbstractCriterion(eqx.Module):
+    """A convex function h of the covariance of place, (2, 2) in squared widths, whose mean over sites is minimised."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def after(self, place: Float[Array, "2 2"], change: Float[Array, " k"]) -> Float[Array, " k"]:
+        """h when the covariance changes by ``k k^T`` with ``change = k^T metric k``, or by its negative."""
+
+    @abstractmethod
+    def metric(self, place: Float[Array, "2 2"]) -> tuple[Float[Array, ""], Float[Array, "2 2"]]:
+        """Factor f and matrix G, with which the derivative of h along ``k k^T`` is ``f k^T G k``."""
+
+    @abstractmethod
+    def length(self, mean: float) -> float:
+        """The mean of h as an error of place, in widths."""
+
+    def mean(self, covariance: Float[Array, "n 4 4"]) -> Float[Array, ""]:
+        """The mean of h over covariances of the unknowns of contacts."""
+        nothing = jnp.zeros(1, covariance.dtype)
+        return jnp.mean(jax.vmap(lambda c: self.after(c[:2, :2], nothing))(covariance))
+
+
+class PlaceError(AbstractCriterion):
+    """h is a power of the error of place, the root of the sum of both variances.
+
+    A power of 1 is the mean error over sites, 2 the mean variance (A-optimal); a larger one looks at the worst sites. h
+    is convex for every power, since the inverse of the sum of variances is concave in the information.
+    """
+
+    name: ClassVar[str] = "place-error"
+    power: float = eqx.field(default=1.0, static=True)
+
+    def __check_init__(self) -> None:
+        if not 0 < self.power <= 40:
+            raise ProtocolError(f"power is {self.power}; give a number above 0, up to 40 (the worst site)")
+
+    def after(self, place: Float[Array, "2 2"], change: Float[Array, " k"]) -> Float[Array, " k"]:
+        return jnp.maximum(jnp.trace(place) + change, 0) ** (0.5 * self.power)
+
+    def metric(self, place: Float[Array, "2 2"]) -> tuple[Float[Array, ""], Float[Array, "2 2"]]:
+        half = 0.5 * self.power
+        return half * jnp.trace(place) ** (half - 1), jnp.eye(2, dtype=place.dtype)
+
+    def length(self, mean: float) -> float:
+        return float(max(mean, 0.0) ** (1 / self.power))
+
+
+class PlaceVolume(AbstractCriterion):
+    """D-optimal: h is the log determinant of the covariance, the area of the ellipse of place."""
+
+    name: ClassVar[str] = "d-optimal"
+
+    def after(self, place: Float[Array, "2 2"], change: Float[Array, " k"]) -> Float[Array, " k"]:
+        return jnp.log(_determinant(place)) + jnp.log1p(jnp.maximum(change, -1))
+
+    def metric(self, place: Float[Array, "2 2"]) -> tuple[Float[Array, ""], Float[Array, "2 2"]]:
+        (a, b), (_, d) = place
+        return jnp.ones((), place.dtype), jnp.array([[d, -b], [-b, a]]) / _determinant(place)
+
+    def length(self, mean: float) -> float:
+        return float(np.sqrt(2) * np.exp(0.25 * mean))
+
+
+def _determinant(place: Float[Array, "2 2"]) -> Float[Array, ""]:
+    return place[0, 0] * place[1, 1] - place[0, 1] ** 2
+
+
+CRITERIA: Registry[AbstractCriterion] = Registry(AbstractCriterion, "criterion", "jaxeit.criteria")
