@@ -28,6 +28,7 @@ LOUD = (
     10**0.5
 )  # a second noise over the first: 50 dB below the readings, where the model of the fit errs less than noise
 DRAWS = 3  # of noise
+COLUMNS, UNSEEN = (3, 4, 6, 8, 12), 11  # sites along x of designs, and of those that judge them
 LOAD = 8.0  # N
 MARGIN, PRESSES, SEED = 0.015, 120, 2030
 GREEDY, DESIGNED, CAREFUL = "D-optimal among the adjacent", "designed", "designed for a dead electrode"
@@ -164,7 +165,25 @@ def channels(run: Run) -> Iterator[Row]:
             yield {"channels": [bench.at_once(DESIGNED, found.pattern, count, found.bound / found.error)]}
 
 
-main = Question("design", __doc__, {"rows": measure, "without": without, "channels": channels})
+def ladder(run: Run) -> Iterator[Row]:
+    """What a quicker design loses: sites along x, seconds of a second call, and errors at sites that none has seen."""
+    bench = Bench(run.smoke)
+    unseen = je.scan.place_sensitivity(bench.model, je.scan.DesignSettings(noise=bench.noise, columns=UNSEEN))
+    yield {"ladder": []}
+    for columns in run.sizes(COLUMNS, COLUMNS[:1]):
+        settings = je.scan.DesignSettings(noise=bench.noise, columns=columns)
+        for _ in range(2):  # the first call compiles
+            began = perf_counter()
+            sensitivity = je.scan.place_sensitivity(bench.model, settings)
+            found = je.scan.design_scan(sensitivity, 40 if run.smoke else 100)
+            seconds = perf_counter() - began
+        expected = 1e3 * np.asarray(unseen.errors(found.pattern))
+        row = bench.row(f"{columns} along x", found.pattern, seconds) | {"sites": len(sensitivity.sites)}
+        row |= {"bound_mm": float(expected.mean()), "bound_worst_mm": float(expected.max())}
+        yield {"ladder": [row]}
+
+
+main = Question("design", __doc__, {"rows": measure, "without": without, "channels": channels, "ladder": ladder})
 
 if __name__ == "__main__":
     main()

@@ -33,6 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--electrode-dead", action="store_true", help=text)
     text = f"standard deviation of a contact, m; default: {usual.width}"
     parser.add_argument("--width", type=above_zero, default=usual.width, metavar="M", help=text)
+    text = f"places along x for which the scan is designed; fewer are quicker and say less; default: {usual.columns}"
+    parser.add_argument("--columns", type=int, default=usual.columns, metavar="N", help=text)
     text = "standard deviation of a reading, V; default: 60 dB below the rms of the scan"
     parser.add_argument("--noise", type=above_zero, metavar="V", help=text)
     text = "further noise of a reading, as part of its voltage, such as 1e-3; default: 0"
@@ -77,7 +79,9 @@ def run(args: argparse.Namespace) -> int:
     if args.sense_channels is not None:
         skin = replace(skin, protocol=replace(skin.protocol, sense_channels=args.sense_channels))
     limits, readings = _limits(args), _readings(args, skin)
-    settings = je.scan.DesignSettings(width=args.width, noise=args.noise, relative=args.relative_noise)
+    settings = je.scan.DesignSettings(
+        width=args.width, columns=args.columns, noise=args.noise, relative=args.relative_noise
+    )
     announce_model(skin, je.Fidelity.draft())
     scan = partial(
         je.scan.design_scan,
