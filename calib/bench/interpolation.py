@@ -24,7 +24,7 @@ MIN_POINTS, MAX_POINTS = 3, 65  # along an axis
 FULL_RANGE_POINTS = 17  # typical number along an axis that spans the full range of a parameter
 LARGEST_DROP = 0.3  # a term below this share of the one before it may be small by accident
 LARGEST_RATIO = 0.9  # of a term to the one before it, so that the sum of all that follow is finite
-NOISE = 100  # rounding errors of a solve, in units of the last place of the largest reading
+NOISE = 200  # rounding errors of a solve, in units of the last place of the largest reading
 
 Index = tuple[int, ...]
 Solve = Callable[[Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
@@ -89,9 +89,9 @@ class FrameInterpolant:
         """Add points until the error is below ``tolerance`` times the largest change from ``rest``."""
         self._low, self._span, self._rest = box.low, box.high - box.low, rest
         self._axes = np.flatnonzero(self._span > 0)
-        terms = _NewtonTerms(len(self._axes), lambda points: solve(self._at(points)) - rest)
-        noise = NOISE * np.finfo(rest.dtype).eps * np.abs(rest).max()
-        while terms.error > tolerance * terms.change + noise and terms.following is not None:
+        noise = NOISE * float(np.finfo(rest.dtype).eps * np.abs(rest).max())
+        terms = _NewtonTerms(len(self._axes), lambda points: solve(self._at(points)) - rest, noise)
+        while terms.error > tolerance * terms.change and terms.following is not None:
             terms.add(terms.following)
         self.error, self.solves = terms.error, len(terms.known)
         self._series = terms.dense()
@@ -138,11 +138,11 @@ class _NewtonTerms:
     | following | index of the largest of these; None if there are points for no more |
     """
 
-    def __init__(self, axes: int, function: Solve):
+    def __init__(self, axes: int, function: Solve, noise: float):
         self.known: dict[Index, np.ndarray] = {}
         self.change, self.error = 0.0, 0.0
         self.following: Index | None = None
-        self._function = function
+        self._function, self._noise = function, noise  # terms up to the noise count as zero
         along = np.eye(axes, dtype=int)
         self.add((0,) * axes, *(tuple((k * row).tolist()) for row in along for k in range(1, MIN_POINTS)))
 
@@ -174,13 +174,14 @@ class _NewtonTerms:
         if not indices.size:
             return  # no variable: the first term is the function
         sizes = np.full(indices.max(0) + 2, np.nan)
-        sizes[tuple(indices.T)] = [np.abs(term).max() for term in self.known.values()]
+        largest = np.array([np.abs(term).max() for term in self.known.values()])
+        sizes[tuple(indices.T)] = np.where(largest > self._noise, largest, 0)
         along = [np.moveaxis(_left_out(np.moveaxis(sizes, axis, 0)), 0, axis) for axis in range(sizes.ndim)]
         left = np.max(along, axis=0)
         self.error = float(left.sum())
         allowed = left[(slice(MAX_POINTS),) * sizes.ndim]
-        largest = np.unravel_index(np.argmax(allowed), allowed.shape)
-        self.following = tuple(map(int, largest)) if allowed[largest] > 0 else None
+        place = np.unravel_index(np.argmax(allowed), allowed.shape)
+        self.following = tuple(map(int, place)) if allowed[place] > 0 else None
 
 
 def _left_out(sizes: Float[np.ndarray, "terms_and_1 ..."]) -> Float[np.ndarray, "terms_and_1 ..."]:

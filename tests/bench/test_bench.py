@@ -117,6 +117,18 @@ def test_interpolants_do_not_underestimate_their_error(kind, variables):
         assert error < min(made.error, 1e-4 * change)
 
 
+def test_noise_of_the_solver_is_not_interpolated():
+    """In single precision, whose rounding errors are above the tolerance."""
+    rng, box = np.random.default_rng(5), ParameterBox(np.zeros(2), np.ones(2))
+    rest = np.ones(20, np.float32)
+
+    def solve(q):
+        exact = 1 + 0.01 * q.prod(1, keepdims=True) * np.ones(20)
+        return (exact + rng.uniform(-50, 50, exact.shape) * np.finfo(np.float32).eps).astype(np.float32)
+
+    assert FrameInterpolant(box, solve, rest, 1e-4).solves < 40
+
+
 def test_a_sheet_at_rest_is_solved_once():
     box = ParameterBox(np.array([0.0, 2.0]), np.array([0.0, 2.0]))
     made = FrameInterpolant(box, lambda q: q + 1, np.zeros(2), 1e-4)
