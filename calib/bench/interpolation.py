@@ -2,28 +2,31 @@
 
 Within a press the sheet is a function of few parameters: the load that the sheet feels under each tip, the progress
 of each tip along its slide, and the temperature. The voltages are smooth functions of these. They are therefore solved
-at Chebyshev points of the ranges of the parameters, and interpolated by a polynomial. Points are added until the
-truncation error, estimated as the geometric tail of the series along each axis, is below the tolerance.
+at few points of the ranges of the parameters, and interpolated by a polynomial in Newton's form on Leja points. Each
+point that is added gives the polynomial a term, whose largest value is its coefficient. Terms that are left out are
+estimated from those before them; points are added where the estimate is largest, until all that is left out is below
+the tolerance. A parameter of little effect, and what parameters do together, thus take few points (adaptive sparse
+grids: Gerstner and Griebel, Computing 71, 2003; on Leja points: Chkifa, Cohen and Schwab, Foundations of Computational
+Mathematics 14, 2014).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Integer
-from numpy.polynomial.chebyshev import chebvander
-from scipy.fft import dct
+from jaxtyping import Array, Float, Int
 
 import jaxeit as je
 
 MIN_POINTS, MAX_POINTS = 3, 65  # along an axis
 FULL_RANGE_POINTS = 17  # typical number along an axis that spans the full range of a parameter
-SOLVE_BATCH = 16  # points that are sent to the device together
+LARGEST_DROP = 0.3  # a term below this share of the one before it may be small by accident
+LARGEST_RATIO = 0.9  # of a term to the one before it, so that the sum of all that follow is finite
+NOISE = 200  # rounding errors of a solve, in units of the last place of the largest reading
 
+Index = tuple[int, ...]
 Solve = Callable[[Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
 
 
@@ -74,32 +77,39 @@ def _points(low: np.ndarray, high: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 class FrameInterpolant:
-    """Polynomial through solved frames over a box: a product of Chebyshev series."""
+    """Polynomial through solved frames over a box.
+
+    | attribute | meaning                          |
+    |-----------|----------------------------------|
+    | error     | estimate of the largest error, V |
+    | solves    | number of solved frames          |
+    """
 
     def __init__(self, box: ParameterBox, solve: Solve, rest: Float[np.ndarray, " readings"], tolerance: float):
         """Add points until the error is below ``tolerance`` times the largest change from ``rest``."""
-        self._low, self._span = box.low, box.high - box.low
+        self._low, self._span, self._rest = box.low, box.high - box.low, rest
         self._axes = np.flatnonzero(self._span > 0)
-        counts, solved = np.full(len(self._axes), MIN_POINTS), _SolvedGrid(box, self._axes, solve)
-        while True:
-            values = solved(counts)
-            self._series = _coefficients(values)
-            change = np.abs(values - rest).max()
-            self.errors = np.array([_truncation_error(self._series, axis) for axis in range(len(counts))])
-            short = (self.errors > tolerance * change) & (counts < MAX_POINTS)
-            if not short.any():
-                break
-            counts = np.where(short, 2 * counts - 1, counts)
-        self.solves = len(solved.known)
+        noise = NOISE * float(np.finfo(rest.dtype).eps * np.abs(rest).max())
+        terms = _NewtonTerms(len(self._axes), lambda points: solve(self._at(points)) - rest, noise)
+        while terms.error > tolerance * terms.change and terms.following is not None:
+            terms.add(terms.following)
+        self.error, self.solves = terms.error, len(terms.known)
+        self._series = terms.dense()
 
     def __call__(self, q: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
         """Frames at points ``q``: one point for each reading of a frame (m readings), or one for all (m is 1)."""
         x = 2 * (q[..., self._axes] - self._low[self._axes]) / self._span[self._axes] - 1
         counts = self._series.shape[:-1]
-        bases = [chebvander(np.clip(x[..., axis], -1, 1), count - 1) for axis, count in enumerate(counts)]
+        bases = [_newton_basis(np.clip(x[..., axis].T, -1, 1), count) for axis, count in enumerate(counts)]
         if q.shape[1] > 1 and bases:
-            return self._one_by_one(bases)
-        return self._together([basis[:, 0] for basis in bases], len(q))
+            return np.asarray(self._rest + self._one_by_one(bases))
+        return np.asarray(self._rest + self._together([basis[0] for basis in bases], len(q)))
+
+    def _at(self, points: Float[np.ndarray, "points axes"]) -> Float[np.ndarray, "points d"]:
+        """Parameters at places -1 to 1 along each axis."""
+        share = np.zeros((len(points), len(self._low)))
+        share[:, self._axes] = 0.5 * (1 + points)
+        return np.asarray(self._low + share * self._span)
 
     def _together(self, bases: list[np.ndarray], frames: int) -> np.ndarray:
         product = np.ones((frames, 1))
@@ -108,7 +118,7 @@ class FrameInterpolant:
         return np.asarray(product @ self._series.reshape(-1, self._series.shape[-1]))
 
     def _one_by_one(self, bases: list[np.ndarray]) -> np.ndarray:
-        *others, last = (basis.swapaxes(0, 1) for basis in bases)  # (readings, frames, terms)
+        *others, last = bases  # (readings, frames, terms)
         series = np.moveaxis(self._series, -1, 0)
         rows = np.swapaxes(series.reshape(len(series), -1, series.shape[-1]), 1, 2)
         sums = (last @ rows).reshape(*last.shape[:2], *series.shape[1:-1])
@@ -117,101 +127,133 @@ class FrameInterpolant:
         return sums.T
 
 
-class _SolvedGrid:
-    """Frames at the points of nested grids; each point is solved once."""
+class _NewtonTerms:
+    """Terms of a polynomial in variables from -1 to 1. With a term, it has all those of smaller indices.
 
-    def __init__(self, box: ParameterBox, axes: np.ndarray, solve: Solve):
-        self.known: dict[tuple[int, ...], np.ndarray] = {}
-        self._box, self._axes, self._solve = box, axes, solve
-
-    def __call__(self, counts: Int[np.ndarray, " axes"]) -> Float[np.ndarray, "... readings"]:
-        grid = [range(0, MAX_POINTS, (MAX_POINTS - 1) // (n - 1)) for n in counts]
-        wanted = list(_product(grid))
-        missing = [index for index in wanted if index not in self.known]
-        if missing:
-            at = np.tile(self._box.low, (len(missing), 1))
-            share = 0.5 * (1 - np.cos(np.pi * np.array(missing) / (MAX_POINTS - 1))).reshape(len(missing), -1)
-            span = (self._box.high - self._box.low)[self._axes]
-            at[:, self._axes] += share * span
-            self.known.update(zip(missing, self._solve(at), strict=True))
-        return np.array([self.known[index] for index in wanted]).reshape(*counts, -1)
-
-
-def _product(grid: list[range]) -> list[tuple[int, ...]]:
-    return [tuple(g[i] for g, i in zip(grid, index, strict=True)) for index in np.ndindex(*map(len, grid))]
-
-
-def _coefficients(values: Float[np.ndarray, "... readings"]) -> Float[np.ndarray, "... readings"]:
-    """Chebyshev series along all axes but the last, from values at the points cos(pi (1 - share))."""
-    for axis in range(values.ndim - 1):
-        count = values.shape[axis]
-        values = dct(np.flip(values, axis), type=1, axis=axis) / (count - 1)
-        ends = np.ones(count)
-        ends[[0, -1]] = 0.5
-        values = values * ends.reshape([-1 if a == axis else 1 for a in range(values.ndim)])
-    return values
-
-
-def _truncation_error(series: Float[np.ndarray, "... readings"], axis: int) -> float:
-    """Truncation error of a series along one axis, by extrapolating its coefficients as a geometric series."""
-    other = tuple(a for a in range(series.ndim) if a != axis)
-    size = np.abs(series).max(other)
-    last = max(size[-1], size[-2])
-    if last <= 1e-14 * size.max():
-        return 0.0
-    ratio = min((last / size[:2].max()) ** (1 / (len(size) - 1)), 0.9)
-    return float(last * ratio / (1 - ratio))
-
-
-def frame_solver(model: je.Model, diameter: float) -> Callable[[np.ndarray, np.ndarray], Solve]:
-    """Create a function that solves frames for given places of the tips (contacts, 2) m and their slide (2,) m.
-
-    Its result maps points (points, d) to frames. A point holds the loads of the contacts in N, their progress along
-    the slide, and the temperature in K. ``diameter`` is that of the tips in m.
+    | attribute | meaning                                                             |
+    |-----------|---------------------------------------------------------------------|
+    | known     | coefficients of the terms, by their index along each axis           |
+    | change    | largest value of the function so far                                |
+    | error     | estimate of the sum of all terms that are left out                  |
+    | following | index of the largest of these; None if there are points for no more |
     """
-    tip = jnp.asarray(diameter, model.dtype)
 
-    def press(places: np.ndarray, slide: np.ndarray) -> Solve:
-        at, way = jnp.asarray(places, model.dtype), jnp.asarray(slide, model.dtype)
+    def __init__(self, axes: int, function: Solve, noise: float):
+        self.known: dict[Index, np.ndarray] = {}
+        self.change, self.error = 0.0, 0.0
+        self.following: Index | None = None
+        self._function, self._noise = function, noise  # terms up to the noise count as zero
+        along = np.eye(axes, dtype=int)
+        self.add((0,) * axes, *(tuple((k * row).tolist()) for row in along for k in range(1, MIN_POINTS)))
 
-        def solve(points: np.ndarray) -> np.ndarray:
-            out = []
-            for first in range(0, len(points), SOLVE_BATCH):
-                part = points[first : first + SOLVE_BATCH]
-                padded = np.zeros((SOLVE_BATCH, points.shape[1]))
-                padded[: len(part)] = part
-                frames = _frames()(model, at, way, tip, jnp.asarray(padded, model.dtype), len(part))
-                out.append(np.asarray(frames)[: len(part)])
-            return np.concatenate(out)
+    def add(self, *indices: Index) -> None:
+        """Add terms, with those of smaller indices."""
+        wanted = [tuple(place) for index in indices for place in np.ndindex(*(k + 1 for k in index))]
+        missing = [index for index in dict.fromkeys(wanted) if index not in self.known]
+        places = np.array(missing, int)
+        values = self._function(_leja_points()[places])
+        self.change = max(self.change, float(np.abs(values).max()))
+        for index, place, value in zip(missing, places, values, strict=True):
+            self.known[index] = value - self._at_point(place) if self.known else value
+        self._estimate()
 
-        return solve
+    def dense(self) -> Float[np.ndarray, "... readings"]:
+        """All coefficients, with zeros for the terms that are left out."""
+        indices = np.array(list(self.known), int)
+        found = np.zeros((*indices.max(0) + 1, *self.known[(0,) * indices.shape[1]].shape))
+        found[tuple(indices.T)] = np.array(list(self.known.values()))
+        return found
 
-    return press
+    def _at_point(self, place: Int[np.ndarray, " axes"]) -> Float[np.ndarray, " readings"]:
+        """Value of the polynomial at a Leja point, by the index of the point along each axis."""
+        weights = _basis_at_points()[place, np.array(list(self.known), int)].prod(-1)
+        return np.asarray(weights @ np.array(list(self.known.values())))
+
+    def _estimate(self) -> None:
+        indices = np.array(list(self.known), int)
+        if not indices.size:
+            return  # no variable: the first term is the function
+        sizes = np.full(indices.max(0) + 2, np.nan)
+        largest = np.array([np.abs(term).max() for term in self.known.values()])
+        sizes[tuple(indices.T)] = np.where(largest > self._noise, largest, 0)
+        along = [np.moveaxis(_left_out(np.moveaxis(sizes, axis, 0)), 0, axis) for axis in range(sizes.ndim)]
+        left = np.max(along, axis=0)
+        self.error = float(left.sum())
+        allowed = left[(slice(MAX_POINTS),) * sizes.ndim]
+        place = np.unravel_index(np.argmax(allowed), allowed.shape)
+        self.following = tuple(map(int, place)) if allowed[place] > 0 else None
+
+
+def _left_out(sizes: Float[np.ndarray, "terms_and_1 ..."]) -> Float[np.ndarray, "terms_and_1 ..."]:
+    """Estimated sum of the missing terms after each line of terms along the first axis, at the first one that misses.
+
+    The terms of a line decrease as those of any other line do, at most. After the last term that any line has, they
+    decrease as slowly as in the last two steps.
+
+    Args:
+        sizes: largest values of the terms, NaN where there is none.
+    """
+    safe = sizes.copy()
+    safe[MIN_POINTS:] = np.maximum(sizes[MIN_POINTS:], LARGEST_DROP * sizes[MIN_POINTS - 1 : -1])
+    steps = np.nan_to_num(safe[1:] / np.maximum(safe[:-1], np.finfo(float).tiny))
+    ratio = steps.reshape(len(steps), -1).max(1)
+    ratio[-1] = ratio[-3:-1].max()
+    ratio = np.minimum(ratio, LARGEST_RATIO)
+    rest = np.nan_to_num(safe[:-1].T * (ratio / (1 - ratio))).T
+    return np.concatenate([np.zeros_like(sizes[:1]), np.where(np.isnan(sizes[1:]), rest, 0)])
 
 
 @cache
-def _frames() -> Callable[..., Array]:
-    return jax.jit(_solve, compiler_options=je.compiler_options())
+def _leja_points() -> Float[np.ndarray, " points"]:
+    """Leja points: 0, then always where the product of the distances from the points before is largest.
+
+    At the first point, half the load, all parameters change the frame; without a load, progress changes nothing.
+    """
+    x = np.cos(np.linspace(0, np.pi, 20001))
+    points, product = np.zeros(MAX_POINTS), np.abs(x)
+    for k in range(1, MAX_POINTS):
+        points[k] = x[np.argmax(product)]
+        product *= np.abs(x - points[k])
+    return points
 
 
-def _solve(
+@cache
+def _basis_at_points() -> Float[np.ndarray, "points terms"]:
+    return _newton_basis(_leja_points(), MAX_POINTS)
+
+
+def _newton_basis(x: Float[np.ndarray, "*n"], count: int) -> Float[np.ndarray, "*n terms"]:
+    """Polynomials that are one at their own Leja point and zero at those before it; none is larger than one."""
+    points = _leja_points()
+    basis = np.ones((count, *x.shape))
+    for k in range(1, count):
+        step = points[k] - points[: k - 1], points[k - 1] - points[: k - 1]
+        share = 1 / ((points[k] - points[k - 1]) * np.prod(step[0] / step[1]))
+        np.multiply(x, share, out=basis[k])
+        basis[k] -= points[k - 1] * share
+        basis[k] *= basis[k - 1]
+    return np.moveaxis(basis, 0, -1)
+
+
+def frame_solver(model: je.Model, diameter: float) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Create a function that solves a frame (readings,); several threads may call it at the same time.
+
+    Its arguments are the places of the tips (contacts, 2) m, their slide (2,) m, and the parameters of the sheet (d,):
+    the loads of the tips in N, their progress along the slide, and the temperature in K. ``diameter`` is that of the
+    tips in m.
+    """
+    frame = je.bind(_frame, model, jnp.asarray(diameter, model.dtype))
+    return lambda *numbers: np.asarray(frame(*(array.astype(model.dtype) for array in numbers)))
+
+
+def _frame(
     model: je.Model,
+    diameter: Float[Array, ""],
     places: Float[Array, "contacts 2"],
     slide: Float[Array, "2"],
-    diameter: Float[Array, ""],
-    points: Float[Array, "points d"],
-    count: Integer[ArrayLike, ""],
-) -> Float[Array, "points readings"]:
+    point: Float[Array, " d"],
+) -> Float[Array, " readings"]:
     contacts = len(places)
-
-    def frame(point: Array) -> Array:
-        load, progress, temperature = point[:contacts], point[contacts:-1], point[-1]
-        spread = [je.model.load_spread(model, p + s * slide, diameter) for p, s in zip(places, progress, strict=True)]
-        return je.forward(model, je.conductivity(model, load @ jnp.stack(spread), temperature))
-
-    def step(i: Array, out: Array) -> Array:
-        return out.at[i].set(frame(points[i]))
-
-    out = jnp.zeros((len(points), len(model.pattern)), model.dtype)
-    found: Float[Array, "points readings"] = jax.lax.fori_loop(0, count, step, out)
-    return found
+    load, progress, temperature = point[:contacts], point[contacts:-1], point[-1]
+    spread = [je.model.load_spread(model, p + s * slide, diameter) for p, s in zip(places, progress, strict=True)]
+    return je.forward(model, je.conductivity(model, load @ jnp.stack(spread), temperature))

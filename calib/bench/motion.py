@@ -61,13 +61,14 @@ def loads_at(motion: Motion, times: Float[np.ndarray, " time"]) -> LoadState:
     since = (times - motion.start[press] - timing.rest)[:, None] - delay
     pace = motion.pace[press, None]
     up = np.clip(since * pace / timing.ramp, 0, 1)
-    slid = np.clip((since - timing.ramp) / timing.hold, 0, 1)
     down = np.clip((since - timing.ramp - timing.hold) * pace / timing.release, 0, 1)
-    load = 0.5 * (np.cos(np.pi * down) - np.cos(np.pi * up)) * motion.forces[press]
+    load = 0.5 * (1 - np.cos(np.pi * (up - down))) * motion.forces[press]
     ends = np.cumsum([0, timing.ramp, timing.hold, timing.release])
     changes = np.sort((delay[:, None] + ends).ravel())
     phase = np.searchsorted(changes, since[:, 0], side="right")
-    progress = 0.5 * (1 - np.cos(np.pi * slid)) * any(motion.bench.slide)
+    progress = np.zeros_like(load)
+    if any(motion.bench.slide):
+        progress = 0.5 * (1 - np.cos(np.pi * np.clip((since - timing.ramp) / timing.hold, 0, 1)))
     return LoadState(press, phase, load, progress)
 
 

@@ -14,14 +14,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 from jaxeit import effects as fx
 
 from .bench import Bench
-from .interpolation import FrameInterpolant, ParameterBox, enclosing_boxes, frame_solver
+from .interpolation import frame_solver
 from .motion import Motion, barometer_rise, loads_at, phase_count, planned_motion, temperature_rise
+from .press_frames import PressFrames
 
 BLOCK_ROWS = 1024  # samples of a block
 SLIDE_PLACES = 65  # places along a slide at which the response of the pads is computed
@@ -222,38 +223,33 @@ class SimulatedEit(AbstractSimulatedStream):
         self._solver = frame_solver(model, bench.tip_diameter)
         self._memory = fx.chosen(bench.scene.effects, fx.AbstractMemoryEffect)
         self._offsets = _offsets(bench)
-        self._ready: dict[int, list[FrameInterpolant]] = {}
-        self.solves = 0
 
     @property
     def rate(self) -> float:  # type: ignore[override]
         return self.bench.eit_rate
 
     def _resting(self) -> np.ndarray:
-        return np.asarray(je.forward(self.model))
+        # Solved as all frames are, so that the program is compiled before threads use it.
+        return self._solver(self.motion.places[0], np.array(self.bench.slide), np.zeros(self._parameters))
+
+    @property
+    def _parameters(self) -> int:
+        """Number of parameters of the sheet: load and progress of each tip, and the temperature."""
+        return 1 + 2 * int(self.motion.places.shape[1])
+
+    def _solve(self, press: int, points: Float[np.ndarray, "points d"]) -> Float[np.ndarray, "points readings"]:
+        """Frames of a press at parameters of the sheet; those without a load and a change of temperature are alike."""
+        places, slide = self.motion.places[press], np.array(self.bench.slide)
+        changed = points[:, : len(places)].any(1) | (points[:, -1] != 0)
+        pairs = zip(points, changed, strict=True)
+        return np.array([self._solver(places, slide, point) if differs else self.resting for point, differs in pairs])
 
     def _before(self) -> Any:
         return fx.history_start(self._memory, jnp.zeros(self.motion.forces.shape[1]))
 
     def quantity(self, number: int, times: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
         lag, after = self._lag(number, times, state)
-        press, phase, points = self._points(times, self._offsets, lag)
-        out = np.empty((len(times), len(self.resting)))
-        box = self._owners[press, phase]
-        for this in np.unique(press).tolist():
-            for which in np.unique(box[press == this]).tolist():
-                mine = (press == this) & (box == which)
-                rows = mine.any(1)
-                out[rows] = np.where(mine[rows], self._frames(this, which, points[rows]), out[rows])
-        return out, after
-
-    def _frames(self, press: int, which: int, points: np.ndarray) -> np.ndarray:
-        if self._tolerance > 0:
-            return self._interpolants(press)[which](points)
-        flat, back = np.unique(points.reshape(-1, points.shape[-1]), axis=0, return_inverse=True)
-        self.solves += len(flat)
-        solved = self._solver(self.motion.places[press], np.array(self.bench.slide))(flat)
-        return solved[back.reshape(points.shape[:2]), np.arange(solved.shape[1])]
+        return self._frames(*self._points(times, self._offsets, lag)), after
 
     def _lag(self, number: int, times: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
         """Difference of the load that the sheet feels, with memory, from the acting load (rows + 1, contacts) N.
@@ -286,11 +282,18 @@ class SimulatedEit(AbstractSimulatedStream):
         points = np.concatenate([load, now.progress.reshape(shape), warmer[..., None]], -1)
         return now.press.reshape(when.shape), now.phase.reshape(when.shape), points
 
+    @property
+    def solves(self) -> int:
+        """Number of solves so far."""
+        return self._frames.solves
+
     def solves_expected(self) -> int:
         """Number of solves in the whole session, if all presses need as many as the first."""
-        if self._tolerance == 0:
-            return self.samples
-        return sum(made.solves for made in self._interpolants(0)) * len(self.motion.start)
+        return self._frames.solves_in(0) * len(self.motion.start) if self._tolerance > 0 else self.samples
+
+    @cached_property
+    def _frames(self) -> PressFrames:
+        return PressFrames(self._solve, self.resting, self._tolerance, self._extents())
 
     @cached_property
     def _feels_warmth(self) -> bool:
@@ -300,10 +303,9 @@ class SimulatedEit(AbstractSimulatedStream):
         cold, warm = (je.conductivity(self.model, None, t) for t in (0.0, 1.0))
         return bool(jnp.any(cold != warm))
 
-    @cached_property
     def _extents(self) -> tuple[np.ndarray, np.ndarray]:
         """Ranges of the parameters in each phase of each press (presses, phases, d), from the loads without a solve."""
-        shape = (len(self.motion.start), phase_count(self.bench), 2 * self.motion.forces.shape[1] + 1)
+        shape = (len(self.motion.start), phase_count(self.bench), self._parameters)
         low, high = np.full(shape, np.inf), np.full(shape, -np.inf)
         state = self._before()
         between = np.unique(np.quantile(self._offsets, [0, 0.5, 1]))
@@ -316,27 +318,6 @@ class SimulatedEit(AbstractSimulatedStream):
         # The temperature changes in all phases. One range for the whole press lets the phases share their points.
         low[..., -1], high[..., -1] = low[..., -1].min(1, keepdims=True), high[..., -1].max(1, keepdims=True)
         return low, high
-
-    @cached_property
-    def _boxes(self) -> tuple[list[list[ParameterBox]], Int[np.ndarray, "presses phases"]]:
-        low, high = self._extents
-        seen = np.isfinite(low) & np.isfinite(high)
-        scale = np.where(seen, high, 0).max((0, 1)) - np.where(seen, low, 0).min((0, 1))
-        parts = [enclosing_boxes(a, b, scale) for a, b in zip(low, high, strict=True)]
-        return [part[0] for part in parts], np.array([part[1] for part in parts])
-
-    @property
-    def _owners(self) -> Int[np.ndarray, "presses phases"]:
-        return self._boxes[1]
-
-    def _interpolants(self, press: int) -> list[FrameInterpolant]:
-        if press not in self._ready:
-            self._ready = {p: made for p, made in self._ready.items() if p >= press - 1}
-            solve = self._solver(self.motion.places[press], np.array(self.bench.slide))
-            made = [FrameInterpolant(box, solve, self.resting, self._tolerance) for box in self._boxes[0][press]]
-            self.solves += sum(m.solves for m in made)
-            self._ready[press] = made
-        return self._ready[press]
 
 
 def _offsets(bench: Bench) -> Float[np.ndarray, " readings_or_one"]:

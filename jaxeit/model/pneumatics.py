@@ -20,13 +20,17 @@ def pad_response(skin: Skin, model: Model) -> Float[Array, "pads elements"]:
     the response to each place.  ``pad_response(skin, model) @ pressure`` is (pads,) Pa.
     """
     corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
-    places = np.einsum("sc,ecd->esd", _barycentric(CUTS_PER_SIDE), corners)
+    centres = corners.mean(1)
+    radii = np.linalg.norm(corners - centres[:, None], axis=-1).max(1)
     coverage, distance = [], []
     for pad in skin.pads:
         outline = Polygon(pad.outline)
-        inside = outline.contains(places.reshape(-1, 2)).reshape(places.shape[:2])
-        coverage.append(inside.mean(1) / pad.area)
-        distance.append(outline.boundary_distance(corners.mean(1)))
+        distance.append(outline.boundary_distance(centres))
+        covered = outline.contains(centres).astype(float)
+        cut = np.flatnonzero(distance[-1] <= radii + outline.tolerance)  # others lie on one side of the outline
+        samples = np.einsum("sc,ecd->esd", _barycentric(CUTS_PER_SIDE), corners[cut])
+        covered[cut] = outline.contains(samples.reshape(-1, 2)).reshape(samples.shape[:2]).mean(1)
+        coverage.append(covered / pad.area)
     shape = (len(skin.pads), len(corners))
     felt = jnp.asarray(np.reshape(coverage, shape), model.dtype) * model.areas
     places_in = jnp.asarray(np.reshape(distance, shape), model.dtype)
