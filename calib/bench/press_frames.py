@@ -1,16 +1,12 @@
-"""Frames of the presses of a session: which polynomial gives which frame, and threads that make the polynomials."""
+"""Frames of the presses of a session: which polynomial gives which frame."""
 
-import os
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .interpolation import FrameInterpolant, Solve, enclosing_boxes
-
-PRESSES_AHEAD = 4  # presses that the threads work on while the frames of another are computed
+from .interpolation import SOLVED_TOGETHER, FrameInterpolant, SolveEach, enclosing_boxes, interpolants
 
 Frames = Callable[[Float[np.ndarray, "frames m d"]], Float[np.ndarray, "frames readings"]]
 
@@ -25,13 +21,13 @@ class PressFrames:
 
     def __init__(
         self,
-        solve: Callable[[int, np.ndarray], np.ndarray],
+        solve: SolveEach,
         rest: Float[np.ndarray, " readings"],
         tolerance: float,
         extents: tuple[Float[np.ndarray, "presses phases d"], Float[np.ndarray, "presses phases d"]],
     ):
         """Args:
-        solve: frames (points, readings) of a press, by its index, at points (points, d); threads use it.
+        solve: frames (points, readings) of presses, by their index (points,), at points (points, d).
         rest: frame without contact.
         tolerance: error over the largest change of a press; 0: every frame is solved.
         extents: lowest and highest parameters in each phase of each press; infinite for a phase without samples.
@@ -44,8 +40,6 @@ class PressFrames:
         self._boxes = [boxes for boxes, _ in parts]
         self._first = np.cumsum([0, *map(len, self._boxes)])  # the boxes of all presses are counted together
         self._owners = np.array([owner for _, owner in parts]) + self._first[:-1, None]
-        self._threads = ThreadPoolExecutor(os.cpu_count())
-        self._coming: dict[int, list[Future[FrameInterpolant]]] = {}
         self._made: dict[int, list[FrameInterpolant]] = {}
         self.solves = 0
 
@@ -73,33 +67,23 @@ class PressFrames:
     def _frames(self, number: int) -> Frames:
         press = int(np.searchsorted(self._first, number, side="right")) - 1
         if self._tolerance == 0:
-            return partial(self._solved, partial(self._solve, press))
+            return partial(self._solved, press)
         return self._polynomials(press)[number - int(self._first[press])]
 
-    def _solved(self, solve: Solve, points: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
+    def _solved(self, press: int, points: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
         flat, back = np.unique(points.reshape(-1, points.shape[-1]), axis=0, return_inverse=True)
         self.solves += len(flat)
-        parts = np.array_split(flat, min(len(flat), os.cpu_count() or 1))
-        solved = np.concatenate(list(self._threads.map(solve, parts)))
-        return np.asarray(solved[back.reshape(points.shape[:2]), np.arange(solved.shape[1])])
+        solved = self._solve(np.full(len(flat), press), flat)
+        return np.asarray(solved[back.reshape(points.shape[:2]), np.arange(len(self._rest))])
 
     def _polynomials(self, press: int) -> list[FrameInterpolant]:
-        """The polynomials of a press; the threads go on with those of the presses that follow."""
-        for coming in range(press, min(press + PRESSES_AHEAD, len(self._boxes) - 1) + 1):
-            if coming not in self._made and coming not in self._coming:
-                arguments = partial(self._solve, coming), self._rest, self._tolerance
-                self._coming[coming] = [
-                    self._threads.submit(FrameInterpolant, box, *arguments) for box in self._boxes[coming]
-                ]
-        if press in self._coming:
-            self._made = {past: made for past, made in self._made.items() if past >= press - 1}
-            self._made[press] = self._finished(self._coming.pop(press))
-            self.solves += sum(made.solves for made in self._made[press])
+        """The polynomials of a press. A press is always made with the same others, so that all bits are the same."""
+        if press not in self._made:
+            group = range(press - press % SOLVED_TOGETHER, len(self._boxes))[:SOLVED_TOGETHER]
+            of = np.repeat(group, [len(self._boxes[one]) for one in group])
+            boxes = [box for one in group for box in self._boxes[one]]
+            made = interpolants(boxes, lambda box, points: self._solve(of[box], points), self._rest, self._tolerance)
+            self._made = {past: self._made[past] for past in self._made if past >= group[0] - 1}
+            self._made |= {one: [each for each, its in zip(made, of, strict=True) if its == one] for one in group}
+            self.solves += sum(one.solves for one in made)
         return self._made[press]
-
-    def _finished(self, coming: list[Future[FrameInterpolant]]) -> list[FrameInterpolant]:
-        try:
-            return [made.result() for made in coming]
-        except BaseException:  # such as Ctrl-C: the interpreter would wait for all that is queued
-            self._threads.shutdown(wait=False, cancel_futures=True)
-            raise
