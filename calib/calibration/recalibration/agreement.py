@@ -11,7 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.stats import t as student_t
 
+from ...fitting.intervals import COVERAGE, NORMAL_MULTIPLE
 from ...presses.table import PressMeasurements
 from ...session import Session, SessionError
 from ..calibration import Calibration
@@ -83,16 +85,29 @@ def _agreement(
 
 
 def widened(calibration: Calibration, found: Recalibration) -> Calibration:
-    """The calibration with the gains that it has, and their uncertainty increased by what ordinary use says they moved.
-
-    The square of a move exceeds its expectation by the variance of the move, which is taken off.
-    """
-    doubt = np.where(found.determined, np.maximum(found.change**2 - found.change_error**2, 0.0), 0.0)
+    """The calibration, its gains as they are, and more uncertain by what ordinary use says they moved."""
+    doubt = covariance_of_moves(found.change[found.determined], found.change_error[found.determined])
     if not doubt.any():
         return calibration
-    last = calibration.recalibration
-    covariance = np.diag(doubt) + (0.0 if last is None else last.covariance)
+    last, pads = calibration.recalibration, len(found.change)
+    covariance = np.zeros((pads, pads)) if last is None else np.array(last.covariance)
+    covariance[np.ix_(found.determined, found.determined)] += doubt
     return replace(calibration, recalibration=replace(found, log_gain=found.before, covariance=covariance))
+
+
+def covariance_of_moves(change: Float[np.ndarray, " n"], error: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """Covariance of the log gains of pads that have moved relative to each other by as much, with these errors.
+
+    The square of a move exceeds its expectation by the variance of the move, which is taken off. The image tells moves
+    of n pads relative to each other only. Where pads move independently of each other, the squares of these sum up to
+    (n - 1) variances of a move, and the mean of all moves, which looks like a gain of the image, has an nth of it. So
+    few moves tell their variance roughly: the mean has Student's distribution.
+    """
+    square = np.maximum(change**2 - error**2, 0.0)
+    if len(square) < 2:
+        return np.diag(square)
+    wider = float(student_t.ppf(0.5 + COVERAGE / 2, len(square) - 1)) / NORMAL_MULTIPLE
+    return np.asarray(np.diag(square) + wider**2 * square.sum() / (len(square) * (len(square) - 1)))
 
 
 def _outside(calibration: Calibration, loads: LoadedPads) -> list[str]:
