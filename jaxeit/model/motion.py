@@ -1,13 +1,15 @@
-"""Electrodes that move: readings as a differentiable function of where the electrodes sit.
+"""Electrodes that move and grow: readings as a differentiable function of where the electrodes sit, and of their sizes.
 
 The mesh follows its electrodes: the nodes of an electrode move with it, those around it by a part that falls to zero
-before the next electrode and the rim. No node changes its neighbours, so that the arrays of the model are smooth
-functions of the shifts. With x_a the field of a unit current into electrode a, the transfer matrix ``Z[a, b]`` has the
-derivative ``-dA(x_a, x_b)``, that of the energy with the fields held (`forward_model`), as for a conductivity: the
-fields are stationary, and no further solve is needed. The conductivity of an element moves with it.
+before the next electrode and the rim; an electrode that grows moves them away from its middle in the same way. No node
+changes its neighbours, so that the arrays of the model are smooth functions of the shifts. With x_a the field of a unit
+current into electrode a, the transfer matrix ``Z[a, b]`` has the derivative ``-dA(x_a, x_b)``, that of the energy with
+the fields held (`forward_model`), as for a conductivity: the fields are stationary, and no further solve is needed. The
+conductivity of an element moves with it.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -45,6 +47,8 @@ class Motion(eqx.Module):
     | electrode: that each node follows                                     | (nodes,)        |      |
     | chart_step: change of a node's flat coordinates per shift of that     | (nodes, 2, 2)   | 1    |
     | space_step: the same of its place in space                            | (nodes, d, 2)   | 1    |
+    | arm: of each node, from the middle of the electrode that it follows   | (nodes, 2)      | m    |
+    | radius: of what an electrode touches; 0: it is a point                | (electrodes,)   | m    |
     | reach: distance from its middle within which nodes follow an electrode | (electrodes,)  | m    |
     | places: of each contribution to the matrix, among the stiffnesses     | (n, c) each     |      |
     | corners: nodes of each piece under an electrode; of an edge the last one twice | (p, 3) |      |
@@ -53,6 +57,8 @@ class Motion(eqx.Module):
     electrode: Int[Array, " nodes"]
     chart_step: Float[Array, "nodes 2 2"]
     space_step: Float[Array, "nodes d 2"]
+    arm: Float[Array, "nodes 2"]
+    radius: Float[Array, " electrodes"]
     reach: Float[Array, " electrodes"]
     places: tuple[Int[Array, "_ _"], ...]
     corners: Int[Array, "p 3"]
@@ -74,7 +80,7 @@ def electrode_motion(model: Model) -> Motion:
     mesh = Mesh(np.asarray(model.nodes, float), np.asarray(model.triangles), np.asarray(model.chart, float))
     unknown = np.zeros(len(mesh.nodes), int)
     unknown[mesh.triangles] = np.asarray(model.system.dofs)[:, :3]
-    electrode, step, reach = _follow(mesh, _nodes_of_electrodes(model, unknown))
+    follows = _follow(mesh, _nodes_of_electrodes(model, unknown))
     # The derivative of the place in space by the flat coordinates, constant on a triangle; at a node the mean.
     flat, space = (_sides(places[mesh.triangles]) for places in (mesh.chart, mesh.nodes))
     slope = np.linalg.solve(flat, space).swapaxes(1, 2)
@@ -82,10 +88,12 @@ def electrode_motion(model: Model) -> Motion:
     np.add.at(tangents, mesh.triangles, slope[:, None])
     np.add.at(around, mesh.triangles, 1.0)
     return Motion(
-        on_device(electrode, jnp.int32),
-        on_device(step, model.dtype),
-        on_device(tangents / around @ step, model.dtype),
-        on_device(reach, model.dtype),
+        on_device(follows.electrode, jnp.int32),
+        on_device(follows.step, model.dtype),
+        on_device(tangents / around @ follows.step, model.dtype),
+        on_device(follows.arm, model.dtype),
+        on_device(follows.radius, model.dtype),
+        on_device(follows.reach, model.dtype),
         tuple(on_device(table, jnp.int32) for table in stiffness_places(model.system)),
         on_device(_corners_of_pieces(model, unknown), jnp.int32),
     )
@@ -113,8 +121,17 @@ def _corners_of_pieces(model: Model, unknown: np.ndarray) -> np.ndarray:
     return corners
 
 
-def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The electrode that each node follows, its step per shift of that electrode, and each electrode's reach."""
+class _Follows(NamedTuple):
+    """How nodes follow electrodes; see `Motion`."""
+
+    electrode: np.ndarray
+    step: np.ndarray
+    arm: np.ndarray
+    radius: np.ndarray
+    reach: np.ndarray
+
+
+def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> _Follows:
     rim = _Rim(mesh)
     middles = np.stack([mesh.chart[nodes].mean(0) for nodes in electrodes])
     away = np.linalg.norm(mesh.chart[:, None] - middles, axis=2)
@@ -141,7 +158,7 @@ def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> tuple[np.ndarray, np.nd
     along = np.where(rim.inside[:, None], rim.tangent, own[follows])
     bound = along[:, :, None] * own[follows][:, None, :]  # the part along the rim, turned with the rim
     step = share[:, None, None] * np.where(on_rim[follows][:, None, None], bound, np.eye(2))
-    return follows, step, reach
+    return _Follows(follows, step, mesh.chart - middles[follows], radii, reach)
 
 
 class _Rim:
@@ -166,8 +183,13 @@ class _Rim:
         return unit
 
 
-def moved(model: Model, motion: Motion, shift: Float[ArrayLike, "electrodes 2"]) -> Model:
-    """The model with its electrodes moved, differentiable with respect to the shift under jit, vmap and grad.
+def moved(
+    model: Model,
+    motion: Motion,
+    shift: Float[ArrayLike, "electrodes 2"] | None = None,
+    growth: Float[ArrayLike, " electrodes"] | None = None,
+) -> Model:
+    """The model with its electrodes moved and grown, differentiable with respect to both under jit, vmap and grad.
 
     Conductivities, and a basis that was laid over the model, move with the elements. ::
 
@@ -177,35 +199,54 @@ def moved(model: Model, motion: Motion, shift: Float[ArrayLike, "electrodes 2"])
     Args:
         model: with which `electrode_motion` made the motion.
         shift: of each electrode in the sheet's flat coordinates, (electrodes, 2) m; of an electrode on the rim, the
-            part along the rim counts. Triangles turn over at about half of the reach.
+            part along the rim counts. Triangles turn over at about half of the reach. Default: none.
+        growth: of the diameter or length of each electrode, (electrodes,), as a part of itself. Default: none.
 
     Returns:
         A model whose readings are not finite if a triangle turns over.
 
     Raises:
-        MotionError: if the shift has another shape, or (unless JAX traces it) a triangle turns over.
+        MotionError: if shift or growth has another shape, an electrode that is a point should grow, or (unless JAX
+            traces it) a triangle turns over.
     """
-    shift = jnp.asarray(shift, model.dtype)
+    shift = jnp.zeros((model.electrodes, 2), model.dtype) if shift is None else jnp.asarray(shift, model.dtype)
     if shift.shape != (model.electrodes, 2):
         raise MotionError(
             f"the shift has shape {shift.shape}; give one of 2 coordinates to each of {model.electrodes} electrodes"
         )
+    grown = None if growth is None else _checked_growth(model, motion, growth)
     if len(motion.electrode) != len(model.nodes):
         raise MotionError("the motion is that of another mesh; make electrode_motion(model) of this model")
-    found = _moved(model, motion, shift)
-    if not is_traced((model, shift)) and not bool(jnp.isfinite(found.system.slopes[0, 0, 0])):
+    found = _moved(model, motion, shift, grown)
+    if not is_traced((model, shift, growth)) and not bool(jnp.isfinite(found.system.slopes[0, 0, 0])):
         far = np.linalg.norm(np.asarray(shift), axis=1)
         k = int(np.argmax(far / np.asarray(motion.reach)))
         raise MotionError(
             f"a triangle turns over: electrode {k} moves {1e3 * far[k]:.3g} mm, and the mesh follows it within "
-            f"{1e3 * float(motion.reach[k]):.3g} mm; make smaller shifts, or a new mesh"
+            f"{1e3 * float(motion.reach[k]):.3g} mm; make smaller shifts, let electrodes grow less, or make a new mesh"
         )
     return found
 
 
+def _checked_growth(
+    model: Model, motion: Motion, growth: Float[ArrayLike, " electrodes"]
+) -> Float[Array, " electrodes"]:
+    growth = jnp.asarray(growth, model.dtype)
+    if growth.shape != (model.electrodes,):
+        raise MotionError(f"growth has shape {growth.shape}; give one number to each of {model.electrodes} electrodes")
+    if not is_traced((motion, growth)) and bool(jnp.any((growth != 0) & (motion.radius == 0))):
+        k = int(jnp.argmax((growth != 0) & (motion.radius == 0)))
+        raise MotionError(f"electrode {k} is a point of this mesh and cannot grow; give it a growth of 0")
+    return growth
+
+
 @verb
-def _moved(model: Model, motion: Motion, shift: Float[Array, "electrodes 2"]) -> Model:
+def _moved(
+    model: Model, motion: Motion, shift: Float[Array, "electrodes 2"], growth: Float[Array, " electrodes"] | None = None
+) -> Model:
     system, own = model.system, shift[motion.electrode]
+    if growth is not None:
+        own += growth[motion.electrode, None] * motion.arm
     chart = model.chart + jnp.einsum("nij,nj->ni", motion.chart_step, own)
     nodes = model.nodes + jnp.einsum("nij,nj->ni", motion.space_step, own)
     areas = _areas(nodes[model.triangles])

@@ -71,6 +71,23 @@ def test_derivatives_are_those_of_the_moved_readings(case):
     np.testing.assert_allclose(jnp.einsum("res,es->r", slopes, direction), forwards, rtol=1e-9, atol=1e-12)
 
 
+def test_derivatives_by_sizes_are_those_of_the_grown_readings(case):
+    """Forward and reverse, at electrodes that have moved and grown already, against differences."""
+    model, motion, shift = case
+    start, direction = 0.03 * shift[:, 0], shift[:, 1]
+
+    @jax.jit
+    def readings(growth):
+        return je.forward(moved(model, motion, 0.02 * motion.reach.min() * shift, growth))
+
+    expected = (readings(start + 1e-5 * direction) - readings(start - 1e-5 * direction)) / 2e-5
+    value, forwards = jax.jvp(readings, (start,), (direction,))
+    np.testing.assert_allclose(forwards, expected, rtol=1e-6, atol=1e-7 * float(jnp.abs(expected).max()))
+    weight = jnp.arange(1.0, len(value) + 1)
+    backwards = jax.grad(lambda growth: weight @ readings(growth))(start)
+    np.testing.assert_allclose(jnp.sum(backwards * direction), weight @ forwards, rtol=1e-9)
+
+
 def test_derivatives_are_those_of_greens_function():
     """Point electrodes in a rectangle, moved one by one: the closed form, but for the error of the mesh."""
     model = square_model(POINTS, [[0, 1, 2, 3], [0, 3, 1, 2]], 40)
@@ -99,6 +116,23 @@ def test_a_bolt_that_moves_is_the_bolt_of_another_mesh(skin):
     model = readings(0.0)
     expected = (je.forward(readings(2e-3)) - je.forward(readings(-2e-3))) / 4e-3
     found = shift_jacobian(model, electrode_motion(model))[:, 7, 0]
+    assert float(jnp.linalg.norm(found - expected) / jnp.linalg.norm(expected)) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contact", [1e-6, 1e-3])
+def test_a_bolt_that_grows_is_the_bolt_of_another_mesh(contact):
+    """The derivative against bolts whose diameter is a twentieth more and less, each on a mesh of its own."""
+
+    def readings(growth):
+        bolts = [je.AreaPatch(p, 0.008 * (1 + growth * (k == 1)), contact) for k, p in enumerate(POINTS)]
+        skin = skin_of(je.Rectangle(0.2, 0.2), bolts, [[0, 1, 2, 3], [0, 1, 0, 1], [1, 2, 0, 3]])
+        return je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.04, order=2, solver=Dense()))
+
+    model = readings(0.0)
+    expected = (je.forward(readings(0.05)) - je.forward(readings(-0.05))) / 0.1
+    motion, one = electrode_motion(model), jnp.zeros(4).at[1].set(1.0)
+    found = jax.jvp(lambda growth: je.forward(moved(model, motion, growth=growth)), (0 * one,), (one,))[1]
     assert float(jnp.linalg.norm(found - expected) / jnp.linalg.norm(expected)) < 0.05
 
 
@@ -139,6 +173,10 @@ def test_what_cannot_be_moved_is_refused(skin):
         moved(model, motion, jnp.zeros(2))
     with pytest.raises(MotionError, match="another mesh"):
         moved(square_model(POINTS, [[0, 1, 2, 3]], 16), motion, jnp.zeros((4, 2)))
+    with pytest.raises(MotionError, match=r"growth has shape \(2,\); give one number to each of 4"):
+        moved(model, motion, growth=jnp.zeros(2))
+    with pytest.raises(MotionError, match="electrode 3 is a point"):
+        moved(model, motion, growth=jnp.zeros(4).at[3].set(0.1))
     far = jnp.zeros((4, 2)).at[2, 0].set(0.05)
     with pytest.raises(MotionError, match="electrode 2 moves 50 mm"):
         moved(model, motion, far)
