@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import t as student_t
+from scipy.stats import chi2, t as student_t
 
 from ...fitting.intervals import COVERAGE, NORMAL_MULTIPLE
 from ...presses.table import PressMeasurements
@@ -28,6 +28,7 @@ from .procedure import MIN_SHARE, KnownForces, LoadedPads, OrdinaryUse, estimato
 REST_CHANGE = 0.03
 # Part of the presses outside what was calibrated from which it is worth a line.
 MIN_OUTSIDE = 0.02
+CERTAIN = 0.95  # probability, without a move, of moves that are smaller than those taken for real
 
 
 class Agreement(NamedTuple):
@@ -101,13 +102,13 @@ def covariance_of_moves(change: Float[np.ndarray, " n"], error: Float[np.ndarray
     The square of a move exceeds its expectation by the variance of the move, which is taken off. The image tells moves
     of n pads relative to each other only. Where pads move independently of each other, the squares of these sum up to
     (n - 1) variances of a move, and the mean of all moves, which looks like a gain of the image, has an nth of it. So
-    few moves tell their variance roughly: the mean has Student's distribution.
+    few moves tell their variance roughly: the mean has Student's distribution. Moves that may be errors tell nothing.
     """
-    square = np.maximum(change**2 - error**2, 0.0)
-    if len(square) < 2:
+    square, count = np.maximum(change**2 - error**2, 0.0), len(change)
+    if count < 2 or np.sum(change**2) <= chi2.ppf(CERTAIN, count - 1) * np.mean(error**2):
         return np.diag(square)
-    wider = float(student_t.ppf(0.5 + COVERAGE / 2, len(square) - 1)) / NORMAL_MULTIPLE
-    return np.asarray(np.diag(square) + wider**2 * square.sum() / (len(square) * (len(square) - 1)))
+    wider = float(student_t.ppf(0.5 + COVERAGE / 2, count - 1)) / NORMAL_MULTIPLE
+    return np.asarray(np.diag(square) + wider**2 * square.sum() / (count * (count - 1)))
 
 
 def _outside(calibration: Calibration, loads: LoadedPads) -> list[str]:
