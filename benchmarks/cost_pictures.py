@@ -15,7 +15,7 @@ from .markdown import cell
 from .rows import Row, grouped
 
 STAGES = {"reading": GREY, "model and images": BLUE, "fitting": ORANGE, "holding out": "#8a9a5b"}
-FIRST = ("import numpy", "import jax", "import jaxeit", "README")
+FIRST = ("import numpy", "import jax", "first use", "README")
 
 
 def to_accuracy(results: Row) -> Figure:
