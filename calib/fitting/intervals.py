@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import nnls
+from scipy.stats import t as student_t
 
 COVERAGE = 0.9  # of the intervals
 NORMAL_MULTIPLE = 1.6449  # half the width of a normal distribution's 90 % interval, in standard deviations
@@ -146,6 +147,12 @@ def _scored(
         if np.all(np.abs(step) <= TOLERANCE * parts):
             break
     return parts, now
+
+
+def student_factor(freedom: int) -> float:
+    """How much wider the 90 % interval is where the deviation is known from so many degrees of freedom (Student's
+    distribution), over that of a known deviation."""
+    return float(student_t.ppf(0.5 + COVERAGE / 2, freedom)) / NORMAL_MULTIPLE
 
 
 def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:

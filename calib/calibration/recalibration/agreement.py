@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2, t as student_t
+from scipy.stats import chi2
 
-from ...fitting.intervals import COVERAGE, NORMAL_MULTIPLE
+from ...fitting.intervals import student_factor
 from ...presses.table import PressMeasurements
 from ...session import Session, SessionError
 from ..calibration import Calibration
@@ -107,8 +107,8 @@ def covariance_of_moves(change: Float[np.ndarray, " n"], error: Float[np.ndarray
     square, count = np.maximum(change**2 - error**2, 0.0), len(change)
     if count < 2 or np.sum(change**2) <= chi2.ppf(CERTAIN, count - 1) * np.mean(error**2):
         return np.diag(square)
-    wider = float(student_t.ppf(0.5 + COVERAGE / 2, count - 1)) / NORMAL_MULTIPLE
-    return np.asarray(np.diag(square) + wider**2 * square.sum() / (count * (count - 1)))
+    common = student_factor(count - 1) ** 2 * square.sum() / (count * (count - 1))
+    return np.asarray(np.diag(square) + common)
 
 
 def _outside(calibration: Calibration, loads: LoadedPads) -> list[str]:

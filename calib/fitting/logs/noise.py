@@ -4,9 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import t as student_t
 
-from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, most_likely_sizes
+from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, most_likely_sizes, student_factor
 
 STRETCHES = 0.75  # share of the stretches of time in which the interval covers the readings
 # s before and after a sample, over which the rate of its force is taken. It is as long as the lags of sensors are: a
@@ -67,7 +66,7 @@ def fit_log_noise(
     sizes = most_likely_sizes(residual, variance, 1 / count[group], terms)
     deviation = np.sqrt(np.maximum(variance + terms @ sizes**2, np.finfo(float).tiny))
     floor, fraction, lag = map(jnp.asarray, sizes)
-    wider = float(student_t.ppf(0.5 + COVERAGE / 2, repetitions)) / NORMAL_MULTIPLE
+    wider = student_factor(repetitions)
     return LogNoise(floor, fraction, lag, jnp.asarray(wider * _multiple(np.abs(residual) / deviation, group)))
 
 
