@@ -83,8 +83,6 @@ class FrameInterpolant:
 
     | attribute | meaning                                                       |
     |-----------|---------------------------------------------------------------|
-    | error     | estimate of the largest error, V                              |
-    | solves    | number of solved frames                                       |
     | wanted    | points of the frames that it needs next, (points, d); or none |
     """
 
@@ -103,9 +101,18 @@ class FrameInterpolant:
         if terms.error > self._tolerance * terms.change and terms.following is not None:
             terms.want(terms.following)
         self.wanted = self._at(terms.places)
-        self.error, self.solves = terms.error, len(terms.known)
         if not len(self.wanted):
             self._series = terms.dense()
+
+    @property
+    def error(self) -> float:
+        """Estimate of the largest error, V."""
+        return self._terms.error
+
+    @property
+    def solves(self) -> int:
+        """Number of solved frames."""
+        return len(self._terms.known)
 
     def __call__(self, q: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
         """Frames at points ``q``: one point for each reading of a frame (m readings), or one for all (m is 1)."""

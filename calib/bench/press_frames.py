@@ -1,14 +1,9 @@
 """Frames of the presses of a session: which polynomial gives which frame."""
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 from jaxtyping import Float, Int
 
 from .interpolation import SOLVED_TOGETHER, FrameInterpolant, SolveEach, enclosing_boxes, interpolants
-
-Frames = Callable[[Float[np.ndarray, "frames m d"]], Float[np.ndarray, "frames readings"]]
 
 
 class PressFrames:
@@ -26,21 +21,25 @@ class PressFrames:
         tolerance: float,
         extents: tuple[Float[np.ndarray, "presses phases d"], Float[np.ndarray, "presses phases d"]],
     ):
-        """Args:
-        solve: frames (points, readings) of presses, by their index (points,), at points (points, d).
-        rest: frame without contact.
-        tolerance: error over the largest change of a press; 0: every frame is solved.
-        extents: lowest and highest parameters in each phase of each press; infinite for a phase without samples.
+        """Divide the ranges of the parameters into boxes; nothing is solved yet.
+
+        Args:
+            solve: frames (points, readings) of presses, by their index (points,), at points (points, d).
+            rest: frame without contact.
+            tolerance: error over the largest change of a press; 0: every frame is solved.
+            extents: lowest and highest parameters in each phase of each press; infinite for a phase without samples.
         """
         self._solve, self._rest, self._tolerance = solve, rest, tolerance
         low, high = extents
         seen = np.isfinite(low) & np.isfinite(high)
         scale = np.where(seen, high, 0).max((0, 1)) - np.where(seen, low, 0).min((0, 1))
         parts = [enclosing_boxes(a, b, scale) for a, b in zip(low, high, strict=True)]
-        self._boxes = [boxes for boxes, _ in parts]
-        self._first = np.cumsum([0, *map(len, self._boxes)])  # the boxes of all presses are counted together
-        self._owners = np.array([owner for _, owner in parts]) + self._first[:-1, None]
-        self._made: dict[int, list[FrameInterpolant]] = {}
+        # The boxes of all presses are counted together.
+        self._boxes = [box for boxes, _ in parts for box in boxes]
+        counts = [len(boxes) for boxes, _ in parts]
+        self._press = np.repeat(np.arange(len(parts)), counts)
+        self._owners = np.array([owner for _, owner in parts]) + (np.cumsum(counts) - counts)[:, None]
+        self._made: dict[int, FrameInterpolant] = {}
         self.solves = 0
 
     def __call__(
@@ -56,19 +55,14 @@ class PressFrames:
         for number in range(first.min(), last.max() + 1):
             rows = np.flatnonzero((first <= number) & (number <= last))
             if len(rows):
-                frames = self._frames(number)(points[rows])
+                solved, part = self._tolerance == 0, points[rows]
+                frames = self._solved(int(self._press[number]), part) if solved else self._polynomial(number)(part)
                 out[rows] = np.where(box[rows] == number, frames, out[rows])
         return out
 
-    def solves_in(self, press: int) -> int:
-        """Number of solves that the polynomials of a press take."""
-        return sum(made.solves for made in self._polynomials(press))
-
-    def _frames(self, number: int) -> Frames:
-        press = int(np.searchsorted(self._first, number, side="right")) - 1
-        if self._tolerance == 0:
-            return partial(self._solved, press)
-        return self._polynomials(press)[number - int(self._first[press])]
+    def polynomials(self, press: int) -> list[FrameInterpolant]:
+        """The polynomials of a press."""
+        return [self._polynomial(number) for number in np.flatnonzero(self._press == press).tolist()]
 
     def _solved(self, press: int, points: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
         flat, back = np.unique(points.reshape(-1, points.shape[-1]), axis=0, return_inverse=True)
@@ -76,14 +70,14 @@ class PressFrames:
         solved = self._solve(np.full(len(flat), press), flat)
         return np.asarray(solved[back.reshape(points.shape[:2]), np.arange(len(self._rest))])
 
-    def _polynomials(self, press: int) -> list[FrameInterpolant]:
-        """The polynomials of a press. A press is always made with the same others, so that all bits are the same."""
-        if press not in self._made:
-            group = range(press - press % SOLVED_TOGETHER, len(self._boxes))[:SOLVED_TOGETHER]
-            of = np.repeat(group, [len(self._boxes[one]) for one in group])
-            boxes = [box for one in group for box in self._boxes[one]]
-            made = interpolants(boxes, lambda box, points: self._solve(of[box], points), self._rest, self._tolerance)
-            self._made = {past: self._made[past] for past in self._made if past >= group[0] - 1}
-            self._made |= {one: [each for each, its in zip(made, of, strict=True) if its == one] for one in group}
+    def _polynomial(self, number: int) -> FrameInterpolant:
+        """That of a box. A press is always made with the same others, so that all bits are the same."""
+        if number not in self._made:
+            group = self._press // SOLVED_TOGETHER == self._press[number] // SOLVED_TOGETHER
+            press, numbers = self._press[group], np.flatnonzero(group).tolist()
+            boxes = [self._boxes[each] for each in numbers]
+            made = interpolants(boxes, lambda box, points: self._solve(press[box], points), self._rest, self._tolerance)
+            self._made = {past: self._made[past] for past in self._made if self._press[past] >= press[0] - 1}
+            self._made |= zip(numbers, made, strict=True)
             self.solves += sum(one.solves for one in made)
-        return self._made[press]
+        return self._made[number]

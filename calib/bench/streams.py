@@ -293,7 +293,9 @@ class SimulatedEit(AbstractSimulatedStream):
 
     def solves_expected(self) -> int:
         """Number of solves in the whole session, if all presses need as many as the first."""
-        return self._frames.solves_in(0) * len(self.motion.start) if self._tolerance > 0 else self.samples
+        if self._tolerance == 0:
+            return self.samples
+        return sum(made.solves for made in self._frames.polynomials(0)) * len(self.motion.start)
 
     @cached_property
     def _frames(self) -> PressFrames:
