@@ -4,6 +4,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 
+def codes_of_pairs(pattern: Integer[np.ndarray, "k 4"]) -> tuple[Int[np.ndarray, "k 2"], int]:
+    """A number for each pair of a reading, whatever its direction; ``divmod`` of it by the second value is the pair."""
+    size = int(pattern.max()) + 1
+    return np.sort(pattern.reshape(-1, 2, 2), 2) @ [size, 1], size
+
+
 def cover(
     pattern: np.ndarray, weights: Float[np.ndarray, " k"] | Bool[np.ndarray, " k"], most: int | None = None
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "drives 2"]]:
@@ -12,8 +18,7 @@ def cover(
     Pairs are taken one by one, each time the one of the largest weight of readings not yet covered, until all readings
     with a weight are covered or ``most`` pairs are taken. A reading that is not covered has the number -1.
     """
-    size = int(pattern.max()) + 1
-    ends = np.sort(pattern.reshape(-1, 2, 2), 2) @ [size, 1]
+    ends, size = codes_of_pairs(pattern)
     found, left = np.full(len(pattern), -1), np.asarray(weights, float).copy()
     taken: list[tuple[int, int]] = []
     while left.any() and len(taken) < (len(pattern) if most is None else most):

@@ -194,7 +194,7 @@ def scan_time(protocol: Protocol, switch: float = 0.0) -> float:
     """
     drive = drives(protocol.rows("scan_time"))
     changes = int(np.sum(drive != np.roll(drive, 1)))
-    return float((protocol.slots[-1] + 1 + switch * changes) * protocol.reading_time)
+    return (protocol.frame_slots + switch * changes) * protocol.reading_time
 
 
 def in_frame(

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, Integer
 
 from .._compile import verb
 from .criteria import AbstractCriterion
+from .driven_pairs import codes_of_pairs
 from .exchange import MIN_GAIN, Cases, changes, covariance_of, information_of, inverse_of, mean_and_forms
 
 TRIES = 12  # exchanges that are tried before there is none
@@ -37,8 +38,7 @@ class Drives(NamedTuple):
     @staticmethod
     def of(pattern: Integer[np.ndarray, "candidates 4"], pairs: Integer[np.ndarray, "pairs 2"] | None) -> "Drives":
         """Those among ``pairs``; None: all pairs that a candidate names."""
-        size = int(pattern.max()) + 1
-        ends = np.sort(pattern.reshape(-1, 2, 2), 2) @ [size, 1]
+        ends, size = codes_of_pairs(pattern)
         codes = np.unique(ends) if pairs is None else np.sort(pairs, 1) @ [size, 1]
         found = [np.flatnonzero((ends == code).any(1)) for code in codes]
         longest = max(map(len, found))
@@ -125,9 +125,9 @@ def improved(
         mean, worth, loss = (np.asarray(part) for part in _worths(criterion, cases, _flags(cases, slots)))
         found = search.reading(slots, float(mean), worth, loss) or search.slot(slots, float(mean), worth, loss)
         if found is None:
-            break
+            return slots, float(mean)
         slots = filled(drives, -worth, frame, found)  # where a drive was given up, there may be time for a slot
-    return slots, float(_mean(criterion, cases, _flags(cases, slots)))
+    return slots, float(_worths(criterion, cases, _flags(cases, slots))[0])
 
 
 class _Search(NamedTuple):
@@ -197,11 +197,6 @@ def _best(change: Float[np.ndarray, " n"]) -> Int[np.ndarray, " tries"]:
 def _flags(cases: Cases, slots: Slots) -> Float[Array, " candidates"]:
     """One for each candidate that is taken, zero for others."""
     return jnp.asarray(slots.owner >= 0, cases.alive.dtype)
-
-
-@verb
-def _mean(criterion: AbstractCriterion, cases: Cases, taken: Float[Array, " candidates"]) -> Float[Array, ""]:
-    return mean_and_forms(criterion, covariance_of(cases, taken))[0]
 
 
 @verb

@@ -154,6 +154,11 @@ class Protocol:
         return np.cumsum(since % self.sense_channels == 0) - 1
 
     @property
+    def frame_slots(self) -> int:
+        """Number of slots in a frame: its duration over that of a reading."""
+        return int(self.slots[-1]) + 1
+
+    @property
     def reading_offsets(self) -> Float[np.ndarray, " readings"]:
         """When each reading is taken, in seconds after the first."""
         return self.slots * self.reading_time
@@ -161,7 +166,7 @@ class Protocol:
     @property
     def frame_time(self) -> float:
         """Duration of one scan in seconds."""
-        return float((self.slots[-1] + 1) * self.reading_time)
+        return self.frame_slots * self.reading_time
 
     def check(self, electrodes: int) -> "Protocol":
         """This protocol; raises ProtocolError if a row names an electrode outside 0 to ``electrodes`` - 1."""

@@ -149,7 +149,7 @@ def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
     if protocol.reading_time == 0:
         if args.rate is not None:
             raise ValueError(f"--rate: the readings of {skin.name} take no time; give reading_time, or --readings")
-        return int(protocol.slots[-1]) + 1
+        return protocol.frame_slots
     time = je.scan.scan_time(protocol, args.switch) if args.rate is None else 1 / args.rate
     found = int(time / protocol.reading_time * (1 + 1e-9))
     if found < 1:
@@ -194,7 +194,7 @@ def _figures(skin: "je.Skin", sensitivity: "PlaceSensitivity", switch: float) ->
     electrode, dead = sensitivity.worst_dead(pattern)
     time = je.scan.scan_time(skin.protocol, switch)
     channels = skin.protocol.sense_channels
-    at_once = {f"times of reading, {channels} at once": f"{skin.protocol.slots[-1] + 1:,}"} if channels > 1 else {}
+    at_once = {f"times of reading, {channels} at once": f"{skin.protocol.frame_slots:,}"} if channels > 1 else {}
     return {
         "readings": f"{len(pattern):,}",
         **at_once,
