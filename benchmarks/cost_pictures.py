@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calib.report.figures.parts import write_figure
 
-from .figures import BLUE, GREY, ORANGE, logarithmic, panels
+from .figures import BLUE, GREY, ORANGE, legend, logarithmic, panels
 from .harness import ROOT
 from .markdown import cell
 from .rows import Row, grouped
@@ -45,7 +44,8 @@ def frames(results: Row) -> Figure:
                 axes.plot(times["p50_ms"], place + shift, "o", color=colour, markersize=4)
     _named(axes, names)
     axes.set(xscale="log", xlabel="ms from the readings of a frame to its image: median (dot) to 99th percentile")
-    axes.legend(handles=_handles({"frame after frame": BLUE, "after other work": ORANGE}), frameon=False, fontsize=8)
+    looks = {"frame after frame": BLUE, "after other work": ORANGE}
+    legend(figure, [{"label": label, "color": colour, "marker": "o"} for label, colour in looks.items()], 2)
     return figure
 
 
@@ -140,10 +140,6 @@ def _named(axes: Any, names: Sequence[str]) -> None:
     axes.set_yticks(np.arange(len(names)), names, fontsize=8)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _handles(colours: dict[str, str]) -> list[Any]:
-    return [Line2D([], [], color=colour, marker="o", markersize=4, label=name) for name, colour in colours.items()]
 
 
 def draw(results: Row) -> None:

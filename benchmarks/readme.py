@@ -21,12 +21,12 @@ def main() -> None:
     set_up()
     with calib.open_session(ROOT / "data" / "sessions" / "testbed_grid.h5") as session:
         calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge()))
-    results = table("results", calibration.evaluation.summary())
+    results, stored = table("results", calibration.evaluation.summary()), measured()
     for page in PAGES:
-        text = filled(replaced(page.read_text(encoding="utf-8"), "results", results), measured())
+        text = filled(replaced(page.read_text(encoding="utf-8"), "results", results), stored)
         with replacing(page) as new:
             new.write_text(text, encoding="utf-8")
-    draw(measured())
+    draw(stored)
     figure = sensitivity_figure(calibration.evaluation, calibration.skin, simulated=True)
     write_figure(figure, ROOT / "docs" / "sensitivity.png")
 
