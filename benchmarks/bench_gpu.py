@@ -1,4 +1,4 @@
-"""A GPU at forward solves, Jacobians, gradients and training, in both precisions, alone and in batches.
+"""A GPU at forward solves, Jacobians, gradients, training and the ladder, in both precisions, alone and in batches.
 
 Conductivities lie on the device before a call, and results stay there. Before a clock is read, voltages are compared
 with those of SuperLU in float64 on the host; Jacobians and gradients with ours in float64 on the CPU. Beside ours stand
@@ -9,6 +9,7 @@ Without a GPU it says so. With ``--smoke`` it runs on a CPU as well.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -31,6 +32,18 @@ from .tools import MAX_FLOAT32_DIFFERENCE, basis_of
 LOOSE = {"float32": MAX_FLOAT32_DIFFERENCE, "float64": 1e-8}
 CHECKED = 3  # conductivities of a batch whose voltages are compared
 LARGEST_DENSE = 30  # cells a side
+LADDER = (
+    "draft",
+    "draft f32",
+    "draft P2",
+    "draft P2 f32",
+    "standard",
+    "standard f32",
+    "fine",
+    "reference f32",
+    "reference",
+)
+RUNG = ("label", "nodes", "unknowns", "voltage_error", "difference_error", "forward", "jacobian")
 
 
 @cache
@@ -225,6 +238,16 @@ def learning(run: Run) -> Iterator[Row]:
     yield {"training": [{"steps_per_s": steps / spent, "frames_per_s": count / spent, "first_epoch_s": first}]}
 
 
+def ladder(run: Run) -> Iterator[Row]:
+    """The rungs of the testbed's ladder: their errors and times on this device, without images."""
+    named = {choice.label: replace(choice, imaging=None) for choice in je.accuracy.fidelity_choices()}
+    labels = run.sizes(LADDER, LADDER[:2])
+    reference = (je.Fidelity.standard(order=2), je.Fidelity.reference(order=2)) if run.smoke else None
+    found = je.ladder(je.Scene(je.load_skin("testbed")), [named[label] for label in labels], reference=reference)
+    print(found.table(), flush=True)
+    yield {"ladder": [{k: row[k] for k in RUNG} for row in found.summary()["rungs"]]}
+
+
 PARTS = {
     "limits": limits,
     "singles": singles,
@@ -232,6 +255,7 @@ PARTS = {
     "gradients": gradients,
     "peers": peers,
     "training": learning,
+    "ladder": ladder,
 }
 main = Question("gpu", __doc__, PARTS)
 

@@ -179,12 +179,17 @@ def _paper(results: Row) -> Iterator[Row]:
 
 
 def _ladder(skin: int) -> Callable[[Row], Iterator[Row]]:
-    """The rungs of a skin that name a fidelity or lie on the front of error against time of a forward solve."""
+    """The rungs of a skin that name a fidelity or lie on the front of error against time of a forward solve.
 
-    def rows(results: Row) -> Iterator[Row]:
+    The times of a GPU stand beside them where its results are given.
+    """
+
+    def rows(results: Row, gpu: Row | None = None) -> Iterator[Row]:
+        beside = {row["label"]: row for row in (gpu or {"ladder": []})["ladder"]}
         for row in results["ladders"][skin]["rungs"]:
             if row["front"] or row["label"] in ("draft", "standard", "reference"):
-                yield row | {"name": f"**{row['label']}**" if row["front"] else row["label"]}
+                name = f"**{row['label']}**" if row["front"] else row["label"]
+                yield row | {"name": name, "gpu": beside.get(row["label"], {})}
 
     return rows
 

@@ -8,7 +8,7 @@ from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings
 from jaxeit.tracking.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
 
-from .conftest import SECONDS, load
+from .conftest import SECONDS, in_double_precision, load
 
 
 def silent(tracker):
@@ -101,22 +101,23 @@ def test_missing_readings_are_left_out(tracker, frame_of, followed):
 
 def test_an_update_is_the_conditional_normal_distribution(tracker, followed):
     """At a frame as it is expected: the covariance given the frame, by dense algebra."""
-    filter_, belief = tracker.filter, predicted(tracker.filter, followed[0][6].belief, jnp.asarray(SECONDS))
+    filter_, belief = map(in_double_precision, (tracker.filter, followed[0][6].belief))
+    belief = predicted(filter_, belief, jnp.asarray(SECONDS))
     active = np.asarray(active_numbers(filter_, belief.contacts))
     contacts = belief.contacts[:, :SEEN]
     shown = filter_.sheet.shown(contacts, belief.gain, jnp.asarray(active[SEEN:] - SIZE), filter_.sheet.near(contacts))
     y, compress = np.asarray(shown.readings), np.asarray(filter_.compress)
     frame = np.linalg.lstsq(compress, y)[0]
-    np.testing.assert_allclose(compress @ frame, y, atol=1e-6)
+    np.testing.assert_allclose(compress @ frame, y, atol=1e-9)
     found = updated(filter_, belief, frame, silent(tracker), jnp.asarray(1e3)).belief
-    np.testing.assert_allclose(found.contacts, belief.contacts, atol=1e-5)
+    np.testing.assert_allclose(found.contacts, belief.contacts, atol=1e-9)
     slopes, prior = np.zeros((len(y), len(belief.covariance))), np.asarray(belief.covariance)
     slopes[:, active] = np.asarray(shown.reading_slopes).T
     variance = 1 + float(filter_.error_share) * (y @ y) / len(y)
     gain = np.linalg.solve(slopes @ prior @ slopes.T + variance * np.eye(len(y)), slopes @ prior).T
     wanted = prior - gain @ slopes @ prior
     scale = np.sqrt(np.diag(wanted))
-    np.testing.assert_allclose((np.asarray(found.covariance) - wanted) / np.outer(scale, scale), 0, atol=1e-3)
+    np.testing.assert_allclose((np.asarray(found.covariance) - wanted) / np.outer(scale, scale), 0, atol=1e-9)
 
 
 def test_a_belief_moves_by_the_integrated_random_walk(tracker, followed):
