@@ -1,14 +1,18 @@
 """Start-up times of fresh processes: imports, help, and the README's first program.
 
 Times are from the start of a process to its end.  The program runs without a cache of compiled programs, with an empty
-cache, and with the cache that this run filled.
+cache, and with the cache that this run filled; `phases` says what JAX spends of it on tracing, on lowering, and on
+compiling or on reading the cache.
 """
 
+import json
 import re
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import partial
+
+import numpy as np
 
 from .clock import fresh, in_turns, spread
 from .harness import ROOT, Question, Run
@@ -26,6 +30,20 @@ COMMANDS = {
 }
 
 
+EVENTS = {
+    "tracing": "/jax/core/compile/jaxpr_trace_duration",
+    "lowering": "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "compiling, or reading the cache": "/jax/core/compile/backend_compile_duration",
+}
+LISTENING = """
+import atexit, collections, json, time
+from jax import monitoring
+spent = collections.Counter()
+monitoring.register_event_duration_secs_listener(lambda name, seconds, **_: spent.update({name: seconds}))
+atexit.register(lambda: print(json.dumps(spent)))
+"""
+
+
 def measure(run: Run) -> Iterator[Row]:
     """Commands in turn, whose first round fills the system's file caches; then the program."""
     calls = {name: partial(fresh, code) for name, code in COMMANDS.items()}
@@ -33,6 +51,7 @@ def measure(run: Run) -> Iterator[Row]:
     yield {"rows": [{"start": name, **spread(taken[1:])} for name, taken in times.items()]}
     if not run.smoke:
         yield {"rows": programs(3)}
+        yield {"phases": phases(3)}
 
 
 def program() -> str:
@@ -48,11 +67,24 @@ def programs(repeats: int) -> list[Row]:
     """The first program without a cache, with an empty one, and with a full one."""
     code, times = program(), defaultdict(list)
     for _ in range(repeats):
-        times["no cache"].append(fresh(code))
+        times["no cache"].append(fresh(code)[0])
         with tempfile.TemporaryDirectory() as folder:
             for name in ("empty cache", "full cache"):
-                times[name].append(fresh(code, cache=folder))
+                times[name].append(fresh(code, cache=folder)[0])
     return [{"start": f"the README's program, {name}", **spread(taken)} for name, taken in times.items()]
+
+
+def phases(repeats: int) -> list[Row]:
+    """What the first program spends in JAX without a cache and with a full one, s, and on how many programs."""
+    code = LISTENING + program()
+    found: Row = {name: {"phase": name} for name in EVENTS}
+    with tempfile.TemporaryDirectory() as folder:
+        fresh(code, cache=folder)
+        for key, cache in (("no_cache_s", ""), ("full_cache_s", folder)):
+            runs = [json.loads(fresh(code, cache=cache)[1].splitlines()[-1]) for _ in range(repeats)]
+            for name, event in EVENTS.items():
+                found[name][key] = float(np.median([run[event] for run in runs]))
+    return list(found.values())
 
 
 main = Question("start", __doc__, {"rows": measure})

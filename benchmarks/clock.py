@@ -134,13 +134,14 @@ CACHE = {  # as the command line sets it, calib/runtime.py
 }
 
 
-def fresh(code: str, cache: str = "") -> float:
-    """Seconds of a fresh Python that runs the code, with a folder for compiled programs, or none."""
+def fresh(code: str, cache: str = "") -> tuple[float, str]:
+    """Seconds of a fresh Python that runs the code, with a folder for compiled programs, or none; and what it prints."""
     ours = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", *CACHE)
     environment = {name: value for name, value in os.environ.items() if name not in ours}
     environment |= CACHE | {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
     how: Any = {"cwd": Path(__file__).parents[1], "env": environment, "capture_output": True, "check": True}
-    return seconds(lambda: subprocess.run([sys.executable, "-c", code], **how))[0]
+    spent, done = seconds(lambda: subprocess.run([sys.executable, "-c", code], text=True, **how))
+    return spent, done.stdout
 
 
 def limits() -> dict[str, float]:

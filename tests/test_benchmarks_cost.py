@@ -399,7 +399,10 @@ def test_tables_of_the_pages(root):
                 | {name: {"exponent": 1.2, "theory": "1 to 1.5"} for name in ("time", "memory")}
             ]
         },
-        "start": {"rows": [{"start": "import jaxeit", **spread}]},
+        "start": {
+            "rows": [{"start": "import jaxeit", **spread}],
+            "phases": [{"phase": "tracing", "no_cache_s": 0.5, "full_cache_s": 0.5}],
+        },
     }
     stages = dict.fromkeys(("reading", "model and images", "fitting", "holding out", "all"), 0.125)
     results["fit"] = {"end_to_end": [{"session": "bundled", "location": "no", "call": "later"} | stages]}
