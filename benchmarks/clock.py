@@ -135,7 +135,7 @@ CACHE = {  # as the command line sets it, calib/runtime.py
 
 
 def fresh(code: str, cache: str = "") -> tuple[float, str]:
-    """Seconds of a fresh Python that runs the code, with a folder for compiled programs, or none; and what it prints."""
+    """Seconds of a fresh Python that runs the code, with a folder of compiled programs or none; and what it prints."""
     ours = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", *CACHE)
     environment = {name: value for name, value in os.environ.items() if name not in ours}
     environment |= CACHE | {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}

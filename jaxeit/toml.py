@@ -168,7 +168,7 @@ class TomlTable:
 
     def choice(self, key: str, *names: str, default: Any = ...) -> str:
         """One of ``names``; errors as for `get`."""
-        meaning = "one of " + ", ".join(f'"{name}"' for name in names)
+        meaning = ("one of " if len(names) > 1 else "") + ", ".join(f'"{name}"' for name in names)
         chosen: str = self.get(key, lambda v: v in names, meaning, default)
         return chosen
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..session.errors import printable
 from .report import ChannelTable, CheckReport, Finding, PadRow, Severity, StreamRow, counted
+from .streams.clocks import beside
 
 TEXT_WIDTH = 96
 MAX_LISTED = 10  # rejected presses and readings on a page
@@ -133,7 +134,7 @@ def _presses(report: CheckReport) -> Iterator[str]:
     for name, onset in report.onsets:
         if onset.presses:
             yield (
-                f"  {printable(name, 16)} rises {round(1e3 * onset.delay):+d} ms after the force "
+                f"  {printable(name, 16)} rises {beside(onset.delay)} the force "
                 f"(spread {1e3 * onset.spread:.0f} ms, {counted(onset.presses, 'press', 'presses')})"
             )
 

@@ -14,6 +14,7 @@ from .windows import PressWindows
 
 RISE_FRACTIONS = (0.2, 0.5, 0.8)  # of the way from rest to hold: far from noise at either end
 HALF = RISE_FRACTIONS.index(0.5)
+EARLY_ROUNDS = 4  # the rest before the force holds the rise of an early stream: its windows move by the delay found
 
 
 @dataclass(frozen=True)
@@ -48,22 +49,17 @@ def crossing(time: np.ndarray, signal: np.ndarray, level: float) -> float:
     return float(time[i] + part * (time[i + 1] - time[i]))
 
 
-def _magnitude(values: np.ndarray) -> np.ndarray:
-    """Reduce many channels to one signal: the norm over the channels that are finite throughout."""
-    good = np.isfinite(values).all(axis=0)
-    return np.asarray(np.linalg.norm(values[:, good], axis=1))
-
-
 def _rise_times(stream: ReadableStream, windows: PressWindows, i: int) -> list[float]:
-    """Times (ns) from the contact to the rise through `RISE_FRACTIONS` of the way from rest to hold."""
+    """Times (ns) of the rise through `RISE_FRACTIONS` of the way from rest to hold."""
     time, values = remove_baseline(stream, windows, i, TwoSided(), ())
-    signal = _magnitude(values)
-    rest, hold = (
-        float(signal[slice(*index_ranges(time, getattr(windows, name)[i]))].mean()) for name in ("rest_before", "hold")
-    )
+    values = values[:, np.isfinite(values).all(axis=0)]
+    rests, holds = (values[slice(*index_ranges(time, getattr(windows, n)[i]))].mean(0) for n in ("rest_before", "hold"))
+    # Along the change that the press makes: a norm would fold where a stream is early and its rest is none.
+    signal = values @ (holds - rests)
+    rest, hold = rests @ (holds - rests), holds @ (holds - rests)
     stop = np.searchsorted(time, windows.hold[i, 0])
     levels = [rest + fraction * (hold - rest) for fraction in RISE_FRACTIONS]
-    return [crossing(time[:stop], signal[:stop], level) - float(windows.ramp[i, 0]) for level in levels]
+    return [crossing(time[:stop], signal[:stop], level) for level in levels]
 
 
 def onset_delays(
@@ -79,11 +75,19 @@ def onset_delays(
     """
     rows = np.flatnonzero(presses.accepted)
 
-    def rise_times(stream: ReadableStream) -> np.ndarray:
-        return np.array([_rise_times(stream, windows, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS))
+    def rise_times(stream: ReadableStream, seen: PressWindows) -> np.ndarray:
+        return np.array([_rise_times(stream, seen, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS))
 
-    reference = rise_times(force)
-    return {stream.name: _onset_delay(rise_times(stream) - reference) for stream in others}
+    reference, found = rise_times(force, windows), {}
+    for stream in others:
+        delays = rise_times(stream, windows) - reference
+        for _ in range(EARLY_ROUNDS):
+            early = float(np.nanmedian(delays[:, HALF])) if np.isfinite(delays[:, HALF]).any() else 0.0
+            if early >= 0:
+                break
+            delays = rise_times(stream, windows.moved(round(early))) - reference
+        found[stream.name] = _onset_delay(delays)
+    return found
 
 
 def _onset_delay(delays: np.ndarray) -> OnsetDelay:

@@ -29,6 +29,10 @@ class PressWindows:
         """Windows of some of the presses."""
         return PressWindows(*(getattr(self, field.name)[index] for field in fields(self)))
 
+    def moved(self, step: int) -> "PressWindows":
+        """All windows later by ``step``, ns."""
+        return PressWindows(*(getattr(self, field.name) + step for field in fields(self)))
+
 
 @dataclass(frozen=True)
 class WindowLengths:

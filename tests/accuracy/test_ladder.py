@@ -289,6 +289,14 @@ def test_an_unknown_skin_is_one_line_that_names_those_there_are(what, capsys):
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(("line", "said"), [('format = "jaxeit-skim"', "is 'jaxeit-skim'"), ("", "missing")])
+def test_a_file_of_neither_kind_is_told_which_there_are(line, said, tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text(f"{line}\nversion = 1\n")
+    assert calib.cli.main(["bench", str(path)]) == 2
+    assert f'{path}: format: {said}; give "jaxeit-skin" or "jaxeit-scene"' in capsys.readouterr().err
+
+
 def test_scenes_and_skins_are_told_apart(tmp_path, root, skin):
     (tmp_path / "mine.toml").write_text(skin.toml)
     assert bench_scene(str(tmp_path / "mine.toml")).effects == ()

@@ -559,9 +559,18 @@ def test_millimetres_put_presses_outside_the_sheet(parts, look):
     only(look(parts), Severity.ERROR, "2 of 2 presses lie outside the sheet")
 
 
-def test_clocks_that_disagree(parts, look):
-    parts.change("pressure", np.roll(parts.values("pressure"), 80, 0))
-    only(look(parts), Severity.ERROR, "/streams/pressure", "rises +0.80")
+@pytest.mark.parametrize(("rows", "said"), [(80, "rises 0.800 s after"), (-80, "rises 0.800 s before")])
+def test_clocks_that_disagree(parts, look, rows, said):
+    parts.change("pressure", np.roll(parts.values("pressure"), rows, 0))
+    only(look(parts), Severity.ERROR, "/streams/pressure", said)
+
+
+@pytest.mark.parametrize("rows", [-60, -15, 0, 15, 60])
+def test_the_delay_of_a_stream_is_found_in_either_direction(parts, look, rows):
+    """Also where the rest before a press holds the rise of a stream that is early."""
+    plain = dict(look(parts).onsets)["pressure"].delay
+    parts.change("pressure", np.roll(parts.values("pressure"), rows, 0))
+    assert dict(look(parts).onsets)["pressure"].delay - plain == pytest.approx(0.01 * rows, abs=2e-3)
 
 
 def test_damaged_samples_are_a_finding(parts, tmp_path, transfer):

@@ -300,9 +300,9 @@ LIES = {
     ),
     # time
     "EIT 0.5 s late": Lie(late("eit", 0.5), ERROR, ("/streams/eit", "after the force")),
-    "pressure 0.5 s early": Lie(late("pressure", -0.5), ERROR, ("/streams/pressure", "after the force")),
-    "pressure 7 s late": Lie(late("pressure", 7.0), ERROR, ("/streams/pressure", "+7.0", "when moved")),
-    "EIT 9 s late": Lie(late("eit", 9.0), ERROR, ("/streams/eit", "+9.0", "when moved")),
+    "pressure 0.5 s early": Lie(late("pressure", -0.5), ERROR, ("/streams/pressure", "0.500 s before the force")),
+    "pressure 7 s late": Lie(late("pressure", 7.0), ERROR, ("/streams/pressure", "7.000 s after", "when moved")),
+    "EIT 9 s late": Lie(late("eit", 9.0), ERROR, ("/streams/eit", "9.000 s after", "when moved")),
     "table of another recording": Lie(
         lambda r: r.pressed(
             **{n: getattr(r.presses, n) + 10**12 for n in r.presses.__dataclass_fields__ if n[:2] == "t_"}

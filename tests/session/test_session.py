@@ -485,6 +485,12 @@ def test_foreign_and_old_hdf5_is_refused(tmp_path: Path) -> None:
         assert words in refusal(tmp_path / "s.h5")
 
 
+@pytest.mark.parametrize(("text", "said"), [('a = "b"\n[c]\n', "looks like TOML"), ("a,b\n1,2\n", "looks like CSV")])
+def test_text_is_told_apart(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "s.h5").write_text(text)
+    assert said in refusal(tmp_path / "s.h5")
+
+
 def test_an_unfinished_recording_opens_and_says_so(good: Path, tmp_path: Path) -> None:
     path = changed(good, tmp_path, lambda f: f.attrs.modify("complete", np.uint8(0)))
     with open_session(path) as s:

@@ -21,6 +21,11 @@ MAX_LAG = 60.0  # s
 MIN_CORRELATION, MIN_GAIN = 0.7, 0.3  # of the streams when moved by the lag, and over that when they are not moved
 
 
+def beside(delay: float) -> str:
+    """A delay, s, in words: "0.800 s before"."""
+    return f"{abs(delay):.3f} s {'before' if delay < 0 else 'after'}"
+
+
 def compare_clocks(
     streams: Mapping[str, Stream], evidence: PressEvidence, findings: list[Finding]
 ) -> tuple[tuple[str, OnsetDelay], ...]:
@@ -33,7 +38,7 @@ def compare_clocks(
     for name, onset in onsets.items():
         allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / streams[name].nominal_rate
         if onset.presses and abs(onset.shift) > max(allowed, SPREADS * onset.spread):
-            what = f"rises {onset.delay:+.3f} s after the force; the ramp takes {ramp:.2f} s"
+            what = f"rises {beside(onset.delay)} the force; the ramp takes {ramp:.2f} s"
             findings.append(_disagreement(name, what))
     return tuple(sorted(onsets.items()))
 
@@ -44,7 +49,7 @@ def lag_findings(statistics: Mapping[str, StreamStatistics], known: list[Finding
     if force is None or len(force.time) < 2 or not force.finite.any():
         return
     values = np.nan_to_num(force.stream.read()[:, 0], nan=0.0)
-    late = {f.where for f in known if "after the force" in f.what}
+    late = {f.where for f in known if "the force; the ramp takes" in f.what}
     for name in ("eit", "pressure"):
         stats = statistics.get(name)
         if stats is None or f"/streams/{name}" in late or len(stats.time) < 2:
@@ -52,7 +57,7 @@ def lag_findings(statistics: Mapping[str, StreamStatistics], known: list[Finding
         lag, moved, unmoved = stream_lag((force.time, values), (stats.time, np.nan_to_num(stats.activity)))
         if moved > MIN_CORRELATION and moved - abs(unmoved) > MIN_GAIN:
             what = (
-                f"comes {lag:+.2f} s after the force: they correlate by {moved:.2f} when moved by as much, "
+                f"comes {beside(lag)} the force: they correlate by {moved:.2f} when moved by as much, "
                 f"by {unmoved:.2f} as recorded"
             )
             yield _disagreement(name, what)

@@ -94,9 +94,13 @@ def bench_scene(what: str) -> "Scene":
     if not path.exists() and what not in presets():
         known = ", ".join((*je.skin.shipped_skins(), *presets()))
         raise ValueError(f"{what}: no such file, skin or scene; shipped are {known}")
-    if path.is_file() and re.search(r'^format\s*=\s*"jaxeit-skin"', je.toml.read_text(path), re.MULTILINE):
-        return je.Scene(je.load_skin(path))
-    return load_bench(what).scene
+    if not path.is_file():
+        return load_bench(what).scene
+    named = re.search(r"^format\s*=\s*[\"'](.*?)[\"']", je.toml.read_text(path), re.MULTILINE)
+    if named and named[1] in ("jaxeit-skin", "jaxeit-scene"):
+        return je.Scene(je.load_skin(path)) if named[1] == "jaxeit-skin" else load_bench(what).scene
+    found = f"is {named[1]!r}" if named else "missing"
+    raise ValueError(f'{what}: format: {found}; give "jaxeit-skin" or "jaxeit-scene"')
 
 
 def _write_ladder_figure(found: "Ladder", path: Path) -> None:

@@ -8,6 +8,7 @@ bounded numbers of members and attributes. Values are plain numbers and fixed-le
 
 import contextlib
 import os
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -114,9 +115,11 @@ def _foreign_kind(head: bytes) -> tuple[str, str]:
         return "is a classic netCDF file, not HDF5", "convert it with `nccopy -k nc4`"
     if head.startswith(b"\x1f\x8b"):
         return "is a gzip file, not HDF5", "unpack it, or use `jaxeit import csv` for a table"
-    if all(32 <= b < 127 or b in b"\t\r\n" or b >= 128 for b in head):
-        return "is text, not HDF5; it looks like CSV", "use `jaxeit import csv`"
-    return "is not an HDF5 file", sessions
+    if not all(32 <= b < 127 or b in b"\t\r\n" or b >= 128 for b in head):
+        return "is not an HDF5 file", sessions
+    if re.search(rb"^(\[[\w.]+\]|\w+ *= *\S.*)\s*$", head, re.MULTILINE):
+        return "is text, not HDF5; it looks like TOML", sessions + "; `jaxeit simulate` makes one of a scene"
+    return "is text, not HDF5; it looks like CSV", "use `jaxeit import csv`"
 
 
 def _check_superblock(path: Path, head: bytes) -> None:
