@@ -12,6 +12,7 @@ from jaxeit.files import open_regular
 from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
 
+from .instruments import instrument_tank, is_instrument
 from .matlab import eidors_tank, is_ktc, ktc_tank, read_matlab
 from .recording import Tank, TankError, tank_of
 from .texts import pyeidors_tank, sciospec_tank
@@ -25,7 +26,8 @@ def load_tank(
     """A tank and its frames, from any file that this room reads.
 
     Args:
-        path: .mat (EIDORS or the Kuopio challenge), .csv (PyEIDORS), .eit (Sciospec), .npz, or a folder of .eit files.
+        path: .mat (EIDORS or the Kuopio challenge), .csv (PyEIDORS), .eit (Sciospec, CareFusion, Draeger), .get
+            (GOE-MF II, Draeger), .npz, or a folder of .eit files of Sciospec.
         domain: shape of the tank, where the file has none (all but .mat), such as ``je.Disc(0.03)``.
         rim: its electrodes; default: `je.skin.rim_electrodes`, electrode 0 at +x, counter-clockwise.
         skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone; in place of ``domain`` and
@@ -45,11 +47,11 @@ def load_tank(
     if kind == ".mat":
         variables = read_matlab(path)
         return ktc_tank(path, variables) if is_ktc(variables) else eidors_tank(path, variables)
-    if kind == ".eit":
+    if kind == ".eit" and not is_instrument(path):
         return load_sciospec([path], domain, rim)
-    readers = {".csv": load_pyeidors, ".npz": load_npz}
+    readers = {".csv": load_pyeidors, ".npz": load_npz, ".get": load_instrument, ".eit": load_instrument}
     if kind not in readers:
-        raise TankError(f"{path.name}: is no file of a tank by its name; give .mat, .csv, .eit or .npz")
+        raise TankError(f"{path.name}: is no file of a tank by its name; give .mat, .csv, .eit, .get or .npz")
     return readers[kind](path, domain, rim)
 
 
@@ -94,6 +96,21 @@ def load_sciospec(paths: Sequence[str | Path], domain: Domain | None = None, rim
     Arguments as for `load_tank`.
     """
     return sciospec_tank([Path(path) for path in paths], domain, rim)
+
+
+def load_instrument(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+    """A binary file of an instrument for the chest: .get of GOE-MF II or Draeger, .eit of CareFusion or Draeger.
+
+    16 electrodes, adjacent readings. No format is documented: the unit of readings is not known, so that the level of
+    the conductivity has no meaning. Arguments as for `load_tank`.
+
+    Raises:
+        TankError: for a file that was cut short, of an unknown version, or without frames.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".get" and not is_instrument(path):
+        raise TankError(f"{path.name}: does not begin like a file of CareFusion or Draeger")
+    return instrument_tank(path, domain, rim)
 
 
 def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:

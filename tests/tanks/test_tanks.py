@@ -1,7 +1,6 @@
 """Files of tanks, written here as other programs write them; the programs of docs/tanks.md on them."""
 
 import itertools
-from types import SimpleNamespace
 
 import h5py
 import jax.numpy as jnp
@@ -17,24 +16,11 @@ from calib.tanks import TankError, difference_image, load_tank
 
 from ..helpers import REAL_DATA, skin_of
 from ..test_docs import blocks, run
+from .rods import COUNT, CURRENT, PLACE, RADIUS, sees_the_rod
 
 pytest.importorskip("matplotlib")
-COUNT, RADIUS, CURRENT = 16, 0.03, 5.5e-5
-PLACE = np.array([0.012, 0.008])  # of a conductive rod
 RING = np.eye(COUNT) - np.roll(np.eye(COUNT), 1, 0)
 CSV = "tank_55uA_1000Hz.csv"
-
-
-@pytest.fixture(scope="module")
-def bench():
-    """A tank with adjacent readings before and after a rod was put in, and potentials for any currents."""
-    disc = je.Disc(RADIUS)
-    rim = je.skin.rim_electrodes(disc, COUNT, contact=2e-3)
-    skin = skin_of(disc, rim, je.skin.adjacent(COUNT), current=CURRENT)
-    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.06))
-    rod = jnp.linalg.norm(model.centroids - PLACE, axis=1) < 0.004
-    frames = [je.forward(model, jnp.where(rod, gain, 1.0) * model.background) for gain in (1.0, 5.0)]
-    return SimpleNamespace(skin=skin, model=model, frames=np.array(frames))
 
 
 def _write_csv(path, frames):
@@ -119,21 +105,13 @@ def _write_v73(path, variables):
     return path
 
 
-def _sees_the_rod(tank, tolerance=0.005):
-    found = difference_image(tank, basis=je.Pixels(24))
-    place = np.asarray(found.recon.centres)[np.argmax(found.change)]
-    np.testing.assert_allclose(place, PLACE, atol=tolerance)
-    assert found.correlation > 0.98
-    return found
-
-
 def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
     tank = load_tank(_write_mat(tmp_path / "tank.mat", bench))
     assert tank.names == ("vh", "vi")
     np.testing.assert_array_equal(tank.frames, bench.frames)
     np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
     np.testing.assert_allclose(je.forward(tank.model()), bench.frames[0], rtol=1e-9)
-    found = _sees_the_rod(tank)
+    found = sees_the_rod(tank)
     assert found.background == pytest.approx(1.0)
     sparse = _forward_model(bench)["stimulation"].copy()
     for stimulation in sparse.flat:
@@ -170,7 +148,7 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
     assert (csv.skin.protocol.current, csv.skin.protocol.frequency) == (pytest.approx(CURRENT), 1000)
     np.testing.assert_allclose(csv.frames, bench.frames)
     np.testing.assert_allclose(csv.quadrature, -0.1 * bench.frames)
-    found = _sees_the_rod(csv)
+    found = sees_the_rod(csv)
     half = difference_image(csv, 0, 1, basis=je.Pixels(24))
     assert float(half.change.min()) < 0 < float(found.change.max())
 
@@ -200,7 +178,7 @@ def test_a_tank_whose_scan_is_named(bench, tmp_path, root, capsys):
     np.savez(path, frames=frames)
     tank = load_tank(path, skin=skin)
     assert tank.frames.shape == (2, 240)
-    _sees_the_rod(tank)
+    sees_the_rod(tank)
     words = ["image", str(path), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "picture.png")]
     assert main(words) == 0
     assert "16 electrodes, 240 readings" in capsys.readouterr().out

@@ -22,7 +22,8 @@ COLOURS = ("#ffffff", "#2166ac", "#b2182b")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A file of a tank, its geometry where the file has none, and the picture to write."""
     text = (
-        "MATLAB file of EIDORS or the Kuopio challenge, CSV of PyEIDORS, .eit of Sciospec or a folder of them, or NPZ"
+        "MATLAB file of EIDORS or the Kuopio challenge, CSV of PyEIDORS, .eit of Sciospec or a folder of them, .eit or "
+        ".get of Draeger, CareFusion or GOE-MF II, or NPZ"
     )
     parser.add_argument("tank", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", required=True, metavar="PICTURE.png", help="PNG, PDF or SVG by its name")
@@ -69,9 +70,14 @@ def run(args: argparse.Namespace) -> int:
     with replacing(Path(args.output)) as new:
         figure.savefig(new, format=kind, dpi=150)
     count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
-    print(f"{count} electrodes, {readings} readings, frames: {', '.join(tank.names)}")
+    print(f"{count} electrodes, {readings} readings, {_listed(tank.names)}")
     print("\n".join(lines))
     return 0
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """The names of frames, or the first and the last of a recording."""
+    return f"{len(names)} frames: {names[0]} to {names[-1]}" if len(names) > 12 else f"frames: {', '.join(names)}"
 
 
 def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", method: Any, axes: "Axes") -> list[str]:
