@@ -1,17 +1,14 @@
 """Open the file of a tank by its format, or by its name and content."""
 
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 import jaxeit as je
-from jaxeit.files import open_regular
 from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
 
+from .archives import archive_tank, read_archive
+from .described import described_tank
 from .instruments import instrument_tank, is_instrument
 from .matlab import eidors_tank, is_ktc, ktc_tank, read_matlab
 from .recording import Tank, TankError, tank_of
@@ -30,8 +27,8 @@ def load_tank(
             (GOE-MF II, Draeger), .npz, or a folder of .eit files of Sciospec.
         domain: shape of the tank, where the file has none (all but .mat), such as ``je.Disc(0.03)``.
         rim: its electrodes; default: `je.skin.rim_electrodes`, electrode 0 at +x, counter-clockwise.
-        skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone; in place of ``domain`` and
-            ``rim``.
+        skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone and for a .mat without a model,
+            whose arrays of as many rows as the scan has readings are the frames; in place of ``domain`` and ``rim``.
 
     Raises:
         TankError, OSError: naming the file and what is wrong with it.
@@ -40,7 +37,7 @@ def load_tank(
     if not path.exists():
         raise TankError(f"{path}: does not exist; check the name and the folder")
     if skin is not None:
-        return _frames_of(skin, path)
+        return described_tank(path, skin)
     if path.is_dir():
         return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
     kind = path.suffix.lower()
@@ -120,7 +117,7 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
     Arguments as for `load_tank`.
     """
     path = Path(path)
-    arrays = _npz(path)
+    arrays = read_archive(path)
     if "frames" not in arrays or not (
         {"pattern", "amplitude"} <= set(arrays) or {"current", "measurement"} <= set(arrays)
     ):
@@ -133,30 +130,4 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
     else:
         protocol = je.Protocol.from_matrices(arrays["current"], arrays["measurement"])
         electrodes = len(arrays["current"])
-    return _tank(tank_of(path.stem, protocol, electrodes, domain, rim), arrays["frames"])
-
-
-def _frames_of(skin: je.Skin, path: Path) -> Tank:
-    """The frames of an .npz that holds nothing else, as readings of this skin."""
-    arrays = _npz(path) if path.suffix.lower() == ".npz" else {}
-    if set(arrays) != {"frames"}:
-        raise TankError(
-            f"{path.name}: a file of frames that a skin's TOML describes is an .npz with frames (frames, readings) V "
-            "and nothing else; other files have a scan of their own: leave the skin out"
-        )
-    return _tank(skin, arrays["frames"])
-
-
-def _tank(skin: je.Skin, frames: np.ndarray) -> Tank:
-    frames = np.atleast_2d(frames)
-    quadrature = frames.imag if np.iscomplexobj(frames) else None
-    names = tuple(f"frame {k}" for k in range(len(frames)))
-    return Tank(skin, frames.real.astype(float), names, quadrature)
-
-
-def _npz(path: Path) -> dict[str, Any]:
-    try:
-        with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise TankError(f"{path.name}: cannot be read as a NumPy archive: {error}") from None
+    return archive_tank(tank_of(path.stem, protocol, electrodes, domain, rim), arrays["frames"])

@@ -189,6 +189,88 @@ def test_a_tank_whose_scan_is_named(bench, tmp_path, root, capsys):
         load_tank(path, skin=skin)
 
 
+TANK_TOML = f"""
+format = "jaxeit-skin"
+version = 1
+name = "tank"
+[sheet]
+shape = "disc"
+radius = {RADIUS}
+sheet_resistance = 1.0
+[electrodes]
+kind = "edge"
+count = 16
+width = 0.005
+contact = 2e-3
+[protocol]
+pattern = "eidors-adjacent"
+current = {CURRENT}
+"""
+
+
+def _as_eidors(frames):
+    """Of every drive all pairs from the first on, zero where a driven electrode takes part; above zero."""
+    square = np.zeros((len(frames), COUNT, COUNT))
+    for drive, step in itertools.product(range(COUNT), range(2, COUNT - 1)):
+        square[:, drive, (drive + step) % COUNT] = -frames[:, (COUNT - 3) * drive + step - 2]
+    return square.reshape(len(frames), -1).T
+
+
+def test_matlab_files_without_a_model(bench, tmp_path, capsys):
+    """The readings of 'no_meas_current' and of 'meas_current', and a stimulation that tells another order."""
+    (tmp_path / "tank.toml").write_text(TANK_TOML)
+    skin = je.load_skin(tmp_path / "tank.toml")
+    every = _as_eidors(bench.frames)
+    kept = every[every[:, 0] != 0]
+    savemat(tmp_path / "kept.mat", {"vi": {"meas": kept[:, 1]}, "vh": {"meas": kept[:, 0]}, "volts": np.ones(16)})
+    tank = load_tank(tmp_path / "kept.mat", skin=skin)
+    assert tank.names == ("vh", "vi")
+    np.testing.assert_array_equal(tank.frames, kept.T)
+    sees_the_rod(tank)
+    savemat(tmp_path / "every.mat", {"data": 2 * every, "vvRef": every[:, :1]})
+    for pattern in ("adjacent", "eidors-adjacent"):
+        rows = je.skin.named_pattern(pattern, COUNT)
+        ours = je.Skin("ours", skin.domain, 1.0, skin.electrodes, je.Protocol(rows, CURRENT))
+        tank = load_tank(tmp_path / "every.mat", skin=ours)
+        assert tank.names == ("vvRef", "data(1)", "data(2)")
+        expected = bench.frames[0] if pattern == "adjacent" else kept[:, 0]
+        np.testing.assert_array_equal(tank.frames[:2], [expected, 2 * expected])
+    told = {"vh": bench.frames[0], "vi": bench.frames[1], "stim": _forward_model(bench)["stimulation"]}
+    savemat(tmp_path / "told.mat", told)
+    tank = load_tank(tmp_path / "told.mat", skin=skin)
+    np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
+    sees_the_rod(tank)
+    words = ["image", str(tmp_path / "kept.mat"), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "a.png")]
+    assert main(words) == 0
+    assert "16 electrodes, 208 readings, frames: vh, vi" in capsys.readouterr().out
+
+
+def test_matlab_files_that_do_not_fit_their_skin(bench, tmp_path, capsys):
+    (tmp_path / "tank.toml").write_text(TANK_TOML)
+    skin = je.load_skin(tmp_path / "tank.toml")
+    path = tmp_path / "a.mat"
+    savemat(path, {"vh": np.ones(200), "vi": np.ones((200, 3)), "note": "none"})
+    message = (
+        "a.mat: holds vh 200 x 1, vi 200 x 3; the protocol of the skin has 208 readings of 16 electrodes: give the "
+        "protocol of these readings, or save them as columns of as many rows"
+    )
+    with pytest.raises(TankError) as found:
+        load_tank(path, skin=skin)
+    assert str(found.value) == message
+    assert main(["image", str(path), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "a.png")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(TankError, match=r"no variable has a forward model .* --skin TANK\.toml"):
+        load_tank(path)
+    savemat(path, {"text": "none"})
+    with pytest.raises(TankError, match="holds no numbers; the protocol of the skin has 208"):
+        load_tank(path, skin=skin)
+    savemat(path, {"vh": np.ones(9), "stim": _forward_model(bench)["stimulation"]})
+    with pytest.raises(TankError, match="holds vh 9 x 1; the protocol of stim has 208 readings"):
+        load_tank(path, skin=skin)
+    with pytest.raises(TankError, match=r"tank\.mat: has a tank of its own; leave the skin out"):
+        load_tank(_write_mat(tmp_path / "tank.mat", bench), skin=skin)
+
+
 def test_potentials_of_sciospec(bench, tmp_path):
     """Potentials above an unknown ground; two frequencies, of which the first is taken."""
     mean = je.Protocol.from_matrices(CURRENT * RING, np.eye(COUNT) - 1 / COUNT)

@@ -31,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=int, default=0, metavar="N", help="frame it is compared with; default: 0")
     text = "radius in m of a round tank; needed where the file does not describe its tank (all but .mat)"
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
-    text = "shape, electrodes and scan of the tank, for an .npz of frames alone: a TOML file, or a shipped skin's name"
+    text = (
+        "shape, electrodes and scan of the tank, for an .npz of frames alone or a .mat without a model: a TOML file, "
+        "or a shipped skin's name"
+    )
     parser.add_argument("--skin", metavar="TANK.toml", help=text)
     parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
