@@ -8,11 +8,12 @@ above its surroundings by a part of the highest, chosen so that at most 5 % of s
 Recorded, with ``--data``: the frames of `pyeidors_tank` with metal and plastic beside known electrodes. An object is
 kept if the image is higher at its place than anywhere away from all objects; the least of these ratios is stated too.
 And the four training frames of `ktc2023` with all electrodes, by Otsu's thresholds and the score of the challenge.
-Lengths of priors and methods are parts of the radius. Methods are the linear ones; `bench_images` has the others.
+Lengths of priors and methods are parts of the radius. The image of `je.imaging.segment` is the logarithm of the
+conductivity, which takes the place of a difference image; its classes take the place of Otsu's.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ RATIOS, NOISES = {"1:1": 1.0, "1:2": 0.5, "1:4": 0.25}, {"60 dB": 1e-3, "40 dB":
 RISES = (0.02, 0.03, 0.04, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.55)
 MAX_FALSE_SECONDS = 0.05
 HYPERPARAMETERS = (0.1, 0.3)
+SEGMENT = "segment"
 
 
 def ways(radius: float) -> dict[str, tuple[je.AbstractPrior, Any]]:
@@ -42,14 +44,40 @@ def ways(radius: float) -> dict[str, tuple[je.AbstractPrior, Any]]:
         "Gaussian": (je.GaussianSmooth(length=0.1 * radius), je.OneStep()),
         "GREIT": (je.Noser(), je.Greit(width=0.12 * radius, radius=0.2 * radius, edge=0.04 * radius)),
         "truncated SVD": (je.Noser(), je.TruncatedSvd()),
+        "not negative": (je.Noser(), je.NonNegative()),
+        "sparse Bayes": (je.Noser(), je.SparseBayes()),
+        "total variation": (je.TotalVariation(), je.Reweighted()),
     }
 
 
+class Way(NamedTuple):
+    """A method prepared for a model: images of changes, (frames, readings) V, from a reference; their picture."""
+
+    images: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    picture: Any
+
+
+def prepared(model: je.Model, radius: float, name: str, strength: float | None, **where: Any) -> Way:
+    """The way of a name with a hyperparameter; `je.imaging.segment` with its own weight."""
+    if name == SEGMENT:
+        basis = je.Pixels(PIXELS).on(model)
+
+        def segmented(changes: np.ndarray, reference: np.ndarray) -> np.ndarray:
+            found = [je.imaging.segment(model, reference, reference + change, basis).image for change in changes]
+            return np.array(found)
+
+        return Way(segmented, basis)
+    prior, method = ways(radius)[name]
+    recon = je.prepare(model, prior, method, je.Pixels(PIXELS), hyperparameter=strength, **where)
+    return Way(lambda changes, _: np.asarray(recon(jnp.asarray(changes))), recon)
+
+
 class Simulated(NamedTuple):
-    """Places of the pairs, (pairs, 2, 2) m; model; changes of the readings by ratio and noise."""
+    """Places of the pairs, (pairs, 2, 2) m; model; untouched readings; their changes by ratio and noise."""
 
     places: np.ndarray
     model: je.Model
+    still: np.ndarray
     singles: dict[str, np.ndarray]
     pairs: dict[tuple[str, str], np.ndarray]
 
@@ -79,22 +107,22 @@ def simulated(count: int) -> Simulated:
 
     singles = {name: changes(0.0, noise) for name, noise in NOISES.items()}
     pairs = {(r, n): changes(ratio, noise) for r, ratio in RATIOS.items() for n, noise in NOISES.items()}
-    return Simulated(np.array(places), je.discretise(scene, je.Fidelity.standard()), singles, pairs)
+    return Simulated(np.array(places), je.discretise(scene, je.Fidelity.standard()), still, singles, pairs)
 
 
-def regions(recon: Any, image: np.ndarray, rise: float) -> np.ndarray:
-    return np.asarray(je.contacts.find_regions(image, recon, level=0.02, least=rise).centres)
+def regions(way: Way, image: np.ndarray, rise: float) -> np.ndarray:
+    return np.asarray(je.contacts.find_regions(image, way.picture, level=0.02, least=rise).centres)
 
 
-def kept(recon: Any, one: Simulated) -> Row:
+def kept(way: Way, one: Simulated) -> Row:
     """Share of pairs of which both are seen, by ratio and noise."""
     row: Row = {}
     for noise, frames in one.singles.items():
-        alone = np.asarray(recon(frames))
-        few = (r for r in RISES if np.mean([len(regions(recon, i, r)) > 1 for i in alone]) <= MAX_FALSE_SECONDS)
+        alone = way.images(frames, one.still)
+        few = (r for r in RISES if np.mean([len(regions(way, i, r)) > 1 for i in alone]) <= MAX_FALSE_SECONDS)
         rise = next(few, RISES[-1])
         for ratio in RATIOS:
-            found = [regions(recon, image, rise) for image in np.asarray(recon(one.pairs[ratio, noise]))]
+            found = [regions(way, image, rise) for image in way.images(one.pairs[ratio, noise], one.still)]
             both = [
                 len(f) == 2 and (np.linalg.norm(f[:, None] - p, axis=2).min(0) < 0.25 * RADIUS).all()
                 for f, p in zip(found, one.places, strict=True)
@@ -116,33 +144,35 @@ class Recorded:
         self.water_model = ktc.tank(self.data)
         self.water = ktc.homogeneous(self.water_model, self.data.reference, self.data.channel)
 
-    def kept(self, name: str, hyperparameter: float) -> Row:
-        prior, method = ways(0.03)[name]
-        recon = je.prepare(self.model, prior, method, je.Pixels(PIXELS), hyperparameter=hyperparameter)
-        ratios = np.concatenate([self._ratios(recon, *one) for one in zip(self.tanks, self.objects, strict=True)])
-        return {"kept": int(np.sum(ratios > 1)), "objects": len(ratios), "least_over_artefact": float(ratios.min())}
+    def kept(self, name: str, strength: float | None) -> Row:
+        way = prepared(self.model, 0.03, name, strength)
+        ratios = np.concatenate([self._ratios(way, *one) for one in zip(self.tanks, self.objects, strict=True)])
+        least = max(0.0, float(ratios.min()))  # below zero: an image of the other sign
+        return {"kept": int(np.sum(ratios > 1)), "objects": len(ratios), "least_over_artefact": least}
 
-    def _ratios(self, recon: Any, tank: Any, objects: list[tuple[int, int]]) -> np.ndarray:
+    def _ratios(self, way: Way, tank: Any, objects: list[tuple[int, int]]) -> np.ndarray:
         """Of each object: the image at its place over that anywhere away from all."""
         first, last = tank.frames[0], tank.frames[-1]
         even = np.asarray(je.forward(self.model))
-        inside = np.asarray(recon.areas) > 0
-        image = np.asarray(recon(jnp.asarray((even @ first) / (first @ first) * (last - first))))
+        scale = (even @ first) / (first @ first)
+        inside = np.asarray(way.picture.areas) > 0
+        (image,) = way.images(scale * (last - first)[None], scale * first)
         places = 0.65 * tank.skin.electrode_positions[[number for number, _ in objects]]
-        apart = np.linalg.norm(np.asarray(recon.centres)[:, None] - places, axis=2) / 0.03
+        apart = np.linalg.norm(np.asarray(way.picture.centres)[:, None] - places, axis=2) / 0.03
         away = inside & (apart.min(1) > 0.4)
         return np.array([
             np.max(sign * image[inside & (apart[:, k] < 0.25)]) / max(np.max(sign * image[away]), 1e-12)
             for k, (_, sign) in enumerate(objects)
         ])  # fmt: skip
 
-    def score(self, name: str, hyperparameter: float) -> Row:
-        prior, method = ways(ktc.RADIUS)[name]
-        sigma = jnp.full_like(self.water_model.background, self.water.sigma)
-        basis = je.Pixels(PIXELS)
-        recon = je.prepare(self.water_model, prior, method, basis, hyperparameter=hyperparameter, sigma=sigma)
-        images = np.asarray(recon(jnp.asarray(self.data.frames - self.data.reference)))
-        labels = [ktc.otsu_labels(ktc.on_grid(image, recon)) for image in images]
+    def score(self, name: str, strength: float | None) -> Row:
+        if name == SEGMENT:
+            labels = ktc.variation(self.water_model, je.Pixels(PIXELS).on(self.water_model), self.water, self.data)
+        else:
+            sigma = jnp.full_like(self.water_model.background, self.water.sigma)
+            way = prepared(self.water_model, ktc.RADIUS, name, strength, sigma=sigma)
+            images = way.images(self.data.frames - self.data.reference, self.data.reference)
+            labels = [ktc.otsu_labels(ktc.on_grid(image, way.picture)) for image in images]
         scores = [float(je.metrics.ktc_score(a, b)) for a, b in zip(labels, self.data.truth, strict=True)]
         return {"challenge": float(np.mean(scores))}
 
@@ -150,14 +180,14 @@ class Recorded:
 def measure(run: Run) -> Iterator[Row]:
     one = simulated(run.sizes(PAIRS, 4))
     recorded = None if run.args.data is None else Recorded(run.args.data)
-    for name, (prior, method) in ways(RADIUS).items():
-        for strength in run.sizes(HYPERPARAMETERS, HYPERPARAMETERS[:1]):
-            recon = je.prepare(one.model, prior, method, je.Pixels(PIXELS), hyperparameter=strength)
-            row = {"way": name, "hyperparameter": strength} | kept(recon, one)
-            if recorded is not None:
-                row |= recorded.kept(name, strength) | recorded.score(name, strength)
-            print(row, flush=True)
-            yield {"rows": [row]}
+    strengths = run.sizes(HYPERPARAMETERS, HYPERPARAMETERS[:1])
+    for name, strength in [*((name, s) for name in ways(RADIUS) for s in strengths), (SEGMENT, None)]:
+        row = {"way": name, "hyperparameter": "its own" if strength is None else strength}
+        row |= kept(prepared(one.model, RADIUS, name, strength), one)
+        if recorded is not None:
+            row |= recorded.kept(name, strength) | recorded.score(name, strength)
+        print(row, flush=True)
+        yield {"rows": [row]}
 
 
 DATA: Row = {"type": Path, "help": "folder with pyeidors_tank/ and ktc2023/; default: simulated pairs only"}

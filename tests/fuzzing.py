@@ -45,8 +45,10 @@ from calib.record.wire.framing import cobs_encode, crc16
 from calib.record.wire.messages import Layout, Pong
 from calib.session import SessionError, open_session
 from calib.session.importers import FileSpec, StreamSpec, import_csv
+from calib.tanks import TankError, load_tank
 from tests.record.test_recorder import both, journal
 from tests.session.test_session import everything, make
+from tests.tanks import instrument_files
 
 MEMORY = 1 << 30  # bytes beyond what the libraries take
 NUMBERS = ("-1", "0", "1e308", "1e-320", "nan", "inf", "-inf", "9" * 400, "1_0", "true", "1979-05-27", "0x7fffffffffff")
@@ -398,6 +400,11 @@ def lines(_: Path) -> bytes:
     return b"".join(b"%d,%d,%.3f,%.3f,%.3f,%.3f\n" % (i, 1000 * i, *row) for i, row in enumerate(values))
 
 
+def frames_of(write: Callable[[np.ndarray], bytes]) -> Callable[[Path], bytes]:
+    """Two frames of an instrument."""
+    return lambda _: write(np.random.default_rng(0).uniform(0.01, 1.0, (2, 208)))
+
+
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
@@ -478,7 +485,13 @@ def read_lines(_: Path, raw: bytes):
     return len(found)
 
 
+def read_instrument(path: Path, _: bytes):
+    return load_tank(path, je.Disc(0.1)).frames.tobytes()
+
+
 FILES = (SessionError, je.toml.TomlError)
+SUFFIXES = {"reconstructor": ".npz", "journal": ".part", ".get": ".get", ".eit": ".eit"}
+"""Of the file, where a reader goes by it and the kind of input has this in its name."""
 READERS = {
     "session": Reader(session, damaged, lambda path, _: everything(path), (SessionError,)),
     "hostile session": Reader(session, rewritten, lambda path, _: everything(path), FILES, False),
@@ -493,6 +506,10 @@ READERS = {
     "hostile journal": Reader(full_recording, resealed, read_journal, (JournalError, SessionError), False),
     "frames": Reader(frames, damaged, read_frames, (), False),
     "lines": Reader(lines, cells, read_lines, (), False),
+    ".get": Reader(frames_of(instrument_files.goe_half_get), damaged, read_instrument, (TankError,), False),
+    "old .get": Reader(frames_of(instrument_files.draeger_get), damaged, read_instrument, (TankError,), False),
+    ".eit": Reader(frames_of(instrument_files.draeger_eit), damaged, read_instrument, (TankError,), False),
+    "XML .eit": Reader(frames_of(instrument_files.carefusion_eit), damaged, read_instrument, (TankError,), False),
 }
 
 
@@ -502,7 +519,8 @@ def run(kind: str, count: int, seed: int, folder: Path) -> dict:
     work = folder / "work"
     work.mkdir(parents=True)
     raw = reader.original(folder)
-    path = work / f"input{'.npz' if 'reconstructor' in kind else '.part' if 'journal' in kind else '.h5'}"
+    suffix = next((suffix for word, suffix in SUFFIXES.items() if word in kind), ".h5")
+    path = work / f"input{suffix}"
     path.write_bytes(raw)
     whole = reader.read(path, raw)  # the sound one compiles what there is to compile
     jax.devices()  # the driver of a GPU takes its address space before the limit, for readers that compile nothing too

@@ -36,6 +36,8 @@ def test_a_disc_as_in_eidors(eidors):
     assert (eidors["vh"] > 0).all()  # the polarity of '{ad}', '{ad}'
     assert eidors["rows"][:2].tolist() == [[1, 0, 2, 3], [1, 0, 3, 4]]
     assert eidors["rows"][13:15].tolist() == [[2, 1, 3, 4], [2, 1, 4, 5]]  # the sense pairs do not rotate
+    assert eidors["rows"][26:28].tolist() == [[3, 2, 0, 1], [3, 2, 4, 5]]
+    np.testing.assert_array_equal(je.skin.named_pattern("eidors-adjacent", 16), eidors["rows"])
     assert eidors["picture"].shape == (32, 32)
     place = je.LevelCentroid(0.5)(eidors["image"], eidors["recon"])
     np.testing.assert_allclose(place, [0.3, 0.4], atol=0.05)

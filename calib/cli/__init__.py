@@ -20,7 +20,7 @@ COMMANDS = {
     "recalibrate": "move a calibration to what the pads read now: offsets, gains and drift",
     "evaluate": "evaluate a calibration on other sessions",
     "apply": "write the force map of every frame of a session",
-    "image": "draw the difference image of a tank: files of EIDORS, the Kuopio challenge, PyEIDORS, Sciospec, NumPy",
+    "image": "draw the difference image of a tank: files of EIDORS, PyEIDORS, instruments (.get, .eit), NumPy",
     "export": "write for other programs: a C header for firmware, or a bag of ROS 2 (MCAP)",
     "bench": "measure what accuracy costs in time, for a skin on this machine",
     "design": "choose which readings a skin should take, out of all that its electrodes allow",

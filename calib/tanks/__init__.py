@@ -1,6 +1,6 @@
-"""Tanks of others: files of EIDORS, the Kuopio challenge, PyEIDORS, Sciospec and NumPy, and images of their frames."""
+"""Tanks of others: files of EIDORS, the Kuopio challenge, PyEIDORS, instruments and NumPy; images of their frames."""
 
-from .formats import load_eidors, load_ktc, load_npz, load_pyeidors, load_sciospec, load_tank
+from .formats import load_eidors, load_instrument, load_ktc, load_npz, load_pyeidors, load_sciospec, load_tank
 from .images import TankImage, difference_image, segmented_frame
 from .recording import Tank, TankError
 
@@ -10,6 +10,7 @@ __all__ = [
     "TankImage",
     "difference_image",
     "load_eidors",
+    "load_instrument",
     "load_ktc",
     "load_npz",
     "load_pyeidors",

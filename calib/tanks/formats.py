@@ -1,17 +1,15 @@
 """Open the file of a tank by its format, or by its name and content."""
 
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 import jaxeit as je
-from jaxeit.files import open_regular
 from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
 
+from .archives import archive_tank, read_archive
+from .described import described_tank
+from .instruments import instrument_tank, is_instrument
 from .matlab import eidors_tank, is_ktc, ktc_tank, read_matlab
 from .recording import Tank, TankError, tank_of
 from .texts import pyeidors_tank, sciospec_tank
@@ -25,11 +23,12 @@ def load_tank(
     """A tank and its frames, from any file that this room reads.
 
     Args:
-        path: .mat (EIDORS or the Kuopio challenge), .csv (PyEIDORS), .eit (Sciospec), .npz, or a folder of .eit files.
+        path: .mat (EIDORS or the Kuopio challenge), .csv (PyEIDORS), .eit (Sciospec, CareFusion, Draeger), .get
+            (GOE-MF II, Draeger), .npz, or a folder of .eit files of Sciospec.
         domain: shape of the tank, where the file has none (all but .mat), such as ``je.Disc(0.03)``.
         rim: its electrodes; default: `je.skin.rim_electrodes`, electrode 0 at +x, counter-clockwise.
-        skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone; in place of ``domain`` and
-            ``rim``.
+        skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone and for a .mat without a model,
+            whose arrays of as many rows as the scan has readings are the frames; in place of ``domain`` and ``rim``.
 
     Raises:
         TankError, OSError: naming the file and what is wrong with it.
@@ -38,18 +37,18 @@ def load_tank(
     if not path.exists():
         raise TankError(f"{path}: does not exist; check the name and the folder")
     if skin is not None:
-        return _frames_of(skin, path)
+        return described_tank(path, skin)
     if path.is_dir():
         return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
     kind = path.suffix.lower()
     if kind == ".mat":
         variables = read_matlab(path)
         return ktc_tank(path, variables) if is_ktc(variables) else eidors_tank(path, variables)
-    if kind == ".eit":
+    if kind == ".eit" and not is_instrument(path):
         return load_sciospec([path], domain, rim)
-    readers = {".csv": load_pyeidors, ".npz": load_npz}
+    readers = {".csv": load_pyeidors, ".npz": load_npz, ".get": load_instrument, ".eit": load_instrument}
     if kind not in readers:
-        raise TankError(f"{path.name}: is no file of a tank by its name; give .mat, .csv, .eit or .npz")
+        raise TankError(f"{path.name}: is no file of a tank by its name; give .mat, .csv, .eit, .get or .npz")
     return readers[kind](path, domain, rim)
 
 
@@ -96,6 +95,21 @@ def load_sciospec(paths: Sequence[str | Path], domain: Domain | None = None, rim
     return sciospec_tank([Path(path) for path in paths], domain, rim)
 
 
+def load_instrument(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
+    """A binary file of an instrument for the chest: .get of GOE-MF II or Draeger, .eit of CareFusion or Draeger.
+
+    16 electrodes, adjacent readings. No format is documented: the unit of readings is not known, so that the level of
+    the conductivity has no meaning. Arguments as for `load_tank`.
+
+    Raises:
+        TankError: for a file that was cut short, of an unknown version, or without frames.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".get" and not is_instrument(path):
+        raise TankError(f"{path.name}: does not begin like a file of CareFusion or Draeger")
+    return instrument_tank(path, domain, rim)
+
+
 def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = None) -> Tank:
     """NumPy arrays: ``frames`` (frames, readings) V, with ``pattern`` (readings, 4) and ``amplitude`` A, or with
     ``current`` (electrodes, drives) A and ``measurement`` (electrodes, senses) as for `Protocol.from_matrices`.
@@ -103,7 +117,7 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
     Arguments as for `load_tank`.
     """
     path = Path(path)
-    arrays = _npz(path)
+    arrays = read_archive(path)
     if "frames" not in arrays or not (
         {"pattern", "amplitude"} <= set(arrays) or {"current", "measurement"} <= set(arrays)
     ):
@@ -116,30 +130,4 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
     else:
         protocol = je.Protocol.from_matrices(arrays["current"], arrays["measurement"])
         electrodes = len(arrays["current"])
-    return _tank(tank_of(path.stem, protocol, electrodes, domain, rim), arrays["frames"])
-
-
-def _frames_of(skin: je.Skin, path: Path) -> Tank:
-    """The frames of an .npz that holds nothing else, as readings of this skin."""
-    arrays = _npz(path) if path.suffix.lower() == ".npz" else {}
-    if set(arrays) != {"frames"}:
-        raise TankError(
-            f"{path.name}: a file of frames that a skin's TOML describes is an .npz with frames (frames, readings) V "
-            "and nothing else; other files have a scan of their own: leave the skin out"
-        )
-    return _tank(skin, arrays["frames"])
-
-
-def _tank(skin: je.Skin, frames: np.ndarray) -> Tank:
-    frames = np.atleast_2d(frames)
-    quadrature = frames.imag if np.iscomplexobj(frames) else None
-    names = tuple(f"frame {k}" for k in range(len(frames)))
-    return Tank(skin, frames.real.astype(float), names, quadrature)
-
-
-def _npz(path: Path) -> dict[str, Any]:
-    try:
-        with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise TankError(f"{path.name}: cannot be read as a NumPy archive: {error}") from None
+    return archive_tank(tank_of(path.stem, protocol, electrodes, domain, rim), arrays["frames"])

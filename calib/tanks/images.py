@@ -24,6 +24,9 @@ from .recording import Tank, TankError
 LEAST_CORRELATION = 0.5
 """Correlation of the reference with the model below which order, polarity or geometry cannot be right."""
 
+OPPOSITE = -0.8
+"""Correlation below which the polarity alone is wrong, since the order and the places are nearly those of the model."""
+
 
 class TankImage(NamedTuple):
     """A difference image.
@@ -127,6 +130,7 @@ def _scaled(
         raise TankError(
             f"{tank.skin.name}: the correlation of frame {first} with a model of even content is {correlation:.2f}; "
             "check the order and the polarity of readings, and the place and direction of electrodes"
+            + ("; it seems to be the polarity: save the readings with the other sign" if correlation < OPPOSITE else "")
         )
     found = None if fit is None else fit_reference(model, np.where(used, before, np.nan), fit)
     model = model if found is None else found.model

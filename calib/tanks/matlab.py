@@ -38,9 +38,12 @@ def read_matlab(path: Path) -> dict[str, Any]:
 
 def eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol | None = None) -> Tank:
     """A forward model of EIDORS, on its own mesh, and every variable that holds a frame of it."""
-    model = next((found for value in variables.values() for found in _forward_models(value)), None)
+    model = next(forward_models(variables), None)
     if model is None:
-        raise TankError(f"{path.name}: no variable has a forward model (nodes, elems); save fwd_model, img or imdl")
+        raise TankError(
+            f"{path.name}: no variable has a forward model (nodes, elems); save fwd_model, img or imdl, or describe "
+            "the tank: skin=, or --skin TANK.toml"
+        )
     where = f"{path.name}: fwd_model"
     mesh, number = _mesh(where, model)
     rim = _Rim(mesh)
@@ -48,21 +51,30 @@ def eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol 
         rim.electrode(f"{where}.electrode({k + 1})", one, number)
         for k, one in enumerate(_each(where, model, "electrode"))
     )
-    protocol = _stimulation(where, model, len(electrodes)) if protocol is None else protocol
+    protocol = stimulation_protocol(where, model, len(electrodes)) if protocol is None else protocol
     skin = je.Skin(path.stem, rim.domain, 1.0, electrodes, protocol)
     frames = {
         name if columns.shape[1] == 1 else f"{name}({k + 1})": column
         for name, value in variables.items()
-        if (columns := _frames_of(value, protocol.readings)) is not None
+        if (columns := columns_of(value)) is not None and len(columns) == protocol.readings
         for k, column in enumerate(columns.T)
     }
-    names = tuple(sorted(frames, key=lambda name: name.split("(")[0] not in REFERENCES))
-    values = np.array([frames[name] for name in names]).reshape(len(names), protocol.readings)
+    return named_frames(skin, frames, mesh)
+
+
+def named_frames(skin: je.Skin, frames: Mapping[str, np.ndarray], mesh: je.meshing.Mesh | None = None) -> Tank:
+    """A tank with frames by name, those that are references first."""
+    names = tuple(sorted(frames, key=lambda name: not _is_reference(name.split("(")[0])))
+    values = np.array([frames[name] for name in names]).reshape(len(names), skin.protocol.readings)
     parts = np.ascontiguousarray(values.real), values.imag if np.iscomplexobj(values) else None
     return Tank(skin, parts[0].astype(float), names, parts[1], mesh)
 
 
-def _stimulation(where: str, model: SimpleNamespace, electrodes: int) -> je.Protocol:
+def _is_reference(name: str) -> bool:
+    return name in REFERENCES or name.lower().endswith("ref")
+
+
+def stimulation_protocol(where: str, model: SimpleNamespace, electrodes: int) -> je.Protocol:
     """The protocol of ``stimulation``; its currents are in A unless it says mA."""
     stimulation = _each(where, model, "stimulation")
     current = [
@@ -76,6 +88,12 @@ def _stimulation(where: str, model: SimpleNamespace, electrodes: int) -> je.Prot
         raise TankError(f"{where}.stimulation: patterns are for {sorted(sizes)} electrodes, not {electrodes}")
     columns = np.stack([column.ravel() for column in current], 1)
     return je.Protocol.from_matrices(columns, [matrix.T for matrix in measured])
+
+
+def forward_models(variables: Mapping[str, Any]) -> Iterator[SimpleNamespace]:
+    """What has nodes and elements, in images and inverse models too."""
+    for value in variables.values():
+        yield from _forward_models(value)
 
 
 def _forward_models(value: Any) -> Iterator[SimpleNamespace]:
@@ -166,14 +184,12 @@ def _numbers(struct: SimpleNamespace, name: str) -> np.ndarray:
     return np.asarray(value.real.ravel(), float)
 
 
-def _frames_of(value: Any, readings: int) -> np.ndarray | None:
-    """The frames of a variable as columns, if it is an array or a data structure of so many readings."""
+def columns_of(value: Any) -> np.ndarray | None:
+    """A variable that can hold frames, one a column: an array of one or two axes, or a data structure with one."""
     value = getattr(value, "meas", value)
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiuc":
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiuc" or value.ndim not in (1, 2):
         return None
-    columns = value
-    columns = columns[:, None] if columns.ndim == 1 else columns
-    return columns if columns.ndim == 2 and len(columns) == readings else None
+    return value[:, None] if value.ndim == 1 else value
 
 
 # --- the Kuopio Tomography Challenge 2023

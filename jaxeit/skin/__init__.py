@@ -12,7 +12,7 @@ from .description import (
 from .edges import BoundaryPatch
 from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
 from .identity import skin_hash
-from .patterns import adjacent, all_pairs, named_pattern, named_protocol, opposite, skip, trigonometric
+from .patterns import adjacent, all_pairs, eidors_adjacent, named_pattern, named_protocol, opposite, skip, trigonometric
 from .points import PointElectrode
 from .polygons import PolygonPatch, RectanglePatch
 from .protocol import Protocol, ProtocolError, reciprocal_rows
@@ -39,6 +39,7 @@ __all__ = [
     "Skin",
     "adjacent",
     "all_pairs",
+    "eidors_adjacent",
     "load_skin",
     "named_pattern",
     "named_protocol",

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from .protocol import Protocol, ProtocolError
 
-ROW_NAMES = '"adjacent", "opposite" or "skip-1", "skip-2", ...'
+ROW_NAMES = '"adjacent", "eidors-adjacent", "opposite" or "skip-1", "skip-2", ...'
 """What `named_pattern` knows, in words."""
 
 NAMES = f'"trigonometric", {ROW_NAMES}'
@@ -62,7 +62,7 @@ def trigonometric(electrodes: int) -> Float[np.ndarray, "electrodes drives"]:
 
 
 def named_pattern(name: str, electrodes: int) -> np.ndarray:
-    """The pattern of a name: "adjacent", "opposite", or "skip-n" with a whole number n.
+    """The pattern of a name: "adjacent", "eidors-adjacent", "opposite", or "skip-n" with a whole number n.
 
     Returns:
         (readings, 4) int32: drive+, drive-, sense+, sense-.
@@ -75,6 +75,8 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
     kind, _, number = name.partition("-")
     if name == "adjacent":
         return adjacent(electrodes)
+    if name == "eidors-adjacent":
+        return eidors_adjacent(electrodes)
     if name == "opposite":
         return opposite(electrodes)
     if kind == "skip" and number.isascii() and number.isdecimal() and len(number) < 6:
@@ -96,6 +98,23 @@ def adjacent(electrodes: int) -> np.ndarray:
         ProtocolError: for fewer than four electrodes.
     """
     return skip(electrodes, 0)
+
+
+def eidors_adjacent(electrodes: int) -> np.ndarray:
+    """The readings of `adjacent` in the order and the polarity of EIDORS, ``mk_stim_patterns(n, 1, '{ad}', '{ad}')``.
+
+    Drive ``s`` leads the current from electrode ``s + 1`` to ``s``, and its readings sense ``(m, m + 1)`` from the
+    lowest ``m`` on ('no_rotate_meas'), without the pairs that share an electrode with it ('no_meas_current'). Readings
+    of an even disc are above zero.
+
+    Returns:
+        (readings, 4) int32: drive+, drive-, sense+, sense-.
+
+    Raises:
+        ProtocolError: for fewer than four electrodes.
+    """
+    rows = adjacent(electrodes)[:, [1, 0, 2, 3]]
+    return rows[np.lexsort([rows[:, 2], rows[:, 1]])]
 
 
 def skip(electrodes: int, skipped: int) -> np.ndarray:

@@ -39,6 +39,7 @@ HOST = {
     "move_electrodes": _PREPARES,
     "discretise": _GEOMETRY,
     "drives": _DESCRIBES,
+    "eidors_adjacent": _DESCRIBES,
     "electrode_motion": _PREPARES,
     "expected_mesh_nodes": _GEOMETRY,
     "few_choices": _PREPARES,

@@ -1,7 +1,6 @@
 """Files of tanks, written here as other programs write them; the programs of docs/tanks.md on them."""
 
 import itertools
-from types import SimpleNamespace
 
 import h5py
 import jax.numpy as jnp
@@ -17,24 +16,11 @@ from calib.tanks import TankError, difference_image, load_tank
 
 from ..helpers import REAL_DATA, skin_of
 from ..test_docs import blocks, run
+from .rods import COUNT, CURRENT, PLACE, RADIUS, sees_the_rod
 
 pytest.importorskip("matplotlib")
-COUNT, RADIUS, CURRENT = 16, 0.03, 5.5e-5
-PLACE = np.array([0.012, 0.008])  # of a conductive rod
 RING = np.eye(COUNT) - np.roll(np.eye(COUNT), 1, 0)
 CSV = "tank_55uA_1000Hz.csv"
-
-
-@pytest.fixture(scope="module")
-def bench():
-    """A tank with adjacent readings before and after a rod was put in, and potentials for any currents."""
-    disc = je.Disc(RADIUS)
-    rim = je.skin.rim_electrodes(disc, COUNT, contact=2e-3)
-    skin = skin_of(disc, rim, je.skin.adjacent(COUNT), current=CURRENT)
-    model = je.discretise(je.Scene(skin), je.Fidelity(edge_length=0.06))
-    rod = jnp.linalg.norm(model.centroids - PLACE, axis=1) < 0.004
-    frames = [je.forward(model, jnp.where(rod, gain, 1.0) * model.background) for gain in (1.0, 5.0)]
-    return SimpleNamespace(skin=skin, model=model, frames=np.array(frames))
 
 
 def _write_csv(path, frames):
@@ -119,21 +105,13 @@ def _write_v73(path, variables):
     return path
 
 
-def _sees_the_rod(tank, tolerance=0.005):
-    found = difference_image(tank, basis=je.Pixels(24))
-    place = np.asarray(found.recon.centres)[np.argmax(found.change)]
-    np.testing.assert_allclose(place, PLACE, atol=tolerance)
-    assert found.correlation > 0.98
-    return found
-
-
 def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
     tank = load_tank(_write_mat(tmp_path / "tank.mat", bench))
     assert tank.names == ("vh", "vi")
     np.testing.assert_array_equal(tank.frames, bench.frames)
     np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
     np.testing.assert_allclose(je.forward(tank.model()), bench.frames[0], rtol=1e-9)
-    found = _sees_the_rod(tank)
+    found = sees_the_rod(tank)
     assert found.background == pytest.approx(1.0)
     sparse = _forward_model(bench)["stimulation"].copy()
     for stimulation in sparse.flat:
@@ -170,7 +148,7 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
     assert (csv.skin.protocol.current, csv.skin.protocol.frequency) == (pytest.approx(CURRENT), 1000)
     np.testing.assert_allclose(csv.frames, bench.frames)
     np.testing.assert_allclose(csv.quadrature, -0.1 * bench.frames)
-    found = _sees_the_rod(csv)
+    found = sees_the_rod(csv)
     half = difference_image(csv, 0, 1, basis=je.Pixels(24))
     assert float(half.change.min()) < 0 < float(found.change.max())
 
@@ -179,7 +157,9 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
     with pytest.raises(TankError, match="does not tell the shape of the tank"):
         load_tank(tmp_path / "rows.npz")
     reversed_polarity = calib.tanks.Tank(csv.skin, -csv.frames, csv.names)
-    with pytest.raises(TankError, match=r"correlation of frame 0 .* is -.*check the order and the polarity"):
+    with pytest.raises(
+        TankError, match=r"correlation of frame 0 .* is -.*check the order and the polarity.*the other sign"
+    ):
         difference_image(reversed_polarity)
     for frame in (0, -2, 7):
         with pytest.raises(TankError, match=f"frame {frame} less frame 0, of 2 frames; give two different ones"):
@@ -200,7 +180,7 @@ def test_a_tank_whose_scan_is_named(bench, tmp_path, root, capsys):
     np.savez(path, frames=frames)
     tank = load_tank(path, skin=skin)
     assert tank.frames.shape == (2, 240)
-    _sees_the_rod(tank)
+    sees_the_rod(tank)
     words = ["image", str(path), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "picture.png")]
     assert main(words) == 0
     assert "16 electrodes, 240 readings" in capsys.readouterr().out
@@ -209,6 +189,88 @@ def test_a_tank_whose_scan_is_named(bench, tmp_path, root, capsys):
     np.savez(path, frames=frames, pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
     with pytest.raises(TankError, match="other files have a scan of their own: leave the skin out"):
         load_tank(path, skin=skin)
+
+
+TANK_TOML = f"""
+format = "jaxeit-skin"
+version = 1
+name = "tank"
+[sheet]
+shape = "disc"
+radius = {RADIUS}
+sheet_resistance = 1.0
+[electrodes]
+kind = "edge"
+count = 16
+width = 0.005
+contact = 2e-3
+[protocol]
+pattern = "eidors-adjacent"
+current = {CURRENT}
+"""
+
+
+def _as_eidors(frames):
+    """Of every drive all pairs from the first on, zero where a driven electrode takes part; above zero."""
+    square = np.zeros((len(frames), COUNT, COUNT))
+    for drive, step in itertools.product(range(COUNT), range(2, COUNT - 1)):
+        square[:, drive, (drive + step) % COUNT] = -frames[:, (COUNT - 3) * drive + step - 2]
+    return square.reshape(len(frames), -1).T
+
+
+def test_matlab_files_without_a_model(bench, tmp_path, capsys):
+    """The readings of 'no_meas_current' and of 'meas_current', and a stimulation that tells another order."""
+    (tmp_path / "tank.toml").write_text(TANK_TOML)
+    skin = je.load_skin(tmp_path / "tank.toml")
+    every = _as_eidors(bench.frames)
+    kept = every[every[:, 0] != 0]
+    savemat(tmp_path / "kept.mat", {"vi": {"meas": kept[:, 1]}, "vh": {"meas": kept[:, 0]}, "volts": np.ones(16)})
+    tank = load_tank(tmp_path / "kept.mat", skin=skin)
+    assert tank.names == ("vh", "vi")
+    np.testing.assert_array_equal(tank.frames, kept.T)
+    sees_the_rod(tank)
+    savemat(tmp_path / "every.mat", {"data": 2 * every, "vvRef": every[:, :1]})
+    for pattern in ("adjacent", "eidors-adjacent"):
+        rows = je.skin.named_pattern(pattern, COUNT)
+        ours = je.Skin("ours", skin.domain, 1.0, skin.electrodes, je.Protocol(rows, CURRENT))
+        tank = load_tank(tmp_path / "every.mat", skin=ours)
+        assert tank.names == ("vvRef", "data(1)", "data(2)")
+        expected = bench.frames[0] if pattern == "adjacent" else kept[:, 0]
+        np.testing.assert_array_equal(tank.frames[:2], [expected, 2 * expected])
+    told = {"vh": bench.frames[0], "vi": bench.frames[1], "stim": _forward_model(bench)["stimulation"]}
+    savemat(tmp_path / "told.mat", told)
+    tank = load_tank(tmp_path / "told.mat", skin=skin)
+    np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
+    sees_the_rod(tank)
+    words = ["image", str(tmp_path / "kept.mat"), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "a.png")]
+    assert main(words) == 0
+    assert "16 electrodes, 208 readings, frames: vh, vi" in capsys.readouterr().out
+
+
+def test_matlab_files_that_do_not_fit_their_skin(bench, tmp_path, capsys):
+    (tmp_path / "tank.toml").write_text(TANK_TOML)
+    skin = je.load_skin(tmp_path / "tank.toml")
+    path = tmp_path / "a.mat"
+    savemat(path, {"vh": np.ones(200), "vi": np.ones((200, 3)), "note": "none"})
+    message = (
+        "a.mat: holds vh 200 x 1, vi 200 x 3; the protocol of the skin has 208 readings of 16 electrodes: give the "
+        "protocol of these readings, or save them as columns of as many rows"
+    )
+    with pytest.raises(TankError) as found:
+        load_tank(path, skin=skin)
+    assert str(found.value) == message
+    assert main(["image", str(path), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "a.png")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(TankError, match=r"no variable has a forward model .* --skin TANK\.toml"):
+        load_tank(path)
+    savemat(path, {"text": "none"})
+    with pytest.raises(TankError, match="holds no numbers; the protocol of the skin has 208"):
+        load_tank(path, skin=skin)
+    savemat(path, {"vh": np.ones(9), "stim": _forward_model(bench)["stimulation"]})
+    with pytest.raises(TankError, match="holds vh 9 x 1; the protocol of stim has 208 readings"):
+        load_tank(path, skin=skin)
+    with pytest.raises(TankError, match=r"tank\.mat: has a tank of its own; leave the skin out"):
+        load_tank(_write_mat(tmp_path / "tank.mat", bench), skin=skin)
 
 
 def test_potentials_of_sciospec(bench, tmp_path):

@@ -22,7 +22,8 @@ COLOURS = ("#ffffff", "#2166ac", "#b2182b")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A file of a tank, its geometry where the file has none, and the picture to write."""
     text = (
-        "MATLAB file of EIDORS or the Kuopio challenge, CSV of PyEIDORS, .eit of Sciospec or a folder of them, or NPZ"
+        "MATLAB file of EIDORS or the Kuopio challenge, CSV of PyEIDORS, .eit of Sciospec or a folder of them, .eit or "
+        ".get of Draeger, CareFusion or GOE-MF II, or NPZ"
     )
     parser.add_argument("tank", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", required=True, metavar="PICTURE.png", help="PNG, PDF or SVG by its name")
@@ -30,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=int, default=0, metavar="N", help="frame it is compared with; default: 0")
     text = "radius in m of a round tank; needed where the file does not describe its tank (all but .mat)"
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
-    text = "shape, electrodes and scan of the tank, for an .npz of frames alone: a TOML file, or a shipped skin's name"
+    text = (
+        "shape, electrodes and scan of the tank, for an .npz of frames alone or a .mat without a model: a TOML file, "
+        "or a shipped skin's name"
+    )
     parser.add_argument("--skin", metavar="TANK.toml", help=text)
     parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
@@ -69,9 +73,14 @@ def run(args: argparse.Namespace) -> int:
     with replacing(Path(args.output)) as new:
         figure.savefig(new, format=kind, dpi=150)
     count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
-    print(f"{count} electrodes, {readings} readings, frames: {', '.join(tank.names)}")
+    print(f"{count} electrodes, {readings} readings, {_listed(tank.names)}")
     print("\n".join(lines))
     return 0
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """The names of frames, or the first and the last of a recording."""
+    return f"{len(names)} frames: {names[0]} to {names[-1]}" if len(names) > 12 else f"frames: {', '.join(names)}"
 
 
 def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", method: Any, axes: "Axes") -> list[str]:
