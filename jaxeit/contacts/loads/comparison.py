@@ -29,7 +29,7 @@ FORMS = {
 # Half of the fall of chi-square at which a fit ends: one whose errors are those at its start, and the last one.
 TRIAL_FALL, LAST_FALL = 1.0, 0.02
 MIN_FALL = 12.0  # of chi-square by a third load, below which none is fitted
-ASTRAY = 4.0  # chi-square over the number of readings, above which a fit of one load starts elsewhere
+ASTRAY = 4.0  # chi-square over the number of readings, above which a fit starts elsewhere
 MIN_PROBABILITY = 2e-3  # of a kind that is proposed, below which it is not fitted
 # Chi-square over the number of readings, above which a fit from a proposal is searched too. Proposals of three loads
 # often begin astray. Beyond 1.3 lies one in a thousand of fits whose errors are those believed.
@@ -136,21 +136,31 @@ class Comparison:
         return [] if self.contacts is None else self.fitter.starts.seen(self.contacts, count)
 
     def one(self) -> Fit:
-        """The best single load; where the contacts lead astray, from the atom that explains most."""
+        """The best single load; where the contacts lead astray, a usual load in their place or the best atom."""
         starts = self.fitter.starts
+        atom = starts.atom(self.y, np.eye(len(self.y)))[1]
         if self.contacts is None:
-            return self.best(LoadKind.ONE, [starts.atom(self.y, np.eye(len(self.y)))[1]])
-        found = self.best(LoadKind.ONE, [starts.single(self.y, self.contacts)])
+            return self.best(LoadKind.ONE, [atom])
+        begin = starts.single(self.y, self.contacts)
+        found = self.best(LoadKind.ONE, [begin])
         if found.square < ASTRAY * len(self.y):
             return found
-        anew = self.best(LoadKind.ONE, [starts.atom(self.y, np.eye(len(self.y)))[1]])
-        return min(found, anew, key=lambda fit: fit.square)
+        usual = np.append(begin[0, :2], np.asarray(self.fitter.usual))[None]
+        return min(found, self.best(LoadKind.ONE, [usual, atom]), key=lambda fit: fit.square)
 
     def best(self, kind: LoadKind, starts: list[np.ndarray]) -> Fit:
-        """The best fit from some starts, with the errors at its end."""
-        tried = [self.fit(kind, start, TRIAL_FALL) for start in starts]
-        first = min(tried, key=improbability)
-        return self.fit(kind, first.loads[: len(FORMS[kind])], LAST_FALL)
+        """The best fit from some starts, with the errors at its end.
+
+        Errors are those where a fit begins. A fit of another force or place than they are meant for can be worse by its
+        own errors, and end far away: then the next start is taken.
+        """
+        tried = sorted((self.fit(kind, start, TRIAL_FALL) for start in starts), key=improbability)
+        found: list[Fit] = []
+        for first in tried:
+            found.append(self.fit(kind, first.loads[: len(FORMS[kind])], LAST_FALL))
+            if found[-1].square < ASTRAY * len(self.y):
+                return found[-1]
+        return min(found, key=improbability)
 
     def fit(self, kind: LoadKind, rows: np.ndarray, fall: float) -> Fit:
         """The best loads near a start, with the errors there."""
