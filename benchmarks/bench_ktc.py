@@ -135,11 +135,12 @@ def linear(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) 
     return [otsu_labels(on_grid(image, recon)) for image in images]
 
 
-def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) -> list[np.ndarray]:
-    """`je.imaging.segment` with its defaults, and water as the reference tells it."""
+def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data, **settings: Any) -> list[np.ndarray]:
+    """`je.imaging.segment` with its defaults or ``settings``, and water as the reference tells it."""
     filled = jnp.full_like(model.background, water.sigma), jnp.full_like(model.contact, 1 / water.contact)
     model = eqx.tree_at(lambda m: (m.background, m.contact), model, filled)
-    found = [je.imaging.segment(model, data.reference, frame, image, missed=water.missed) for frame in data.frames]
+    settings = {"missed": water.missed} | settings
+    found = [je.imaging.segment(model, data.reference, frame, image, **settings) for frame in data.frames]
     return [np.where(INSIDE, one.classes[::-1], WATER) for one in found]
 
 
