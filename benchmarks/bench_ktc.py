@@ -1,31 +1,38 @@
-"""Kuopio Tomography Challenge 2023: untrained methods on its four training frames, with electrodes taken away.
+"""Kuopio Tomography Challenge 2023: untrained methods on phantoms of our own and on the challenge's training frames.
 
 A water tank of 0.115 m radius with 32 electrodes around it, plastic and metal pieces in it (Räsänen et al. 2023). The
 challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, with every reading that uses one. Its
-evaluation frames are not used here; the levels are made by leaving those readings of the training frames out.
+evaluation frames are not used here; the levels are made by leaving those readings out.
+
+`phantoms` simulates the tank (`ktc_phantoms.py`): settings of methods are chosen on the set `tuning`, and `fresh` was
+never looked at for that. `rows`, with ``--data``, is the last look: the four training frames.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from zlib import compress, decompress
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 from scipy.io import loadmat
 from scipy.optimize import minimize_scalar
 
 import jaxeit as je
 
 from .clock import seconds
+from .figures import BLUE, ORANGE, panels
 from .harness import Question, Run
+from .ktc_phantoms import CONDUCTIVE, ELECTRODES, GRID, INSIDE, OBJECTS, RADIUS, RESISTIVE, WATER, Data, simulated
 from .rows import Row, grouped
 
-RADIUS, ELECTRODES, GRID = 0.115, 32, 256
 LEVELS, SMOKE_LEVELS = tuple(range(1, 8)), (1, 7)
-WATER, RESISTIVE, CONDUCTIVE = 0, 1, 2
 PUBLISHED = {"linear baseline": 10.30, "winners (trained networks), about": 15.0}
 
 
@@ -38,31 +45,6 @@ def otsu_labels(image: np.ndarray) -> np.ndarray:
 
 
 # --- the challenge
-
-
-@dataclass(frozen=True, eq=False)
-class Data:
-    """The training set.
-
-    | meaning                                               | shape         | unit |
-    |-------------------------------------------------------|---------------|------|
-    | pattern: drive+, drive-, sense+, sense-               | (2356, 4)     |      |
-    | mean current, as the file tells it                    | ()            | mA   |
-    | reference: water only                                 | (2356,)       | V    |
-    | frames                                                | (4, 2356)     | V    |
-    | truth: 0 water, 1 resistive, 2 conductive; row 0 = +y | (4, 256, 256) |      |
-    """
-
-    pattern: np.ndarray
-    current: float
-    reference: np.ndarray
-    frames: np.ndarray
-    truth: np.ndarray
-
-    @property
-    def channel(self) -> np.ndarray:
-        """Pair of sensing electrodes of each reading."""
-        return np.unique(self.pattern[:, 2:], axis=0, return_inverse=True)[1].ravel()
 
 
 def load(folder: Path) -> Data:
@@ -137,10 +119,6 @@ def with_level(data: Data, level: int) -> Data:
     return replace(data, reference=np.where(lost, np.nan, data.reference), frames=frames)
 
 
-LINE = np.linspace(-1, 1, GRID)
-INSIDE = np.hypot(LINE, LINE[:, None]) <= 1
-
-
 def on_grid(values: np.ndarray, picture: Any) -> np.ndarray:
     """The challenge's 256 x 256 pixels, row 0 at +y, from those of an image by bilinear interpolation."""
     return np.where(INSIDE, je.imaging.on_grid(values, picture.picture, (GRID, GRID))[::-1], 0.0)
@@ -157,18 +135,131 @@ def linear(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) 
     return [otsu_labels(on_grid(image, recon)) for image in images]
 
 
-def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) -> list[np.ndarray]:
-    """`je.imaging.segment`, with water as the reference tells it and one weight for all levels."""
+def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data, **settings: Any) -> list[np.ndarray]:
+    """`je.imaging.segment` with its defaults or ``settings``, and water as the reference tells it."""
     filled = jnp.full_like(model.background, water.sigma), jnp.full_like(model.contact, 1 / water.contact)
     model = eqx.tree_at(lambda m: (m.background, m.contact), model, filled)
-    how: dict[str, Any] = {"missed": water.missed, "penalty": je.imaging.IsotropicVariation()}
-    found = [je.imaging.segment(model, data.reference, frame, image, **how) for frame in data.frames]
+    settings = {"missed": water.missed} | settings
+    found = [je.imaging.segment(model, data.reference, frame, image, **settings) for frame in data.frames]
     return [np.where(INSIDE, one.classes[::-1], WATER) for one in found]
 
 
-def methods(model: je.Model, water: Water, pixels: int = 40) -> dict[str, Method]:
-    image = je.Pixels(pixels).on(model)
-    return {way.__name__: partial(way, model, image, water) for way in (linear, variation)}
+def methods(model: je.Model, water: Water) -> dict[str, Method]:
+    """The ways of this benchmark by name, each on its pixels."""
+    columns = {linear: 40, variation: 30}
+    return {way.__name__: partial(way, model, je.Pixels(n).on(model), water) for way, n in columns.items()}
+
+
+# --- phantoms
+
+SETS: dict[str, tuple[int, ...]] = {"tuning": (0, 1, 2), "fresh": (101, 102, 103)}  # seeds of the tanks of each set
+SHOWN, SHOWN_LEVEL = ("crescent", "cross", "three"), 4  # of the first fresh tank
+
+
+class Tank(NamedTuple):
+    """Simulated frames, the methods that know its water, and the kind of each frame's phantom."""
+
+    data: Data
+    ways: dict[str, Method]
+    kinds: tuple[str, ...]
+
+
+def tanks(seeds: Sequence[int], kinds: tuple[str, ...] = tuple(OBJECTS)) -> list[Tank]:
+    """Tanks by seed, inverted with the mesh of the challenge's."""
+    all_data = [simulated(seed, kinds) for seed in seeds]
+    model = tank(all_data[0])
+    waters = [homogeneous(model, data.reference, data.channel) for data in all_data]
+    return [Tank(data, methods(model, water), kinds) for data, water in zip(all_data, waters, strict=True)]
+
+
+def found(one: Tank, method: str, level: int) -> list[Row]:
+    """Kind, score, seconds and classes of each phantom of a tank."""
+    data, rows = with_level(one.data, level), []
+    for kind, frame, truth in zip(one.kinds, data.frames, data.truth, strict=True):
+        spent, (classes,) = seconds(one.ways[method], replace(data, frames=frame[None]))
+        score = float(je.metrics.ktc_score(classes, truth))
+        rows.append({"kind": kind, "score": score, "seconds": spent, "classes": classes})
+    return rows
+
+
+def summary(rows: list[Row]) -> Row:
+    """Mean score, mean score of each kind, median and largest seconds a frame."""
+    by_kind = {
+        kind: round(float(np.mean([r["score"] for r in some])), 3) for kind, some in grouped(rows, "kind").items()
+    }
+    times = [row["seconds"] for row in rows]
+    mean = round(float(np.mean([row["score"] for row in rows])), 3)
+    return {
+        "mean": mean,
+        "by_kind": by_kind,
+        "seconds": round(float(np.median(times)), 2),
+        "most_s": round(max(times), 2),
+    }
+
+
+def phantoms(run: Run) -> Iterator[Row]:
+    """Both sets at all levels."""
+    yield {"phantoms": [], "pictures": []}
+    kinds = tuple(run.sizes(tuple(OBJECTS), ("crescent",)))
+    for name, seeds in SETS.items():
+        several = tanks(run.sizes(seeds, seeds[:1]), kinds)
+        for level in run.sizes(LEVELS, SMOKE_LEVELS):
+            by_method = {
+                method: [r for one in several for r in found(one, method, level)] for method in several[0].ways
+            }
+            for method, rows in by_method.items():
+                row = {"set": name, "level": level, "method": method} | summary(rows)
+                print(row, flush=True)
+                yield {"phantoms": [row], "phantoms_of_21": phantom_totals([*run.data["phantoms"], row])}
+            if name == "fresh" and level == SHOWN_LEVEL:
+                yield {"pictures": pictures(several[0], by_method)}
+
+
+def phantom_totals(rows: list[Row]) -> Row:
+    """Of 21 points, by set and method."""
+    return {name: totals(mine) for name, mine in grouped(rows, "set").items()}
+
+
+# --- picture
+
+
+def pictures(one: Tank, by_method: dict[str, list[Row]]) -> list[Row]:
+    """Classes of the phantoms shown: truth, and by method with its score."""
+    rows = []
+    for kind in SHOWN:
+        place = one.kinds.index(kind)
+        classes = {"truth": packed(one.data.truth[place])}
+        classes |= {method: packed(some[place]["classes"]) for method, some in by_method.items()}
+        scores = {method: round(some[place]["score"], 2) for method, some in by_method.items()}
+        rows.append({"kind": kind, "level": SHOWN_LEVEL, "classes": classes, "scores": scores})
+    return rows
+
+
+def packed(classes: np.ndarray) -> str:
+    """Classes as a short text."""
+    return b64encode(compress(classes.astype(np.uint8).tobytes(), 9)).decode()
+
+
+def unpacked(text: str) -> np.ndarray:
+    """Classes, (256, 256), of a text of `packed`."""
+    return np.frombuffer(decompress(b64decode(text)), np.uint8).reshape(GRID, GRID)
+
+
+COLOURS = ListedColormap(["#dfe9f2", ORANGE, BLUE])  # water, resistive, conductive
+HEADS = {"truth": "truth", "linear": "linear", "variation": "je.imaging.segment"}
+
+
+def picture(data: Row) -> Figure:
+    """Truth and methods side by side, a row for each phantom."""
+    rows = data["pictures"]
+    figure, axes = panels(5.4, 1.9 * len(rows), len(rows), len(HEADS))
+    for row, places in zip(rows, np.reshape(axes, (len(rows), len(HEADS))), strict=True):
+        for place, (name, head) in zip(places, HEADS.items(), strict=True):
+            shown = np.ma.masked_where(~INSIDE, unpacked(row["classes"][name]))
+            place.imshow(shown, cmap=COLOURS, vmin=WATER, vmax=CONDUCTIVE)
+            place.set_title(f"{head}: {row['scores'][name]:.2f}" if name in row["scores"] else row["kind"], fontsize=8)
+            place.axis("off")
+    return figure
 
 
 # --- results
@@ -190,7 +281,15 @@ def totals(rows: list[Row]) -> dict[str, float]:
 
 
 def challenge(run: Run) -> Iterator[Row]:
-    """All levels."""
+    """The training frames at all levels.
+
+    Raises:
+        SystemExit: without the folder of the challenge; a smoke run leaves the part out.
+    """
+    if run.args.data is None:
+        if run.smoke:
+            return
+        raise SystemExit("give the folder of the challenge's training set, --data FOLDER, or --only phantoms")
     data = load(run.args.data)
     model = tank(data)
     ways = methods(model, homogeneous(model, data.reference, data.channel))
@@ -203,8 +302,9 @@ def challenge(run: Run) -> Iterator[Row]:
             yield {"rows": [row], "of_21": totals([*run.data["rows"], row])}
 
 
-DATA: Row = {"type": Path, "required": True, "help": "folder with training/ and groundtruth_training/"}
-main = Question("ktc", __doc__, {"rows": challenge}, {"--data": DATA})
+DATA: Row = {"type": Path, "help": "folder with training/ and groundtruth_training/, for the part rows"}
+PARTS = {"rows": challenge, "phantoms": phantoms}
+main = Question("ktc", __doc__, PARTS, {"--data": DATA}, picture=picture, file="ktc-phantoms.png")
 
 if __name__ == "__main__":
     main()

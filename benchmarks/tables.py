@@ -7,6 +7,8 @@ from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 
+import numpy as np
+
 import jaxeit as je
 
 from .markdown import all_columns, cell, crossed, markdown, plain, replaced
@@ -166,6 +168,24 @@ def _ktc(results: Row) -> list[Row]:
     return by_level + [{"method": name, "head": "of 21", "score": f"{total:.2f}"} for name, total in totals]
 
 
+def _ktc_phantoms(results: Row) -> list[Row]:
+    """Mean scores on fresh phantoms: of each level with the total of 21, then of each kind over all levels."""
+    fresh, rows = [row for row in results["phantoms"] if row["set"] == "fresh"], []
+    for row in fresh:
+        rows.append({"method": row["method"], "line": f"level {row['level']}", "score": f"{row['mean']:.3f}"})
+    for name, total in results["phantoms_of_21"]["fresh"].items():
+        rows.append({"method": name, "line": "of 21", "score": f"{total:.2f}"})
+    for row in fresh:
+        for kind in row["by_kind"]:
+            mean = np.mean([one["by_kind"][kind] for one in fresh if one["method"] == row["method"]])
+            rows.append({"method": row["method"], "line": KTC_KINDS.get(kind, kind), "score": f"{mean:.3f}"})
+    return [row | {"method": KTC_METHODS[row["method"]]} for row in rows]
+
+
+KTC_METHODS = {"linear": "linear, Otsu's thresholds", "variation": "`je.imaging.segment`"}
+KTC_KINDS = {"convex": "disc, ellipse or polygon", "two": "two pieces", "three": "three pieces"}
+
+
 def _paper(results: Row) -> Iterator[Row]:
     """Mean ± standard deviation over the seeds, a row for each load spreading."""
     for row in results["rows"]:
@@ -305,6 +325,7 @@ ROWS: dict[str, Callable] = {
     "locations": _locations,
     "scans": _scans,
     "ktc": _ktc,
+    "ktc_phantoms": _ktc_phantoms,
     "paper": _paper,
     "ladder_testbed": _ladder(0),
     "ladder_chest": _ladder(1),

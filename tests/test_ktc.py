@@ -1,11 +1,15 @@
-"""The Kuopio Tomography Challenge 2023: what does not need its data, and its training frames where they are at hand."""
+"""The Kuopio Tomography Challenge 2023: what does not need its data, phantoms of our own, and its training frames where
+they are at hand."""
+
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import label
 
 import jaxeit as je
-from benchmarks import bench_ktc as ktc, tables
+from benchmarks import bench_ktc as ktc, ktc_phantoms, tables
 
 from .helpers import REAL_DATA, disc_model
 
@@ -95,6 +99,84 @@ def test_totals_are_of_21():
     assert table.splitlines()[-1] == "| b | 0.500 | 0.500 | 10.50 |"
 
 
+# --- phantoms
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    """A coarse tank with faults."""
+    return ktc_phantoms.uneven_tank(np.random.default_rng(7), edge_length=0.06)
+
+
+@pytest.mark.parametrize("kind", ktc_phantoms.OBJECTS)
+def test_phantoms_have_their_pieces(kind, uneven):
+    """As many regions as pieces, each in its class; picture, mesh and corners agree on areas; a seed is a phantom."""
+    first, again, other = (ktc_phantoms.phantom(kind, np.random.default_rng([seed, 5])) for seed in (50, 50, 51))
+    classes = ktc_phantoms.truth(first)
+    assert np.array_equal(classes, ktc_phantoms.truth(again))
+    assert not np.array_equal(classes, ktc_phantoms.truth(other))
+    regions, count = label(classes > 0, np.ones((3, 3)))
+    assert count == len(first) == ktc_phantoms.OBJECTS[kind]
+    assert sorted(classes[regions == k].max() for k in range(1, count + 1)) == sorted(piece.kind for piece in first)
+    for piece in first:
+        x, y = piece.outline.T
+        area = 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))
+        on_mesh = ktc_phantoms.covered(uneven, piece) @ np.asarray(uneven.areas) / ktc.RADIUS**2
+        in_picture = (ktc_phantoms.truth((piece,)) > 0).sum() * (2 / 255) ** 2
+        assert on_mesh == pytest.approx(area, rel=0.04)
+        assert in_picture == pytest.approx(area, rel=0.04)
+        assert (piece.ratio < 1) == (piece.kind == ktc.RESISTIVE)
+
+
+def test_row_0_of_the_truth_is_at_plus_y():
+    square = np.array([[-0.1, 0.5], [0.1, 0.5], [0.1, 0.7], [-0.1, 0.7]])
+    rows, columns = np.nonzero(ktc_phantoms.truth((ktc_phantoms.Piece(square, ktc.CONDUCTIVE, 10.0),)))
+    assert [rows.min(), rows.max()] == pytest.approx([0.15 * 255, 0.25 * 255], abs=1)
+    assert columns.mean() == pytest.approx(127.5)
+
+
+def test_simulated_frames_differ_by_their_pieces_and_repeat_by_seed(uneven):
+    """Faults of the instrument cancel: what is left of two untouched frames is far below what a piece changes."""
+    frames = []
+    for _ in range(2):
+        recorder = ktc_phantoms.Recorder(uneven, np.random.default_rng(8))
+        pieces = ktc_phantoms.phantom("convex", np.random.default_rng(9))
+        frames.append([recorder.frame(), recorder.frame(), recorder.frame(pieces)])
+    reference, again, touched = frames[0]
+    assert all(np.array_equal(a, b) for a, b in zip(*frames, strict=True))
+    assert np.linalg.norm(again - reference) < 0.02 * np.linalg.norm(reference)
+    assert np.linalg.norm(touched - reference) > 2 * np.linalg.norm(again - reference)
+
+
+def test_pictures_of_classes_are_kept_as_text():
+    classes = ktc_phantoms.truth(ktc_phantoms.phantom("three", np.random.default_rng(3)))
+    text = ktc.packed(classes)
+    assert np.array_equal(ktc.unpacked(text), classes)
+    shown = {"kind": "three", "level": 4, "scores": {"linear": 0.5, "variation": 0.75}}
+    figure = ktc.picture({"pictures": [shown | {"classes": dict.fromkeys(("truth", "linear", "variation"), text)}]})
+    assert [axes.get_title() for axes in figure.axes] == ["three", "linear: 0.50", "je.imaging.segment: 0.75"]
+
+
+@pytest.mark.slow
+def test_smoke_phantoms():
+    data = ktc.main(["--smoke"])
+    assert "rows" not in data  # without the challenge's data
+    assert {(row["set"], row["level"], row["method"]) for row in data["phantoms"]} == {
+        (name, level, way) for name in ("tuning", "fresh") for level in (1, 7) for way in ("linear", "variation")
+    }
+    assert all(0 < total["linear"] < 21 and total["variation"] > 10 for total in data["phantoms_of_21"].values())
+    text = tables.table("ktc-phantoms", data)
+    assert text.count("level 1") == text.count("| crescent |") == 1
+
+
+# --- the training frames
+
+
+@needs_data
+def test_the_pattern_is_the_challenge_s(tank):
+    assert np.array_equal(tank[0].pattern, ktc_phantoms.pattern())
+
+
 @pytest.fixture(scope="module")
 def tank():
     """The training set, a coarse model, and water as the reference tells it."""
@@ -132,6 +214,18 @@ def test_the_linear_recipe(tank, level, least):
 @pytest.mark.slow
 @pytest.mark.parametrize(("level", "least"), [(1, 0.88), (7, 0.6)])
 def test_total_variation(tank, level, least):
+    """With finer pixels and a heavier penalty, which suit these frames at level 1 and were chosen on them."""
+    data, model, water = tank
+    heavy = {"penalty": je.imaging.IsotropicVariation(), "relative_error": 0.05}
+    way = partial(ktc.variation, model, je.Pixels(40).on(model), water, **heavy)
+    (row,) = ktc.scored(data, {"variation": way}, level)
+    assert row["mean"] > least
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize(("level", "least"), [(1, 0.83), (7, 0.67)])
+def test_segment_with_its_defaults(tank, level, least):
     data, model, water = tank
     (row,) = ktc.scored(data, {"variation": ktc.methods(model, water)["variation"]}, level)
     assert row["mean"] > least

@@ -2,7 +2,8 @@
 
 The image is the logarithm of the conductivity over that of the reference, found through the full forward map with a
 penalty on edges (`gauss_newton`, `IsotropicVariation`); each region that stands out is cut at half of its own height. A
-blurred edge lies at half the height, however high.
+blurred edge lies at half the height, however high. Beside a piece of large contrast the image swings to the other side,
+a little; such regions are left out.
 """
 
 import equinox as eqx
@@ -22,8 +23,10 @@ from .noise import InverseError
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
 """The classes."""
-WEIGHT = 0.03
+WEIGHT = 0.0064
 """Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
+COLUMNS = 30
+"""Pixels along x where no basis is given."""
 
 
 class Segmentation(eqx.Module):
@@ -49,27 +52,31 @@ def segment(
     *,
     penalty: AbstractPenalty | None = None,
     missed: Float[ArrayLike, " readings"] | None = None,
-    relative_error: float = 0.05,
-    absolute_error: float = 0.01,
+    relative_error: float = 0.03,
+    absolute_error: float = 0.003,
     floor: float = 0.5,
     least: float = 2.28e-3,
+    weakest: float = 0.18,
     pixels: int = 256,
 ) -> Segmentation:
     """Find what changed from a reference of even content, in three classes; on the host, seconds a frame.
 
     The model is asked for the change only, ``forward(model) + frame - reference``, since what it misses of the
-    reference it mostly misses of the frame too. The error of a reading is a part of its own change, a part of the
-    largest, and of what the model misses of the reference the part that the change is of the readings.
+    reference it mostly misses of the frame too. The error of a reading has three parts: of its own change; of the
+    reference, since frames do not repeat exactly; and of what the model misses of the reference, the part that the
+    change is of the readings.
 
     Args:
         model: with the reference's conductivity and contacts, as `fit_reference` gives it.
         reference, frame: V; readings that are not finite in either are left out.
-        basis: default `Pixels`, 40 along x.
-        penalty: default `IsotropicVariation` with a weight of 0.03 for each reading that is used.
+        basis: default `Pixels`, 30 along x.
+        penalty: default `IsotropicVariation` with a weight of 0.0064 for each reading that is used.
         missed: of the reference by the model, V; default: the difference.
-        relative_error, absolute_error: of a change, over itself and over the largest.
+        relative_error: of a change, over itself.
+        absolute_error: of a reading that does not change, over the sum of its size and the root mean square of all.
         floor: least height of a region, logarithm of conductivity.
         least: smallest region, over the area of the picture.
+        weakest: sum of the image over the weakest region, over that of the strongest.
         pixels: of the classes along each axis.
 
     Raises:
@@ -79,23 +86,33 @@ def segment(
     before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
     for values in (before, after):
         require_frame(values, even)
-    require_positive(
-        relative_error=relative_error, absolute_error=absolute_error, floor=floor, least=least, pixels=pixels
-    )
-    basis = Pixels() if basis is None else basis
+    require_positive(relative_error=relative_error, absolute_error=absolute_error)
+    require_positive(floor=floor, least=least, weakest=weakest, pixels=pixels)
+    basis = Pixels(COLUMNS) if basis is None else basis
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     if len(image.picture.shape) != 2:
         raise InverseError("the basis is no picture; give pixels, such as basis=Pixels(40)")
     change, left = after - before, before - even if missed is None else jnp.asarray(missed, model.dtype)
-    share = jnp.sqrt(jnp.nansum(change**2) / jnp.nansum(before**2))
-    size = jnp.abs(change)
-    std = relative_error * size + absolute_error * jnp.nanmax(size) + share * jnp.abs(left)
+    std = _errors(before, change, left, relative_error, absolute_error)
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
     if penalty is None:
         penalty = IsotropicVariation(weight=WEIGHT * jnp.sum(jnp.isfinite(change), dtype=model.dtype))
     found = gauss_newton(physics, penalty, even + change, std)
     fine = on_grid(found, image.picture, (pixels, pixels))
-    return Segmentation(found, image.picture, half_height_classes(fine, floor, least))
+    return Segmentation(found, image.picture, half_height_classes(fine, floor, least, weakest))
+
+
+def _errors(
+    before: Float[Array, " readings"],
+    change: Float[Array, " readings"],
+    left: Float[Array, " readings"],
+    relative_error: float,
+    absolute_error: float,
+) -> Float[Array, " readings"]:
+    """Standard errors of the changes, V, as `segment` describes them."""
+    share = jnp.sqrt(jnp.nansum(change**2) / jnp.nansum(before**2))
+    size = jnp.abs(before) + jnp.sqrt(jnp.nanmean(before**2))
+    return relative_error * jnp.abs(change) + absolute_error * size + share * jnp.abs(left)
 
 
 def on_grid(
@@ -114,18 +131,21 @@ def on_grid(
 
 
 def half_height_classes(
-    image: Float[np.ndarray, "rows columns"], floor: float, least: float
+    image: Float[np.ndarray, "rows columns"], floor: float, least: float, weakest: float = 0.0
 ) -> Int[np.ndarray, "rows columns"]:
     """Classes of an image that is zero where nothing changed: regions beyond ``floor``, each cut at half its own peak.
 
     Args:
         least: smallest region, over the area of the picture.
+        weakest: sum of the image over the weakest region, over that of the strongest.
     """
-    classes = np.full(image.shape, UNCHANGED)
+    classes, regions = np.full(image.shape, UNCHANGED), []
     for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):
-        regions, count = label(sign * image > floor)
-        for region in (regions == number for number in range(1, count + 1)):
-            cut = max(floor, 0.5 * float(np.max(sign * image[region])))
-            if region.mean() >= least:
-                classes[region & (sign * image > cut)] = kind
+        labels, count = label(sign * image > floor)
+        several = (labels == number for number in range(1, count + 1))
+        regions += [(sign * image, kind, region) for region in several if region.mean() >= least]
+    sums = [float(np.sum(height[region])) for height, _, region in regions]
+    for (height, kind, region), total in zip(regions, sums, strict=True):
+        if total >= weakest * max(sums):
+            classes[region & (height > max(floor, 0.5 * float(np.max(height[region]))))] = kind
     return classes
