@@ -78,6 +78,16 @@ def test_a_tank_in_classes():
         je.imaging.segment(water, reference, frame, je.model.Elements())
 
 
+@pytest.mark.slow
+def test_frames_that_repeat_worse_than_is_believed_show_few_pieces():
+    """Noise of 1 % alone; where errors do not grow, it is explained by pieces that cover a fifth of the tank."""
+    water = disc_model(0.02, 0.1, electrodes=16, pattern=je.skin.adjacent(16))
+    reference = np.array(je.forward(water))
+    noise = 0.01 * np.sqrt(np.mean(reference**2)) * np.random.default_rng(8).normal(size=(4, reference.size))
+    classes = [je.imaging.segment(water, reference, reference + one, je.Pixels(24)).classes for one in noise]
+    assert np.mean(np.array(classes) != ktc.WATER) < 0.05
+
+
 @pytest.mark.parametrize(
     ("values", "labels"), [((-1, 0, 1), (1, 0, 2)), ((0, 1, 2), (0, 2, 2)), ((-2, -1, 0), (1, 1, 0))]
 )

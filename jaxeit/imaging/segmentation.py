@@ -27,6 +27,8 @@ WEIGHT = 0.0064
 """Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
 COLUMNS = 30
 """Pixels along x where no basis is given."""
+MORE_FITS = 3
+"""Of an image that leaves more of a frame than its errors, each with larger ones."""
 
 
 class Segmentation(eqx.Module):
@@ -73,7 +75,8 @@ def segment(
         penalty: default `IsotropicVariation` with a weight of 0.0064 for each reading that is used.
         missed: of the reference by the model, V; default: the difference.
         relative_error: of a change, over itself.
-        absolute_error: of a reading that does not change, over the sum of its size and the root mean square of all.
+        absolute_error: of a reading that does not change, over the sum of its size and the root mean square of all; it
+            grows where the image leaves more of the frame than that.
         floor: least height of a region, logarithm of conductivity.
         least: smallest region, over the area of the picture.
         weakest: sum of the image over the weakest region, over that of the strongest.
@@ -93,11 +96,17 @@ def segment(
     if len(image.picture.shape) != 2:
         raise InverseError("the basis is no picture; give pixels, such as basis=Pixels(40)")
     change, left = after - before, before - even if missed is None else jnp.asarray(missed, model.dtype)
-    std = _errors(before, change, left, relative_error, absolute_error)
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
     if penalty is None:
         penalty = IsotropicVariation(weight=WEIGHT * jnp.sum(jnp.isfinite(change), dtype=model.dtype))
-    found = gauss_newton(physics, penalty, even + change, std)
+    found, misfit = jnp.zeros(0), 1.0
+    for _ in range(1 + MORE_FITS):
+        absolute_error *= misfit
+        std = _errors(before, change, left, relative_error, absolute_error)
+        found = gauss_newton(physics, penalty, even + change, std)
+        misfit = float(jnp.sqrt(jnp.nanmean(((even + change - physics.voltages(found)) / std) ** 2)))
+        if not misfit > 1.05:
+            break
     fine = on_grid(found, image.picture, (pixels, pixels))
     return Segmentation(found, image.picture, half_height_classes(fine, floor, least, weakest))
 
