@@ -20,7 +20,7 @@ from .presses import NAMES, list_presses, press_evidence, press_summary
 from .report import ChannelTable, CheckReport, Finding, Severity
 from .responses import pad_response_findings, reading_response_findings
 from .skin import check_skin
-from .streams.clocks import compare_clocks, lag_findings
+from .streams.clocks import CLOCKS_DISAGREE, COMPARED, check_table_clock, compare_clocks
 from .streams.dropouts import dropout_findings
 from .streams.shifts import shift_findings
 from .streams.statistics import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
@@ -68,7 +68,9 @@ def check_session(
         skin=session.skin_name,
         simulated=session.simulated,
         complete=session.complete,
-        findings=tuple(findings),
+        findings=tuple(
+            dict.fromkeys(findings)
+        ),  # a wrong sign shows where presses are detected and where they are compared
         streams=tuple(s.row for s in statistics.values()),
         pads=pads,
         channels=channels,
@@ -91,22 +93,34 @@ def _compare(
     """Compare the streams with each other by the presses that all of them see; returns the onset delays by stream."""
     if evidence is None or not len(evidence.number):
         return ()
-    streams = {name: s.stream for name, s in statistics.items() if name in NAMES}
-    onsets = compare_clocks(streams, evidence, findings)
-    findings += lag_findings(statistics, findings)
-    if "force" in statistics:
+    onsets = compare_clocks(statistics, evidence, findings)
+    moved = _streams_of_wrong_clocks(statistics, evidence, findings)
+    # What a wrong clock makes of the presses looks like wrong signs, places and pads.
+    if "force" in statistics and not ({*COMPARED} & {*statistics} <= moved and moved):
         findings += force_findings(evidence, skin, statistics["force"])
-    if channels is not None:
+    if channels is not None and "eit" not in moved:
         findings += reading_response_findings(evidence, channels)
     if skin is None:
         return onsets
     # A wrong order of the readings, or of the pads, would show as wrong places too.
-    pattern = None if order is None or order.claimed else session.pattern
+    pattern = None if order is None or order.claimed or "eit" in moved else session.pattern
     places = list(place_findings(evidence, skin, pattern, {n: s.stream for n, s in statistics.items()}))
     findings += places
-    if all(f.severity < Severity.ERROR for f in places):
+    if all(f.severity < Severity.ERROR for f in places) and "pressure" not in moved:
         findings += pad_response_findings(evidence, skin)
     return onsets
+
+
+def _streams_of_wrong_clocks(
+    statistics: dict[str, StreamStatistics], evidence: PressEvidence, findings: list[Finding]
+) -> set[str]:
+    """Names of the streams that disagree with the force in time; all of them if the table of presses does."""
+    moved = {f.where.rpartition("/")[2] for f in findings if f.remedy == CLOCKS_DISAGREE}
+    if moved or "force" not in statistics:
+        return moved
+    known = len(findings)
+    check_table_clock(statistics["force"], evidence, findings)
+    return {*NAMES} if len(findings) > known else set()
 
 
 def _session_findings(session: Session) -> Iterator[Finding]:

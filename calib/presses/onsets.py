@@ -14,7 +14,10 @@ from .windows import PressWindows
 
 RISE_FRACTIONS = (0.2, 0.5, 0.8)  # of the way from rest to hold: far from noise at either end
 HALF = RISE_FRACTIONS.index(0.5)
-EARLY_ROUNDS = 4  # the rest before the force holds the rise of an early stream: its windows move by the delay found
+ROUNDS = 4  # in which the windows of a stream move by the delay found
+MIN_STEP = 10_000_000  # ns; a smaller change of the delay moves no window
+MIN_COMPARED = 3  # presses at the beginning and at the end, whose delays are compared
+CHANGE_SPREADS = 3.0  # of the delays within these presses: a smaller change is scatter
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,8 @@ class OnsetDelay:
     | presses | number of presses used                                                              |      |
     | shift   | part of the delay that all of `RISE_FRACTIONS` share: the least of their delays, or | s    |
     |         | 0 if their signs differ                                                             |      |
+    | change  | growth of the delay from the first quarter of the presses to the last one; 0 if     | s    |
+    |         | their scatter explains it                                                           |      |
 
     A clock moves the whole rise alike. A curved response, friction and creep move its parts differently, and the start
     of the rise hardly at all, so that `shift` is what a clock alone may explain.
@@ -37,6 +42,7 @@ class OnsetDelay:
     spread: float
     presses: int
     shift: float
+    change: float
 
 
 def crossing(time: np.ndarray, signal: np.ndarray, level: float) -> float:
@@ -73,31 +79,79 @@ def onset_delays(
     The delay checks clocks and is no clock itself: a curved response shifts the crossing too (a stream that follows
     force**0.7 reaches half its value sooner), which `OnsetDelay.shift` leaves out as far as it can be told.
     """
+    reference = _rises(force, presses, windows)
+    origin = reference - windows.centre("ramp")[np.flatnonzero(presses.accepted), None]
+    seen = windows.moved(_middle(origin))
+    return {s.name: _onset_delay(_delays(s, presses, seen, reference)) for s in others}
+
+
+def ramp_delay(force: ReadableStream, presses: PressColumns, windows: PressWindows) -> OnsetDelay:
+    """Delay of the force after even ramps between the times that the list of presses states."""
+    ramp = windows.ramp[np.flatnonzero(presses.accepted)]
+    stated = ramp[:, :1] + np.diff(ramp, axis=1) * np.array(RISE_FRACTIONS)
+    return _onset_delay(_rises(force, presses, windows) - stated)
+
+
+def _rises(force: ReadableStream, presses: PressColumns, windows: PressWindows) -> np.ndarray:
+    """Times (accepted presses, fractions) ns of the rises of the force."""
+    middle = windows.centre("ramp")[np.flatnonzero(presses.accepted), None]
+    return np.asarray(_delays(force, presses, windows, middle) + middle)
+
+
+def _delays(stream: ReadableStream, presses: PressColumns, windows: PressWindows, origin: np.ndarray) -> np.ndarray:
+    """Delays (accepted presses, fractions) ns of the rises of a stream after ``origin``.
+
+    The windows follow the stream: the rest before the force holds the rise of an early stream, and the beginning of
+    the hold that of a late one.
+    """
     rows = np.flatnonzero(presses.accepted)
 
-    def rise_times(stream: ReadableStream, seen: PressWindows) -> np.ndarray:
-        return np.array([_rise_times(stream, seen, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS))
+    def against(step: int) -> np.ndarray:
+        seen = windows.moved(step)
+        return np.asarray(
+            np.array([_rise_times(stream, seen, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS)) - origin
+        )
 
-    reference, found = rise_times(force, windows), {}
-    for stream in others:
-        delays = rise_times(stream, windows) - reference
-        for _ in range(EARLY_ROUNDS):
-            early = float(np.nanmedian(delays[:, HALF])) if np.isfinite(delays[:, HALF]).any() else 0.0
-            if early >= 0:
-                break
-            delays = rise_times(stream, windows.moved(round(early))) - reference
-        found[stream.name] = _onset_delay(delays)
-    return found
+    delays = against(0)
+    if np.isnan(delays[:, HALF]).mean() > 0.5:  # it rises later than the ramp ends, or not at all
+        later = against(round(float(np.median(np.diff(windows.ramp[rows], axis=1)))))
+        delays = delays if np.isnan(later[:, HALF]).mean() > 0.5 else later
+    last = 0
+    for _ in range(ROUNDS):
+        step = _middle(delays)
+        if abs(step - last) < MIN_STEP:
+            break
+        delays, last = against(step), step
+    return delays
+
+
+def _middle(delays: np.ndarray) -> int:
+    """Median delay at half of the hold value, ns; 0 without any."""
+    half = delays[:, HALF]
+    return round(float(np.nanmedian(half))) if np.isfinite(half).any() else 0
 
 
 def _onset_delay(delays: np.ndarray) -> OnsetDelay:
     """Summary of delays (presses, fractions) in ns."""
     good = delays[np.isfinite(delays[:, HALF])] / SECOND
     if not len(good):
-        return OnsetDelay(float("nan"), float("nan"), 0, float("nan"))
+        return OnsetDelay(float("nan"), float("nan"), 0, float("nan"), 0.0)
     middle = float(np.median(good[:, HALF]))
-    spread = float(MAD_TO_SIGMA * np.median(np.abs(good[:, HALF] - middle)))
     sign = np.sign(good[:, HALF])
     one_sign = ((np.sign(good) == sign[:, None]) | np.isnan(good)).all(axis=1)
     shift = np.where(one_sign, sign * np.nanmin(np.abs(good), axis=1), 0.0)
-    return OnsetDelay(middle, spread, len(good), float(np.median(shift)))
+    return OnsetDelay(middle, _spread(good[:, HALF]), len(good), float(np.median(shift)), _change(good[:, HALF]))
+
+
+def _spread(values: np.ndarray) -> float:
+    return float(MAD_TO_SIGMA * np.median(np.abs(values - np.median(values))))
+
+
+def _change(delay: np.ndarray) -> float:
+    """How much the delay (presses,) grows from the first presses to the last ones; 0 if their scatter explains it."""
+    count = max(len(delay) // 4, MIN_COMPARED)
+    if len(delay) < 2 * count:
+        return 0.0
+    first, last = delay[:count], delay[-count:]
+    change = float(np.median(last) - np.median(first))
+    return change if abs(change) > CHANGE_SPREADS * max(_spread(first), _spread(last)) else 0.0

@@ -95,6 +95,28 @@ def late(name, seconds):
     return lambda r: r.at(name, r.streams[name].time + int(seconds * SECOND))
 
 
+def table_late(seconds):
+    return lambda r: r.pressed(
+        **{n: getattr(r.presses, n) + int(seconds * SECOND) for n in ("t_press", "t_hold0", "t_hold1", "t_release")}
+    )
+
+
+def at_rate(name, factor):
+    """The time stamps of one stream run at another rate."""
+    return lambda r: r.at(name, r.streams[name].time * factor)
+
+
+def jump(name, seconds):
+    """The clock of one stream jumps in the middle."""
+
+    def tell(r):
+        time = r.streams[name].time.copy()
+        time[len(time) // 2 :] += int(seconds * SECOND)
+        return r.at(name, time)
+
+    return tell
+
+
 def moved(x=lambda x, y: x, y=lambda x, y: y):
     return lambda r: r.pressed(x=x(r.presses.x, r.presses.y), y=y(r.presses.x, r.presses.y))
 
@@ -303,6 +325,15 @@ LIES = {
     "pressure 0.5 s early": Lie(late("pressure", -0.5), ERROR, ("/streams/pressure", "0.500 s before the force")),
     "pressure 7 s late": Lie(late("pressure", 7.0), ERROR, ("/streams/pressure", "7.000 s after", "when moved")),
     "EIT 9 s late": Lie(late("eit", 9.0), ERROR, ("/streams/eit", "9.000 s after", "when moved")),
+    "pressure 0.3 s late": Lie(late("pressure", 0.3), ERROR, ("/streams/pressure", "0.300 s after the force")),
+    "pressure 3.1 s late": Lie(late("pressure", 3.1), ERROR, ("/streams/pressure", "3.100 s after the force")),
+    "EIT 1.5 s late": Lie(late("eit", 1.5), ERROR, ("/streams/eit", "1.500 s after the force")),
+    "pressure at 1.005 times its rate": Lie(at_rate("pressure", 1.005), ERROR, ("/streams/pressure", "another rate")),
+    "force at 0.995 times its rate": Lie(at_rate("force", 0.995), ERROR, ("/streams/pressure", "another rate")),
+    "clock of the EIT jumps by 2 s": Lie(jump("eit", 2.0), ERROR, ("second half", "2.000 s after", "jumped")),
+    "clock of the pressure jumps by 0.5 s": Lie(jump("pressure", 0.5), ERROR, ("second half", "0.500 s after")),
+    "table 0.3 s late": Lie(table_late(0.3), ERROR, ("/presses", "0.300 s before the presses of the table")),
+    "table 0.5 s early": Lie(table_late(-0.5), ERROR, ("/presses", "0.500 s after the presses of the table")),
     "table of another recording": Lie(
         lambda r: r.pressed(
             **{n: getattr(r.presses, n) + 10**12 for n in r.presses.__dataclass_fields__ if n[:2] == "t_"}

@@ -1,23 +1,30 @@
 """Compare the clocks of the streams with each other, because all streams record the same presses."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage, signal
 
-from ...presses.onsets import OnsetDelay, onset_delays
-from ...session import Stream
+from ...presses.onsets import OnsetDelay, onset_delays, ramp_delay
+from ...presses.streams import index_ranges
+from ...presses.windows import PressWindows
+from ...session import PressTable
 from ...session.units import SECOND
 from ..evidence import PressEvidence
 from ..report import Finding, Severity
 from .statistics import StreamStatistics
 
+COMPARED = ("eit", "pressure")  # streams that rise with the force
+CLOCKS_DISAGREE = "the clocks disagree: align the streams before the calibration"
 ALLOWED_SHIFT = 0.3  # of the ramp, beyond which a shift of the whole rise is no property of the skin
 MIN_ALLOWED_SHIFT = 0.05  # s
 SPREADS = 2.0  # of the delays over the presses: a clock is late by the same time in all of them
 GRID_STEP, MAX_GRID = 0.05, 2**18  # s and samples of the time axis on which streams are correlated
 SLOW = 30.0  # s: what is slower is drift
 MAX_LAG = 60.0  # s
+MIN_RAMP_SHARE = 0.05  # of the force of a press, over its ramp: the force has begun to rise
+MIN_CHANGE_SHARE = 0.25  # of a change of the delays, by which the lags of the halves must differ
 MIN_CORRELATION, MIN_GAIN = 0.7, 0.3  # of the streams when moved by the lag, and over that when they are not moved
 
 
@@ -27,40 +34,72 @@ def beside(delay: float) -> str:
 
 
 def compare_clocks(
-    streams: Mapping[str, Stream], evidence: PressEvidence, findings: list[Finding]
+    statistics: Mapping[str, StreamStatistics], evidence: PressEvidence, findings: list[Finding]
 ) -> tuple[tuple[str, OnsetDelay], ...]:
     """Delays of the other streams after the force at the beginning of the presses; adds a finding for a wrong clock."""
-    if "force" not in streams:
+    force = statistics.get("force")
+    if force is None or evidence.force is None or force.dead.all():
         return ()
     presses, windows = evidence.compared()
-    onsets = onset_delays(streams["force"], [s for n, s in streams.items() if n != "force"], presses, windows)
+    streams = {name: statistics[name].stream for name in COMPARED if name in statistics}
+    onsets = onset_delays(force.stream, streams.values(), presses, windows)
     ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
     for name, onset in onsets.items():
         allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / streams[name].nominal_rate
-        if onset.presses and abs(onset.shift) > max(allowed, SPREADS * onset.spread):
-            what = f"rises {beside(onset.delay)} the force; the ramp takes {ramp:.2f} s"
+        what = _clock_text(force, statistics[name], onset, allowed, ramp)
+        if what:
             findings.append(_disagreement(name, what))
     return tuple(sorted(onsets.items()))
 
 
-def lag_findings(statistics: Mapping[str, StreamStatistics], known: list[Finding]) -> Iterator[Finding]:
-    """Findings for streams that resemble the force only when shifted by seconds, except streams known to be late."""
-    force = statistics.get("force")
-    if force is None or len(force.time) < 2 or not force.finite.any():
-        return
+def _clock_text(
+    force: StreamStatistics, stats: StreamStatistics, onset: OnsetDelay, allowed: float, ramp: float
+) -> str:
+    """How the clock of a stream disagrees with that of the force; empty if it does not."""
+    if len(force.time) < 2 or len(stats.time) < 2 or not force.finite.any():
+        return ""
+    late = onset.presses and abs(onset.shift) > max(allowed, SPREADS * onset.spread)
+    whole = _lag(force, stats, -np.inf, np.inf)
+    # A tip that slides changes the readings late, and their activity with the force.
+    late = late and (onset.shift < ramp / 2 or abs(whole.seconds - onset.delay) < 2 * allowed)
+    # A stream that is late by more than a press rises with another press.
+    if late and (not whole.clear or abs(whole.seconds - onset.delay) < 2 * allowed):
+        return f"rises {beside(onset.delay)} the force; the ramp takes {ramp:.2f} s"
+    if whole.clear:
+        return f"comes {whole.text}"
+    middle = float(force.time[0] + force.time[-1]) / 2
+    first, second = _lag(force, stats, -np.inf, middle), _lag(force, stats, middle, np.inf)
+    for name, half in (("first", first), ("second", second)):
+        if half.clear and abs(half.seconds) > allowed:
+            return f"comes, in the {name} half of the recording, {half.text}; a clock has jumped, or samples were lost"
+    if abs(onset.change) > allowed and MIN_CHANGE_SHARE < (second.seconds - first.seconds) / onset.change < 1:
+        sense = "grows" if onset.change > 0 else "falls"
+        return (
+            f"its delay after the force {sense} by {abs(onset.change):.3f} s from the first presses to the last ones: "
+            "a clock runs at another rate, or has jumped"
+        )
+    return ""
+
+
+class _Lag(NamedTuple):
+    """The lag of a stream after the force: s, whether they resemble each other only when moved by it, and words."""
+
+    seconds: float
+    clear: bool
+    text: str
+
+
+def _lag(force: StreamStatistics, stats: StreamStatistics, start: float, stop: float) -> _Lag:
+    """The lag of a stream after the force by their samples from ``start`` to ``stop`` (ns)."""
+    here, there = ((t >= start) & (t <= stop) for t in (force.time, stats.time))
+    if here.sum() < 2 or there.sum() < 2:
+        return _Lag(0.0, False, "")
     values = np.nan_to_num(force.stream.read()[:, 0], nan=0.0)
-    late = {f.where for f in known if "the force; the ramp takes" in f.what}
-    for name in ("eit", "pressure"):
-        stats = statistics.get(name)
-        if stats is None or f"/streams/{name}" in late or len(stats.time) < 2:
-            continue
-        lag, moved, unmoved = stream_lag((force.time, values), (stats.time, np.nan_to_num(stats.activity)))
-        if moved > MIN_CORRELATION and moved - abs(unmoved) > MIN_GAIN:
-            what = (
-                f"comes {beside(lag)} the force: they correlate by {moved:.2f} when moved by as much, "
-                f"by {unmoved:.2f} as recorded"
-            )
-            yield _disagreement(name, what)
+    second = stats.time[there], np.nan_to_num(stats.activity)[there]
+    lag, moved, unmoved = stream_lag((force.time[here], values[here]), second)
+    alike = f"they correlate by {moved:.2f} when moved by as much, by {unmoved:.2f} as recorded"
+    clear = moved > MIN_CORRELATION and moved - abs(unmoved) > MIN_GAIN
+    return _Lag(lag, clear, f"{beside(lag)} the force: {alike}")
 
 
 def stream_lag(
@@ -91,5 +130,52 @@ def _without_drift(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _disagreement(name: str, what: str) -> Finding:
-    remedy = "the clocks disagree: align the streams before the calibration"
-    return Finding(Severity.ERROR, f"/streams/{name}", what, remedy)
+    return Finding(Severity.ERROR, f"/streams/{name}", what, CLOCKS_DISAGREE)
+
+
+def check_table_clock(force: StreamStatistics, evidence: PressEvidence, findings: list[Finding]) -> None:
+    """Compare the times of the table of presses with the force; a finding is added if they disagree."""
+    if not isinstance(evidence.presses, PressTable) or force.dead.all():
+        return
+    presses, windows = evidence.compared()
+    onset = ramp_delay(force.stream, presses, windows)
+    ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
+    allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / force.row.nominal_rate
+    # A second contact raises the force again: only what the whole rise shares is a matter of clocks.
+    if not onset.presses or abs(onset.shift) <= max(allowed, SPREADS * onset.spread):
+        return
+    if onset.shift > 0 and _ramp_share(force, windows) > MIN_RAMP_SHARE:
+        return
+    lag = _table_lag(force, evidence.presses)
+    delay = onset.delay if lag is None or abs(lag - onset.delay) < 2 * allowed else lag
+    what = f"the force rises {beside(delay)} the presses of the table; their ramps take {ramp:.2f} s"
+    remedy = "the clocks disagree: move the times of the table, or leave it out so that presses are detected"
+    findings.append(Finding(Severity.ERROR, "/presses", what, remedy))
+
+
+def _ramp_share(force: StreamStatistics, windows: PressWindows) -> float:
+    """Mean force over the ramps of the table, of the largest force of each press; median over the presses.
+
+    It is a half for an even ramp, less for the first of two contacts, and nothing where the force comes later.
+    """
+    values, shares = force.stream.read()[:, 0], []
+    for before, ramp, hold in zip(windows.rest_before, windows.ramp, windows.hold, strict=True):
+        rest, rise, press = (
+            values[slice(*index_ranges(force.time, np.array([w]))[0])] for w in (before, ramp, [ramp[0], hold[1]])
+        )
+        if len(rest) and len(rise) and np.isfinite(press).any():
+            level = np.nanmedian(rest)
+            shares.append(np.nanmean(rise - level) / max(np.nanmax(press - level), np.finfo(float).tiny))
+    return float(np.nanmedian(shares)) if shares else 1.0
+
+
+def _table_lag(force: StreamStatistics, presses: PressTable) -> float | None:
+    """The lag (s) that makes the force resemble the table, if it resembles it only so."""
+    edges = np.stack([presses.t_press, presses.t_hold0, presses.t_hold1, presses.t_release], 1).ravel()
+    if len(force.time) < 2 or (np.diff(edges) < 0).any():
+        return None
+    load = np.where(presses.target_force > 0, presses.target_force, np.median(np.abs(presses.target_force)) or 1.0)
+    profile = np.interp(force.time, edges, (load[:, None] * [0.0, 1.0, 1.0, 0.0]).ravel())
+    values = np.nan_to_num(force.stream.read()[:, 0], nan=0.0)
+    lag, moved, unmoved = stream_lag((force.time, profile), (force.time, values))
+    return lag if moved > MIN_CORRELATION and moved - abs(unmoved) > MIN_GAIN else None
