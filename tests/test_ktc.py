@@ -11,7 +11,7 @@ from scipy.ndimage import label
 import jaxeit as je
 from benchmarks import bench_ktc as ktc, ktc_phantoms, tables
 
-from .helpers import REAL_DATA, disc_model
+from .helpers import REAL_DATA, disc_model, require_identical
 
 DATA = REAL_DATA / "ktc2023"
 needs_data = pytest.mark.skipif(
@@ -153,7 +153,7 @@ def test_simulated_frames_differ_by_their_pieces_and_repeat_by_seed(uneven):
         pieces = ktc_phantoms.phantom("convex", np.random.default_rng(9))
         frames.append([recorder.frame(), recorder.frame(), recorder.frame(pieces)])
     reference, again, touched = frames[0]
-    assert all(np.array_equal(a, b) for a, b in zip(*frames, strict=True))
+    require_identical(*map(np.array, frames))
     assert np.linalg.norm(again - reference) < 0.02 * np.linalg.norm(reference)
     assert np.linalg.norm(touched - reference) > 2 * np.linalg.norm(again - reference)
 
