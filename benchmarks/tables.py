@@ -92,9 +92,11 @@ def _speed(forward: Row, jacobian: Row) -> list[Row]:
     return [row | {"tool": label} for (kind, tool), label in SPEED.items() for row in runs[kind] if row["tool"] == tool]
 
 
-def _gpu_batches(results: Row) -> Iterator[Row]:
-    """Ours and those of other solvers, then memory and compilation of ours."""
-    for row in [{"tool": "jaxeit"} | row for row in results["batches"]] + results["peers"]:
+def _gpu_batches(results: Row, larger: Row) -> Iterator[Row]:
+    """Ours, on a larger GPU too, and those of other solvers, then memory and compilation of ours."""
+    ours = [{"tool": "jaxeit"} | row for row in results["batches"]]
+    beyond = [{"tool": "jaxeit on an H200"} | row for row in larger["batches"]]
+    for row in ours + beyond + results["peers"]:
         yield row | {"line": f"{row['tool']}, batches of {row['batch']:,}", "shown": f"{row['per_s']:,.0f}"}
     for row in results["batches"]:
         if row["batch"] == 1024:

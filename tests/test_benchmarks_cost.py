@@ -433,6 +433,7 @@ def test_tables_of_the_pages(root):
         "training": [{"steps_per_s": 100.0, "frames_per_s": 25600.0, "first_epoch_s": 4.5}],
         "ladder": [{"label": "standard", "forward": {"median": 0.8e-3}, "jacobian": {"median": 1.25e-3}}],
     }
+    results["gpu_h200"] = {"batches": [one | {"per_s": 600e3}]}
     pages = [(root / "docs" / name).read_text() for name in ("costs.md", "live.md")]
     marks = re.findall(r"<!-- end of ([\w-]+) -->", "".join(pages))
     assert set(marks) <= set(tables.FORMATS)
@@ -443,7 +444,12 @@ def test_tables_of_the_pages(root):
     assert "| **standard** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 | 0.8 | 1.25 | 1.23 | 0.06 |" in text["ladder"]
     assert "| **P1, 2 mm** | 1,681 | 0.18 % | 0.02 % | 5.93 | 5.93 |  |  |  |  |" in text["ladder"]
     assert "behind the front" not in text["ladder"]
-    for line in ("jaxeit, batches of 1,024 | 512,000", "cuDSS, batches of 1,024 | 15,000", "compilation, s | 6.2"):
+    for line in (
+        "jaxeit, batches of 1,024 | 512,000",
+        "jaxeit on an H200, batches of 1,024 | 600,000",
+        "cuDSS, batches of 1,024 | 15,000",
+        "compilation, s | 6.2",
+    ):
         assert f"| {line} |" in text["gpu-batches"]
     assert "| forward, one call, ms | 2.00 |" in text["gpu-verbs"]
     assert "100 steps a second there, of 256 random frames" in text["gpu-training"]
