@@ -20,7 +20,7 @@ from .presses import NAMES, list_presses, press_evidence, press_summary
 from .report import ChannelTable, CheckReport, Finding, Severity
 from .responses import pad_response_findings, reading_response_findings
 from .skin import check_skin
-from .streams.clocks import CLOCKS_DISAGREE, COMPARED, check_table_clock, compare_clocks
+from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks, table_clock_finding
 from .streams.dropouts import dropout_findings
 from .streams.shifts import shift_findings
 from .streams.statistics import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
@@ -68,9 +68,8 @@ def check_session(
         skin=session.skin_name,
         simulated=session.simulated,
         complete=session.complete,
-        findings=tuple(
-            dict.fromkeys(findings)
-        ),  # a wrong sign shows where presses are detected and where they are compared
+        # A wrong sign shows where presses are detected and where they are compared.
+        findings=tuple(dict.fromkeys(findings)),
         streams=tuple(s.row for s in statistics.values()),
         pads=pads,
         channels=channels,
@@ -118,9 +117,11 @@ def _streams_of_wrong_clocks(
     moved = {f.where.rpartition("/")[2] for f in findings if f.remedy == CLOCKS_DISAGREE}
     if moved or "force" not in statistics:
         return moved
-    known = len(findings)
-    check_table_clock(statistics["force"], evidence, findings)
-    return {*NAMES} if len(findings) > known else set()
+    found = table_clock_finding(statistics["force"], evidence)
+    if found is None:
+        return set()
+    findings.append(found)
+    return {*NAMES}
 
 
 def _session_findings(session: Session) -> Iterator[Finding]:

@@ -49,10 +49,9 @@ def _of_matlab(path: Path, variables: Mapping[str, Any], skin: je.Skin) -> Tank:
         skin, whose = replace(skin, protocol=protocol), f"{name}"
     columns = {name: found for name, value in variables.items() if (found := columns_of(value)) is not None}
     frames = {
-        name if chosen.shape[1] == 1 else f"{name}({k + 1})": column
+        name: chosen
         for name, found in columns.items()
         if (chosen := _readings_of(found, skin.protocol, electrodes)) is not None
-        for k, column in enumerate(chosen.T)
     }
     if not frames:
         sizes = [f"{name} {' x '.join(map(str, found.shape))}" for name, found in columns.items()]

@@ -53,17 +53,17 @@ def eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol 
     )
     protocol = stimulation_protocol(where, model, len(electrodes)) if protocol is None else protocol
     skin = je.Skin(path.stem, rim.domain, 1.0, electrodes, protocol)
+    columns = {name: found for name, value in variables.items() if (found := columns_of(value)) is not None}
+    return named_frames(skin, {name: found for name, found in columns.items() if len(found) == protocol.readings}, mesh)
+
+
+def named_frames(skin: je.Skin, variables: Mapping[str, np.ndarray], mesh: je.meshing.Mesh | None = None) -> Tank:
+    """A tank with the frames of variables (readings, frames), by name and number, those that are references first."""
     frames = {
         name if columns.shape[1] == 1 else f"{name}({k + 1})": column
-        for name, value in variables.items()
-        if (columns := columns_of(value)) is not None and len(columns) == protocol.readings
+        for name, columns in variables.items()
         for k, column in enumerate(columns.T)
     }
-    return named_frames(skin, frames, mesh)
-
-
-def named_frames(skin: je.Skin, frames: Mapping[str, np.ndarray], mesh: je.meshing.Mesh | None = None) -> Tank:
-    """A tank with frames by name, those that are references first."""
     names = tuple(sorted(frames, key=lambda name: not _is_reference(name.split("(")[0])))
     values = np.array([frames[name] for name in names]).reshape(len(names), skin.protocol.readings)
     parts = np.ascontiguousarray(values.real), values.imag if np.iscomplexobj(values) else None

@@ -27,8 +27,8 @@ WEIGHT = 0.0064
 """Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
 COLUMNS = 30
 """Pixels along x where no basis is given."""
-MORE_FITS = 3
-"""Of an image that leaves more of a frame than its errors, each with larger ones."""
+MORE_FITS, BELIEVED_MISFIT = 3, 1.05
+"""Fits with larger errors, of an image that leaves more of a frame than these; root mean square over the errors."""
 
 
 class Segmentation(eqx.Module):
@@ -99,14 +99,15 @@ def segment(
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
     if penalty is None:
         penalty = IsotropicVariation(weight=WEIGHT * jnp.sum(jnp.isfinite(change), dtype=model.dtype))
-    found, misfit = jnp.zeros(0), 1.0
-    for _ in range(1 + MORE_FITS):
+    std = _errors(before, change, left, relative_error, absolute_error)
+    found = gauss_newton(physics, penalty, even + change, std)
+    for _ in range(MORE_FITS):
+        misfit = float(jnp.sqrt(jnp.nanmean(((even + change - physics.voltages(found)) / std) ** 2)))
+        if not misfit > BELIEVED_MISFIT:
+            break
         absolute_error *= misfit
         std = _errors(before, change, left, relative_error, absolute_error)
         found = gauss_newton(physics, penalty, even + change, std)
-        misfit = float(jnp.sqrt(jnp.nanmean(((even + change - physics.voltages(found)) / std) ** 2)))
-        if not misfit > 1.05:
-            break
     fine = on_grid(found, image.picture, (pixels, pixels))
     return Segmentation(found, image.picture, half_height_classes(fine, floor, least, weakest))
 

@@ -133,24 +133,24 @@ def _disagreement(name: str, what: str) -> Finding:
     return Finding(Severity.ERROR, f"/streams/{name}", what, CLOCKS_DISAGREE)
 
 
-def check_table_clock(force: StreamStatistics, evidence: PressEvidence, findings: list[Finding]) -> None:
-    """Compare the times of the table of presses with the force; a finding is added if they disagree."""
+def table_clock_finding(force: StreamStatistics, evidence: PressEvidence) -> Finding | None:
+    """How the times of the table of presses disagree with the force, if they do."""
     if not isinstance(evidence.presses, PressTable) or force.dead.all():
-        return
+        return None
     presses, windows = evidence.compared()
     onset = ramp_delay(force.stream, presses, windows)
     ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
     allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / force.row.nominal_rate
     # A second contact raises the force again: only what the whole rise shares is a matter of clocks.
     if not onset.presses or abs(onset.shift) <= max(allowed, SPREADS * onset.spread):
-        return
+        return None
     if onset.shift > 0 and _ramp_share(force, windows) > MIN_RAMP_SHARE:
-        return
+        return None
     lag = _table_lag(force, evidence.presses)
     delay = onset.delay if lag is None or abs(lag - onset.delay) < 2 * allowed else lag
     what = f"the force rises {beside(delay)} the presses of the table; their ramps take {ramp:.2f} s"
     remedy = "the clocks disagree: move the times of the table, or leave it out so that presses are detected"
-    findings.append(Finding(Severity.ERROR, "/presses", what, remedy))
+    return Finding(Severity.ERROR, "/presses", what, remedy)
 
 
 def _ramp_share(force: StreamStatistics, windows: PressWindows) -> float:

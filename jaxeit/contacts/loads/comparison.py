@@ -138,15 +138,15 @@ class Comparison:
     def one(self) -> Fit:
         """The best single load; where the contacts lead astray, a usual load in their place or the best atom."""
         starts = self.fitter.starts
-        atom = starts.atom(self.y, np.eye(len(self.y)))[1]
         if self.contacts is None:
-            return self.best(LoadKind.ONE, [atom])
+            return self.best(LoadKind.ONE, [starts.atom(self.y, np.eye(len(self.y)))[1]])
         begin = starts.single(self.y, self.contacts)
         found = self.best(LoadKind.ONE, [begin])
         if found.square < ASTRAY * len(self.y):
             return found
         usual = np.append(begin[0, :2], np.asarray(self.fitter.usual))[None]
-        return min(found, self.best(LoadKind.ONE, [usual, atom]), key=lambda fit: fit.square)
+        anew = self.best(LoadKind.ONE, [usual, starts.atom(self.y, np.eye(len(self.y)))[1]])
+        return min(found, anew, key=lambda fit: fit.square)
 
     def best(self, kind: LoadKind, starts: list[np.ndarray]) -> Fit:
         """The best fit from some starts, with the errors at its end.
