@@ -1,7 +1,7 @@
 """Contacts followed through time, by frames and pad forces together."""
 
+from .belief.layer import GainField, LearnedLayer
 from .compilation import compile_tracker
-from .layer import GainField, LearnedLayer
 from .model_error import fit_model_error, press_evidence
 from .settings import TrackerSettings
 from .smoothing import Smoother, TimedTracks

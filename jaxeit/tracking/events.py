@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .filter import PLACE, ROUND, SIZE, Belief
+from .belief.filter import PLACE, ROUND, SIZE, Belief
 from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from .belief.filter import Update
+from .belief.programs import Programs
 from .events import Events, Hypothesis
-from .filter import Update
-from .programs import Programs
 from .tracks import Backlog, Look, Seen, Tracking, Trial
 
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from .._compile import require_known
 from ..imaging.noise import InverseError
-from .filter import Pads
-from .layer import LearnedLayer
+from .belief.filter import Pads
+from .belief.layer import LearnedLayer
 from .tracker import Tracker
 
 # Model errors that are tried: each is larger than the one before by this factor, up to the last.

@@ -23,10 +23,10 @@ from ..model.forward_model import conductivity
 from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
-from .filter import PLACE, SIZE, ContactFilter
-from .layer import GainField
-from .reanalysis import prepare_reanalysis
-from .response import LoadedSheet, Neighbours, half_lengths
+from .belief.filter import PLACE, SIZE, ContactFilter
+from .belief.layer import GainField
+from .belief.reanalysis import prepare_reanalysis
+from .belief.response import LoadedSheet, Neighbours, half_lengths
 from .settings import TrackerSettings
 
 # Cells of the grid of neighbours, along the longer side.

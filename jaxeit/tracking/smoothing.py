@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .consider import ConsiderErrors
-from .filter import SIZE, Belief, predicted
+from .belief.consider import ConsiderErrors
+from .belief.filter import SIZE, Belief, predicted
 from .tracker import Tracker
 from .tracks import Track, Tracking, track_of
 

@@ -17,13 +17,13 @@ from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
-from .consider import ConsiderErrors
+from .belief.consider import ConsiderErrors
+from .belief.filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
+from .belief.layer import GainField, LearnedLayer
+from .belief.programs import Programs
 from .events import Events
-from .filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
-from .layer import GainField, LearnedLayer
 from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
 from .preparation import prepare_filter
-from .programs import Programs
 from .settings import TrackerSettings
 from .tracks import Backlog, Look, Seen, Tracking
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .consider import ConsiderErrors
+from .belief.consider import ConsiderErrors
+from .belief.filter import SIZE, Attempt, Belief, Pads
 from .events import Hypothesis
-from .filter import SIZE, Attempt, Belief, Pads
 
 
 class Track(NamedTuple):

@@ -5,7 +5,7 @@ import pytest
 
 import jaxeit as je
 from jaxeit.tracking import TrackerSettings, prepare_tracker
-from jaxeit.tracking.response import load_pressure
+from jaxeit.tracking.belief.response import load_pressure
 
 SECONDS = 0.01
 SETTINGS = TrackerSettings(most=2, unknowns=64, modes=8, pixels=250, columns=40)

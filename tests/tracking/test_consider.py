@@ -12,8 +12,8 @@ import jaxeit as je
 from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import Form, line_shapes, shape_directions
 from jaxeit.tracking import prepare_tracker
-from jaxeit.tracking.consider import ConsiderErrors
-from jaxeit.tracking.response import SHORTEST, load_pressure
+from jaxeit.tracking.belief.consider import ConsiderErrors
+from jaxeit.tracking.belief.response import SHORTEST, load_pressure
 from tests.compiled import compiled
 
 from .conftest import SECONDS, SETTINGS, load

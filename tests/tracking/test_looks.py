@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.tracking.filter import PIECE, SIZE, STEPS, Pads
+from jaxeit.tracking.belief.filter import PIECE, SIZE, STEPS, Pads
+from jaxeit.tracking.belief.programs import Programs
 from jaxeit.tracking.looks import KEPT, PATIENCE, meanwhile
-from jaxeit.tracking.programs import Programs
 from jaxeit.tracking.tracks import Seen
 
 from .conftest import SECONDS, load

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, press_evidence
-from jaxeit.tracking.filter import SIZE
+from jaxeit.tracking.belief.filter import SIZE
 from jaxeit.tracking.model_error import STEP
 
 from .conftest import SECONDS, load

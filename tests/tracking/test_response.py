@@ -9,8 +9,8 @@ import jaxeit as je
 from jaxeit.imaging.noise import whitened_readings
 from jaxeit.model.bases import Elements
 from jaxeit.model.sensitivity import pair_jacobian
-from jaxeit.tracking.reanalysis import prepare_reanalysis
-from jaxeit.tracking.response import load_pressure
+from jaxeit.tracking.belief.reanalysis import prepare_reanalysis
+from jaxeit.tracking.belief.response import load_pressure
 from tests.compiled import compiled
 
 from .conftest import in_double_precision

@@ -6,7 +6,7 @@ import pytest
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings
-from jaxeit.tracking.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
+from jaxeit.tracking.belief.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
 
 from .conftest import SECONDS, in_double_precision, load
 

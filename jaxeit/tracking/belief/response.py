@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..contacts.loads.pressure import line, line_shapes
-from ..effects.material import ContactPiezoresistance
+from ...contacts.loads.pressure import line, line_shapes
+from ...effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.

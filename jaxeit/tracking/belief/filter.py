@@ -20,10 +20,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import verb
-from ..contacts.search import ContactFinder, Frame
-from ..least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations
-from ..linalg import lapack
+from ..._compile import verb
+from ...contacts.search import ContactFinder, Frame
+from ...least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations
+from ...linalg import lapack
 from .response import LoadedSheet, Near, Shown
 
 # Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._compile import verb
-from ..linalg import lapack
+from ..._compile import verb
+from ...linalg import lapack
 from .filter import ROUND, SEEN, Belief, ContactFilter, Pads, active_numbers
 
 # Frames n, each with an error of the model of its own, after which contacts are told by the frames and not by P.

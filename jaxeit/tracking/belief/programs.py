@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._compile import bind
+from ..._compile import bind
 from .consider import consider_covariance
 from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, predicted, unexplained
 

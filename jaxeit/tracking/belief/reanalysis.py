@@ -25,11 +25,11 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse.linalg import splu
 
-from .._compile import full_precision, verb
-from ..linalg import lapack
-from ..linalg.base import on_device
-from ..model.discretisation import Model
-from ..model.forward_model import Coefficients, assemble, coefficients, fields
+from ..._compile import full_precision, verb
+from ...linalg import lapack
+from ...linalg.base import on_device
+from ...model.discretisation import Model
+from ...model.forward_model import Coefficients, assemble, coefficients, fields
 
 
 class Reanalysis(eqx.Module):

@@ -6,9 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..contacts.loads.preparation import field_bumps, field_nodes, field_norm
-from ..contacts.loads.settings import LoadSettings
-from ..imaging.noise import InverseError
+from ...contacts.loads.preparation import field_bumps, field_nodes, field_norm
+from ...contacts.loads.settings import LoadSettings
+from ...imaging.noise import InverseError
 
 # Difference within which numbers of two fields count as equal, relative to the length of the field.
 SAME = 1e-5

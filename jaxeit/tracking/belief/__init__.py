@@ -1,0 +1,1 @@
+"""The belief of contacts: what frames show of them, its change by one frame, and what stays unknown in all frames."""
