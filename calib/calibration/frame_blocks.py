@@ -40,7 +40,7 @@ class FrameBlocks:
 
     def __init__(self, session: Session, processing: Processing, levels: Mapping[str, Any]):
         self._eit, self._pressure = session.stream("eit"), session.stream("pressure")
-        self._filters = {s.name: processing.of(s)[0] for s in (self._eit, self._pressure)}
+        self._filters = {s.name: processing.of(s) for s in (self._eit, self._pressure)}
         self._levels = levels
 
     def __len__(self) -> int:

@@ -61,6 +61,9 @@ OUT_OF_MEMORY = "this machine has too little memory for it; use less data, a coa
 def _run(argv: list[str]) -> int:
     """Run one command, flush its output and return its exit status."""
     try:
+        if not argv:
+            _parser(argv).print_help(sys.stderr)
+            return 2
         args = _parser(argv).parse_args(argv)
         status: int = args.command(args)
         return status

@@ -237,7 +237,7 @@ def _quiet_frames(recording: PressMeasurements, processing: Processing) -> np.nd
     Subtracting the mean of n frames removes one degree of freedom; the factor sqrt(n / (n - 1)) restores the variance.
     """
     stream, windows = recording.session.stream("eit"), recording.windows.rest_before[recording.presses.accepted]
-    corrections, _ = processing.of(stream)
+    corrections = processing.of(stream)
     rests = [np.empty((0, stream.channels))]
     for window in windows:
         first, last = index_ranges(stream.time, window + np.array([-FILTER_MARGIN, FILTER_MARGIN]))

@@ -1,6 +1,6 @@
 """Measure the presses of a session: position, change of the readings, pad pressures and force of each press."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,17 +36,18 @@ class Processing:
     baseline: AbstractBaseline = field(default_factory=TwoSided)
     windows: WindowLengths = field(default_factory=WindowLengths)
 
-    def of(self, stream: Stream) -> tuple[tuple[AbstractCorrection, ...], str]:
-        """Corrections for one stream, and a note if the default correction does not apply to it."""
+    def of(self, stream: Stream) -> tuple[AbstractCorrection, ...]:
+        """Corrections for one stream."""
         if self.corrections is not None:
-            return self.corrections, ""
-        rate = sample_rate(stream.time)
-        if rate > 2 * DEFAULT_CUTOFF:
-            return (LowPass(DEFAULT_CUTOFF),), ""
-        return (), (
-            f"{stream.name} is recorded at {rate:.3g} Hz: the {DEFAULT_CUTOFF:g} Hz low-pass has nothing "
-            "to remove and is left out"
-        )
+            return self.corrections
+        return (LowPass(DEFAULT_CUTOFF),) if sample_rate(stream.time) > 2 * DEFAULT_CUTOFF else ()
+
+    def notes(self, streams: Iterable[Stream]) -> tuple[str, ...]:
+        """A note on the streams that the default correction does not apply to."""
+        slow = [f"{each.name} ({sample_rate(each.time):.3g} Hz)" for each in streams if not self.of(each)]
+        if self.corrections is not None or not slow:
+            return ()
+        return (f"no {DEFAULT_CUTOFF:g} Hz low-pass on {', '.join(slow)}: slow samples hold no higher frequencies",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ def measure(
     presses = reject_without_samples(presses, windows, streams.values(), processing.baseline)
     chosen = {name: processing.of(stream) for name, stream in streams.items()}
     held = {
-        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name][0])
+        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name])
         for name, stream in streams.items()
     }
     means = {name: found.change.mean for name, found in held.items()}
@@ -123,10 +124,9 @@ def measure(
         presses,
         windows,
         baseline=processing.baseline,
-        corrections=chosen["force"][0],
+        corrections=chosen["force"],
     )
     position = np.stack([presses.x, presses.y], 1)[kept]
-    notes = [note for _, note in chosen.values() if note]
     return PressMeasurements(
         session=session,
         position=position,
@@ -140,7 +140,7 @@ def measure(
         samples=samples,
         presses=presses,
         windows=windows,
-        notes=(*notes, *lost, *_set_aside(presses)),
+        notes=(*processing.notes(streams.values()), *lost, *_set_aside(presses)),
     )
 
 

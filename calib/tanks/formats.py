@@ -48,7 +48,8 @@ def load_tank(
         return load_sciospec([path], domain, rim)
     readers = {".csv": load_pyeidors, ".npz": load_npz, ".get": load_instrument, ".eit": load_instrument}
     if kind not in readers:
-        raise TankError(f"{path.name}: is no file of a tank by its name; give .mat, .csv, .eit, .get or .npz")
+        sessions = "jaxeit apply makes maps of a session"
+        raise TankError(f"{path.name}: is no file of a tank; give .mat, .csv, .eit, .get or .npz; {sessions}")
     return readers[kind](path, domain, rim)
 
 

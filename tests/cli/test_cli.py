@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from calib.cli import main
+from calib.cli import COMMANDS, main
 
 
 @pytest.fixture(scope="module")
@@ -138,10 +138,11 @@ def test_an_output_that_cannot_be_written_is_said_at_once(grid_file, tmp_path, c
     assert "is not text; give a TOML file" in capsys.readouterr().err
 
 
-def test_no_command_is_an_error():
-    with pytest.raises(SystemExit) as caught:
-        main([])
-    assert caught.value.code == 2
+def test_no_command_prints_the_commands_as_an_error(capsys):
+    assert main([]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert all(command in err for command in COMMANDS)
 
 
 @pytest.mark.parametrize(

@@ -322,7 +322,7 @@ def test_frames_of_the_kuopio_challenge(tmp_path):
         ("a.csv", "1\n" * 4, r"lines have \[1\] columns"),
         ("a.mat", "no MATLAB", "is no MATLAB file"),
         ("a.npz", "no archive", "cannot be read as a NumPy archive"),
-        ("a.xyz", "", "is no file of a tank by its name"),
+        ("a.xyz", "", "is no file of a tank; give .mat"),
     ],
 )
 def test_other_files_are_refused(tmp_path, name, content, message):

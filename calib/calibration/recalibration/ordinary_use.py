@@ -75,7 +75,7 @@ def use_contacts(session: Session, calibration: Calibration) -> UseContacts:
         free = zero[~touched] if not touched.all() else zero[:1]
         return UseContacts(np.empty((0, eit.channels)), none, np.empty(0, int), free, time[: len(free)])
     windows = _windows(np.array(blocks))
-    corrections = {s.name: calibration.processing.of(s)[0] for s in (eit, pressure)}
+    corrections = {s.name: calibration.processing.of(s) for s in (eit, pressure)}
     held = {s.name: press_means(s, windows, corrections=corrections[s.name]) for s in (eit, pressure)}
     pads, number = held["pressure"], windows.rest_before[:, 1]  # blocks of one contact follow the same rest
     return UseContacts(held["eit"].change.mean, pads.change.mean, number, pads.baseline, windows.hold.mean(1))
