@@ -158,7 +158,7 @@ class Calibration:
             ("sessions", ", ".join(sessions)),
             ("presses", f"{len(found.force)}" + (", simulated" if self.simulated else "")),
             ("curve, location", found.recipe),
-            (f"error of force, held out by {found.held_out_by}", f"{np.sqrt(np.nanmean(error**2)):.3g} N, RMSE"),
+            (f"error of force, {found.held_out}", f"{np.sqrt(np.nanmean(error**2)):.3g} N, RMSE"),
         ]
         if places is not None:
             distance = np.linalg.norm(places - found.position, axis=1)

@@ -64,7 +64,8 @@ class Evaluation:
     | half_width: half the 90 % interval of the total force; None: old  | (presses,)      | N    |
     | image_sum: integral of the image                                   | (presses,)      | S m^2|
     | centre of the sheet                                                | (2,)            | m    |
-    | held_out_by: what the fit had not seen, "location" or "session"    |                 |      |
+    | held_out_by: what the fit had not seen, "location" or "session";   |                 |      |
+    |   empty if it had seen all                                         |                 |      |
     | others: total force by other methods of `METHODS`, held out alike  | (presses,) each | N    |
     | recipe: curve and location of the calibration, in words            |                 |      |
     | splits: errors with pads, indenters or sessions held out           |                 |      |
@@ -95,6 +96,11 @@ class Evaluation:
         """Image sum per newton, divided by its mean over the presses, (presses,)."""
         ratio = self.image_sum / self.force
         return np.asarray(ratio / ratio.mean())
+
+    @property
+    def held_out(self) -> str:
+        """What the fit had not seen, in words."""
+        return f"held out by {self.held_out_by}" if self.held_out_by else "not held out"
 
     @property
     def sensitivity_hybrid(self) -> np.ndarray:
@@ -207,7 +213,7 @@ class Evaluation:
             "position": (self.position, "m", "true position of the tip"),
             "force": (self.force, "N", "load cell"),
             "pressure": (self.pressure, "Pa", "change of each pad's pressure over the hold"),
-            "pad_force": (self.pad_force, "N", f"estimated, held out by {self.held_out_by}"),
+            "pad_force": (self.pad_force, "N", f"estimated, {self.held_out}"),
             "image_sum": (self.image_sum, "S m2", "integral of the image"),
             "centre": (self.centre, "m", "centre of the sheet"),
         }
@@ -216,7 +222,7 @@ class Evaluation:
         for name, estimate in self.estimated.items():
             out[f"estimated_{name}"] = (estimate, "m", f"position estimated by {name}")
         for name, total in self.others.items():
-            out[f"force_{name}"] = (total, "N", f"total force by {METHODS[name]}, held out by {self.held_out_by}")
+            out[f"force_{name}"] = (total, "N", f"total force by {METHODS[name]}, {self.held_out}")
         return out
 
     @classmethod
@@ -267,7 +273,7 @@ def render_table(evaluation: Evaluation, title: str) -> str:
     """The results as a table for a terminal; CV with ddof 1."""
     s = evaluation.summary()
     lines = [
-        f"{title}: {s['presses']:.0f} presses, forces held out by {evaluation.held_out_by}",
+        f"{title}: {s['presses']:.0f} presses, forces {evaluation.held_out}",
         "",
     ]
     lines.append("  localisation, mm        mean  (+- SE)  median     p95   inward bias")

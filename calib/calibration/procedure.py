@@ -27,6 +27,7 @@ from ..session import Session, SessionError
 from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
+from .fitted_sessions import FITTED, is_fitted, require_each_once
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes
@@ -59,13 +60,14 @@ def calibrate(
         progress: called with the name of each of the `STAGES`, `PLACING` or `LEARNING`, when the stage begins.
 
     Raises:
-        SessionError: a session cannot be used, or was recorded on another skin.
+        SessionError: a session cannot be used, is given twice, or was recorded on another skin.
         RecordingError: `check_session` finds an error in a session.
         FitError: a pad was not pressed enough to fit its curve, or there are too few presses for a field.
         InverseError, HyperparameterError: no image can be made as the recipe asks.
     """
     if not sessions:
         raise SessionError("calibrate: no session given; give one or more session files")
+    require_each_once(sessions)
     recipe = recipe or Recipe()
     skin = skin or je.skin.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
     progress("reading")
@@ -201,6 +203,7 @@ def evaluate(
         SessionError: if the session was recorded on another skin or cannot be used.
         RecordingError: if `check_session` finds an error in the session.
     """
+    fitted = is_fitted(calibration.provenance, session)
     found = measure(session, calibration.skin, processing or calibration.processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
@@ -216,8 +219,8 @@ def evaluate(
         half_width=half_width,
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
-        held_out_by="session",
-        notes=(*ignored, *found.notes, *agreement.notes),
+        held_out_by="" if fitted else "session",
+        notes=(*([FITTED] if fitted else []), *ignored, *found.notes, *agreement.notes),
         others=_compared_forces(calibration, found, images.integral),
         recipe=calibration.evaluation.recipe,
     )

@@ -1,6 +1,7 @@
 """Arguments that several commands take, and checks of them before the work begins."""
 
 import argparse
+import dataclasses
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
@@ -43,14 +44,52 @@ def skin_of(name: str | None) -> "je.Skin | None":
     return je.load_skin(name)
 
 
-def prepare_outputs(*paths: str | None) -> None:
-    """Create the folders of output files; raises ValueError before the work begins if a file cannot be written."""
-    for path in map(Path, filter(None, paths)):
+def prepare_outputs(args: argparse.Namespace, *names: str) -> None:
+    """Create the folders of the output files in the arguments of these names, before the work begins.
+
+    Raises:
+        ValueError: if a file cannot be written, is given twice, or would take the place of an input or of a session.
+    """
+    outputs = [Path(path) for name in names if (path := getattr(args, name))]
+    inputs = [Path(word) for name, value in vars(args).items() if name not in names for word in _words(value)]
+    for number, path in enumerate(outputs):
         if path.is_dir():
             raise ValueError(f"{path}: is a folder; give a file name")
+        if path.exists() and not path.is_file():
+            raise ValueError(f"{path}: is a device or a pipe; give a file name")
+        if any(_same(path, other) for other in inputs):
+            raise ValueError(f"{path}: is also an input, which would be lost; give another name")
+        if any(path.absolute() == other.absolute() for other in outputs[:number]):
+            raise ValueError(f"{path}: is given for two outputs; give two names")
         path.parent.mkdir(parents=True, exist_ok=True)
         if not os.access(path.parent, os.W_OK):
             raise ValueError(f"{path}: the folder cannot be written to; choose another")
+
+
+def prepare_results(args: argparse.Namespace, *names: str) -> None:
+    """`prepare_outputs` for files that are no sessions, which take the place of none."""
+    from ..session import require_no_session
+
+    prepare_outputs(args, *names)
+    for name in names:
+        if path := getattr(args, name):
+            require_no_session(Path(path))
+
+
+def _words(value: object) -> list[str]:
+    """The words in the value of an argument."""
+    if dataclasses.is_dataclass(value):
+        value = list(vars(value).values())
+    if isinstance(value, list | tuple):
+        return [word for each in value for word in _words(each)]
+    return [value] if isinstance(value, str) else []
+
+
+def _same(path: Path, other: Path) -> bool:
+    try:
+        return path.samefile(other)
+    except (OSError, ValueError):  # one of them does not exist, or is no path
+        return False
 
 
 NO_PROPOSAL = "none"

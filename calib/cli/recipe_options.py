@@ -26,7 +26,7 @@ from ..calibration.recipe_text import (
 from ..fitting import CURVES, FIELDS, LOSSES
 from ..presses.corrections import BASELINES, LowPass
 from ..presses.table import Processing
-from .arguments import count
+from .arguments import above_zero, count
 
 T = TypeVar("T")
 
@@ -71,7 +71,7 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
 def add_low_pass_argument(parser: Any) -> None:
     """The option of the low-pass filter."""
     text = "cutoff of the low-pass filter; default: 50, or no filter for streams of 100 Hz or slower"
-    parser.add_argument("--low-pass", type=float, metavar="HZ", help=text)
+    parser.add_argument("--low-pass", type=above_zero, metavar="HZ", help=text)
 
 
 def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:

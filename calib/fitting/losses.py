@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxeit.registry import Registry
+from jaxeit.registry import AbstractChoice, Registry, limited
 
 
-class AbstractLoss(eqx.Module):
+class AbstractLoss(AbstractChoice):
     """A robust loss rho, with rho(s) = s near zero; `width` in units of the residuals' scale."""
 
     width: eqx.AbstractVar[Array]
@@ -47,7 +47,7 @@ class AbstractLoss(eqx.Module):
 class Squared(AbstractLoss):
     """rho(s) = s: ordinary least squares, on which one outlier has unbounded influence."""
 
-    width: Array = eqx.field(converter=jnp.asarray, default=1.0)
+    width: Array = limited(1.0, above=0, converter=jnp.asarray)
 
     def ratio(self, s: Array) -> Array:
         return jnp.ones_like(s)
@@ -56,7 +56,7 @@ class Squared(AbstractLoss):
 class Huber(AbstractLoss):
     """rho(s) = s up to 1, then 2 sqrt(s) - 1. Width 1.345: 95 % efficient on normal noise."""
 
-    width: Array = eqx.field(converter=jnp.asarray, default=1.345)
+    width: Array = limited(1.345, above=0, converter=jnp.asarray)
 
     def ratio(self, s: Array) -> Array:
         far = jnp.maximum(s, 1.0)
@@ -69,7 +69,7 @@ class Huber(AbstractLoss):
 class SoftL1(AbstractLoss):
     """rho(s) = 2 (sqrt(1 + s) - 1), a smooth Huber. Width 1.287: 95 % efficient on normal noise."""
 
-    width: Array = eqx.field(converter=jnp.asarray, default=1.287)
+    width: Array = limited(1.287, above=0, converter=jnp.asarray)
 
     def ratio(self, s: Array) -> Array:
         return 2 / (jnp.sqrt(1 + s) + 1)
@@ -82,7 +82,7 @@ class SoftL1(AbstractLoss):
 class Cauchy(AbstractLoss):
     """rho(s) = log(1 + s): gross outliers lose all influence. Width 2.385: 95 % efficient on normal noise."""
 
-    width: Array = eqx.field(converter=jnp.asarray, default=2.385)
+    width: Array = limited(2.385, above=0, converter=jnp.asarray)
 
     def ratio(self, s: Array) -> Array:
         small = s < 1e-4

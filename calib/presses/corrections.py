@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import signal
 
-from jaxeit.registry import Registry
+from jaxeit.registry import Registry, limited, require_limits
 
 from .streams import finite_mean
 
@@ -87,15 +87,12 @@ class LowPass(AbstractCorrection):
     100 Hz, where the paper's filter would be exactly at the Nyquist frequency.
     """
 
-    cutoff: float = 50.0
-    order: int = 2
+    cutoff: float = limited(50.0, above=0)
+    order: int = limited(2, least=1, most=20)
     causal: bool = False
 
     def __post_init__(self) -> None:
-        if not self.cutoff > 0 or self.order < 1:
-            raise CorrectionError(
-                f"a low-pass needs a cutoff above 0 Hz and an order of at least 1, not {self.cutoff} and {self.order}."
-            )
+        require_limits(self, CorrectionError)
 
     def sections(self, rate: float, name: str = "stream") -> np.ndarray:
         """Second-order sections for a stream of `rate` Hz."""

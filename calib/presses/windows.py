@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from jaxeit.registry import limited, require_limits
+
 from ..session.units import SECOND
 from .corrections import AbstractBaseline, TwoSided
 from .streams import ReadableStream, index_ranges
@@ -46,10 +48,13 @@ class WindowLengths:
     | guard    | margin that is left out before a contact and at the end of the hold                |
     """
 
-    hold: float = 1.0
-    rest: float = 0.5
-    recovery: float = 1.5
-    guard: float = 0.05
+    hold: float = limited(1.0, above=0)
+    rest: float = limited(0.5, above=0)
+    recovery: float = limited(1.5, least=0)
+    guard: float = limited(0.05, least=0)
+
+    def __post_init__(self) -> None:
+        require_limits(self)
 
 
 def _ns(seconds: float) -> int:

@@ -177,7 +177,7 @@ def _places(evaluation: Evaluation) -> int:
 
 def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> str:
     groups = {
-        f"{name}: {len(e.force)} presses, held out by {e.held_out_by}": _method_rows(e)
+        f"{name}: {len(e.force)} presses, {e.held_out}": _method_rows(e)
         for name, e in _all(calibration, evaluations).items()
     }
     if calibration.skin.name == PAPERS_SKIN:

@@ -7,7 +7,7 @@
 from .archive import Archive, ArchiveReader, ArchiveWriter, open_archive, read_archive, write_archive
 from .errors import SessionError
 from .facts import SessionFacts, StreamFacts
-from .hdf5.storage import file_hash, replacing
+from .hdf5.storage import file_hash, replacing, require_no_session
 from .reader import Session, open_session
 from .stream import Stream
 from .tables import ClockTable, Events, PressTable, Status
@@ -32,5 +32,6 @@ __all__ = [
     "open_session",
     "read_archive",
     "replacing",
+    "require_no_session",
     "write_archive",
 ]

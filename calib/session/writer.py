@@ -25,6 +25,7 @@ from calib.session.hdf5.storage import (
     make_group,
     make_index,
     put_attributes,
+    require_no_session,
     text_array,
 )
 from calib.session.tables import (
@@ -77,11 +78,15 @@ class SessionWriter(FileWriter):
     byte.
 
     Raises:
-        SessionError: for data that the format cannot hold.
+        SessionError: for data that the format cannot hold, and for a simulated session in the place of a recording.
     """
+
+    session = True
 
     def __init__(self, path: str | os.PathLike[str], facts: SessionFacts):
         super().__init__(Path(path))
+        if facts.simulated:
+            require_no_session(self.path, simulated_too=False)
         self._epoch = _utc(self.path, facts.epoch)
         if facts.simulated and (facts.scene is None or facts.seed is None):
             raise self._problem("scene", "a simulated session does not say how", "give scene, seed")

@@ -18,9 +18,7 @@
 Histories are processed in blocks of samples; a history effect passes its state from one block to the next.
 """
 
-import dataclasses
 import enum
-import math
 import zlib
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -29,10 +27,9 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from .._compile import is_traced
+from ..registry import limited, require_limits
 
 
 class StreamKind(enum.Enum):
@@ -149,7 +146,7 @@ def parameter(default: float | tuple[float, ...], *, least: float = 0.0) -> Any:
 
     An effect with a value below ``least`` is refused when it is made, unless jit, grad or vmap hides the value.
     """
-    return eqx.field(converter=jnp.asarray, default=default, metadata={"least": least})
+    return limited(default, least=least, finite=False, converter=jnp.asarray)
 
 
 class EffectError(ValueError):
@@ -170,15 +167,7 @@ class AbstractEffect(eqx.Module):
     alternative: ClassVar[str] = ""
 
     def __check_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value, least = getattr(self, field.name), field.metadata.get("least", -math.inf)
-            if least == -math.inf or not isinstance(value, jax.Array) or is_traced(value):
-                continue
-            wrong = ~(np.asarray(value) >= least)
-            if wrong.any():
-                number = np.asarray(value)[wrong].ravel()[0]
-                name = f"{type(self).__name__}: {field.name}"
-                raise EffectError(f"{name} is {number:g}; give at least {least:g}")
+        require_limits(self, EffectError)
 
     @abstractmethod
     def __call__(self, state: Any, /, *context: Any) -> Any:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from .._compile import full_precision
 from ..linalg.lapack import eigh
-from ..registry import Registry
+from ..registry import AbstractChoice, Registry, limited
 from .methods import Problem
 
 # Takes frames, (..., readings) V, to whitened ones, (..., k).
@@ -61,7 +61,7 @@ def spectrum(problem: Problem) -> Spectrum:
     return Spectrum(jnp.maximum(squares, 0), vectors, gained @ vectors / scale, problem)
 
 
-class AbstractHyperparameter(eqx.Module):
+class AbstractHyperparameter(AbstractChoice):
     """A way to choose the hyperparameter, given to `prepare` in place of a number."""
 
     needs_noise: ClassVar[bool] = False
@@ -154,7 +154,7 @@ class Discrepancy(AbstractFrameChoice):
 
     needs_noise: ClassVar[bool] = True
     frames: Float[ArrayLike, "... readings"] | None = None
-    factor: float = 1.0
+    factor: float = limited(1.0, above=0)
 
     def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
         tried, filters = spectrum.filters()
@@ -178,7 +178,7 @@ class NoiseFigure(AbstractHyperparameter):
     defined by means of absolute values, Adler and Guardo 1996.)
     """
 
-    target: float = 0.5
+    target: float = limited(0.5, above=0)
 
     def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
         tried, filters = spectrum.filters()

@@ -119,7 +119,7 @@ def prepare(
         HyperparameterError: if the hyperparameter is to be chosen by values that jit, grad or vmap hides.
     """
     method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()
-    require_choices(prior, method, basis)
+    require_choices(prior, method, basis, hyperparameter)
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     sigma = sheet_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
@@ -193,7 +193,7 @@ def _chosen(hyperparameter: Any, problem: Problem, found: Whitened, noise_is_kno
     return hyperparameter.choose(spectrum(problem), partial(_whiten, found, problem.jacobian.dtype))
 
 
-def require_choices(prior: Any, method: Any, basis: Any) -> None:
+def require_choices(prior: Any, method: Any, basis: Any, weight: Any) -> None:
     """Refuse a choice that stands in the place of another."""
     for name, choice, kinds, example in (
         ("prior", prior, AbstractPrior, "prior=Noser()"),
@@ -203,6 +203,13 @@ def require_choices(prior: Any, method: Any, basis: Any) -> None:
         if not isinstance(choice, kinds):
             stated = type(choice).__name__ if not isinstance(choice, type) else f"the class {choice.__name__}"
             raise InverseError(f"{stated} is not a {name}; give {name} by its name, such as {example}")
+    if not (isinstance(weight, AbstractHyperparameter) or is_traced(weight) or _is_number(weight)):
+        ways = "a number, such as 0.1, or a way to choose one, such as je.imaging.LCurve()"
+        raise InverseError(f"the hyperparameter is {weight!r}; give {ways}")
+
+
+def _is_number(value: Any) -> bool:
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
 
 
 def check_range(hyperparameter: Any, method: Any, dtype: np.dtype) -> None:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.lapack import cho_factor, cho_solve, cholesky, solve_triangular
 from ..model.bases import Picture
-from ..registry import Registry
+from ..registry import AbstractChoice, Registry, limited
 
 
 class AbstractPrecision(eqx.Module):
@@ -132,7 +132,7 @@ class Covariance(AbstractPrecision):
         return solve_triangular(cholesky(self.values, lower=True), x, lower=True)
 
 
-class AbstractPrior(eqx.Module):
+class AbstractPrior(AbstractChoice):
     """A choice of R.  A new prior is one class in a module of this room; `PRIORS` finds it there.
 
     ``follows_image``: whether R depends on the image; such a prior needs a method that asks for R at each image.
@@ -161,11 +161,11 @@ class Noser(AbstractPrior):
     | meaning  | default | range    |
     |----------|---------|----------|
     | exponent | 0.5     | 0 to 1   |
-    | floor    | 1e-3    | above 0  |
+    | floor    | 1e-3    | to 1     |
     """
 
-    exponent: float = 0.5
-    floor: float = 1e-3
+    exponent: float = limited(0.5, least=0, most=1)
+    floor: float = limited(1e-3, above=0, most=1)
 
     def precision(
         self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None
@@ -193,7 +193,7 @@ class Laplace(AbstractPrior):
     EIDORS' `prior_laplace`, whose R is the graph Laplacian as here).
     """
 
-    floor: float = 1e-3
+    floor: float = limited(1e-3, above=0)
 
     def precision(
         self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None
@@ -214,8 +214,8 @@ class GaussianSmooth(AbstractPrior):
     | noser                                                       | False   |      |
     """
 
-    length: float = 0.01
-    nugget: float = 1e-3
+    length: float = limited(0.01, above=0)
+    nugget: float = limited(1e-3, above=0)
     noser: bool = eqx.field(static=True, default=False)
 
     def precision(
@@ -238,8 +238,8 @@ class TotalVariation(AbstractPrior):
     """
 
     follows_image: ClassVar[bool] = True
-    beta: float = 1e-2
-    floor: float = 1e-3
+    beta: float = limited(1e-2, above=0)
+    floor: float = limited(1e-3, above=0)
 
     def precision(
         self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None

@@ -40,7 +40,7 @@ class Imaging:
     noise: AbstractNoise = field(default_factory=EqualNoise)
 
     def __post_init__(self) -> None:
-        require_choices(self.prior, self.method, self.basis)
+        require_choices(self.prior, self.method, self.basis, self.hyperparameter)
         weight = self.hyperparameter
         if isinstance(weight, int | float) and not 0 < weight < float("inf"):
             raise InverseError(f"the hyperparameter is {weight}; give a number above zero, such as 0.1")

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
 
 from .._compile import full_precision
+from ..registry import AbstractChoice
 
 
 class PatternError(ValueError):
@@ -108,7 +109,7 @@ class AbstractPlan(eqx.Module):
     n: eqx.AbstractVar[int]
 
 
-class AbstractLinearSolver(eqx.Module):
+class AbstractLinearSolver(AbstractChoice):
     """Analyse once on the host, factor once per matrix, solve as often as needed.
 
     A matrix that is not positive definite, or an iteration that does not converge, gives NaN

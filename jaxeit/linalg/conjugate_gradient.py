@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer
 
 from .._compile import full_precision
+from ..registry import limited
 from .base import AbstractLinearSolver, AbstractPlan, SparsityPattern, index_arrays, jacobi_scale, matvec, unit_columns
 
 # Step, solution, residual, direction, and energy of the residual.
@@ -51,8 +52,8 @@ class ConjugateGradient(AbstractLinearSolver):
     """
 
     preconditioner: AbstractLinearSolver | None = None
-    tolerance: float = eqx.field(static=True, default=1e-12)
-    max_steps: int = eqx.field(static=True, default=5000)
+    tolerance: float = limited(1e-12, above=0, most=1, static=True)
+    max_steps: int = limited(5000, least=1, static=True)
 
     def analyse(self, pattern: SparsityPattern) -> ConjugateGradientPlan:
         inner = None if self.preconditioner is None else self.preconditioner.analyse(pattern)

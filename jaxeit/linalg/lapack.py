@@ -77,6 +77,8 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
     @custom_vmap
     def stacked(*stacks: Array) -> Stacks:
         count = stacks[0].shape[0]
+        if not count:  # a batch without samples
+            return stacks
         rows, columns = (max(stack.shape[axis] for stack in stacks) for axis in (1, 2))
         portion = portion_of(count, rows, columns, operations)
         done: Stacks = by_platform(
@@ -88,8 +90,10 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
 
     @stacked.def_vmap
     def _(size: int, batched: Sequence[bool], *stacks: Array) -> tuple[Stacks, Any]:
-        whole = (s.reshape(s.shape[0] * s.shape[1], *s.shape[2:]) for s in _spread(size, batched, stacks))
-        apart = jax.tree.map(lambda a: a.reshape(size, len(a) // size, *a.shape[1:]), stacked(*whole))
+        spread = list(_spread(size, batched, stacks))
+        count = spread[0].shape[1]
+        whole = stacked(*(s.reshape(size * count, *s.shape[2:]) for s in spread))
+        apart = jax.tree.map(lambda a: a.reshape(size, count, *a.shape[1:]), whole)
         return apart, jax.tree.map(lambda _: True, apart)
 
     return stacked

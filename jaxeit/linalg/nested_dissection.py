@@ -19,7 +19,6 @@ from itertools import pairwise
 from math import prod
 from typing import TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from jax import lax
 from jaxtyping import Array, Float, Integer
 
 from .._compile import by_platform, full_precision
+from ..registry import limited
 from .base import AbstractLinearSolver, SparsityPattern, index_arrays, jacobi_scale, on_device
 from .batches import lane_plan, lanewise, swept_lanes, written_levels
 from .dissection import dissect
@@ -52,7 +52,7 @@ T = TypeVar("T")
 class NestedDissection(AbstractLinearSolver):
     """Multifrontal Cholesky on a nested dissection whose leaves have at most about ``leaf_size`` unknowns."""
 
-    leaf_size: int = eqx.field(static=True, default=32)
+    leaf_size: int = limited(32, least=1, static=True)
 
     def analyse(self, pattern: SparsityPattern) -> NestedDissectionPlan:
         owner, depth = dissect(pattern, self.leaf_size)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from .._compile import verb
 from ..budget import require
 from ..linalg.base import on_device
-from ..registry import Registry
+from ..registry import Registry, limited, require_limits
 from .discretisation import Model
 from .stiffness import Stiffness, stiffness
 
@@ -154,13 +154,11 @@ class Pixels(AbstractBasis):
     | rows along y; None: square pixels                            | None    |
     """
 
-    columns: int = 40
-    rows: int | None = None
+    columns: int = limited(40, least=1, most=2000)
+    rows: int | None = limited(None, least=1, most=2000, whole=True)
 
     def __post_init__(self) -> None:
-        for name, count in (("columns", self.columns), ("rows", self.rows)):
-            if count is not None and not 1 <= count <= 2000:
-                raise BasisError(f"{name} is {count}; give 1 to 2000 pixels")
+        require_limits(self, BasisError)
 
     def on(self, model: Model) -> BasisMap:
         chart = _host(model.chart)
@@ -198,16 +196,12 @@ class Bumps(AbstractBasis):
     | width: standard deviation of a bump                      | 0.012   | m    |
     """
 
-    columns: int = 41
-    rows: int | None = None
-    width: float = 0.012
+    columns: int = limited(41, least=2, most=500)
+    rows: int | None = limited(None, least=2, most=500, whole=True)
+    width: float = limited(0.012, above=0)
 
     def __post_init__(self) -> None:
-        for name, count in (("columns", self.columns), ("rows", self.rows)):
-            if count is not None and not 2 <= count <= 500:
-                raise BasisError(f"{name} is {count}; give 2 to 500 bumps")
-        if not (np.isfinite(self.width) and self.width > 0):
-            raise BasisError(f"the width is {self.width} m; give a positive number")
+        require_limits(self, BasisError)
 
     def on(self, model: Model) -> BasisMap:
         chart, places = _host(model.chart), _host(model.centroids)

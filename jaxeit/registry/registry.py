@@ -208,7 +208,7 @@ def _made(kind: type[T], table: TomlTable, given: Mapping[str, Any], parts: tupl
     try:
         return kind(**values, **given)
     except (ValueError, TypeError) as error:
-        raise table.error(kind.__name__, _one_line(error)) from None
+        raise table.error(kind.__name__, _one_line(error).removeprefix(f"{kind.__name__}: ")) from None
 
 
 @functools.cache

@@ -3,17 +3,15 @@
 from abc import abstractmethod
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..registry import Registry
-from ..skin.protocol import ProtocolError
+from ..registry import AbstractChoice, Registry, limited
 
 
-class AbstractCriterion(eqx.Module):
+class AbstractCriterion(AbstractChoice):
     """A convex function h of the covariance of place, (2, 2) in squared widths, whose mean over sites is minimised."""
 
     name: ClassVar[str]
@@ -44,11 +42,7 @@ class PlaceError(AbstractCriterion):
     """
 
     name: ClassVar[str] = "place-error"
-    power: float = eqx.field(default=1.0, static=True)
-
-    def __check_init__(self) -> None:
-        if not 0 < self.power <= 40:
-            raise ProtocolError(f"power is {self.power}; give a number above 0, up to 40 (the worst site)")
+    power: float = limited(1.0, above=0, most=40, static=True)
 
     def after(self, place: Float[Array, "2 2"], change: Float[Array, " k"]) -> Float[Array, " k"]:
         return jnp.maximum(jnp.trace(place) + change, 0) ** (0.5 * self.power)

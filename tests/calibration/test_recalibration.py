@@ -11,6 +11,7 @@ import pytest
 
 import calib
 from calib.calibration import KnownForces, OrdinaryUse, assess
+from calib.calibration.fitted_sessions import is_fitted
 from calib.calibration.recalibration.agreement import covariance_of_moves
 from calib.calibration.recalibration.changes import Advice, Evidence, render
 from calib.calibration.recalibration.image_reference import fit_reference
@@ -148,6 +149,14 @@ def test_a_pad_that_is_not_pressed_stays_as_it_is(calibration, later):
     levels = rest_levels(lower.rest, lower.time)
     record = recorded(calibration, KnownForces().kind, found, np.ones(4), levels, (LATER, "x"))
     assert any("upper left" in note for note in record.notes)
+
+
+def test_a_session_moves_a_calibration_once(moved, ten):
+    """Counted twice, ten presses would seem as sure as twenty, and they are no test of what they moved."""
+    with calib.open_session(ten) as session:
+        with pytest.raises(calib.SessionError, match=r"ten\.h5: has moved this calibration before; .* that is new"):
+            calib.recalibrate(moved, session)
+        assert is_fitted(moved.provenance, session)
 
 
 # --- ordinary use ----------------------------------------------------------------------------------------------------

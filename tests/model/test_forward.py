@@ -1,5 +1,7 @@
 """The forward model against exact solutions and identities."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -236,6 +238,12 @@ def test_jit_vmap_and_grad_of_forward():
     # voltages are homogeneous of degree -1 in the conductivity (Euler)
     slope = jax.grad(lambda s: je.forward(model, s)[0])(sigma)
     assert float(slope @ sigma) == pytest.approx(-float(alone[0, 0]), rel=1e-10)
+
+
+def test_a_batch_of_no_conductivities_gives_no_readings(model):
+    none = jnp.zeros((0, len(model.background)))
+    assert jax.vmap(partial(je.forward, model))(none).shape == (0, model.readings)
+    assert jax.vmap(partial(je.jacobian, model))(none).shape == (0, model.readings, len(model.background))
 
 
 def test_float32_follows_float64():

@@ -56,7 +56,7 @@ def test_causal_starts_at_rest_and_sees_no_future():
 def test_the_papers_filter_on_a_100_hz_stream_is_refused_with_a_remedy():
     with pytest.raises(CorrectionError, match=r"eit: .*50 Hz.*100 Hz.*cutoff below 50 Hz"):
         LowPass(50.0).apply(clock(500, 100.0), np.zeros((500, 2)), "eit")
-    with pytest.raises(CorrectionError, match="cutoff above 0"):
+    with pytest.raises(CorrectionError, match="cutoff is -1; give more than 0"):
         LowPass(-1.0)
 
 

@@ -35,6 +35,7 @@ from ...fitting.logs import (
 from ...fitting.results import FitError
 from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
+from ..fitted_sessions import FITTED, is_fitted, require_each_once
 from ..recipe import Recipe
 from ..recipe_text import AUTO_CURVES
 from .calibration import LogCalibration
@@ -63,10 +64,11 @@ def calibrate_logs(
         ignore_errors: fit also a session in which `check_session` finds an error, and note it.
 
     Raises:
-        SessionError: if a stream is missing, or the sessions differ in the sensor.
+        SessionError: if a stream is missing, a session is given twice, or the sessions differ in the sensor.
         FitError: if nothing can be fitted.
         RecordingError: if `check_session` finds an error in a session, unless errors are ignored.
     """
+    require_each_once(sessions)
     recipe = recipe or Recipe()
     ignored = accept(sessions, None, ignore_errors=ignore_errors)
     signal = _same_signal(sessions)
@@ -277,7 +279,8 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
     nearest = np.clip(np.searchsorted(signal.time, force.time), 0, len(signal.time) - 1)
     at_force = LogPrediction(predicted, error, low, high, found.valid[nearest] & np.isfinite(predicted))
     recorded = force.read()[:, 0]
-    notes = tuple(filter(None, [*ignored, calibration.unseen(recorded)]))
+    fitted = FITTED if is_fitted(calibration.provenance, session) else ""
+    notes = tuple(filter(None, [fitted, *ignored, calibration.unseen(recorded)]))
     return log_evaluation(session.name, force.time, recorded, at_force, notes)
 
 

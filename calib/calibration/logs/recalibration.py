@@ -8,6 +8,7 @@ from ...check.acceptance import accept
 from ...fitting.gain_update import GainDrift
 from ...fitting.logs import series_of
 from ...session import Session, SessionError
+from ..fitted_sessions import require_not_moved_by
 from .calibration import LogCalibration
 from .procedure import log_of, place_of, stream_of
 from .shift import LogShift, fit_shift, full_scale_of, shift_prior
@@ -59,9 +60,11 @@ def recalibrate_log(
         ignore_errors: use also a session in which `check_session` finds an error, or that does not tell the gain.
 
     Raises:
-        SessionError: if a stream is missing, the sensor is another, or the log does not determine the gain.
+        SessionError: if a stream is missing, the sensor is another, the log does not determine the gain, or
+            has moved the calibration before.
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
     """
+    require_not_moved_by(calibration.provenance, session)
     found = assess_log(calibration, session, drift, ignore_errors=ignore_errors)
     if not found.determined and not ignore_errors:
         raise SessionError(f"{session.name}: {found.health}; or move it all the same (--force, ignore_errors=True)")

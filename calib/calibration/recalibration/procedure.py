@@ -26,6 +26,7 @@ from ...fitting.pad_gains import gain_slopes
 from ...presses.table import measure, require_skin
 from ...session import Session, SessionError
 from ..calibration import Calibration
+from ..fitted_sessions import require_not_moved_by
 from ..force_maps import USED, ForceLaw, law_of, unmoved_forces
 from ..localisation.press_images import Imager
 from .changes import Evidence, Recalibration
@@ -245,9 +246,11 @@ def recalibrate(
 
     Raises:
         SessionError: if the session was recorded on another skin, has too few presses or contacts, or determines the
-            gain of no pad.
+            gain of no pad, or has moved the calibration before.
         RecordingError: if `check_session` finds an error in what is used of the session.
     """
+    require_not_moved_by(calibration.provenance, session)
+    require_not_moved_by(calibration.provenance, session)
     found = assess(calibration, session, evidence, ignore_errors=ignore_errors)
     if not found.determined.any() and not ignore_errors:
         raise SessionError(f"{session.name}: {found.health}; or move it all the same (--force, ignore_errors=True)")

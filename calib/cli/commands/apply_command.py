@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, add_proposal_argument, prepare_outputs, proposal_of, require_matplotlib_for
+from ..arguments import above_zero, add_proposal_argument, prepare_results, proposal_of, require_matplotlib_for
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar
 
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from ...session import open_session
 
     _check_report(args)
-    prepare_outputs(args.output, args.report)
+    prepare_results(args, "output", "report")
     calibration = load_calibration(args.calibration)
     if isinstance(calibration, LogCalibration):
         return _run_log(args, calibration)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_outputs, require_matplotlib_for
+from ..arguments import above_zero, prepare_results, require_matplotlib_for
 from ..recipe_options import add_imaging_arguments, imaging_of
 from ..terminal import announce_model, progress_bar
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     import jaxeit as je
 
-    prepare_outputs(args.output)
+    prepare_results(args, "output")
     if args.output:
         require_matplotlib_for("-o")
     rungs, budget = _rungs(args), 0.1 if args.smoke else 0.5

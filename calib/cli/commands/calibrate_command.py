@@ -10,7 +10,7 @@ from pathlib import Path
 from ...calibration import Recipe
 from ...calibration.recipe_text import NONE
 from ...session import Session
-from ..arguments import count, prepare_outputs, require_matplotlib_for, skin_of
+from ..arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
 from ..terminal import announce_model, stage_bar, title
 
@@ -58,7 +58,7 @@ def _calibrate_together(args: argparse.Namespace) -> int:
     from ...calibration.procedure import STAGES, calibrate, evaluate
     from ...session import open_session
 
-    prepare_outputs(args.output, args.report)
+    prepare_results(args, "output", "report")
     recipe, skin = recipe_of(args), skin_of(args.skin)
     with ExitStack() as stack:
         sessions = [stack.enter_context(open_session(path)) for path in args.sessions]

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, count, prepare_outputs, require_matplotlib_for, skin_of
+from ..arguments import above_zero, count, prepare_results, require_matplotlib_for, skin_of
 from ..terminal import announce_model, progress_bar
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from ...session import replacing
 
     set_up()
-    prepare_outputs(args.output, args.picture)
+    prepare_results(args, "output", "picture")
     if args.picture:
         require_matplotlib_for("--picture")
     began, skin, criterion = (

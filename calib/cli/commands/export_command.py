@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from ..arguments import prepare_outputs
+from ..arguments import prepare_results
 from ..terminal import progress_bar
 
 
@@ -61,7 +61,7 @@ def _write_header(args: argparse.Namespace) -> object:
     from ...calibration import load_calibration
     from ...export import export_c
 
-    prepare_outputs(args.output)
+    prepare_results(args, "output")
     calibration = load_calibration(args.calibration)
     options = {"prefix": args.prefix, "without_location": args.without_location, "place": args.place}
     return export_c(calibration, args.output, **options, tell=_tell)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..arguments import above_zero, prepare_outputs, require_matplotlib_for, skin_of
+from ..arguments import above_zero, prepare_results, require_matplotlib_for, skin_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
     set_up()
     require_matplotlib_for("jaxeit image")
-    prepare_outputs(args.output)
+    prepare_results(args, "output")
     from matplotlib.figure import Figure
 
     import jaxeit as je

@@ -3,7 +3,7 @@
 import argparse
 
 from .. import CommandParser
-from ..arguments import skin_of
+from ..arguments import prepare_outputs, skin_of
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -18,4 +18,5 @@ def run(args: argparse.Namespace) -> int:
     """Write the session file, and print what was found."""
     from ...session.importers import run as run_import
 
+    prepare_outputs(args, "output")
     return run_import(args, skin_of(args.skin))

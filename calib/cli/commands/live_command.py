@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from ...live.presentation import Presentation, present
     from ...record.recorder import StopRequest
 
-    prepare_outputs(args.output, args.recalibrate)
+    prepare_outputs(args, "output", "recalibrate")
     calibration = load_calibration(args.calibration)
     plan, sources = _planned(args, calibration)
     orders = StopRequest()

@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_outputs
+from ..arguments import above_zero, prepare_results
 from ..terminal import title
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from ...fitting.gain_update import GainDrift
     from ...session import open_session
 
-    prepare_outputs(args.output)
+    prepare_results(args, "output")
     drift = GainDrift(args.drift / 100, args.drift / 100)
     ways = {"force": KnownForces(drift), "use": OrdinaryUse(drift)}
     calibration = load_calibration(args.calibration)

@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     urls = {name: getattr(args, name) for name in _STREAMS if getattr(args, name) is not None}
     if not urls:
         raise ValueError(f"which streams? give at least one of {', '.join('--' + n for n in _STREAMS)}")
-    prepare_outputs(args.output)
+    prepare_outputs(args, "output")
     plan, sources = plan_recording(urls, skin_of(args.skin), args.title)
     orders = StopRequest()
     try:

@@ -17,12 +17,12 @@ def run(args: argparse.Namespace) -> int:
     """Write the session, and print what it holds."""
     from ...record.journal.conversion import convert_journal
 
-    output = args.output or args.journal.removesuffix(".part")
+    output = args.output = args.output or args.journal.removesuffix(".part")
     if output == args.journal:
         raise ValueError(f"{args.journal}: does not end in .part; say with -o how the session is to be called")
     if os.path.exists(output):
         raise ValueError(f"{output}: exists already; give another name with -o, or remove it")
-    prepare_outputs(output)
+    prepare_outputs(args, "output")
     with byte_bar(2 * file_size(args.journal), "recovering") as progress:
         summary = convert_journal(args.journal, output, recovered=True, progress=progress)
     print(summary.render())

@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..arguments import count, prepare_outputs, skin_of
+from ..arguments import count, prepare_outputs, prepare_results, skin_of
 from ..signals import interruption_status
 from ..terminal import announce_model, progress_bar
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     if args.explain:
         print(render_costs(bench, measure_costs(bench)))
         return 0
-    prepare_outputs(args.output)
+    prepare_outputs(args, "output")
     if args.serve and Path(args.output).exists():
         return _serve(args.output)
     announce_model(bench.scene.skin, SIMULATION)
@@ -140,7 +140,7 @@ def _simulate_data_set(args: argparse.Namespace) -> int:
 
     if args.explain or args.serve:
         raise ValueError("--explain and --serve are for scenes; leave them out")
-    prepare_outputs(args.output)
+    prepare_results(args, "output")
     skin, progress = skin_of(str(args.scene)), progress_bar("contacts")
     places, steps = write_data_set(skin, args.output, columns=args.data_set, rows=args.data_set, progress=progress)
     print(f"{args.output}: {places} places, {steps} amplitudes, SIMULATED")
@@ -183,7 +183,7 @@ def _simulate_robot(args: argparse.Namespace) -> int:
     from ...bench import load_bench
     from ...simulators.rollout import load_robot, record_rollout
 
-    prepare_outputs(args.output)
+    prepare_outputs(args, "output")
     bench, seconds = load_bench(args.scene), 10.0 if args.seconds is None else args.seconds
     record_rollout(
         args.output,

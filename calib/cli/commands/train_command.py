@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from ..arguments import count, prepare_outputs, skin_of
+from ..arguments import count, prepare_results, skin_of
 from ..signals import interruption_status
 
 
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from ...calibration.recipe_text import fidelity_choice
     from ...learning.procedure import train_proposal
 
-    prepare_outputs(args.output)
+    prepare_results(args, "output")
     skin, began = skin_of(args.skin), time.monotonic()
     given = {name: value for name in ("frames", "epochs") if (value := getattr(args, name)) is not None}
     if args.fidelity is not None:

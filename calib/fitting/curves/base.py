@@ -15,6 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
+from jaxeit.registry import AbstractChoice
+
 from ..order_statistics import median, quantiles
 
 Scalar = Float[Array, ""]
@@ -86,7 +88,7 @@ def optional_array(value: ArrayLike | Sequence[float] | None) -> Real[Array, "..
     return None if value is None else jnp.asarray(value)
 
 
-class AbstractCurve(eqx.Module):
+class AbstractCurve(AbstractChoice):
     """h(parameters, pressure) -> force, its inverse, and the map between its parameters and free coordinates.
 
     Subclasses state `names` and `units` of their parameters, in order. A curve with `path` = True has memory: it gives

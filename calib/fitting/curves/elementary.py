@@ -2,9 +2,10 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import DTypeLike
+
+from jaxeit.registry import limited
 
 from ..order_statistics import median
 from .base import (
@@ -102,7 +103,7 @@ class PowerLaw(AbstractCurve):
 
     name: ClassVar[str] = "power"
 
-    reference: Scalar | None = eqx.field(converter=optional_array, default=None)
+    reference: Scalar | None = limited(None, above=0, converter=optional_array)
 
     names: ClassVar[tuple[str, ...]] = ("secant", "exponent")
     units: ClassVar[tuple[str, ...]] = ("N/Pa", "1")

@@ -3,12 +3,13 @@
 import abc
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
+
+from jaxeit.registry import limited
 
 from .base import (
     AbstractCurve,
@@ -30,7 +31,7 @@ class _RisingFromZero(AbstractCurve):
     `top` is a setting, not a parameter. By default the fit takes the 98 % quantile of the pressure.
     """
 
-    top: Scalar | None = eqx.field(converter=optional_array, default=None)
+    top: Scalar | None = limited(None, above=0, converter=optional_array)
 
     units: ClassVar[tuple[str, ...]] = ()
 

@@ -2,12 +2,13 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
+
+from jaxeit.registry import limited
 
 from .base import AbstractCurve, Mask, Params, PositiveSlopes, Scalar, Scale, Series, Values, optional_array
 from .elementary import Affine
@@ -58,7 +59,7 @@ class _PrandtlIshlinskii(AbstractCurve):
     `widths` r_i (Pa) are settings, not parameters; by default 10, 20 and 40 % of the range of the samples.
     """
 
-    widths: Float[Array, " m"] | None = eqx.field(converter=optional_array, default=None)
+    widths: Float[Array, " m"] | None = limited(None, above=0, converter=optional_array)
 
     path: ClassVar[bool] = True
 
@@ -159,8 +160,8 @@ class PlaySpline(AbstractCurve):
 
     name: ClassVar[str] = "hysteresis-spline"
 
-    widths: Float[Array, " m"] | None = eqx.field(converter=optional_array, default=None)
-    top: Scalar | None = eqx.field(converter=optional_array, default=None)
+    widths: Float[Array, " m"] | None = limited(None, above=0, converter=optional_array)
+    top: Scalar | None = limited(None, above=0, converter=optional_array)
 
     path: ClassVar[bool] = True
     names: ClassVar[tuple[str, ...]] = (*MonotoneSpline.names, *RATIO_NAMES, "offset")

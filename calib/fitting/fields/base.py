@@ -17,6 +17,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxeit.registry import AbstractChoice
+
 from .geometry import Geometry, OnPads
 
 Features = Float[Array, "... pads k"]
@@ -26,7 +28,7 @@ Features = Float[Array, "... pads k"]
 REFERENCE_WIDTH = 0.01
 
 
-class AbstractField(eqx.Module):
+class AbstractField(AbstractChoice):
     """Features of a place on a pad, and the priors of their coefficients.
 
     `shared`: all pads have one field, in coordinates relative to the pad; otherwise each pad has its own coefficients.

@@ -9,6 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxeit.registry import limited
+
 from .base import REFERENCE_WIDTH, AbstractField, Features, cubic_bspline
 from .geometry import Geometry, OnPads, distance, nearest_points
 
@@ -27,8 +29,8 @@ class PadEdge(AbstractField):
     name: ClassVar[str] = "edge"
     early: ClassVar[Mapping[str, Any]] = {"corners": False}
 
-    width: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=8e-3)
-    bumps: int = eqx.field(static=True, default=4)
+    width: Float[Array, ""] = limited(8e-3, above=0, converter=jnp.asarray)
+    bumps: int = limited(4, least=1, most=20, static=True)
     shared: bool = eqx.field(static=True, default=True)
     corners: bool = eqx.field(static=True, default=True)
 

@@ -10,6 +10,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxeit.registry import limited
+
 from .base import AbstractField, Features, cubic_bspline
 from .geometry import Geometry, OnPads, relative_to_pads
 
@@ -58,7 +60,7 @@ class Bilinear(_Grid):
 
     name: ClassVar[str] = "bilinear"
 
-    nodes: int = eqx.field(static=True, default=3)
+    nodes: int = limited(3, least=2, most=50, static=True)
     shared: bool = eqx.field(static=True, default=False)
 
     def _bump(self, z: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -70,7 +72,7 @@ class RadialBasis(_Grid):
 
     name: ClassVar[str] = "rbf"
 
-    nodes: int = eqx.field(static=True, default=5)
+    nodes: int = limited(5, least=2, most=50, static=True)
     shared: bool = eqx.field(static=True, default=False)
 
     def _bump(self, z: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -82,7 +84,7 @@ class TensorSpline(_Grid):
 
     name: ClassVar[str] = "spline"
 
-    nodes: int = eqx.field(static=True, default=4)
+    nodes: int = limited(4, least=2, most=50, static=True)
     shared: bool = eqx.field(static=True, default=False)
 
     def _centres(self) -> tuple[Float[np.ndarray, " nodes"], float]:
@@ -107,8 +109,8 @@ class GaussianProcess(_TensorProduct):
 
     name: ClassVar[str] = "gp"
 
-    lengths: tuple[float, ...] = eqx.field(static=True, converter=_floats, default=(0.3, 0.45, 0.7, 1.0, 1.5))
-    modes: int = eqx.field(static=True, default=8)
+    lengths: tuple[float, ...] = limited((0.3, 0.45, 0.7, 1.0, 1.5), above=0, static=True, converter=_floats)
+    modes: int = limited(8, least=1, most=50, static=True)
     shared: bool = eqx.field(static=True, default=False)
 
     def _frequencies(self) -> Float[np.ndarray, " modes"]:

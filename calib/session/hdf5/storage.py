@@ -20,7 +20,7 @@ import uuid
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import h5py
 import numpy as np
@@ -29,6 +29,7 @@ from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 from jaxeit.files import open_regular
 
 from ..errors import printable, problem
+from ..tables import FORMAT
 from .guard import MAX_ATTRIBUTE_BYTES
 
 try:
@@ -67,9 +68,31 @@ def folder_beside(output: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def require_no_session(path: Path, *, simulated_too: bool = True) -> None:
+    """Refuse a path at which a session lies: a recording cannot be made again, so that no other file replaces it.
+
+    Args:
+        simulated_too: whether simulated sessions are refused too.
+
+    Raises:
+        SessionError: naming the file.
+    """
+    if not path.is_file():
+        return
+    with contextlib.suppress(OSError), h5py.File(path) as file:  # of another kind, it is no session
+        kind, simulated = (file.attrs.get(name) for name in ("format", "simulated"))
+        if not isinstance(kind, str | bytes) or kind not in (FORMAT, FORMAT.encode()):
+            return
+        if simulated_too or not np.any(simulated):
+            what = "session" if simulated_too else "recording"
+            raise problem(path, "file", f"holds a {what}, which would be lost", "give another name")
+
+
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, session: bool = False) -> Iterator[Path]:
     """Yield an empty temporary file beside `path`. It is synced and renamed to `path`, or removed on failure.
+
+    Only another session, ``session``, takes the place of a session.
 
     A process that is killed leaves its temporary file; the next one that writes to `path` removes it. A lock on the
     temporary file, which ends with its process, tells whether the process still runs.
@@ -78,6 +101,10 @@ def replacing(path: Path) -> Iterator[Path]:
         raise problem(path, "file", f"the folder {path.parent} does not exist", "create the folder first")
     if path.is_dir():
         raise problem(path, "file", "is a folder", "give a file name")
+    if path.exists() and not path.is_file():
+        raise problem(path, "file", "is a device or a pipe", "give a file name")
+    if not session:
+        require_no_session(path)
     _remove_abandoned(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp")
     descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -233,13 +260,13 @@ def _checked(path: Path, sink: _FailureTolerantFile) -> None:
 
 
 @contextlib.contextmanager
-def new_file(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
+def new_file(path: Path, *, session: bool = False) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
     """Create an HDF5 file that appears as `path` after a successful end, and not at all after an error.
 
     Yields the file, and a function that raises `SessionError` if a write has failed. Raises `SessionError` if the
-    folder or the disk does not allow the file.
+    folder or the disk does not allow the file, or if a session lies there and this is none.
     """
-    with writing(path), replacing(path) as temporary, open(temporary, "rb+", buffering=0) as raw:
+    with writing(path), replacing(path, session=session) as temporary, open(temporary, "rb+", buffering=0) as raw:
         sink = _FailureTolerantFile(raw)
         with _create(path, sink) as file:
             yield file, functools.partial(_checked, path, sink)
@@ -248,6 +275,8 @@ def new_file(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
 
 class FileWriter(abc.ABC):
     """Base of writers that are context managers: the file appears only after a successful end."""
+
+    session: ClassVar[bool] = False
 
     def __init__(self, path: Path):
         self.path = path
@@ -264,7 +293,7 @@ class FileWriter(abc.ABC):
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
-            self._file, self._check_disk = stack.enter_context(new_file(self.path))
+            self._file, self._check_disk = stack.enter_context(new_file(self.path, session=self.session))
             self._start(self._file)
             self._stack = stack.pop_all()
         return self

@@ -20,6 +20,7 @@ from ...model.bases import BasisMap, Picture
 from ...model.discretisation import Model
 from ...model.forward_model import forward
 from ...model.sensitivity import scaled_jacobian
+from ...registry import AbstractChoice, limited
 from ..priors import AbstractPrecision
 
 
@@ -50,7 +51,7 @@ class LogConductivity(eqx.Module):
         return scaled_jacobian(self.model, sigma, self.image, sigma)
 
 
-class AbstractPenalty(eqx.Module):
+class AbstractPenalty(AbstractChoice):
     """The penalty that a prior puts on an image, a number without unit."""
 
     @abstractmethod
@@ -66,7 +67,7 @@ class Quadratic(AbstractPenalty):
     """``strength / 2 * x^T R x`` for the R of any prior, from `AbstractPrior.precision`."""
 
     precision: AbstractPrecision
-    strength: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    strength: Float[Array, ""] = limited(1.0, above=0, converter=jnp.asarray)
 
     def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
         return 0.5 * self.strength.astype(x.dtype) * x @ self.precision.times(x)
@@ -91,9 +92,9 @@ class IsotropicVariation(AbstractPenalty):
     | ridge                                                             |
     """
 
-    weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=71.0)
-    beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.05)
-    ridge: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1e-3)
+    weight: Float[Array, ""] = limited(71.0, least=0, converter=jnp.asarray)
+    beta: Float[Array, ""] = limited(0.05, above=0, converter=jnp.asarray)
+    ridge: Float[Array, ""] = limited(1e-3, least=0, converter=jnp.asarray)
 
     @full_precision
     def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:

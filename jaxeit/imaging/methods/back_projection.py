@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...registry import limited
 from .base import AbstractLinearMethod, Problem
 
 
@@ -12,7 +13,7 @@ class BackProjection(AbstractLinearMethod):
     The oldest method, for comparison; it uses neither prior nor hyperparameter, and its images are blurred.
     """
 
-    floor: float = 1e-3
+    floor: float = limited(1e-3, above=0)
 
     def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         power = jnp.sum(problem.jacobian**2, 0)

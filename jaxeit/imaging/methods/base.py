@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...model.bases import Picture
+from ...registry import AbstractChoice
 from ..priors import AbstractPrecision, AbstractPrior
 
 
@@ -41,7 +42,7 @@ class Problem(eqx.Module):
         return self.hyperparameter * jnp.sqrt(jnp.sum(seen**2) / self.readings)
 
 
-class AbstractMethod(eqx.Module):
+class AbstractMethod(AbstractChoice):
     """A choice of method: an `AbstractLinearMethod` or an `AbstractIterativeMethod`.
 
     ``follows_prior``: whether the method evaluates the prior again at each image, as `TotalVariation` needs.

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ...registry import limited
 from .base import AbstractLinearMethod, Problem
 from .one_step import damped_solution
 
@@ -23,9 +24,9 @@ class Greit(AbstractLinearMethod):
     | edge: over which the disc falls off             | 0.004  | m    |
     """
 
-    width: float = 0.012
-    radius: float = 0.02
-    edge: float = 0.004
+    width: float = limited(0.012, above=0)
+    radius: float = limited(0.02, above=0)
+    edge: float = limited(0.004, above=0)
 
     def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         areas, centres = problem.picture.areas, problem.picture.centres

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
@@ -13,6 +12,7 @@ from ...least_squares.non_negative import (
     positive_by_interior_point,
     positive_by_newton,
 )
+from ...registry import limited
 from ..priors import Diagonal
 from .base import AbstractIterativeMethod, Problem
 
@@ -28,7 +28,7 @@ class NonNegative(AbstractIterativeMethod):
     that each takes only the steps that it needs.
     """
 
-    steps: int = eqx.field(static=True, default=40)
+    steps: int = limited(40, least=1, static=True)
 
     def image(self, problem: Problem, y: Float[Array, " k"]) -> Float[Array, " basis"]:
         j, precision = problem.jacobian, problem.precision()

@@ -1,11 +1,11 @@
 """Sparse Bayesian learning: images of few pixels."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...linalg.lapack import cho_solve, cholesky, solve_triangular
+from ...registry import limited
 from ..priors import Diagonal
 from .base import AbstractIterativeMethod, Problem
 
@@ -22,7 +22,7 @@ class SparseBayes(AbstractIterativeMethod):
     for g is MacKay's, which Tipping takes; it needs a fraction of the steps of ``g_i <- x_i^2 + g_i (1 - q_i)``.
     """
 
-    steps: int = eqx.field(static=True, default=15)
+    steps: int = limited(15, least=1, static=True)
 
     def image(self, problem: Problem, y: Float[Array, " k"]) -> Float[Array, " basis"]:
         j, precision = problem.jacobian, problem.precision()

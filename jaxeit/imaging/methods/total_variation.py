@@ -2,12 +2,12 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...linalg.lapack import cho_factor, cho_solve
+from ...registry import limited
 from ..priors import AbstractPrecision
 from .base import AbstractIterativeMethod, Problem
 
@@ -19,7 +19,7 @@ class Reweighted(AbstractIterativeMethod):
     """
 
     follows_prior: ClassVar[bool] = True
-    steps: int = eqx.field(static=True, default=8)
+    steps: int = limited(8, least=1, static=True)
 
     def image(self, problem: Problem, y: Float[Array, " k"]) -> Float[Array, " basis"]:
         def again(_: Int[Array, ""], x: Float[Array, " basis"]) -> Float[Array, " basis"]:

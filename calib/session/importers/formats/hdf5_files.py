@@ -99,7 +99,7 @@ def convert_session(path: Path, output: Path) -> ImportReport:
         made = Path(folder) / path.name
         with open_session(made) as session:
             report = _report(path, output, session, left_out)
-        with writing(output), replacing(output) as temporary:
+        with writing(output), replacing(output, session=True) as temporary:
             shutil.copyfile(made, temporary)
     return report
 

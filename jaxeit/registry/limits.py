@@ -1,0 +1,95 @@
+"""Limits of settings: the values that have a meaning, stated beside the default of a field."""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from .._compile import is_traced
+
+
+class SettingError(ValueError):
+    """A setting outside its limits; the message names the class, the setting and the limits."""
+
+
+class Limits(NamedTuple):
+    """Which numbers have a meaning.
+
+    | meaning                                       |
+    |-----------------------------------------------|
+    | least, most: smallest and largest             |
+    | open: whether the smallest itself is refused  |
+    | finite: whether infinite ones are refused     |
+    | whole: whether fractions are refused          |
+    """
+
+    least: float = -math.inf
+    most: float = math.inf
+    open: bool = False
+    finite: bool = True
+    whole: bool = False
+
+    def outside(self, value: Any) -> np.ndarray:
+        """The numbers of a value, an array or a scalar, that have no meaning."""
+        numbers = np.atleast_1d(np.asarray(value))
+        low = numbers > self.least if self.open else numbers >= self.least
+        kind = (np.isfinite(numbers) | (not self.finite)) & ((numbers == np.round(numbers)) | (not self.whole))
+        found: np.ndarray = numbers[~(low & (numbers <= self.most) & kind)]
+        return found
+
+    def __str__(self) -> str:
+        kind = "a whole number, " if self.whole else ""
+        if math.isfinite(self.most):
+            return f"{kind}{'more than ' if self.open else ''}{self.least:g} to {self.most:g}"
+        if math.isfinite(self.least):
+            return f"{kind}{'more than' if self.open else 'at least'} {self.least:g}"
+        return "a finite number" if self.finite else "a number"
+
+
+def limited(
+    default: Any,
+    *,
+    least: float = -math.inf,
+    above: float | None = None,
+    most: float = math.inf,
+    finite: bool = True,
+    whole: bool | None = None,
+    **options: Any,
+) -> Any:
+    """A field of a class whose numbers lie from ``least``, or ``above`` a number, to ``most``.
+
+    Args:
+        finite: whether infinite numbers are refused.
+        whole: whether fractions are refused; by default where the default is a whole number.
+        options: of `equinox.field`, such as ``static`` and ``converter``.
+    """
+    whole = type(default) is int if whole is None else whole
+    limits = Limits(least if above is None else above, most, above is not None, finite, whole)
+    return eqx.field(default=default, metadata={"limits": limits}, **options)
+
+
+def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
+    """Refuse an object with a setting outside of its `limited` field, unless jit, grad or vmap hides the value.
+
+    Raises:
+        SettingError: or the given ``error``.
+    """
+    for field in dataclasses.fields(thing):
+        limits, value = field.metadata.get("limits"), getattr(thing, field.name)
+        if limits is None or value is None or is_traced(value):
+            continue
+        if (wrong := limits.outside(value)).size:
+            raise error(f"{type(thing).__name__}: {field.name} is {wrong[0]:g}; give {limits}")
+
+
+class AbstractChoice(eqx.Module):
+    """A class that a registry knows by name, whose settings lie within their limits.
+
+    Raises:
+        SettingError: for a setting outside of its `limited` field.
+    """
+
+    def __check_init__(self) -> None:
+        require_limits(self)

@@ -1,0 +1,74 @@
+"""Settings outside the values that have a meaning, from Python and from text."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import calib
+import jaxeit as je
+from jaxeit.imaging import HYPERPARAMETERS, METHODS, PRIORS
+from jaxeit.model.bases import BASES
+from jaxeit.registry import SettingError, settings_of
+from jaxeit.scan import CRITERIA
+
+REGISTRIES = [
+    *(PRIORS, METHODS, HYPERPARAMETERS, BASES, CRITERIA, je.linalg.SOLVERS),
+    *(calib.fitting.CURVES, calib.fitting.FIELDS, calib.fitting.LOSSES, calib.presses.CORRECTIONS),
+]
+NUMBERS = ("a number", "a whole number from 0")
+CASES = [
+    (registry, name, setting)
+    for registry in REGISTRIES
+    for name, kind in registry.shipped.items()
+    for setting in settings_of(kind, registry.parts).values()
+    if any(form.meaning.strip("[], .") in NUMBERS for form in setting.forms)
+]
+
+
+def limits_of(registry, name, setting):
+    (field,) = [f for f in dataclasses.fields(registry.shipped[name]) if f.name == setting.name]
+    return field.metadata["limits"]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0].kind}-{case[1]}-{case[2].name}")
+def test_every_number_that_text_can_give_has_limits(case):
+    registry, name, setting = case
+    limits = limits_of(*case)
+    wrong = limits.least - (0 if limits.open else 1)
+    given = int(wrong) if limits.whole else float(wrong)
+    listed = setting.forms[0].meaning.startswith("[")
+    said = f"{setting.name} is {given:g}; give {limits}"
+    with pytest.raises(ValueError, match=said):
+        registry.shipped[name](**{setting.name: jnp.full(3, given) if listed else given})
+    if given >= 0:  # text gives no negative counts
+        with pytest.raises(ValueError, match=said):
+            registry.make(f"{name}:{setting.name}={[given] * 3 if listed else given}")
+
+
+def test_no_number_that_is_not_finite_and_no_fraction_of_a_count():
+    for value in (math.nan, math.inf, -1.0, 0.0):
+        with pytest.raises(SettingError, match=r"GaussianSmooth: length is .*; give more than 0"):
+            je.GaussianSmooth(value)
+    with pytest.raises(je.model.BasisError, match=r"Pixels: columns is 40\.5; give a whole number, 1 to 2000"):
+        je.Pixels(40.5)
+    with pytest.raises(SettingError, match="Noser: exponent is 50; give 0 to 1"):
+        je.Noser(50.0)
+
+
+def test_a_word_names_the_setting_once():
+    with pytest.raises(ValueError, match=r"^prior 'noser:exponent=50': Noser: exponent is 50; give 0 to 1$"):
+        PRIORS.make("noser:exponent=50")
+
+
+def test_hidden_values_are_not_looked_at():
+    """Under grad no limit can be checked, and none is."""
+    assert jax.grad(lambda width: 2 * calib.fitting.Huber(width).width)(-1.0) == 2
+
+
+@pytest.mark.parametrize("weight", ["gcv", None, [0.1], True, je.imaging.LCurve])
+def test_what_is_no_hyperparameter_is_refused(weight):
+    with pytest.raises(je.imaging.InverseError, match=r"give a number, such as 0\.1, or a way to choose one"):
+        je.Imaging(hyperparameter=weight)
