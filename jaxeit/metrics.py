@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
 from ._compile import full_precision, is_traced, verb
+from .registry import AbstractChoice, limited
 
 __all__ = [
     "ESTIMATORS",
@@ -65,7 +66,7 @@ class Pictured(Protocol):
         """Rows and columns of the picture."""
 
 
-class AbstractEstimator(eqx.Module):
+class AbstractEstimator(AbstractChoice):
     """An estimator of the contact's position from an image."""
 
     @abstractmethod
@@ -87,7 +88,7 @@ class LevelCentroid(AbstractEstimator):
     maximum.
     """
 
-    level: float = 0.25
+    level: float = limited(0.25, above=0, most=1)
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         image = jnp.asarray(image)

@@ -16,6 +16,7 @@ from typing import cast
 import numpy as np
 
 import jaxeit as je
+from jaxeit.registry import limited, require_limits
 
 from ..calibration.calibration import Calibration
 from ..calibration.localisation.proposals import ProposalChoice, chosen_proposal
@@ -134,14 +135,17 @@ class LiveSettings:
     | moved        | calibration file to which the moved calibration is written; None: none       | None    |      |
     """
 
-    rest: float = 2.0
-    wait: float = 10.0
+    rest: float = limited(2.0, above=0)
+    wait: float = limited(10.0, least=0)
     event_driven: bool = False
     realtime: bool = False
     recalibrate: bool = False
     track: bool = False
     proposal: ProposalChoice = je.contacts.shipped_proposal
     moved: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        require_limits(self)
 
 
 def run_live(

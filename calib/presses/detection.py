@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from jaxeit.registry import limited, require_limits
+
 from .corrections import sample_rate
 from .streams import MAD_TO_SIGMA, PressError, true_runs
 from .times import PressTimes
@@ -32,12 +34,15 @@ class DetectionLimits:
     | max_unsteady  | tolerated standard deviation during the hold, as a fraction of the hold level |
     """
 
-    smooth: float = 0.05
-    min_duration: float = 0.2
-    min_hold: float = 1.0
-    max_duration: float = 15.0
-    max_missing: float = 0.1
-    max_unsteady: float = 0.1
+    smooth: float = limited(0.05, least=0)
+    min_duration: float = limited(0.2, least=0)
+    min_hold: float = limited(1.0, least=0)
+    max_duration: float = limited(15.0, above=0)
+    max_missing: float = limited(0.1, least=0, most=1)
+    max_unsteady: float = limited(0.1, least=0)
+
+    def __post_init__(self) -> None:
+        require_limits(self)
 
 
 def noise_level(values: np.ndarray) -> float:

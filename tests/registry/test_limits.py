@@ -48,6 +48,25 @@ def test_every_number_that_text_can_give_has_limits(case):
             registry.make(f"{name}:{setting.name}={[given] * 3 if listed else given}")
 
 
+SETTINGS = [
+    je.LevelCentroid,
+    je.imaging.ElectrodeFitSettings,
+    calib.presses.DetectionLimits,
+    calib.presses.WindowLengths,
+    calib.calibration.FittedContact,
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, f.name) for kind in SETTINGS for f in dataclasses.fields(kind)], ids=str
+)
+def test_every_number_of_these_settings_has_limits(kind, name):
+    for wrong in (-1,) if type(getattr(kind(), name)) is int else (-1.0, math.nan):
+        value = (wrong, wrong) if isinstance(getattr(kind(), name), tuple) else wrong
+        with pytest.raises(SettingError, match=f"{kind.__name__}: {name} is {wrong:g}; give "):
+            kind(**{name: value})
+
+
 def test_no_number_that_is_not_finite_and_no_fraction_of_a_count():
     for value in (math.nan, math.inf, -1.0, 0.0):
         with pytest.raises(SettingError, match=r"GaussianSmooth: length is .*; give more than 0"):

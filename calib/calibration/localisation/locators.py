@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 import jaxeit as je
-from jaxeit.registry import Registry
+from jaxeit.registry import Registry, limited, require_limits
 
 from ...fitting.fields import Places, single_places
 
@@ -129,9 +129,12 @@ class FittedContact(AbstractLocatorChoice):
     | widths: smallest and largest standard deviation of a contact         | 0.006, 0.03 | m   |
     """
 
-    most: int = 2
-    columns: int = 31
-    widths: tuple[float, float] = (0.006, 0.03)
+    most: int = limited(2, least=1)
+    columns: int = limited(31, least=2)
+    widths: tuple[float, float] = limited((0.006, 0.03), above=0)
+
+    def __post_init__(self) -> None:
+        require_limits(self)
 
     def prepare(
         self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None

@@ -14,6 +14,8 @@ from scipy import linalg
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
+from jaxeit.registry import limited, require_limits
+
 from ..curves.base import AbstractCurve
 from .combination import AbstractCombination, SmoothSignal, kernel, lag_inputs
 
@@ -52,10 +54,13 @@ class SmoothChannels:
     """
 
     directions: tuple[int, ...] = (2, 3, 4, 5, 6)
-    lags: tuple[float, ...] = (3.0, 30.0)
+    lags: tuple[float, ...] = limited((3.0, 30.0), above=0)
     start: np.ndarray | None = None
-    max_steps: int = MAX_STEPS
-    coordinates: int = 0
+    max_steps: int = limited(MAX_STEPS, least=1)
+    coordinates: int = limited(0, least=0)
+
+    def __post_init__(self) -> None:
+        require_limits(self)
 
     def __call__(
         self, time: np.ndarray, signals: np.ndarray, force: np.ndarray, curve: AbstractCurve | None

@@ -31,6 +31,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import coefficients, fields, forward, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian, moved
 from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
+from ...registry import AbstractChoice, limited
 from ..noise import InverseError
 from ..priors import GaussianSmooth
 from .background import frame_error, require_frame, sheet_level
@@ -41,7 +42,7 @@ WIDTH_STD = 0.3  # of the logarithm of a press's width
 FLATNESS_STD = 0.5  # of the logarithm of the exponent over that of a Gaussian
 
 
-class ElectrodeFitSettings(eqx.Module):
+class ElectrodeFitSettings(AbstractChoice):
     """What is believed before the readings are seen.
 
     | meaning                                                              | default | unit |
@@ -55,15 +56,15 @@ class ElectrodeFitSettings(eqx.Module):
     | columns: pixels of both fields along x                               | 20      |      |
     """
 
-    shift: float = 1e-3
-    coat_std: float = 0.15
-    coat_length: float = 0.03
-    gain_std: float = 0.12
-    gain_length: float = 0.015
-    width: float = 0.012
-    model_error: float = 3e-3
-    press_error: float = 3e-2
-    columns: int = eqx.field(static=True, default=20)
+    shift: float = limited(1e-3, above=0)
+    coat_std: float = limited(0.15, above=0)
+    coat_length: float = limited(0.03, above=0)
+    gain_std: float = limited(0.12, above=0)
+    gain_length: float = limited(0.015, above=0)
+    width: float = limited(0.012, above=0)
+    model_error: float = limited(3e-3, above=0)
+    press_error: float = limited(3e-2, above=0)
+    columns: int = limited(20, least=2, static=True)
 
 
 class KnownPresses(eqx.Module):
