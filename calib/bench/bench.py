@@ -16,6 +16,10 @@ class BenchError(ValueError):
     """A bench cannot be simulated as described."""
 
 
+MAX_FORCE = 1e5  # N: more is another unit
+RATE_TOLERANCE = 0.01  # by which frames may follow one another more quickly than a scan takes
+
+
 @dataclass(frozen=True)
 class Timing:
     """Timing of one press in seconds. The paper states 2 s of hold; the other times are assumed."""
@@ -61,7 +65,8 @@ class Bench:
     | toml                                 | the scene file as text                        |            |           |
 
     Raises:
-        BenchError: for a tip that would leave the sheet.
+        BenchError: for a tip that would leave the sheet or is wider than it, forces that do not press, and rates at
+            which nothing can be recorded.
     """
 
     scene: je.Scene
@@ -85,6 +90,7 @@ class Bench:
     toml: str = ""
 
     def __post_init__(self) -> None:
+        self._require_possible()
         for name, offset in (("", (0.0, 0.0)), *((" of a companion", c.offset) for c in self.companions)):
             for way, moved in (("", (0.0, 0.0)), (", after its slide,", self.slide)):
                 places = self.sites + np.add(offset, moved)
@@ -92,6 +98,24 @@ class Bench:
                 if outside.any():
                     number = int(np.argmax(outside))
                     raise BenchError(f"site {number}{name}{way} at {places[number]} m lies outside the sheet")
+
+    def _require_possible(self) -> None:
+        forces, (low, high) = np.asarray(self.forces), np.asarray(self.scene.skin.domain.bounds)
+        if not forces.size or not ((forces > 0) & (forces <= MAX_FORCE)).all():
+            raise BenchError(f"forces are {forces.tolist()} N; give one or more, above 0 up to {MAX_FORCE:g}")
+        if not len(self.sites):
+            raise BenchError("there is no site to press; give one or more")
+        if self.tip_diameter > (high - low).min():
+            raise BenchError(f"a tip of {self.tip_diameter:g} m is wider than the sheet; give its diameter in m")
+        scan = self.scene.skin.protocol.frame_time
+        if self.eit_rate * scan > 1 + RATE_TOLERANCE:
+            raise BenchError(
+                f"eit_rate is {self.eit_rate:g} Hz, but a scan of this skin takes {scan:.3g} s; give at most "
+                f"{1 / scan:.4g} Hz, or shorten reading_time in the skin's file"
+            )
+        for name, rate in (("eit_rate", self.eit_rate), ("pad_rate", self.pad_rate)):
+            if self.blank * rate < 1 or self.timing.hold * rate < 1:
+                raise BenchError(f"{name} is {rate:g} Hz: no sample in the blank or in a hold; raise it")
 
     @property
     def period(self) -> float:
@@ -170,6 +194,8 @@ def _sites(table: je.toml.TomlTable, domain: je.geometry.Domain) -> np.ndarray:
     require("sites", columns * rows, table.where, je.toml.TomlError)
     margin = table.number("margin", "least distance of the tip's centre from the rim, m")
     (x0, y0), (x1, y1) = domain.bounds
+    if 2 * margin > min(x1 - x0, y1 - y0):
+        raise table.error("margin", f"is {margin:g} m, which leaves no place on a sheet of {x1 - x0:g} x {y1 - y0:g} m")
     x = np.linspace(x0 + margin, x1 - margin, columns)
     y = np.linspace(y0 + margin, y1 - margin, rows)
     grid = np.stack(np.meshgrid(x, y), -1)

@@ -3,8 +3,10 @@
 import math
 import os
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,39 @@ class Pad:
     def area(self) -> float:
         """Area in m^2."""
         return Polygon(self.outline).area
+
+
+MAX_OVERLAP = 0.02  # of the smaller of two pads
+OVERLAP_POINTS = 40  # along each side of the box that two pads have in common
+
+
+class PadError(ValueError):
+    """Pads that cannot lie beside one another; the message names them."""
+
+
+def _require_apart(pads: Sequence[Pad]) -> None:
+    """Refuse pads of one name, and pads of which one lies over another: a force would count twice."""
+    names = [pad.name for pad in pads]
+    if again := [name for name, number in Counter(names).items() if number > 1]:
+        raise PadError(f"{names.count(again[0])} pads have the name {again[0]!r}; give each pad its own")
+    for first, second in combinations(pads, 2):
+        if (share := _overlap(first.outline, second.outline)) > MAX_OVERLAP:
+            raise PadError(
+                f"pads {first.name!r} and {second.name!r} lie over one another by {100 * share:.0f} % of the smaller "
+                "one; correct their corners"
+            )
+
+
+def _overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Share of the smaller of two polygons that lies within the other, by points on a grid over both boxes."""
+    low, high = np.maximum(first.min(0), second.min(0)), np.minimum(first.max(0), second.max(0))
+    if (high <= low).any():
+        return 0.0
+    at = (np.arange(OVERLAP_POINTS) + 0.5) / OVERLAP_POINTS
+    points = low + np.stack(np.meshgrid(at, at), -1).reshape(-1, 2) * (high - low)
+    shapes = Polygon(first), Polygon(second)
+    common = shapes[0].contains(points) & shapes[1].contains(points)
+    return float(common.mean() * np.prod(high - low) / min(shape.area for shape in shapes))
 
 
 @dataclass(frozen=True)
@@ -69,6 +104,7 @@ class Skin:
 
     def __post_init__(self) -> None:
         self.protocol.check(len(self.electrodes))
+        _require_apart(self.pads)
 
     @property
     def electrode_positions(self) -> np.ndarray:
@@ -208,11 +244,12 @@ def _protocol(table: TomlTable, electrodes: int) -> Protocol:
         raise table.error("pattern", str(error)) from None
 
 
+_MIN_PAD_WIDTH = 1e-3  # of the shorter side of the sheet
 _PAD_REACH = 1.0  # of the sheet's width and height: a pad may jut out, but not by a sheet's size
 
 
 def _pad(table: TomlTable, domain: Domain) -> Pad:
-    name = table.get("name", lambda v: isinstance(v, str), "the pad's name as text")
+    name = table.get("name", lambda v: isinstance(v, str) and v.strip() != "", "the pad's name as text")
     if table.has("rectangle"):
         x0, y0, x1, y1 = table.vector("rectangle", 4, "[x0, y0, x1, y1] in m")
         if not (x0 < x1 and y0 < y1):
@@ -225,6 +262,9 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
     if (beyond > _PAD_REACH * (high - low)).any():
         key = "rectangle" if table.has("rectangle") else "polygon"
         raise table.error(key, f"reaches {beyond.max():.3g} m beyond the sheet; give its corners in m")
+    if (size := np.ptp(outline, 0).min()) < _MIN_PAD_WIDTH * (high - low).min():
+        key = "rectangle" if table.has("rectangle") else "polygon"
+        raise table.error(key, f"is {size:.3g} m wide, too little for a pad of this sheet; give its corners in m")
     table.done()
     return Pad(name, np.asarray(outline, float))
 

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ SHEET = (je.effects.LoadSpreading(), je.effects.ContactPiezoresistance())
 
 def _bench(skin, *effects, sites=((0.06, 0.07), (0.13, 0.1)), **changes):
     given = {"timing": QUICK, "blank": 0.2, "eit_rate": 50.0, "pad_rate": 100.0, "toml": "x"} | changes
-    return Bench(je.Scene(skin, effects), np.array(sites), np.array([10.0, 20.0]), **given)
+    return Bench(je.Scene(skin, effects), np.array(sites), given.pop("forces", np.array([10.0, 20.0])), **given)
 
 
 def _all(recording, blocks=None):
@@ -176,7 +177,8 @@ def test_presses_of_shipped_scenes_keep_the_tolerance(name):
 
 
 def test_a_press_takes_few_solves(skin):
-    made = simulated_streams(_bench(skin, *SHEET, je.effects.Hysteresis(), eit_rate=500.0), DRAFT).eit
+    quick = replace(skin, protocol=replace(skin.protocol, reading_time=1e-6))
+    made = simulated_streams(_bench(quick, *SHEET, je.effects.Hysteresis(), eit_rate=500.0), DRAFT).eit
     _all(made)
     assert made.samples > 1000
     assert made.solves == 7 + 8
@@ -362,9 +364,16 @@ def test_an_unknown_preset_is_named():
         ({"slide": (0.3, 0.0)}, "after its slide"),
         ({"companions": (Companion((0.0, 0.2), 1.0),)}, "of a companion"),
         ({"sites": ((0.3, 0.1),)}, "site 0 at"),
+        ({"sites": np.zeros((0, 2))}, "there is no site to press"),
+        ({"forces": np.array([5.0, -3.0])}, r"forces are \[5.0, -3.0\] N; give one or more, above 0"),
+        ({"forces": np.array([])}, r"forces are \[\] N"),
+        ({"forces": np.array([np.nan])}, r"forces are \[nan\] N"),
+        ({"tip_diameter": 0.5}, "a tip of 0.5 m is wider than the sheet"),
+        ({"eit_rate": 200.0}, r"a scan of this skin takes 0.0055 s; give at most 181.8 Hz"),
+        ({"pad_rate": 0.01}, "pad_rate is 0.01 Hz: no sample in the blank or in a hold"),
     ],
 )
-def test_tips_stay_on_the_sheet(skin, change, message):
+def test_what_a_stage_cannot_do_is_refused(skin, change, message):
     with pytest.raises(BenchError, match=message):
         _bench(skin, **change)
 

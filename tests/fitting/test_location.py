@@ -100,7 +100,7 @@ def test_a_place_beside_a_pad_counts_as_its_nearest_edge(geometry):
 def test_pads_with_fewer_corners_and_round_sheets(skin):
     triangle = je.Pad("t", np.array([[0.02, 0.02], [0.08, 0.02], [0.05, 0.08]]))
     round_sheet = je.Disc(0.1)
-    odd = je.Skin("odd", round_sheet, 1.0, skin.electrodes, skin.protocol, (skin.pads[0], triangle))
+    odd = je.Skin("odd", round_sheet, 1.0, skin.electrodes, skin.protocol, (skin.pads[3], triangle))
     point = np.array([[0.05, 0.04]])
     features = np.asarray(features_of(PadEdge(0.01, bumps=1), geometry_of(odd), single_places(point, 2)))[0, 1]
     sides = np.roll(triangle.outline, -1, 0) - triangle.outline

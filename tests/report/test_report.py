@@ -361,7 +361,8 @@ def test_simulated_is_said_in_every_picture(calibration, located, skin, simulate
 
 
 def hostile_calibration(calibration):
-    skin = replace(calibration.skin, name=HOSTILE, pads=(je.Pad(HOSTILE, calibration.skin.pads[0].outline),) * 4)
+    pads = tuple(je.Pad(HOSTILE + str(n), pad.outline) for n, pad in enumerate(calibration.skin.pads))
+    skin = replace(calibration.skin, name=HOSTILE, pads=pads)
     found = replace(calibration.evaluation, held_out_by=HOSTILE, recipe=HOSTILE)
     provenance = {HOSTILE: HOSTILE, "curve": HOSTILE, "choice": HOSTILE}
     return replace(calibration, skin=skin, evaluation=found, provenance=provenance, notes=(HOSTILE,))
