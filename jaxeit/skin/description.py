@@ -39,18 +39,18 @@ MAX_OVERLAP = 0.02  # of the smaller of two pads
 OVERLAP_POINTS = 40  # along each side of the box that two pads have in common
 
 
-class PadError(ValueError):
-    """Pads that cannot lie beside one another; the message names them."""
+class SkinError(ValueError):
+    """Hardware that cannot be; the message names the part."""
 
 
 def _require_apart(pads: Sequence[Pad]) -> None:
     """Refuse pads of one name, and pads of which one lies over another: a force would count twice."""
     names = [pad.name for pad in pads]
     if again := [name for name, number in Counter(names).items() if number > 1]:
-        raise PadError(f"{names.count(again[0])} pads have the name {again[0]!r}; give each pad its own")
+        raise SkinError(f"{names.count(again[0])} pads have the name {again[0]!r}; give each pad its own")
     for first, second in combinations(pads, 2):
         if (share := _overlap(first.outline, second.outline)) > MAX_OVERLAP:
-            raise PadError(
+            raise SkinError(
                 f"pads {first.name!r} and {second.name!r} lie over one another by {100 * share:.0f} % of the smaller "
                 "one; correct their corners"
             )
@@ -90,6 +90,10 @@ class Skin:
     | pads, in the order of pressure channels   |                |
     | surface: its shape in space; None: flat   |                |
     | toml: the text of the skin file           |                |
+
+    Raises:
+        ProtocolError: for a protocol of more electrodes.
+        SkinError: for a sheet that does not conduct, and for pads of one name or over one another.
     """
 
     name: str
@@ -104,6 +108,8 @@ class Skin:
 
     def __post_init__(self) -> None:
         self.protocol.check(len(self.electrodes))
+        if not 0 < self.sheet_resistance < math.inf:
+            raise SkinError(f"sheet_resistance is {self.sheet_resistance}; give ohm per square, above zero")
         _require_apart(self.pads)
 
     @property

@@ -1,6 +1,7 @@
 """Skin files: what is read, and what is said about a wrong one."""
 
 import importlib.resources
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -68,6 +69,13 @@ def test_a_wrong_file_names_key_and_reason(old, new, message):
         je.skin.parse_skin(TEXT.replace(old, new, 1), "mine.toml")
     assert str(caught.value).startswith("mine.toml: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("resistance", [0.0, -200.0, float("nan"), float("inf")])
+def test_a_sheet_conducts(resistance):
+    skin = je.load_skin("testbed")
+    with pytest.raises(je.skin.SkinError, match="sheet_resistance is .*; give ohm per square, above zero"):
+        replace(skin, sheet_resistance=resistance)
 
 
 def test_a_missing_file_says_what_is_shipped():
