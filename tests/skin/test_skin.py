@@ -74,7 +74,7 @@ def test_a_wrong_file_names_key_and_reason(old, new, message):
 @pytest.mark.parametrize("resistance", [0.0, -200.0, float("nan"), float("inf")])
 def test_a_sheet_conducts(resistance):
     skin = je.load_skin("testbed")
-    with pytest.raises(je.skin.SkinError, match="sheet_resistance is .*; give ohm per square, above zero"):
+    with pytest.raises(je.skin.SkinError, match=r"sheet_resistance is .*; give ohm per square, above zero"):
         replace(skin, sheet_resistance=resistance)
 
 
