@@ -58,7 +58,7 @@ def check_session(
     presses, source = list_presses(session, statistics, findings)
     evidence = press_evidence(statistics, presses, findings)
     presses = presses if evidence is None else evidence.presses
-    channels, order = check_eit(session, statistics.get("eit"), presses, skin, transfer, findings)
+    channels, order = check_eit(session, statistics.get("eit"), presses, evidence, skin, transfer, findings)
     pads = check_pads(statistics, skin, findings)
     places = check_electrodes(skin, channels, order, findings) if electrodes else ()
     onsets = _compare(session, statistics, evidence, skin, channels, order, findings)

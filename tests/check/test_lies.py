@@ -129,6 +129,48 @@ def readings(order):
     return lambda r: r.change("eit", r.values("eit")[:, order(len(r.values("eit")[0]))])
 
 
+def in_half(name, change, first=False):
+    """A change of the values of one stream in its second half, or in its first one."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        half = slice(None, len(values) // 2) if first else slice(len(values) // 2, None)
+        values[half] = change(values[half])
+        return r.change(name, values)
+
+    return tell
+
+
+def channels(name, numbers, factor):
+    """Some channels of one stream are multiplied."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        values[:, numbers] *= factor
+        return r.change(name, values)
+
+    return tell
+
+
+def drive_scaled(a, b, factor):
+    """All readings of one drive pair are multiplied."""
+    return lambda r: channels("eit", (r.facts.pattern[:, :2] == [a, b]).all(1), factor)(r)
+
+
+def lost_electrode(noise, half=False):
+    """The readings of electrode 12 are noise, in the whole recording or in its second half."""
+
+    def tell(r):
+        lost = (r.facts.pattern == 12).any(1)
+        values = r.values("eit").copy()
+        some = slice(len(values) // 2 if half else 0, None)
+        shape = values[some][:, lost].shape
+        values[some, lost] = np.random.default_rng(0).normal(0, noise, shape)
+        return r.change("eit", values)
+
+    return tell
+
+
 def pair_exchanged(r):
     """The wires of electrodes 3 and 17 are exchanged."""
     number = np.arange(25)
@@ -280,7 +322,35 @@ LIES = {
     ),
     "voltages reversed": Lie(scaled("eit", -1), ERROR, ("every sign is reversed",)),
     "magnitudes": Lie(lambda r: r.change("eit", np.abs(r.values("eit"))), ERROR, ("magnitudes without sign",)),
+    "voltages reversed from the middle on": Lie(
+        in_half("eit", lambda v: -v), ERROR, ("untouched skin differ from 28.4 s", "every sign is reversed")
+    ),
+    "voltages reversed up to the middle": Lie(
+        in_half("eit", lambda v: -v, first=True),
+        ERROR,
+        ("untouched skin differ up to 28.4 s", "every sign is reversed"),
+    ),
+    "magnitudes from the middle on": Lie(in_half("eit", np.abs), ERROR, ("differ from 28.4 s", "magnitudes")),
+    "voltage in mV up to the middle": Lie(
+        in_half("eit", lambda v: 1e3 * v, first=True), ERROR, ("differ up to 28.4 s", "1000 times that of the other")
+    ),
+    "gain of EIT 1.1 from the middle on": Lie(
+        in_half("eit", lambda v: 1.1 * v), WARNING, ("differ from 28.4 s", "1.1 times that of the other frames")
+    ),
+    "offset of EIT": Lie(added("eit", 0.01), WARNING, ("/streams/eit", "+0.0101 V in addition", "offset")),
+    "one reading reversed": Lie(channels("eit", [275], -1), WARNING, ("reading 275 has the opposite sign",)),
+    "one reading twice as large": Lie(channels("eit", [100], 2), WARNING, ("reading 100 is 2 times",)),
+    "one drive reversed": Lie(drive_scaled(12, 13, -1), WARNING, ("all that drive with 12-13", "the opposite sign")),
+    "one drive in mV": Lie(drive_scaled(12, 13, 1e3), WARNING, ("all that drive with 12-13", "times the reading")),
     # order
+    "two readings exchanged": Lie(
+        readings(lambda n: np.r_[np.arange(5), 300, np.arange(6, 300), 5, np.arange(301, n)]),
+        WARNING,
+        ("readings are exchanged", "5 and 300"),
+    ),
+    "readings rolled from the middle on": Lie(
+        in_half("eit", lambda v: np.roll(v, -7, axis=1)), ERROR, ("differ from 28.4 s", "starts at reading 7 ")
+    ),
     "readings in reversed order": Lie(readings(lambda n: np.arange(n)[::-1]), ERROR, ("reversed order",)),
     "readings rolled": Lie(readings(lambda n: np.roll(np.arange(n), -7)), ERROR, ("starts at reading 7 ",)),
     "electrode pair exchanged": Lie(pair_exchanged, ERROR, ("electrodes 3 and 17 are exchanged",)),
@@ -353,6 +423,10 @@ LIES = {
     "every frame twice": Lie(doubled_frames, WARNING, ("50 % of its frames equal the one before",)),
     "recording pasted twice": Lie(pasted_twice, WARNING, ("copies of earlier ones",)),
     "EIT at the converter's end": Lie(clipped, ERROR, ("saturated",)),
+    "an electrode dead from the middle on": Lie(
+        lost_electrode(0.0, half=True), ERROR, ("differ from 28.4 s", "hold no voltage", "all with electrode 12")
+    ),
+    "an electrode that reads noise": Lie(lost_electrode(1e-5), ERROR, ("readings of electrode 12", "only noise")),
     "an electrode dead": Lie(dead_electrode(0.0), ERROR, ("all of them use electrode 12",)),
     "pressure frozen": Lie(frozen("pressure", 0.5, 0.8), WARNING, ("no pad feels",)),
     "pressure of the last moment for ever": Lie(
