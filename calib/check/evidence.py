@@ -41,6 +41,11 @@ class PressEvidence:
     eit: WindowMeans | None
     rests: np.ndarray | None
 
+    @property
+    def times(self) -> np.ndarray:
+        """Times at which the presses of the rows begin, (rows,) ns."""
+        return np.asarray(np.asarray(self.presses.t_press)[self.number])
+
     def compared(self) -> tuple[PressColumns, PressWindows]:
         """The presses whose frames were read, and their windows."""
         return _chosen(self.presses, self.windows, self.number[self.seen])

@@ -152,6 +152,17 @@ def channels(name, numbers, factor):
     return tell
 
 
+def clipped_at(name, limit, numbers=slice(None)):
+    """Some channels of one stream read no more than a limit."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        values[:, numbers] = np.minimum(values[:, numbers], limit)
+        return r.change(name, values)
+
+    return tell
+
+
 def drive_scaled(a, b, factor):
     """All readings of one drive pair are multiplied."""
     return lambda r: channels("eit", (r.facts.pattern[:, :2] == [a, b]).all(1), factor)(r)
@@ -189,13 +200,13 @@ def dead_electrode(value):
     return tell
 
 
-def frozen(name, first, last):
-    """A stream stands still for a part of the recording."""
+def frozen(name, first, last, numbers=slice(None)):
+    """A stream, or some channels of it, stands still for a part of the recording."""
 
     def tell(r):
         values = r.values(name).copy()
         a, b = int(first * len(values)), int(last * len(values))
-        values[a:b] = values[a]
+        values[a:b, numbers] = values[a, numbers]
         return r.change(name, values)
 
     return tell
@@ -297,6 +308,15 @@ LIES = {
     ),
     "load in g": Lie(scaled("force", 1 / 9.80665e-3), WARNING, ("/streams/force", "times the target")),
     "force of a converter's counts": Lie(scaled("force", 1e4), WARNING, ("cannot be true",)),
+    "one pad in kPa": Lie(
+        channels("pressure", [0], 1e-3), WARNING, ("column 0, pad 'lower left', reads 0.001 times", "kPa")
+    ),
+    "one pad of ten times the gain": Lie(
+        channels("pressure", [1], 10), WARNING, ("column 1, pad 'lower right', reads 9.9 times",)
+    ),
+    "pads at -20 kPa": Lie(added("pressure", -2e4), WARNING, ("lie below the sensor's span",)),
+    "load cell that clips": Lie(clipped_at("force", 12.0), WARNING, ("/streams/force: clips at 12 N", "5 flat tops")),
+    "pad that clips": Lie(clipped_at("pressure", 600.0, [1]), WARNING, ("column 1 clips at 600 Pa", "flat tops")),
     "pressure in kPa": Lie(scaled("pressure", 1e-3), WARNING, ("/streams/pressure", "kPa or bar")),
     "pressure in mbar": Lie(scaled("pressure", 1e-2), WARNING, ("/streams/force", "a unit of one of the two")),
     "pressure in mPa": Lie(scaled("pressure", 1e3), WARNING, ("beyond the sensor's span",)),
@@ -342,6 +362,12 @@ LIES = {
     "one reading twice as large": Lie(channels("eit", [100], 2), WARNING, ("reading 100 is 2 times",)),
     "one drive reversed": Lie(drive_scaled(12, 13, -1), WARNING, ("all that drive with 12-13", "the opposite sign")),
     "one drive in mV": Lie(drive_scaled(12, 13, 1e3), WARNING, ("all that drive with 12-13", "times the reading")),
+    "three pads fall on pressing": Lie(
+        channels("pressure", [0, 1, 3], -1), ERROR, ("column 1, pad 'lower right', falls on pressing", "4 of 4")
+    ),
+    "pressure falls on pressing from the middle on": Lie(
+        in_half("pressure", lambda v: -v), ERROR, ("falls on pressing", "all of them from 27.7 s after the start on")
+    ),
     # order
     "two readings exchanged": Lie(
         readings(lambda n: np.r_[np.arange(5), 300, np.arange(6, 300), 5, np.arange(301, n)]),
@@ -356,6 +382,14 @@ LIES = {
     "electrode pair exchanged": Lie(pair_exchanged, ERROR, ("electrodes 3 and 17 are exchanged",)),
     "pressure columns exchanged": Lie(
         columns("pressure", [1, 0, 2, 3]), ERROR, ("column 1 responds over pad 'lower left'",)
+    ),
+    "pressure columns exchanged from the middle on": Lie(
+        in_half("pressure", lambda v: v[:, [1, 2, 3, 0]]),
+        ERROR,
+        ("responds from 31.0 s after the start on", "column 1 responds over pad 'upper left'"),
+    ),
+    "one pressure column for all pads": Lie(
+        columns("pressure", [0, 0, 0, 0]), ERROR, ("hold the same values: 0 and 1",)
     ),
     "pressure columns exchanged, no table": Lie(
         lambda r: stage_for_table(columns("pressure", [0, 1, 3, 2])(r)),
@@ -420,6 +454,10 @@ LIES = {
     ),
     "EIT of the untouched skin": Lie(at_rest("eit"), ERROR, ("no reading changes", "16 of 16")),
     "EIT frozen": Lie(frozen("eit", 0.5, 0.8), WARNING, ("equal the one before", "the longest for")),
+    "EIT frozen at the end": Lie(frozen("eit", 0.9, 1.0), WARNING, ("/streams/eit", "stands still for 5.65 s")),
+    "one pressure column frozen": Lie(
+        frozen("pressure", 0.5, 0.7, 0), WARNING, ("/streams/pressure: column 0 stands still for 11.3 s",)
+    ),
     "every frame twice": Lie(doubled_frames, WARNING, ("50 % of its frames equal the one before",)),
     "recording pasted twice": Lie(pasted_twice, WARNING, ("copies of earlier ones",)),
     "EIT at the converter's end": Lie(clipped, ERROR, ("saturated",)),

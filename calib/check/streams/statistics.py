@@ -78,7 +78,7 @@ def stream_statistics(
 ) -> dict[str, StreamStatistics]:
     """Read every stream once. Streams without samples and damaged ones are added to ``findings`` and left out."""
     statistics = {}
-    limits = {} if skin is None else {"pressure": _full_scale(skin.pressure_sensor)}
+    limits = {} if skin is None else {"pressure": full_scale(skin.pressure_sensor)}
     for name, stream in session.streams.items():
         if not len(stream):
             findings.append(Finding(Severity.ERROR, f"/streams/{name}", "holds no sample", "record again"))
@@ -91,7 +91,8 @@ def stream_statistics(
     return statistics
 
 
-def _full_scale(sensor: je.skin.PressureSensor) -> float:
+def full_scale(sensor: je.skin.PressureSensor) -> float:
+    """Pressure (Pa) from which a sensor may be at the end of its span."""
     return sensor.maximum - sensor.accuracy
 
 
