@@ -23,11 +23,12 @@ from .report import ChannelTable, CheckReport, Finding, Severity
 from .responses import reading_response_findings
 from .skin import check_skin
 from .streams.clipping import clipping_findings
-from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks, table_clock_finding
+from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks
 from .streams.dropouts import dropout_findings
 from .streams.shifts import shift_findings
 from .streams.statistics import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
 from .streams.stuck import stuck_findings
+from .streams.table_clock import table_clock_finding
 
 
 def check_session(
@@ -109,8 +110,8 @@ def _compare(
     if skin is None:
         return onsets
     # A wrong order of the readings, or of the pads, would show as wrong places too.
-    pattern = None if order is None or order.claimed or "eit" in moved else session.pattern
-    places = list(place_findings(evidence, skin, pattern, {n: s.stream for n, s in statistics.items()}))
+    told = None if order is None or order.claimed or "eit" in moved else channels
+    places = list(place_findings(evidence, skin, told, {n: s.stream for n, s in statistics.items()}))
     findings += places
     if "pressure" in {*statistics} - moved and all(f.severity < Severity.ERROR for f in places):
         findings += pad_response_findings(evidence, skin, int(statistics["pressure"].time[0]))

@@ -57,7 +57,7 @@ def _step_finding(ratio: np.ndarray, times: np.ndarray, start: int) -> Finding |
     level = np.where(np.arange(len(ratio)) < row, before, after)
     if np.quantile(np.abs(np.log(ratio / level)), STEADY) > np.log(MIN_STEP):
         return None
-    first = abs(np.log(before)) > abs(np.log(after))
+    first = bool(abs(np.log(before)) > abs(np.log(after)))
     wrong, right = (before, after) if first else (after, before)
     when = time_text(first, (times[row - 1 if first else row] - start) / 1e9)
     what = f"the force reads {wrong:.3g} times the target of the presses {when}, {right:.3g} times in the others"

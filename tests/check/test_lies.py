@@ -101,6 +101,23 @@ def table_late(seconds):
     )
 
 
+def table_at_rate(factor):
+    """The times of the table run at another rate."""
+
+    def tell(r):
+        times = {n: getattr(r.presses, n) for n in ("t_press", "t_hold0", "t_hold1", "t_release")}
+        first = times["t_press"][0]
+        return r.pressed(**{n: first + ((t - first) * factor).astype(np.int64) for n, t in times.items()})
+
+    return tell
+
+
+def turned(degrees):
+    """The places are turned about the middle of the sheet."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return moved(lambda x, y: 0.1 + c * (x - 0.1) - s * (y - 0.1), lambda x, y: 0.1 + s * (x - 0.1) + c * (y - 0.1))
+
+
 def at_rate(name, factor):
     """The time stamps of one stream run at another rate."""
     return lambda r: r.at(name, r.streams[name].time * factor)
@@ -303,6 +320,21 @@ LIES = {
     # units
     "force in mN": Lie(scaled("force", 1e3), WARNING, ("/streams/force", "times the target")),
     "force in kN": Lie(scaled("force", 1e-3), WARNING, ("/streams/force", "times the target")),
+    "force in kN up to the middle": Lie(
+        in_half("force", lambda v: v / 1e3, first=True),
+        WARNING,
+        ("0.001 times the target", "up to 24.4 s after the start, 1 times"),
+    ),
+    "force doubled from the middle on": Lie(
+        in_half("force", lambda v: 2 * v), WARNING, ("2 times the target of the presses from 27.7 s",)
+    ),
+    "targets of other presses": Lie(
+        lambda r: r.pressed(target_force=np.roll(r.presses.target_force, 1)),
+        WARNING,
+        ("targets are not those of the presses", "1 press too late"),
+    ),
+    "force of the unloaded cell": Lie(at_rest("force"), ERROR, ("/streams/force", "no press changes the force")),
+    "force constant": Lie(lambda r: r.change("force", 0 * r.values("force") + 3), ERROR, ("always reads 3 N",)),
     "force in mN, no target": Lie(
         lambda r: scaled("force", 1e3)(r).pressed(target_force=np.zeros(16)), WARNING, ("what the pressures", "unit")
     ),
@@ -333,6 +365,17 @@ LIES = {
     "force pulls": Lie(scaled("force", -1), ERROR, ("negative while pressing",)),
     "force pulls, no table": Lie(
         lambda r: stage_for_table(scaled("force", -1)(r)), ERROR, ("negative while pressing",)
+    ),
+    "force pulls up to the middle": Lie(
+        in_half("force", lambda v: -v, first=True), ERROR, ("negative while pressing up to 24.4 s",)
+    ),
+    "changes of EIT reversed from the middle on": Lie(
+        lambda r: in_half("eit", lambda v: 2 * np.median(r.values("eit")[:60], 0) - v)(r),
+        ERROR,
+        ("the changes of the readings have the opposite sign from",),
+    ),
+    "targets that are negative": Lie(
+        lambda r: r.pressed(target_force=-r.presses.target_force), WARNING, ("/presses", "target_force is negative")
     ),
     "pressure falls on pressing": Lie(scaled("pressure", -1), ERROR, ("falls on pressing", "16 of 16")),
     "one pad falls on pressing": Lie(
@@ -410,6 +453,34 @@ LIES = {
     "table shuffled": Lie(
         rows(lambda c: c[np.random.default_rng(8).permutation(16)]), WARNING, ("do not match the readings",)
     ),
+    "table five presses late": Lie(rows(lambda c: np.roll(c, 5)), ERROR, ("places look wrong", "5 presses late")),
+    "x mirrored from the middle on": Lie(
+        moved(lambda x, y: np.where(np.arange(16) < 8, x, 0.2 - x)),
+        ERROR,
+        ("look wrong from 31.0 s after the start on", "x is mirrored"),
+    ),
+    "two presses exchanged": Lie(
+        rows(lambda c: np.r_[c[15], c[1:15], c[0]]), WARNING, ("in 2 presses", "presses 0 and 15 look exchanged")
+    ),
+    "one press elsewhere": Lie(
+        moved(lambda x, y: np.r_[0.17, x[1:]], lambda x, y: np.r_[0.165, y[1:]]),
+        WARNING,
+        ("elsewhere than listed in 1 press", "press 0 near x = 0.028 m"),
+    ),
+    "places shifted by 20 mm": Lie(moved(lambda x, y: x + 0.02), WARNING, ("the places look shifted by +18 mm in x",)),
+    "places turned by 10 degrees": Lie(turned(10), WARNING, ("the places look turned by 11 degrees",)),
+    "places scaled by a half": Lie(
+        moved(lambda x, y: 0.05 + x / 2, lambda x, y: 0.05 + y / 2), WARNING, ("the places look scaled by 0.52",)
+    ),
+    "places scaled in x": Lie(moved(lambda x, y: x / 2), WARNING, ("the places look scaled by 0.52 in x",)),
+    "places in km": Lie(
+        moved(lambda x, y: x / 1e3, lambda x, y: y / 1e3), WARNING, ("do not match", "all x lie within 0.14 mm")
+    ),
+    "a stage that stands still, no table": Lie(
+        lambda r: stage_for_table(r, lambda p: 0 * p + 0.07),
+        WARNING,
+        ("do not match", "all x lie within 0 mm of 0.07 m"),
+    ),
     "a pad that is not under the tip": Lie(
         lambda r: r.pressed(pad=np.full(16, 2)), WARNING, ("name a pad that is not under",)
     ),
@@ -436,6 +507,14 @@ LIES = {
     "force at 0.995 times its rate": Lie(at_rate("force", 0.995), ERROR, ("/streams/pressure", "another rate")),
     "clock of the EIT jumps by 2 s": Lie(jump("eit", 2.0), ERROR, ("second half", "2.000 s after", "jumped")),
     "clock of the pressure jumps by 0.5 s": Lie(jump("pressure", 0.5), ERROR, ("second half", "0.500 s after")),
+    "table 1.5 s late": Lie(table_late(1.5), ERROR, ("/presses", "1.500 s before the presses of the table")),
+    "table late by a press": Lie(
+        table_late(3.3), WARNING, ("targets are not those of the presses", "1 press too late")
+    ),
+    "table at 1.01 times its rate": Lie(table_at_rate(1.01), ERROR, ("/presses", "more and more late", "another rate")),
+    "no press accepted": Lie(
+        lambda r: r.pressed(accepted=np.zeros(16, bool), reason=("",) * 16), ERROR, ("all are set aside",)
+    ),
     "table 0.3 s late": Lie(table_late(0.3), ERROR, ("/presses", "0.300 s before the presses of the table")),
     "table 0.5 s early": Lie(table_late(-0.5), ERROR, ("/presses", "0.500 s after the presses of the table")),
     "table of another recording": Lie(
