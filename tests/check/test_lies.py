@@ -101,6 +101,16 @@ def table_late(seconds):
     )
 
 
+def in_blocks(name, size):
+    """The samples of a block have the time stamp of its first one, and a microsecond more each."""
+
+    def tell(r):
+        time, index = r.streams[name].time, np.arange(len(r.streams[name].time))
+        return r.at(name, time[index // size * size] + index % size * 1000)
+
+    return tell
+
+
 def table_at_rate(factor):
     """The times of the table run at another rate."""
 
@@ -507,6 +517,9 @@ LIES = {
     "force at 0.995 times its rate": Lie(at_rate("force", 0.995), ERROR, ("/streams/pressure", "another rate")),
     "clock of the EIT jumps by 2 s": Lie(jump("eit", 2.0), ERROR, ("second half", "2.000 s after", "jumped")),
     "clock of the pressure jumps by 0.5 s": Lie(jump("pressure", 0.5), ERROR, ("second half", "0.500 s after")),
+    "time stamps in blocks": Lie(
+        in_blocks("pressure", 50), WARNING, ("/streams/pressure", "in blocks of 50 samples", "a block every 0.5 s")
+    ),
     "table 1.5 s late": Lie(table_late(1.5), ERROR, ("/presses", "1.500 s before the presses of the table")),
     "table late by a press": Lie(
         table_late(3.3), WARNING, ("targets are not those of the presses", "1 press too late")
