@@ -161,7 +161,7 @@ def _explanation(
         return "magnitudes without sign", "record the signed (in-phase) voltage, not its amplitude", Severity.ERROR
     local = _local_explanation(wrong, right, known, table)
     if local is not None:
-        return *local, Severity.ERROR
+        return local
     order = None if model is None else model.check(wrong, known & ~table.dead, table.pattern)
     if order is not None and order.claimed:
         return order.what, f"{order.remedy}, or use the other part only", Severity.ERROR
@@ -173,8 +173,8 @@ def _explanation(
 
 def _local_explanation(
     wrong: np.ndarray, right: np.ndarray, known: np.ndarray, table: ChannelTable
-) -> tuple[str, str] | None:
-    """A change of the readings of one or two electrodes alone."""
+) -> tuple[str, str, Severity] | None:
+    """A change of the readings of one or two electrodes alone; a load that stays on one is no error."""
     floor = 0.1 * _rms(right[known])
     moved = known & (np.abs(wrong - right) > MIN_LOCAL * np.fmax(np.fmax(np.abs(wrong), np.abs(right)), floor))
     large = known & (np.abs(right) > floor)
@@ -185,4 +185,5 @@ def _local_explanation(
     name = " and ".join(map(str, electrodes))
     how = "hold no voltage" if left < LOST else f"have {left:.2g} times the voltage"
     what = f"{int(moved.sum())} readings {how} ({listed(np.flatnonzero(moved))}), all with electrode {name}"
-    return what, f"check electrode {name}: its terminal, wire and switch"
+    severity = Severity.ERROR if left < LOST else Severity.WARNING
+    return what, f"check electrode {name}: its terminal, wire and switch", severity

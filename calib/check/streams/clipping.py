@@ -6,6 +6,7 @@ import numpy as np
 
 import jaxeit as je
 
+from ...fitting.channel_faults import MIN_ARRAY_CHANNELS
 from ...presses.streams import true_runs
 from ..report import Finding, Severity, counted
 from .statistics import MIN_FRAME_CHANNELS, StreamStatistics, full_scale
@@ -19,7 +20,9 @@ TIMES_OTHER = 5.0  # longer than any other run of equal values
 def clipping_findings(stats: StreamStatistics, skin: je.Skin | None) -> Iterator[Finding]:
     """Channels whose largest value is that of many samples in a row, as no other value is."""
     row = stats.row
-    if row.variable not in CLIPPING or row.channels >= MIN_FRAME_CHANNELS or (stats.at_high < MIN_SAMPLES).all():
+    # Arrays that no skin describes have a check of their own: `check_pads`.
+    most = MIN_ARRAY_CHANNELS if skin is None else MIN_FRAME_CHANNELS
+    if row.variable not in CLIPPING or row.channels >= most or (stats.at_high < MIN_SAMPLES).all():
         return
     limit = full_scale(skin.pressure_sensor) if skin is not None and row.variable == "pressure" else np.inf
     values = stats.stream.read()
