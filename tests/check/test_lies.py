@@ -209,13 +209,18 @@ def lost_electrode(noise, half=False):
     return tell
 
 
-def pair_exchanged(r):
-    """The wires of electrodes 3 and 17 are exchanged."""
-    number = np.arange(25)
-    number[[3, 17]] = 17, 3
-    transfer = transfer_matrix(je.load_skin(r.facts.skin_name))
-    own, wrong = (r.facts.current * predict_readings(transfer, p) for p in (r.facts.pattern, number[r.facts.pattern]))
-    return r.change("eit", r.values("eit") - own + wrong)
+def pair_exchanged(first, second):
+    """The wires of two electrodes are exchanged."""
+
+    def tell(r):
+        number = np.arange(25)
+        number[[first, second]] = second, first
+        patterns = r.facts.pattern, number[r.facts.pattern]
+        transfer = transfer_matrix(je.load_skin(r.facts.skin_name))
+        own, wrong = (r.facts.current * predict_readings(transfer, pattern) for pattern in patterns)
+        return r.change("eit", r.values("eit") - own + wrong)
+
+    return tell
 
 
 def dead_electrode(value):
@@ -432,7 +437,8 @@ LIES = {
     ),
     "readings in reversed order": Lie(readings(lambda n: np.arange(n)[::-1]), ERROR, ("reversed order",)),
     "readings rolled": Lie(readings(lambda n: np.roll(np.arange(n), -7)), ERROR, ("starts at reading 7 ",)),
-    "electrode pair exchanged": Lie(pair_exchanged, ERROR, ("electrodes 3 and 17 are exchanged",)),
+    "electrode pair exchanged": Lie(pair_exchanged(3, 17), ERROR, ("electrodes 3 and 17 are exchanged",)),
+    "neighbouring electrodes exchanged": Lie(pair_exchanged(23, 24), ERROR, ("electrodes 23 and 24 are exchanged",)),
     "pressure columns exchanged": Lie(
         columns("pressure", [1, 0, 2, 3]), ERROR, ("column 1 responds over pad 'lower left'",)
     ),
@@ -489,7 +495,7 @@ LIES = {
     "a stage that stands still, no table": Lie(
         lambda r: stage_for_table(r, lambda p: 0 * p + 0.07),
         WARNING,
-        ("do not match", "all x lie within 0 mm of 0.07 m"),
+        ("do not match", "all x lie within 0 mm, near 0.07 m"),
     ),
     "a pad that is not under the tip": Lie(
         lambda r: r.pressed(pad=np.full(16, 2)), WARNING, ("name a pad that is not under",)

@@ -146,14 +146,14 @@ def _best_part(gain: np.ndarray) -> Part:
 
 
 def _mistake_finding(name: str, when: str, away: np.ndarray, left: float) -> Finding:
-    off = f"the readings change {1e3 * np.median(away):.0f} mm from the places as listed (median)"
-    what = f"the places look wrong{when}: {name}; {off} and {1e3 * left:.0f} mm so"
+    off = f"the contacts that EIT sees lie {1e3 * np.median(away):.0f} mm from the places as listed (median)"
+    what = f"the places look wrong{when}: {name}; {off}, {1e3 * left:.0f} mm so"
     return Finding(Severity.ERROR, WHERE, what, "correct x and y of the table, or the axes of the stage")
 
 
 def _fit_findings(site: np.ndarray, contacts: np.ndarray, pitch: float) -> Iterator[Finding]:
     """Places (rows, 2) that are the same, shifted, scaled or turned against the contacts, or do not match them."""
-    off = f"the readings change {1e3 * _distance(site, contacts):.0f} mm from the places as listed (median)"
+    off = f"the contacts that EIT sees lie {1e3 * _distance(site, contacts):.0f} mm from the places as listed (median)"
     narrow = spread_text(site, contacts)
     fit = "" if narrow else place_fit(site, contacts, pitch)
     if narrow:

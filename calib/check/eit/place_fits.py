@@ -20,8 +20,8 @@ def spread_text(places: np.ndarray, contacts: np.ndarray) -> str:
     spans, seen = np.ptp(places, axis=0), np.ptp(contacts, axis=0)
     same = [(axis, i) for i, axis in enumerate("xy") if spans[i] < NARROW * seen[i]]
     said = (
-        f"all {axis} lie within {1e3 * spans[i]:.2g} mm of {places[:, i].mean():.3g} m, those of the contacts within "
-        f"{1e3 * seen[i]:.0f} mm"
+        f"all {axis} lie within {1e3 * spans[i]:.2g} mm, near {places[:, i].mean():.3g} m, but those of the contacts "
+        f"that EIT sees within {1e3 * seen[i]:.0f} mm"
         for axis, i in same
     )
     return "; ".join(said)
