@@ -21,7 +21,7 @@ WHERE = "/presses"
 MIN_PLACES = 6  # for a comparison of places with the readings
 MIN_SPREAD = 0.05  # standard deviation of the located places, of the size of the sheet
 MIN_ALIKE = 0.5  # correlation of a change with that of a contact, from which the contact is located
-CLEARLY_ALIKE = 0.85  # the same for a single press, which a loose electrode may spoil
+CLEARLY_ALIKE = 0.85  # the same for a single press, which a loose electrode may spoil, and for their median
 # Distances between electrodes by which located places are off: of the median press, of some, and of a single one.
 MAX_AWAY, MAX_FEW, MAX_SINGLE = 0.35, 0.7, 1.25
 BETTER, MOSTLY = 2.0, 0.85  # times nearer with a mistake undone, and share of the presses that are near
@@ -44,6 +44,8 @@ def contact_findings(evidence: PressEvidence, skin: je.Skin, channels: ChannelTa
         yield Finding(Severity.ERROR, "/streams/eit", what, "look for frames that were negated, or subtracted, there")
         return
     rows, contacts, alike = rows[usual], contacts[usual], np.abs(alike[usual])
+    # The fields in closed form do not hold for all sheets, such as one with a corner that points inwards.
+    clear = len(alike) > 0 and bool(np.median(alike) > CLEARLY_ALIKE)
     few = len(np.unique(contacts.round(4), axis=0)) < MIN_PLACES
     if few or (contacts.std(0) < MIN_SPREAD * np.ptp(bounds, axis=0)).any():
         return
@@ -57,11 +59,11 @@ def contact_findings(evidence: PressEvidence, skin: je.Skin, channels: ChannelTa
             name, part, left = found
             when = "" if part is None else f" {part.text(evidence.times[numbers], int(eit.time[0]))}"
             yield _mistake_finding(name, when, away if part is None else away[part.mask(len(away))], left)
-        else:
+        elif clear:
             yield from _fit_findings(site, contacts, pitch)
-    elif ((away > MAX_SINGLE * pitch) & (alike > CLEARLY_ALIKE)).any():
-        clear = (away > MAX_SINGLE * pitch) & (alike > CLEARLY_ALIKE)
-        yield _single(evidence.number[numbers[clear]], site[clear], contacts[clear], pitch)
+    elif clear and ((away > MAX_SINGLE * pitch) & (alike > CLEARLY_ALIKE)).any():
+        other = (away > MAX_SINGLE * pitch) & (alike > CLEARLY_ALIKE)
+        yield _single(evidence.number[numbers[other]], site[other], contacts[other], pitch)
 
 
 def _located(

@@ -93,9 +93,10 @@ def _check_order(table: ChannelTable, good: np.ndarray, model: SkinModel, findin
 def _model_findings(table: ChannelTable, good: np.ndarray, order: OrderCheck, model: SkinModel) -> Iterator[Finding]:
     """Findings from the comparison with a uniform sheet: order, lost electrodes, offset and amplitude."""
     yield from order_findings(order)
-    if order.as_is >= MIN_CORRELATION and not order.claimed:
+    sound = order.as_is >= MIN_CORRELATION and not order.claimed
+    if sound:
         yield from lost_electrode_findings(table, model)
-    offset = None if order.claimed else offset_finding(table, good, model)
+    offset = offset_finding(table, good, model) if sound else None
     if offset is not None:
         yield offset
     else:
