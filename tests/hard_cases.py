@@ -71,6 +71,10 @@ values unless the case says otherwise.
 Spoilt files are refused. Recordings whose numbers are well formed but cannot be true are refused, or named by
 `jaxeit check`, whose message the rows quote. No generated lie that changed a result went through in silence.
 
+No recording tells whether all changes of EIT have the right sign, whether a common gain of EIT, force or pressure is
+wrong by less than a factor of 3, the tare of a load cell, an offset of 2 kPa that all pads share, or a grid that is
+numbered from the opposite corner.
+
 """,
         ("a campaign", "hostile files", "lie:", "lies:", "spoilt input:", "unsound meshes"),
     ),

@@ -28,6 +28,7 @@ class PressEvidence:
     | pressure    | change of the columns; None: no pressure stream                  | (rows, columns)     | Pa   |
     | seen        | rows whose frames were read                                      | (seen,)             |      |
     | eit         | change of their frames with standard errors; None: no EIT stream | (seen, readings)    | V    |
+    | rests       | mean frame of the rest before each of them; None: no EIT stream  | (seen, readings)    | V    |
     """
 
     presses: PressColumns
@@ -38,6 +39,12 @@ class PressEvidence:
     pressure: np.ndarray | None
     seen: np.ndarray
     eit: WindowMeans | None
+    rests: np.ndarray | None
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times at which the presses of the rows begin, (rows,) ns."""
+        return np.asarray(np.asarray(self.presses.t_press)[self.number])
 
     def compared(self) -> tuple[PressColumns, PressWindows]:
         """The presses whose frames were read, and their windows."""
@@ -50,7 +57,7 @@ def gather_evidence(streams: Mapping[str, Stream], presses: PressColumns, window
     seen = np.unique(np.linspace(0, len(number) - 1, min(len(number), MAX_COMPARED_PRESSES)).astype(int))
     _, within = _chosen(presses, windows, number)
     change = {n: press_means(streams[n], within).change.mean for n in ("force", "pressure") if n in streams}
-    eit = press_means(streams["eit"], _chosen(presses, windows, number[seen])[1]).change if "eit" in streams else None
+    eit = press_means(streams["eit"], _chosen(presses, windows, number[seen])[1]) if "eit" in streams else None
     force = change.get("force")
     return PressEvidence(
         presses=presses,
@@ -60,7 +67,8 @@ def gather_evidence(streams: Mapping[str, Stream], presses: PressColumns, window
         force=None if force is None else force[:, 0],
         pressure=change.get("pressure"),
         seen=seen,
-        eit=eit,
+        eit=None if eit is None else eit.change,
+        rests=None if eit is None else eit.rest,
     )
 
 

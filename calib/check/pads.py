@@ -13,6 +13,8 @@ from .report import Finding, PadRow, Severity, listed
 from .streams.statistics import MAX_MISSING, StreamStatistics
 
 MIN_PRESSURE = 5.0  # Pa; no press is lighter, but bar and kPa recorded as Pa give such numbers
+MAX_BELOW = 0.1  # of the span, by which all values may lie below it
+MAX_REST = 0.8  # of the span, at which a pad may rest
 # An array of many channels is searched for faults in so many pieces of so many samples, spread over the recording,
 # because the search holds what it reads in memory.
 PIECES, PIECE_LENGTH = 64, 512
@@ -88,12 +90,21 @@ def _unit_findings(rows: tuple[PadRow, ...], skin: je.Skin | None) -> Iterator[F
     largest = max(max(abs(r.low), abs(r.high)) for r in alive)
     where, remedy = "/streams/pressure", "import again with the right unit (Pa, kPa, mbar, bar, psi)"
     span = je.skin.PressureSensor().maximum if skin is None else skin.pressure_sensor.maximum
-    if largest <= MIN_PRESSURE:
+    below = skin is not None and max(r.high for r in alive) < skin.pressure_sensor.minimum - MAX_BELOW * span
+    if below:
+        low = min(r.low for r in alive)
+        what = f"all values, from {low:.4g} Pa on, lie below the sensor's span: a gage pressure at rest is near zero"
+        yield Finding(Severity.WARNING, where, what, "subtract the ambient pressure once at most, or tare the sensor")
+    elif largest <= MIN_PRESSURE:
         what = f"no value exceeds {largest:.3g} Pa: were kPa or bar recorded as Pa?"
         yield Finding(Severity.WARNING, where, what, remedy)
     elif skin is not None and largest > 1.2 * span:
         what = f"the largest value, {largest:.4g} Pa, lies beyond the sensor's span of {span:.4g} Pa"
         yield Finding(Severity.WARNING, where, what, f"{remedy}; absolute pressure is not gage pressure")
+    elif skin is not None and min(r.low for r in alive) > MAX_REST * span:
+        low = min(r.low for r in alive)
+        what = f"no value is below {low:.4g} Pa, also at rest, of a span of {span:.4g} Pa: little is left for presses"
+        yield Finding(Severity.WARNING, where, what, "give gage pressure, or a sensor of a larger span")
 
 
 def _array_findings(stats: StreamStatistics, force: Stream | None) -> Iterator[Finding]:

@@ -62,7 +62,8 @@ def press_evidence(
     presses = reject_without_samples(presses, windows, needed)
     lost = int(before - presses.accepted.sum())
     if not presses.accepted.any():
-        what = f"none of {len(presses)} presses can be used: {presses.reason[0]}"
+        reason = next(filter(None, presses.reason), "all are set aside (accepted = 0) without a reason")
+        what = f"none of {len(presses)} presses can be used: {reason}"
         # a log of force alone is fitted sample by sample and needs no presses
         severity = Severity.ERROR if "eit" in streams else Severity.WARNING
         findings.append(Finding(severity, "/presses", what, "see the reasons below and record again"))

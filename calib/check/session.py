@@ -1,6 +1,7 @@
 """Check a whole session: what is wrong, where, and what to do about it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,18 +14,21 @@ from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit
 from .electrodes import check_electrodes
 from .evidence import PressEvidence
-from .force import force_findings
+from .force import force_findings, is_silent
+from .pad_responses import pad_response_findings
 from .pads import check_pads
 from .places import place_findings
 from .presses import NAMES, list_presses, press_evidence, press_summary
 from .report import ChannelTable, CheckReport, Finding, Severity
-from .responses import pad_response_findings, reading_response_findings
+from .responses import reading_response_findings
 from .skin import check_skin
-from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks, table_clock_finding
+from .streams.clipping import clipping_findings
+from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks
 from .streams.dropouts import dropout_findings
 from .streams.shifts import shift_findings
 from .streams.statistics import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
 from .streams.stuck import stuck_findings
+from .streams.table_clock import table_clock_finding
 
 
 def check_session(
@@ -54,11 +58,12 @@ def check_session(
         findings += stream_findings(stats)
         if not session.simulated:  # a simulation may be free of noise
             findings += [*copy_findings(stats), *stuck_findings(stats), *dropout_findings(stats)]
+            findings += clipping_findings(stats, skin)
     findings += shift_findings(statistics)
     presses, source = list_presses(session, statistics, findings)
     evidence = press_evidence(statistics, presses, findings)
     presses = presses if evidence is None else evidence.presses
-    channels, order = check_eit(session, statistics.get("eit"), presses, skin, transfer, findings)
+    channels, order = check_eit(session, statistics.get("eit"), presses, evidence, skin, transfer, findings)
     pads = check_pads(statistics, skin, findings)
     places = check_electrodes(skin, channels, order, findings) if electrodes else ()
     onsets = _compare(session, statistics, evidence, skin, channels, order, findings)
@@ -96,17 +101,20 @@ def _compare(
     moved = _streams_of_wrong_clocks(statistics, evidence, findings)
     # What a wrong clock makes of the presses looks like wrong signs, places and pads.
     if "force" in statistics and not ({*COMPARED} & {*statistics} <= moved and moved):
-        findings += force_findings(evidence, skin, statistics["force"])
+        wrong = [*force_findings(evidence, skin, statistics["force"])]
+        findings += wrong
+        # What a wrong force makes of the pads looks like a wrong scale of them.
+        evidence = replace(evidence, force=None) if any(f.where.endswith("force") for f in wrong) else evidence
     if channels is not None and "eit" not in moved:
         findings += reading_response_findings(evidence, channels)
     if skin is None:
         return onsets
     # A wrong order of the readings, or of the pads, would show as wrong places too.
-    pattern = None if order is None or order.claimed or "eit" in moved else session.pattern
-    places = list(place_findings(evidence, skin, pattern, {n: s.stream for n, s in statistics.items()}))
+    told = None if order is None or order.claimed or "eit" in moved else channels
+    places = list(place_findings(evidence, skin, told, {n: s.stream for n, s in statistics.items()}))
     findings += places
-    if all(f.severity < Severity.ERROR for f in places) and "pressure" not in moved:
-        findings += pad_response_findings(evidence, skin)
+    if "pressure" in {*statistics} - moved and all(f.severity < Severity.ERROR for f in places):
+        findings += pad_response_findings(evidence, skin, int(statistics["pressure"].time[0]))
     return onsets
 
 
@@ -115,7 +123,7 @@ def _streams_of_wrong_clocks(
 ) -> set[str]:
     """Names of the streams that disagree with the force in time; all of them if the table of presses does."""
     moved = {f.where.rpartition("/")[2] for f in findings if f.remedy == CLOCKS_DISAGREE}
-    if moved or "force" not in statistics:
+    if moved or "force" not in statistics or is_silent(evidence, statistics["force"]):
         return moved
     found = table_clock_finding(statistics["force"], evidence)
     if found is None:

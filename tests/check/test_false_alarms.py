@@ -19,7 +19,7 @@ from .recording import SECOND, Recording, Samples
 TRUE_WARNINGS = {
     "DropOut": ("lost", "gap"),
     "IntermittentElectrode": ("noisier than most", "median SNR"),
-    "ElectrodeFault": ("noisier than most",),
+    "ElectrodeFault": ("noisier than most", "all that drive through electrode"),
 }
 """What an effect of a scene makes of a recording, and what may therefore be read of it."""
 

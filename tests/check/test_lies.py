@@ -101,6 +101,33 @@ def table_late(seconds):
     )
 
 
+def in_blocks(name, size):
+    """The samples of a block have the time stamp of its first one, and a microsecond more each."""
+
+    def tell(r):
+        time, index = r.streams[name].time, np.arange(len(r.streams[name].time))
+        return r.at(name, time[index // size * size] + index % size * 1000)
+
+    return tell
+
+
+def table_at_rate(factor):
+    """The times of the table run at another rate."""
+
+    def tell(r):
+        times = {n: getattr(r.presses, n) for n in ("t_press", "t_hold0", "t_hold1", "t_release")}
+        first = times["t_press"][0]
+        return r.pressed(**{n: first + ((t - first) * factor).astype(np.int64) for n, t in times.items()})
+
+    return tell
+
+
+def turned(degrees):
+    """The places are turned about the middle of the sheet."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return moved(lambda x, y: 0.1 + c * (x - 0.1) - s * (y - 0.1), lambda x, y: 0.1 + s * (x - 0.1) + c * (y - 0.1))
+
+
 def at_rate(name, factor):
     """The time stamps of one stream run at another rate."""
     return lambda r: r.at(name, r.streams[name].time * factor)
@@ -129,13 +156,71 @@ def readings(order):
     return lambda r: r.change("eit", r.values("eit")[:, order(len(r.values("eit")[0]))])
 
 
-def pair_exchanged(r):
-    """The wires of electrodes 3 and 17 are exchanged."""
-    number = np.arange(25)
-    number[[3, 17]] = 17, 3
-    transfer = transfer_matrix(je.load_skin(r.facts.skin_name))
-    own, wrong = (r.facts.current * predict_readings(transfer, p) for p in (r.facts.pattern, number[r.facts.pattern]))
-    return r.change("eit", r.values("eit") - own + wrong)
+def in_half(name, change, first=False):
+    """A change of the values of one stream in its second half, or in its first one."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        half = slice(None, len(values) // 2) if first else slice(len(values) // 2, None)
+        values[half] = change(values[half])
+        return r.change(name, values)
+
+    return tell
+
+
+def channels(name, numbers, factor):
+    """Some channels of one stream are multiplied."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        values[:, numbers] *= factor
+        return r.change(name, values)
+
+    return tell
+
+
+def clipped_at(name, limit, numbers=slice(None)):
+    """Some channels of one stream read no more than a limit."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        values[:, numbers] = np.minimum(values[:, numbers], limit)
+        return r.change(name, values)
+
+    return tell
+
+
+def drive_scaled(a, b, factor):
+    """All readings of one drive pair are multiplied."""
+    return lambda r: channels("eit", (r.facts.pattern[:, :2] == [a, b]).all(1), factor)(r)
+
+
+def lost_electrode(noise, half=False):
+    """The readings of electrode 12 are noise, in the whole recording or in its second half."""
+
+    def tell(r):
+        lost = (r.facts.pattern == 12).any(1)
+        values = r.values("eit").copy()
+        some = slice(len(values) // 2 if half else 0, None)
+        shape = values[some][:, lost].shape
+        values[some, lost] = np.random.default_rng(0).normal(0, noise, shape)
+        return r.change("eit", values)
+
+    return tell
+
+
+def pair_exchanged(first, second):
+    """The wires of two electrodes are exchanged."""
+
+    def tell(r):
+        number = np.arange(25)
+        number[[first, second]] = second, first
+        patterns = r.facts.pattern, number[r.facts.pattern]
+        transfer = transfer_matrix(je.load_skin(r.facts.skin_name))
+        own, wrong = (r.facts.current * predict_readings(transfer, pattern) for pattern in patterns)
+        return r.change("eit", r.values("eit") - own + wrong)
+
+    return tell
 
 
 def dead_electrode(value):
@@ -147,13 +232,13 @@ def dead_electrode(value):
     return tell
 
 
-def frozen(name, first, last):
-    """A stream stands still for a part of the recording."""
+def frozen(name, first, last, numbers=slice(None)):
+    """A stream, or some channels of it, stands still for a part of the recording."""
 
     def tell(r):
         values = r.values(name).copy()
         a, b = int(first * len(values)), int(last * len(values))
-        values[a:b] = values[a]
+        values[a:b, numbers] = values[a, numbers]
         return r.change(name, values)
 
     return tell
@@ -250,11 +335,35 @@ LIES = {
     # units
     "force in mN": Lie(scaled("force", 1e3), WARNING, ("/streams/force", "times the target")),
     "force in kN": Lie(scaled("force", 1e-3), WARNING, ("/streams/force", "times the target")),
+    "force in kN up to the middle": Lie(
+        in_half("force", lambda v: v / 1e3, first=True),
+        WARNING,
+        ("0.001 times the target", "up to 24.4 s after the start, 1 times"),
+    ),
+    "force doubled from the middle on": Lie(
+        in_half("force", lambda v: 2 * v), WARNING, ("2 times the target of the presses from 27.7 s",)
+    ),
+    "targets of other presses": Lie(
+        lambda r: r.pressed(target_force=np.roll(r.presses.target_force, 1)),
+        WARNING,
+        ("targets are not those of the presses", "1 press too late"),
+    ),
+    "force of the unloaded cell": Lie(at_rest("force"), ERROR, ("/streams/force", "no press changes the force")),
+    "force constant": Lie(lambda r: r.change("force", 0 * r.values("force") + 3), ERROR, ("always reads 3 N",)),
     "force in mN, no target": Lie(
         lambda r: scaled("force", 1e3)(r).pressed(target_force=np.zeros(16)), WARNING, ("what the pressures", "unit")
     ),
     "load in g": Lie(scaled("force", 1 / 9.80665e-3), WARNING, ("/streams/force", "times the target")),
     "force of a converter's counts": Lie(scaled("force", 1e4), WARNING, ("cannot be true",)),
+    "one pad in kPa": Lie(
+        channels("pressure", [0], 1e-3), WARNING, ("column 0, pad 'lower left', reads 0.001 times", "kPa")
+    ),
+    "one pad of ten times the gain": Lie(
+        channels("pressure", [1], 10), WARNING, ("column 1, pad 'lower right', reads 9.9 times",)
+    ),
+    "pads at -20 kPa": Lie(added("pressure", -2e4), WARNING, ("lie below the sensor's span",)),
+    "load cell that clips": Lie(clipped_at("force", 12.0), WARNING, ("/streams/force: clips at 12 N", "5 flat tops")),
+    "pad that clips": Lie(clipped_at("pressure", 600.0, [1]), WARNING, ("column 1 clips at 600 Pa", "flat tops")),
     "pressure in kPa": Lie(scaled("pressure", 1e-3), WARNING, ("/streams/pressure", "kPa or bar")),
     "pressure in mbar": Lie(scaled("pressure", 1e-2), WARNING, ("/streams/force", "a unit of one of the two")),
     "pressure in mPa": Lie(scaled("pressure", 1e3), WARNING, ("beyond the sensor's span",)),
@@ -272,6 +381,17 @@ LIES = {
     "force pulls, no table": Lie(
         lambda r: stage_for_table(scaled("force", -1)(r)), ERROR, ("negative while pressing",)
     ),
+    "force pulls up to the middle": Lie(
+        in_half("force", lambda v: -v, first=True), ERROR, ("negative while pressing up to 24.4 s",)
+    ),
+    "changes of EIT reversed from the middle on": Lie(
+        lambda r: in_half("eit", lambda v: 2 * np.median(r.values("eit")[:60], 0) - v)(r),
+        ERROR,
+        ("the changes of the readings have the opposite sign from",),
+    ),
+    "targets that are negative": Lie(
+        lambda r: r.pressed(target_force=-r.presses.target_force), WARNING, ("/presses", "target_force is negative")
+    ),
     "pressure falls on pressing": Lie(scaled("pressure", -1), ERROR, ("falls on pressing", "16 of 16")),
     "one pad falls on pressing": Lie(
         lambda r: r.change("pressure", r.values("pressure") * [1, 1, -1, 1]),
@@ -280,12 +400,55 @@ LIES = {
     ),
     "voltages reversed": Lie(scaled("eit", -1), ERROR, ("every sign is reversed",)),
     "magnitudes": Lie(lambda r: r.change("eit", np.abs(r.values("eit"))), ERROR, ("magnitudes without sign",)),
+    "voltages reversed from the middle on": Lie(
+        in_half("eit", lambda v: -v), ERROR, ("untouched skin differ from 28.4 s", "every sign is reversed")
+    ),
+    "voltages reversed up to the middle": Lie(
+        in_half("eit", lambda v: -v, first=True),
+        ERROR,
+        ("untouched skin differ up to 28.4 s", "every sign is reversed"),
+    ),
+    "magnitudes from the middle on": Lie(in_half("eit", np.abs), ERROR, ("differ from 28.4 s", "magnitudes")),
+    "voltage in mV up to the middle": Lie(
+        in_half("eit", lambda v: 1e3 * v, first=True), ERROR, ("differ up to 28.4 s", "1000 times that of the other")
+    ),
+    "gain of EIT 1.1 from the middle on": Lie(
+        in_half("eit", lambda v: 1.1 * v), WARNING, ("differ from 28.4 s", "1.1 times that of the other frames")
+    ),
+    "offset of EIT": Lie(added("eit", 0.01), WARNING, ("/streams/eit", "+0.0101 V in addition", "offset")),
+    "one reading reversed": Lie(channels("eit", [275], -1), WARNING, ("reading 275 has the opposite sign",)),
+    "one reading twice as large": Lie(channels("eit", [100], 2), WARNING, ("reading 100 is 2 times",)),
+    "one drive reversed": Lie(drive_scaled(12, 13, -1), WARNING, ("all that drive with 12-13", "the opposite sign")),
+    "one drive in mV": Lie(drive_scaled(12, 13, 1e3), WARNING, ("all that drive with 12-13", "times the reading")),
+    "three pads fall on pressing": Lie(
+        channels("pressure", [0, 1, 3], -1), ERROR, ("column 1, pad 'lower right', falls on pressing", "4 of 4")
+    ),
+    "pressure falls on pressing from the middle on": Lie(
+        in_half("pressure", lambda v: -v), ERROR, ("falls on pressing", "all of them from 27.7 s after the start on")
+    ),
     # order
+    "two readings exchanged": Lie(
+        readings(lambda n: np.r_[np.arange(5), 300, np.arange(6, 300), 5, np.arange(301, n)]),
+        WARNING,
+        ("readings are exchanged", "5 and 300"),
+    ),
+    "readings rolled from the middle on": Lie(
+        in_half("eit", lambda v: np.roll(v, -7, axis=1)), ERROR, ("differ from 28.4 s", "starts at reading 7 ")
+    ),
     "readings in reversed order": Lie(readings(lambda n: np.arange(n)[::-1]), ERROR, ("reversed order",)),
     "readings rolled": Lie(readings(lambda n: np.roll(np.arange(n), -7)), ERROR, ("starts at reading 7 ",)),
-    "electrode pair exchanged": Lie(pair_exchanged, ERROR, ("electrodes 3 and 17 are exchanged",)),
+    "electrode pair exchanged": Lie(pair_exchanged(3, 17), ERROR, ("electrodes 3 and 17 are exchanged",)),
+    "neighbouring electrodes exchanged": Lie(pair_exchanged(23, 24), ERROR, ("electrodes 23 and 24 are exchanged",)),
     "pressure columns exchanged": Lie(
         columns("pressure", [1, 0, 2, 3]), ERROR, ("column 1 responds over pad 'lower left'",)
+    ),
+    "pressure columns exchanged from the middle on": Lie(
+        in_half("pressure", lambda v: v[:, [1, 2, 3, 0]]),
+        ERROR,
+        ("responds from 31.0 s after the start on", "column 1 responds over pad 'upper left'"),
+    ),
+    "one pressure column for all pads": Lie(
+        columns("pressure", [0, 0, 0, 0]), ERROR, ("hold the same values: 0 and 1",)
     ),
     "pressure columns exchanged, no table": Lie(
         lambda r: stage_for_table(columns("pressure", [0, 1, 3, 2])(r)),
@@ -305,6 +468,34 @@ LIES = {
     "table in reversed order": Lie(rows(lambda c: c[::-1]), ERROR, ("/presses", "places look wrong")),
     "table shuffled": Lie(
         rows(lambda c: c[np.random.default_rng(8).permutation(16)]), WARNING, ("do not match the readings",)
+    ),
+    "table five presses late": Lie(rows(lambda c: np.roll(c, 5)), ERROR, ("places look wrong", "5 presses late")),
+    "x mirrored from the middle on": Lie(
+        moved(lambda x, y: np.where(np.arange(16) < 8, x, 0.2 - x)),
+        ERROR,
+        ("look wrong from 31.0 s after the start on", "x is mirrored"),
+    ),
+    "two presses exchanged": Lie(
+        rows(lambda c: np.r_[c[15], c[1:15], c[0]]), WARNING, ("in 2 presses", "presses 0 and 15 look exchanged")
+    ),
+    "one press elsewhere": Lie(
+        moved(lambda x, y: np.r_[0.17, x[1:]], lambda x, y: np.r_[0.165, y[1:]]),
+        WARNING,
+        ("elsewhere than listed in 1 press", "press 0 near x = 0.028 m"),
+    ),
+    "places shifted by 20 mm": Lie(moved(lambda x, y: x + 0.02), WARNING, ("the places look shifted by +18 mm in x",)),
+    "places turned by 10 degrees": Lie(turned(10), WARNING, ("the places look turned by 11 degrees",)),
+    "places scaled by a half": Lie(
+        moved(lambda x, y: 0.05 + x / 2, lambda x, y: 0.05 + y / 2), WARNING, ("the places look scaled by 0.52",)
+    ),
+    "places scaled in x": Lie(moved(lambda x, y: x / 2), WARNING, ("the places look scaled by 0.52 in x",)),
+    "places in km": Lie(
+        moved(lambda x, y: x / 1e3, lambda x, y: y / 1e3), WARNING, ("do not match", "all x lie within 0.14 mm")
+    ),
+    "a stage that stands still, no table": Lie(
+        lambda r: stage_for_table(r, lambda p: 0 * p + 0.07),
+        WARNING,
+        ("do not match", "all x lie within 0 mm, near 0.07 m"),
     ),
     "a pad that is not under the tip": Lie(
         lambda r: r.pressed(pad=np.full(16, 2)), WARNING, ("name a pad that is not under",)
@@ -332,6 +523,17 @@ LIES = {
     "force at 0.995 times its rate": Lie(at_rate("force", 0.995), ERROR, ("/streams/pressure", "another rate")),
     "clock of the EIT jumps by 2 s": Lie(jump("eit", 2.0), ERROR, ("second half", "2.000 s after", "jumped")),
     "clock of the pressure jumps by 0.5 s": Lie(jump("pressure", 0.5), ERROR, ("second half", "0.500 s after")),
+    "time stamps in blocks": Lie(
+        in_blocks("pressure", 50), WARNING, ("/streams/pressure", "in blocks of 50 samples", "a block every 0.5 s")
+    ),
+    "table 1.5 s late": Lie(table_late(1.5), ERROR, ("/presses", "1.500 s before the presses of the table")),
+    "table late by a press": Lie(
+        table_late(3.3), WARNING, ("targets are not those of the presses", "1 press too late")
+    ),
+    "table at 1.01 times its rate": Lie(table_at_rate(1.01), ERROR, ("/presses", "more and more late", "another rate")),
+    "no press accepted": Lie(
+        lambda r: r.pressed(accepted=np.zeros(16, bool), reason=("",) * 16), ERROR, ("all are set aside",)
+    ),
     "table 0.3 s late": Lie(table_late(0.3), ERROR, ("/presses", "0.300 s before the presses of the table")),
     "table 0.5 s early": Lie(table_late(-0.5), ERROR, ("/presses", "0.500 s after the presses of the table")),
     "table of another recording": Lie(
@@ -350,9 +552,17 @@ LIES = {
     ),
     "EIT of the untouched skin": Lie(at_rest("eit"), ERROR, ("no reading changes", "16 of 16")),
     "EIT frozen": Lie(frozen("eit", 0.5, 0.8), WARNING, ("equal the one before", "the longest for")),
+    "EIT frozen at the end": Lie(frozen("eit", 0.9, 1.0), WARNING, ("/streams/eit", "stands still for 5.65 s")),
+    "one pressure column frozen": Lie(
+        frozen("pressure", 0.5, 0.7, 0), WARNING, ("/streams/pressure: column 0 stands still for 11.3 s",)
+    ),
     "every frame twice": Lie(doubled_frames, WARNING, ("50 % of its frames equal the one before",)),
     "recording pasted twice": Lie(pasted_twice, WARNING, ("copies of earlier ones",)),
     "EIT at the converter's end": Lie(clipped, ERROR, ("saturated",)),
+    "an electrode dead from the middle on": Lie(
+        lost_electrode(0.0, half=True), ERROR, ("differ from 28.4 s", "hold no voltage", "all with electrode 12")
+    ),
+    "an electrode that reads noise": Lie(lost_electrode(1e-5), ERROR, ("readings of electrode 12", "only noise")),
     "an electrode dead": Lie(dead_electrode(0.0), ERROR, ("all of them use electrode 12",)),
     "pressure frozen": Lie(frozen("pressure", 0.5, 0.8), WARNING, ("no pad feels",)),
     "pressure of the last moment for ever": Lie(

@@ -10,21 +10,23 @@ from ...presses.streams import finite_mean, true_runs
 from ...presses.times import PressColumns
 from ...session import Session, Status
 from ...session.units import SECOND
+from ..evidence import PressEvidence
 from ..report import ChannelTable, Finding, Severity, listed
 from ..streams.statistics import StreamStatistics
-from .reading_order import OrderCheck, check_order, transfer_matrix
+from .contradictions import check_reciprocity, lost_electrode_findings, offset_finding
+from .grouping import common_electrodes
+from .model import SkinModel
+from .order_findings import MIN_CORRELATION, amplitude_findings, order_findings
+from .reading_order import OrderCheck, transfer_matrix
+from .rests import rest_change, rest_finding
 
 MIN_SNR = 40.0  # dB; healthy benches reach 50 to 60
 NOISE_RATIO = 5.0  # over the median noise of the readings
-MAX_RECIPROCITY_ERROR = 0.02
 SATURATED_FRACTION = 0.01  # of the samples at the converter's end
 MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the converter's end; fewer may be chance
 MAX_EMPTY_FRACTION = 0.25  # of the readings without a value, up to which the others make an image
 MAX_SATURATED_FRACTION = 0.05  # of the readings: those beside the drive may clip without much harm to an image
 MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
-AMPLITUDE_RATIO_RANGE = 0.2, 5.0  # of measured over modelled voltage: outside it, a unit or the sheet is wrong
-AMPLITUDE_RATIO_OF_OTHER_ORDERS = 0.03, 30.0  # the same for readings that do not look like the model
-MIN_CORRELATION = 0.9  # with the model: readings below it do not look like this skin
 MIN_SOUND_READINGS = 10  # for a comparison with the model
 
 
@@ -32,6 +34,7 @@ def check_eit(
     session: Session,
     stats: StreamStatistics | None,
     presses: PressColumns | None,
+    evidence: PressEvidence | None,
     skin: je.Skin | None,
     transfer: np.ndarray | None,
     findings: list[Finding],
@@ -46,12 +49,58 @@ def check_eit(
     findings += _frame_rate_findings(session, stats, skin)
     table = _channel_table(stats, pattern, presses)
     findings += _channel_findings(stats, table)
-    if skin is None or pattern.max() >= len(skin.electrodes):
-        return table, None
-    order = _check_order(session, table, pattern, skin, transfer, findings)
-    if order is not None:
-        findings += _order_findings(order)
+    model = None
+    if skin is not None and pattern.max() < len(skin.electrodes):
+        model = _model(session, skin, transfer, findings)
+    change = None if evidence is None else rest_change(evidence, stats)
+    changed = None if change is None else rest_finding(change, int(stats.time[0]), table, model)
+    if changed is not None:
+        findings.append(changed)
+        # Its words hold for a part of the recording, which a mean frame does not tell.
+        return table, None if model is None else _check_order(table, _sound(table), model, findings)
+    wrong = check_reciprocity(table, model, findings)
+    order = None if model is None else _check_order(table, _sound(table) & ~wrong, model, findings)
+    if order is not None and model is not None:
+        findings += _model_findings(table, _sound(table) & ~wrong, order, model)
     return table, order
+
+
+def _model(session: Session, skin: je.Skin, transfer: np.ndarray | None, findings: list[Finding]) -> SkinModel | None:
+    """The model of the skin with the current of the session; None if the skin has no model, which is added."""
+    try:
+        transfer = transfer_matrix(skin) if transfer is None else transfer
+    except ValueError as error:
+        what = f"the skin {skin.name!r} cannot be modelled: {error}"
+        findings.append(Finding(Severity.ERROR, "/device", what, "correct the skin's TOML file"))
+        return None
+    current = skin.protocol.current if session.current is None else session.current
+    return SkinModel(transfer, current, skin.electrode_positions, skin.protocol.pattern)
+
+
+def _sound(table: ChannelTable) -> np.ndarray:
+    return np.asarray(np.isfinite(table.mean) & ~table.bad)
+
+
+def _check_order(table: ChannelTable, good: np.ndarray, model: SkinModel, findings: list[Finding]) -> OrderCheck | None:
+    """Compare the good readings (readings,) with a uniform sheet; None if there are too few."""
+    if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
+        what = f"only {good.sum()} readings are sound: order and signs were not checked"
+        findings.append(Finding(Severity.WARNING, "/streams/eit", what, "correct the readings above first"))
+        return None
+    return model.check(table.mean, good, table.pattern)
+
+
+def _model_findings(table: ChannelTable, good: np.ndarray, order: OrderCheck, model: SkinModel) -> Iterator[Finding]:
+    """Findings from the comparison with a uniform sheet: order, lost electrodes, offset and amplitude."""
+    yield from order_findings(order)
+    sound = order.as_is >= MIN_CORRELATION and not order.claimed
+    if sound:
+        yield from lost_electrode_findings(table, model)
+    offset = offset_finding(table, good, model) if sound else None
+    if offset is not None:
+        yield offset
+    else:
+        yield from amplitude_findings(order)
 
 
 def _frame_rate_findings(session: Session, stats: StreamStatistics, skin: je.Skin | None) -> Iterator[Finding]:
@@ -154,14 +203,6 @@ def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[
         what = f"low signal: the median SNR of a reading is {np.median(snr):.1f} dB, below {MIN_SNR:g} dB"
         remedy = "raise the current or the averaging, improve the contacts, shield against mains hum"
         yield Finding(Severity.WARNING, where, what, remedy)
-    error = table.reciprocity[~table.bad & np.isfinite(table.reciprocity)]
-    if len(error) and np.median(error) > MAX_RECIPROCITY_ERROR:
-        what = (
-            f"reciprocity error: readings differ by {100 * np.median(error):.1f} % (median) when drive "
-            "and sense are exchanged, where physics allows no difference"
-        )
-        remedy = "compare the wiring and the order of the readings with the recorded pattern"
-        yield Finding(Severity.WARNING, where, what, remedy)
 
 
 def _dead_text(stats: StreamStatistics, dead: np.ndarray) -> str:
@@ -177,77 +218,8 @@ def _channel_list_finding(
     if not len(rows):
         return
     text = f"{len(rows)} of {len(table)} readings {what}: {listed(rows)}"
-    common = _common_electrodes(flag, table.pattern)
+    common = common_electrodes(flag, table.pattern)
     if common:
         text += f"; all of them use electrode {' or '.join(map(str, common))}"
         remedy = f"check electrode {' and '.join(map(str, common))}: its terminal, wire and switch"
     yield Finding(severity, "/streams/eit", text, remedy)
-
-
-def _common_electrodes(flag: np.ndarray, pattern: np.ndarray) -> list[int]:
-    """One or two electrodes that occur in all flagged readings and in few others; found greedily."""
-    left = flag.copy()
-    found: list[int] = []
-    while left.sum() >= 3 and len(found) < 2:
-        uses = np.array([(pattern == e).any(1) for e in range(pattern.max() + 1)])
-        share = (uses & flag).sum(1) / np.maximum(uses.sum(1), 1)
-        hits = np.where(share > 0.8, (uses & left).sum(1), 0)
-        if not hits.any():
-            return []
-        found.append(int(hits.argmax()))
-        left &= ~uses[found[-1]]
-    return [] if left.any() else found
-
-
-def _check_order(
-    session: Session,
-    table: ChannelTable,
-    pattern: np.ndarray,
-    skin: je.Skin,
-    transfer: np.ndarray | None,
-    findings: list[Finding],
-) -> OrderCheck | None:
-    """Compare the sound readings with a uniform sheet; None if there are too few, or if the skin has no model."""
-    good = np.isfinite(table.mean) & ~table.bad
-    if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
-        what = f"only {good.sum()} readings are sound: order and signs were not checked"
-        findings.append(Finding(Severity.WARNING, "/streams/eit", what, "correct the readings above first"))
-        return None
-    try:
-        transfer = transfer_matrix(skin) if transfer is None else transfer
-    except ValueError as error:
-        what = f"the skin {skin.name!r} cannot be modelled: {error}"
-        findings.append(Finding(Severity.ERROR, "/device", what, "correct the skin's TOML file"))
-        return None
-    return check_order(
-        table.mean,
-        good,
-        pattern,
-        transfer,
-        current=skin.protocol.current if session.current is None else session.current,
-        positions=skin.electrode_positions,
-        usual=skin.protocol.pattern,
-    )
-
-
-def _order_findings(order: OrderCheck) -> Iterator[Finding]:
-    where = "/streams/eit"
-    if order.claimed:
-        same = f" (or, with the same readings: {'; '.join(order.same)})" if order.same else ""
-        what = (
-            f"the order looks wrong: {order.what}{same}. Correlation with the model is "
-            f"{order.as_is:.3f} as recorded and {order.best:.3f} in this order"
-        )
-        yield Finding(Severity.ERROR, where, what, order.remedy)
-    elif order.as_is < MIN_CORRELATION:
-        what = (
-            f"the readings do not look like this skin: correlation with its model {order.as_is:.2f}, "
-            f"and no simple reordering explains it (best {order.best:.2f})"
-        )
-        remedy = "compare positions and numbering of the electrodes in the skin's file with the hardware"
-        yield Finding(Severity.WARNING, where, what, remedy)
-    low, high = AMPLITUDE_RATIO_RANGE if order.as_is >= MIN_CORRELATION else AMPLITUDE_RATIO_OF_OTHER_ORDERS
-    if order.as_is > 0 and not low < order.scale < high:
-        parts = "unit (V, mV), gain, current or sheet_resistance is wrong"
-        what = f"the amplitude is {order.scale:.3g} times the model's: {parts}"
-        yield Finding(Severity.WARNING, where, what, "correct the unit at import, current or sheet_resistance")

@@ -6,10 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage, signal
 
-from ...presses.onsets import OnsetDelay, onset_delays, ramp_delay
-from ...presses.streams import index_ranges
-from ...presses.windows import PressWindows
-from ...session import PressTable
+from ...presses.onsets import OnsetDelay, onset_delays
 from ...session.units import SECOND
 from ..evidence import PressEvidence
 from ..report import Finding, Severity
@@ -23,7 +20,6 @@ SPREADS = 2.0  # of the delays over the presses: a clock is late by the same tim
 GRID_STEP, MAX_GRID = 0.05, 2**18  # s and samples of the time axis on which streams are correlated
 SLOW = 30.0  # s: what is slower is drift
 MAX_LAG = 60.0  # s
-MIN_RAMP_SHARE = 0.05  # of the force of a press, over its ramp: the force has begun to rise
 MIN_CHANGE_SHARE = 0.25  # of a change of the delays, by which the lags of the halves must differ
 MIN_CORRELATION, MIN_GAIN = 0.7, 0.3  # of the streams when moved by the lag, and over that when they are not moved
 
@@ -131,51 +127,3 @@ def _without_drift(values: np.ndarray, step: float) -> np.ndarray:
 
 def _disagreement(name: str, what: str) -> Finding:
     return Finding(Severity.ERROR, f"/streams/{name}", what, CLOCKS_DISAGREE)
-
-
-def table_clock_finding(force: StreamStatistics, evidence: PressEvidence) -> Finding | None:
-    """How the times of the table of presses disagree with the force, if they do."""
-    if not isinstance(evidence.presses, PressTable) or force.dead.all():
-        return None
-    presses, windows = evidence.compared()
-    onset = ramp_delay(force.stream, presses, windows)
-    ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
-    allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / force.row.nominal_rate
-    # A second contact raises the force again: only what the whole rise shares is a matter of clocks.
-    if not onset.presses or abs(onset.shift) <= max(allowed, SPREADS * onset.spread):
-        return None
-    if onset.shift > 0 and _ramp_share(force, windows) > MIN_RAMP_SHARE:
-        return None
-    lag = _table_lag(force, evidence.presses)
-    delay = onset.delay if lag is None or abs(lag - onset.delay) < 2 * allowed else lag
-    what = f"the force rises {beside(delay)} the presses of the table; their ramps take {ramp:.2f} s"
-    remedy = "the clocks disagree: move the times of the table, or leave it out so that presses are detected"
-    return Finding(Severity.ERROR, "/presses", what, remedy)
-
-
-def _ramp_share(force: StreamStatistics, windows: PressWindows) -> float:
-    """Mean force over the ramps of the table, of the largest force of each press; median over the presses.
-
-    It is a half for an even ramp, less for the first of two contacts, and nothing where the force comes later.
-    """
-    values, shares = force.stream.read()[:, 0], []
-    for before, ramp, hold in zip(windows.rest_before, windows.ramp, windows.hold, strict=True):
-        rest, rise, press = (
-            values[slice(*index_ranges(force.time, np.array([w]))[0])] for w in (before, ramp, [ramp[0], hold[1]])
-        )
-        if len(rest) and len(rise) and np.isfinite(press).any():
-            level = np.nanmedian(rest)
-            shares.append(np.nanmean(rise - level) / max(np.nanmax(press - level), np.finfo(float).tiny))
-    return float(np.nanmedian(shares)) if shares else 1.0
-
-
-def _table_lag(force: StreamStatistics, presses: PressTable) -> float | None:
-    """The lag (s) that makes the force resemble the table, if it resembles it only so."""
-    edges = np.stack([presses.t_press, presses.t_hold0, presses.t_hold1, presses.t_release], 1).ravel()
-    if len(force.time) < 2 or (np.diff(edges) < 0).any():
-        return None
-    load = np.where(presses.target_force > 0, presses.target_force, np.median(np.abs(presses.target_force)) or 1.0)
-    profile = np.interp(force.time, edges, (load[:, None] * [0.0, 1.0, 1.0, 0.0]).ravel())
-    values = np.nan_to_num(force.stream.read()[:, 0], nan=0.0)
-    lag, moved, unmoved = stream_lag((force.time, profile), (force.time, values))
-    return lag if moved > MIN_CORRELATION and moved - abs(unmoved) > MIN_GAIN else None

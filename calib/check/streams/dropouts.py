@@ -10,6 +10,7 @@ from .stuck import EXAMINED
 
 MIN_FRAMES = 5  # with the value
 TIMES_AWAY = 10  # from both neighbours, over what the neighbours differ by and a usual step of the stream
+MIN_AWAY = 0.02  # of the range of the stream, from both neighbours
 READ = 16  # frames that are read to see whether they hold numbers
 
 
@@ -21,7 +22,7 @@ def dropout_findings(stats: StreamStatistics) -> Iterator[Finding]:
     before, here, after = prints[:-2], prints[1:-1], prints[2:]
     apart = np.abs(after - before)
     usual = np.quantile(apart[apart > 0], 0.25) if apart.any() else np.inf  # many steps may be to the value and back
-    least = TIMES_AWAY * (apart + usual)
+    least = np.maximum(TIMES_AWAY * (apart + usual), MIN_AWAY * np.ptp(prints))  # noise may grow and shrink
     away = np.flatnonzero((np.abs(here - before) > least) & (np.abs(here - after) > least)) + 1
     value, number = np.unique(prints[away], return_counts=True)
     if not len(value) or number.max() < MIN_FRAMES:

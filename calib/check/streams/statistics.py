@@ -12,6 +12,7 @@ from ...presses.streams import finite_mean, true_runs
 from ...session import Session, SessionError, Status, Stream
 from ...session.units import SECOND
 from ..report import Finding, Severity, StreamRow, counted
+from .blocks import block_size, spread_blocks
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
@@ -78,7 +79,7 @@ def stream_statistics(
 ) -> dict[str, StreamStatistics]:
     """Read every stream once. Streams without samples and damaged ones are added to ``findings`` and left out."""
     statistics = {}
-    limits = {} if skin is None else {"pressure": _full_scale(skin.pressure_sensor)}
+    limits = {} if skin is None else {"pressure": full_scale(skin.pressure_sensor)}
     for name, stream in session.streams.items():
         if not len(stream):
             findings.append(Finding(Severity.ERROR, f"/streams/{name}", "holds no sample", "record again"))
@@ -91,7 +92,8 @@ def stream_statistics(
     return statistics
 
 
-def _full_scale(sensor: je.skin.PressureSensor) -> float:
+def full_scale(sensor: je.skin.PressureSensor) -> float:
+    """Pressure (Pa) from which a sensor may be at the end of its span."""
     return sensor.maximum - sensor.accuracy
 
 
@@ -132,8 +134,8 @@ def _count_extreme(values: np.ndarray, count: np.ndarray, lowest: np.ndarray) ->
 
 
 def _summary_row(stream: Stream, missing: float) -> StreamRow:
-    time = stream.time
-    steps = np.diff(time) / SECOND
+    time, block = stream.time, block_size(stream.time)
+    steps = np.diff(spread_blocks(time, block) if block else time) / SECOND
     period = float(np.median(steps)) if len(steps) else np.nan
     long = steps > 1.5 * period
     off = np.abs(steps[~long] - period)
@@ -183,6 +185,7 @@ def stream_findings(stats: StreamStatistics) -> Iterator[Finding]:
     """Wrong rates, gaps, lost samples, missing values, copies, impossible values and status flags of one stream."""
     row, where = stats.row, f"/streams/{stats.row.name}"
     yield from _rate_findings(stats)
+    yield from _block_findings(stats)
     if row.gaps and (
         _gaps_are_jitter(stats) if row.gaps <= IRREGULAR_FRACTION * row.samples else _as_many_as_stated(stats)
     ):
@@ -211,6 +214,15 @@ def stream_findings(stats: StreamStatistics) -> Iterator[Finding]:
             yield Finding(Severity.WARNING, where, f"{count} samples {what} (flag {flag.name})", remedy)
     if stats.flagged(Status.unchecked):
         yield Finding(Severity.OK, where, "came without a checksum (flag unchecked)")
+
+
+def _block_findings(stats: StreamStatistics) -> Iterator[Finding]:
+    block = block_size(stats.time)
+    if block:
+        step = block / stats.row.rate
+        what = f"its time stamps come in blocks of {block} samples with nearly one stamp, a block every {step:.3g} s"
+        remedy = "stamp samples by the device's clock, or spread the stamps of a block up to those of the next one"
+        yield Finding(Severity.WARNING, f"/streams/{stats.row.name}", what, remedy)
 
 
 def _missing_findings(stats: StreamStatistics) -> Iterator[Finding]:
