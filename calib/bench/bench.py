@@ -101,10 +101,9 @@ class Bench:
 
     def _require_possible(self) -> None:
         forces, (low, high) = np.asarray(self.forces), np.asarray(self.scene.skin.domain.bounds)
-        if not forces.size or not ((forces > 0) & (forces <= MAX_FORCE)).all():
+        pressed = (forces > 0) & (forces <= MAX_FORCE)
+        if not pressed.all() or (len(self.sites) and not len(forces)):
             raise BenchError(f"forces are {forces.tolist()} N; give one or more, above 0 up to {MAX_FORCE:g}")
-        if not len(self.sites):
-            raise BenchError("there is no site to press; give one or more")
         if self.tip_diameter > (high - low).min():
             raise BenchError(f"a tip of {self.tip_diameter:g} m is wider than the sheet; give its diameter in m")
         scan = self.scene.skin.protocol.frame_time

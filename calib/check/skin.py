@@ -1,6 +1,7 @@
 """Check the skin that a session describes, and the protocol of its scan."""
 
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -13,6 +14,7 @@ from .report import Finding, Severity, listed
 RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrodes are looked at
 MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
 MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
+MAX_OVERLAP = 0.02  # of the smaller of two pads
 PAD_POINTS = 32  # along each side of a pad's box, at which that share is counted
 
 
@@ -26,6 +28,7 @@ def check_skin(session: Session, given: je.Skin | None, findings: list[Finding])
     skin = own if given is None else given
     if skin is not None:
         findings += _size_findings(skin)
+        findings += _overlap_findings(skin)
         findings += _protocol_findings(session, skin)
     return skin
 
@@ -88,6 +91,14 @@ def _size_findings(skin: je.Skin) -> Iterator[Finding]:
                 "electrodes, outside of all electrodes: EIT tells no place there"
             )
             yield Finding(Severity.WARNING, "/device", what, "correct the positions of the electrodes or the pad")
+
+
+def _overlap_findings(skin: je.Skin) -> Iterator[Finding]:
+    """Pads that lie over one another in part, which air-tight pads beside one another do not."""
+    for first, second in combinations(skin.pads, 2):
+        if (share := je.skin.pad_overlap(first, second)) > MAX_OVERLAP:
+            what = f"{100 * share:.0f} % of pad {first.name!r} or {second.name!r} lie within the other one"
+            yield Finding(Severity.WARNING, "/device", what, "correct the corners: each point of a sheet has one pad")
 
 
 def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:

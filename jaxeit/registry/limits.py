@@ -40,11 +40,11 @@ class Limits(NamedTuple):
         return found
 
     def __str__(self) -> str:
-        kind = "a whole number, " if self.whole else ""
+        kind = ", a whole number" if self.whole else ""
         if math.isfinite(self.most):
-            return f"{kind}{'more than ' if self.open else ''}{self.least:g} to {self.most:g}"
+            return f"{'more than ' if self.open else ''}{self.least:g} to {self.most:g}{kind}"
         if math.isfinite(self.least):
-            return f"{kind}{'more than' if self.open else 'at least'} {self.least:g}"
+            return f"{'more than' if self.open else 'at least'} {self.least:g}{kind}"
         return "a finite number" if self.finite else "a number"
 
 

@@ -7,6 +7,7 @@ from .description import (
     Skin,
     SkinError,
     load_skin,
+    pad_overlap,
     parse_skin,
     shipped_skins,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "named_pattern",
     "named_protocol",
     "opposite",
+    "pad_overlap",
     "parse_skin",
     "reciprocal_rows",
     "rim_electrodes",

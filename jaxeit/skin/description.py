@@ -35,7 +35,7 @@ class Pad:
         return Polygon(self.outline).area
 
 
-MAX_OVERLAP = 0.02  # of the smaller of two pads
+MAX_OVERLAP = 0.9  # of the smaller of two pads: more is one pad that is listed twice
 OVERLAP_POINTS = 40  # along each side of the box that two pads have in common
 
 
@@ -44,26 +44,25 @@ class SkinError(ValueError):
 
 
 def _require_apart(pads: Sequence[Pad]) -> None:
-    """Refuse pads of one name, and pads of which one lies over another: a force would count twice."""
+    """Refuse pads of one name, and one that lies on another. Pads that overlap in part share the force there."""
     names = [pad.name for pad in pads]
     if again := [name for name, number in Counter(names).items() if number > 1]:
         raise SkinError(f"{names.count(again[0])} pads have the name {again[0]!r}; give each pad its own")
     for first, second in combinations(pads, 2):
-        if (share := _overlap(first.outline, second.outline)) > MAX_OVERLAP:
-            raise SkinError(
-                f"pads {first.name!r} and {second.name!r} lie over one another by {100 * share:.0f} % of the smaller "
-                "one; correct their corners"
-            )
+        if (share := pad_overlap(first, second)) > MAX_OVERLAP:
+            within = f"{100 * share:.0f} % of pad {first.name!r} or {second.name!r} lie within the other one"
+            raise SkinError(f"{within}; correct the corners")
 
 
-def _overlap(first: np.ndarray, second: np.ndarray) -> float:
-    """Share of the smaller of two polygons that lies within the other, by points on a grid over both boxes."""
-    low, high = np.maximum(first.min(0), second.min(0)), np.minimum(first.max(0), second.max(0))
+def pad_overlap(first: Pad, second: Pad) -> float:
+    """Share of the smaller of two pads that lies within the other, by points on a grid over what their boxes share."""
+    low = np.maximum(first.outline.min(0), second.outline.min(0))
+    high = np.minimum(first.outline.max(0), second.outline.max(0))
     if (high <= low).any():
         return 0.0
     at = (np.arange(OVERLAP_POINTS) + 0.5) / OVERLAP_POINTS
     points = low + np.stack(np.meshgrid(at, at), -1).reshape(-1, 2) * (high - low)
-    shapes = Polygon(first), Polygon(second)
+    shapes = Polygon(first.outline), Polygon(second.outline)
     common = shapes[0].contains(points) & shapes[1].contains(points)
     return float(common.mean() * np.prod(high - low) / min(shape.area for shape in shapes))
 

@@ -364,7 +364,6 @@ def test_an_unknown_preset_is_named():
         ({"slide": (0.3, 0.0)}, "after its slide"),
         ({"companions": (Companion((0.0, 0.2), 1.0),)}, "of a companion"),
         ({"sites": ((0.3, 0.1),)}, "site 0 at"),
-        ({"sites": np.zeros((0, 2))}, "there is no site to press"),
         ({"forces": np.array([5.0, -3.0])}, r"forces are \[5.0, -3.0\] N; give one or more, above 0"),
         ({"forces": np.array([])}, r"forces are \[\] N"),
         ({"forces": np.array([np.nan])}, r"forces are \[nan\] N"),

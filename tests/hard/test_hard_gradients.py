@@ -72,6 +72,7 @@ HOST = {
     **dict.fromkeys(("half_height_classes", "on_grid", "segment"), "finds regions, on the host, and says so under jit"),
     "pad_masks": "geometry, on the host, and says so under jit",
     "pad_response": _GEOMETRY,
+    "pad_overlap": _DESCRIBES,
     "parse_skin": _DESCRIBES,
     "parse_toml": _DESCRIBES,
     "place_sensitivity": _PREPARES,

@@ -206,5 +206,5 @@ def test_settings_of_a_mesh_that_cannot_be_are_refused(wrong, said):
 
 @pytest.mark.parametrize("wrong", [{"columns": 0}, {"rows": 2001}])
 def test_pixels_that_cannot_be_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; give 1 to 2000 pixels"):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; give 1 to 2000, a whole number"):
         je.Pixels(**wrong)

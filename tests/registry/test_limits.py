@@ -71,7 +71,7 @@ def test_no_number_that_is_not_finite_and_no_fraction_of_a_count():
     for value in (math.nan, math.inf, -1.0, 0.0):
         with pytest.raises(SettingError, match=r"GaussianSmooth: length is .*; give more than 0"):
             je.GaussianSmooth(value)
-    with pytest.raises(je.model.BasisError, match=r"Pixels: columns is 40\.5; give a whole number, 1 to 2000"):
+    with pytest.raises(je.model.BasisError, match=r"Pixels: columns is 40\.5; give 1 to 2000, a whole number"):
         je.Pixels(40.5)
     with pytest.raises(SettingError, match="Noser: exponent is 50; give 0 to 1"):
         je.Noser(50.0)

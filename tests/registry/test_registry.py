@@ -73,7 +73,7 @@ def test_settings_are_given_in_a_word(registry, text, again):
         (METHODS, "greit:width=wide", "width: is 'wide'; give a number such as 0.012 .width: standard deviation of a"),
         (METHODS, "sparse-bayes:steps=1.5", "steps: is 1.5; give a whole number from 0 such as 15"),
         (PRIORS, "gaussian-smooth:noser=1", "noser: is 1; give true or false"),
-        (BASES, "pixels:columns=0", "Pixels: columns is 0; give a whole number, 1 to 2000"),
+        (BASES, "pixels:columns=0", "Pixels: columns is 0; give 1 to 2000, a whole number"),
         (LOCATORS, "fitted-contact:widths=[1,2,3]", r"give \[a number, a number\] such as \[0.006,0.03\]"),
         (HYPERPARAMETERS, "l-curve:frames=1", "frames: unknown key"),
         (EFFECTS, "Noise:stream=eeg", 'give one of "eit", "pressure", "force"'),
