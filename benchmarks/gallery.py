@@ -168,10 +168,19 @@ def train_on_random_scenes(axes: Any, names: Names) -> None:
     axes.set_title("where the force is, on a skin not seen before", fontsize=8)
 
 
+def end_to_end_regressor(axes: Any, names: Names) -> None:
+    """The error of the force by presses of ordinary use, without pads."""
+    true = names["true"]
+    errors = [float(np.median(np.abs(found - true))) for found in names["after"].values()]
+    _line(axes, list(names["after"]), 100 * np.array(errors), "presses of the new skin", "error of the force, %")
+    axes.set(ylim=(0, None), title="readings alone, median")
+
+
 DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "bending": lambda axes, n: _bars(axes, {k: 100 * v for k, v in n["changes"].items()}, "change of the readings, %"),
     "design_a_scan": lambda axes, n: _bars(axes, n["errors"], "expected error of place, mm"),
     "electrodes_that_move": electrodes_that_move,
+    "end_to_end_regressor": end_to_end_regressor,
     "forces_of_a_session": forces_of_a_session,
     "gradient_of_a_loss": gradient_of_a_loss,
     "image_and_forces": image_and_forces,

@@ -19,6 +19,10 @@ FINDS = {
     "electrodes_that_move": lambda names: (
         jnp.linalg.norm(names["change"] - names["linear"]) < 0.1 * jnp.linalg.norm(names["change"])
     ),
+    "end_to_end_regressor": lambda names: (
+        names["errors"][400] < 0.9 * names["errors"][0] < 0.2
+        and names["wrong"]["network"] < 0.3 < 0.33 < names["wrong"]["image"]
+    ),
     "forces_of_a_session": lambda names: names["found"]["force_rmse"] < 1,
     "gradient_of_a_loss": lambda names: jnp.abs(names["guess"] - jnp.array([0.07, 0.12, 0.5])).max() < 1e-3,
     "image_and_forces": lambda names: jnp.abs(names["on_pads"] - names["forces"]).max() < 1e-9,
