@@ -107,7 +107,19 @@ HOST = {
     "verb": "a decorator",
     "AbstractEstimator": "an abstract base of cases",
     "AbstractReconstructor": "an abstract base of cases",
-    **dict.fromkeys(["chosen", "default_solver", "function_space", "laid", "settings_of", "split_word"], _DESCRIBES),
+    **dict.fromkeys(
+        [
+            "chosen",
+            "require_limits",
+            "default_solver",
+            "function_space",
+            "laid",
+            "limited",
+            "settings_of",
+            "split_word",
+        ],
+        _DESCRIBES,
+    ),
     **dict.fromkeys(["computed", "fold", "history", "history_start", "keys", "parameter"], _INNER),
     **dict.fromkeys(["inverse_columns", "matvec", "normal_equations", "quadratic", "solve_spd"], _INNER),
 }
