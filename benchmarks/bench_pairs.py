@@ -63,8 +63,8 @@ def prepared(model: je.Model, radius: float, name: str, strength: float | None, 
         basis = je.Pixels(PIXELS).on(model)
 
         def segmented(changes: np.ndarray, reference: np.ndarray) -> np.ndarray:
-            found = [je.imaging.segment(model, reference, reference + change, basis).image for change in changes]
-            return np.array(found)
+            frames = [reference + change for change in changes]
+            return np.array([je.imaging.segment(model, reference, f, basis, borders=None).image for f in frames])
 
         return Way(segmented, basis)
     prior, method = ways(radius)[name]

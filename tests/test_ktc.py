@@ -3,6 +3,7 @@ they are at hand."""
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from scipy.ndimage import label
 
 import jaxeit as je
 from benchmarks import bench_ktc as ktc, ktc_phantoms, tables
+from jaxeit.imaging import level_set
+from jaxeit.imaging.absolute import images
 
 from .helpers import REAL_DATA, disc_model, require_identical
 
@@ -74,8 +77,61 @@ def test_a_tank_in_classes():
         assert (truth & seen).sum() > 0.6 * (truth | seen).sum()
     with pytest.raises(je.imaging.InverseError, match=r"floor is 0\.0"):
         je.imaging.segment(water, reference, frame, floor=0.0)
+    with pytest.raises(je.imaging.InverseError, match=r"width is 0\.0"):
+        je.imaging.segment(water, reference, frame, je.Pixels(24), borders=je.imaging.LevelSet(widths=(0.5, 0.0)))
     with pytest.raises(je.imaging.InverseError, match="is no picture"):
         je.imaging.segment(water, reference, frame, je.model.Elements())
+
+
+def test_distances_are_signed_and_know_their_class(disc):
+    """Two regions on a grid four times as fine as the picture: distances in its pixels."""
+    classes = np.zeros((40, 40), int)
+    classes[10:20, 4:14], classes[10:20, 28:38] = ktc.RESISTIVE, ktc.CONDUCTIVE
+    found = level_set.signed_distances(classes, disc.image.picture)
+    assert ((found.level > 0) == (classes > 0)).all()
+    assert [float(found.level[place]) for place in ((15, 9), (15, 20), (24, 9))] == [1.25, -1.75, -1.25]
+    assert (found.owner == (np.arange(40) >= 21)).all()
+
+
+def test_gradient_of_a_level_set_is_that_of_its_misfit(disc):
+    """Against automatic differentiation of half the sum of squares; the matrix of Gauss and Newton is definite."""
+    rng, size = np.random.default_rng(30), disc.image.size
+    truth = _bump(disc, 0.45, 0.0, 2.0) + _bump(disc, -0.45, 0.0, -2.0)
+    readings = disc.voltages(truth)
+    weight = jnp.full_like(readings, 1e3 / float(jnp.max(jnp.abs(readings))))
+    image = images.ImagePosterior(disc, je.imaging.IsotropicVariation(weight=2.0), readings, weight)
+    smooth = je.imaging.Laplace(3e-3).precision(jnp.zeros((0, size)), disc.image.picture)
+    expected = jnp.append(jnp.full(size, -2.0), jnp.array([-2.0, 2.0]))
+    owner = jnp.asarray(disc.image.picture.centres[:, 0] > 0, int)
+    prior = je.imaging.Quadratic(smooth, 0.1)
+    posterior = level_set._LevelPosterior(image, prior, expected, jnp.asarray(0.1), owner, jnp.asarray(0.5))
+    at = expected + jnp.asarray(rng.normal(size=size + 2))
+    found = posterior.quadratic(at)
+    np.testing.assert_allclose(found.f, 0.5 * jnp.sum(posterior.residual(at) ** 2) - 1, rtol=1e-12)
+    gradient = jax.grad(lambda z: 0.5 * jnp.sum(posterior.residual(z) ** 2))(at)
+    np.testing.assert_allclose(found.grad, gradient, rtol=1e-6, atol=1e-8 * float(jnp.max(jnp.abs(gradient))))
+    assert np.linalg.eigvalsh(found.hessian.matrix).min() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["star", "crescent"])
+def test_fitted_borders_show_the_shape(kind):
+    """A star and a crescent on another mesh, with noise: a better score than regions cut at half their height have."""
+    rng = np.random.default_rng([2030, kind == "crescent"])
+    pattern = je.skin.adjacent(32)
+    fine = disc_model(0.02, 0.03, electrodes=32, pattern=pattern)
+    water = disc_model(0.02, 0.08, electrodes=32, pattern=pattern)
+    outline = getattr(ktc_phantoms, kind)(rng) + np.array([0.35, -0.1])
+    piece = ktc_phantoms.Piece(outline, ktc.RESISTIVE, 0.1)
+    sigma = jnp.where(jnp.asarray(piece.contains(np.asarray(fine.centroids))), piece.ratio, 1.0)
+    reference, frame = np.array(je.forward(fine)), np.array(je.forward(fine, sigma))
+    frame += 1e-3 * np.sqrt(np.mean(reference**2)) * rng.normal(size=frame.size)
+    truth = ktc_phantoms.truth((piece,))
+    scores = []
+    for borders in (None, je.imaging.LevelSet()):
+        found = je.imaging.segment(water, reference, frame, borders=borders)
+        scores.append(float(je.metrics.ktc_score(found.classes[::-1], truth)))
+    assert scores[1] > scores[0] + 0.01
 
 
 @pytest.mark.slow
@@ -226,7 +282,7 @@ def test_the_linear_recipe(tank, level, least):
 def test_total_variation(tank, level, least):
     """With finer pixels and a heavier penalty, which suit these frames at level 1 and were chosen on them."""
     data, model, water = tank
-    heavy = {"penalty": je.imaging.IsotropicVariation(), "relative_error": 0.05}
+    heavy = {"penalty": je.imaging.IsotropicVariation(), "relative_error": 0.05, "borders": None}
     way = partial(ktc.variation, model, je.Pixels(40).on(model), water, **heavy)
     (row,) = ktc.scored(data, {"variation": way}, level)
     assert row["mean"] > least

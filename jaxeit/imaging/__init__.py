@@ -21,6 +21,7 @@ from .hyperparameters import (
     LCurve,
     NoiseFigure,
 )
+from .level_set import LevelSet
 from .measured_noise import NOISES, AbstractNoise, CorrelatedNoise, EqualNoise, MeasuredNoise
 from .methods import (
     METHODS,
@@ -98,6 +99,7 @@ __all__ = [
     "KnownPresses",
     "LCurve",
     "Laplace",
+    "LevelSet",
     "LogConductivity",
     "MeasuredNoise",
     "NoiseFigure",

@@ -6,11 +6,13 @@ blurred edge lies at half the height, however high. Beside a piece of large cont
 a little; such regions are left out.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, DTypeLike, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from .._compile import require_known
@@ -18,7 +20,15 @@ from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ..model.discretisation import Model
 from ..model.forward_model import forward
 from .absolute.background import require_frame, require_positive
-from .absolute.images import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton
+from .absolute.images import (
+    AbstractPenalty,
+    ImagePosterior,
+    IsotropicVariation,
+    LogConductivity,
+    gauss_newton,
+    reading_weights,
+)
+from .level_set import LevelSet, fitted_level, signed_distances
 from .noise import InverseError
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
@@ -27,6 +37,8 @@ WEIGHT = 0.0064
 """Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
 COLUMNS = 30
 """Pixels along x where no basis is given."""
+BORDERS = LevelSet()
+"""How the borders of pieces are fitted."""
 MORE_FITS, BELIEVED_MISFIT = 3, 1.05
 """Fits with larger errors, of an image that leaves more of a frame than these; root mean square over the errors."""
 
@@ -53,6 +65,7 @@ def segment(
     basis: AbstractBasis | BasisMap | None = None,
     *,
     penalty: AbstractPenalty | None = None,
+    borders: LevelSet | None = BORDERS,
     missed: Float[ArrayLike, " readings"] | None = None,
     relative_error: float = 0.03,
     absolute_error: float = 0.003,
@@ -73,6 +86,7 @@ def segment(
         reference, frame: V; readings that are not finite in either are left out.
         basis: default `Pixels`, 30 along x.
         penalty: default `IsotropicVariation` with a weight of 0.0064 for each reading that is used.
+        borders: how borders are fitted to the readings, from those of the regions; None: left as the image shows them.
         missed: of the reference by the model, V; default: the difference.
         relative_error: of a change, over itself.
         absolute_error: of a reading that does not change, over the sum of its size and the root mean square of all; it
@@ -91,38 +105,82 @@ def segment(
         require_frame(values, even)
     require_positive(relative_error=relative_error, absolute_error=absolute_error)
     require_positive(floor=floor, least=least, weakest=weakest, pixels=pixels)
+    image = _picture_basis(model, basis)
+    left = before - even if missed is None else jnp.asarray(missed, model.dtype)
+    seen = _Seen(even, before, after - before, left)
+    if penalty is None:
+        penalty = IsotropicVariation(weight=WEIGHT * seen.used(model.dtype))
+    physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
+    found, std = _believed_image(physics, penalty, seen, relative_error, absolute_error)
+    classes = half_height_classes(on_grid(found, image.picture, (pixels, pixels)), floor, least, weakest)
+    if borders is not None and classes.any():
+        classes = _shaped(physics, penalty, seen, std, classes, borders)
+    return Segmentation(found, image.picture, classes)
+
+
+def _picture_basis(model: Model, basis: AbstractBasis | BasisMap | None) -> BasisMap:
+    """The basis laid over the model; a picture."""
     basis = Pixels(COLUMNS) if basis is None else basis
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     if len(image.picture.shape) != 2:
         raise InverseError("the basis is no picture; give pixels, such as basis=Pixels(40)")
-    change, left = after - before, before - even if missed is None else jnp.asarray(missed, model.dtype)
-    physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
-    if penalty is None:
-        penalty = IsotropicVariation(weight=WEIGHT * jnp.sum(jnp.isfinite(change), dtype=model.dtype))
-    std = _errors(before, change, left, relative_error, absolute_error)
-    found = gauss_newton(physics, penalty, even + change, std)
+    return image
+
+
+class _Seen(NamedTuple):
+    """Readings, each (readings,) in V: of the model, of the reference, their change, what the model misses of them."""
+
+    even: Float[Array, " readings"]
+    before: Float[Array, " readings"]
+    change: Float[Array, " readings"]
+    left: Float[Array, " readings"]
+
+    @property
+    def target(self) -> Float[Array, " readings"]:
+        """Readings that the model is asked for."""
+        return self.even + self.change
+
+    def used(self, dtype: DTypeLike) -> Float[Array, ""]:
+        """Number of readings."""
+        return jnp.sum(jnp.isfinite(self.change), dtype=dtype)
+
+    def errors(self, relative_error: float, absolute_error: float) -> Float[Array, " readings"]:
+        """Standard errors of the changes, V, as `segment` describes them."""
+        share = jnp.sqrt(jnp.nansum(self.change**2) / jnp.nansum(self.before**2))
+        size = jnp.abs(self.before) + jnp.sqrt(jnp.nanmean(self.before**2))
+        return relative_error * jnp.abs(self.change) + absolute_error * size + share * jnp.abs(self.left)
+
+
+def _believed_image(
+    physics: LogConductivity, penalty: AbstractPenalty, seen: _Seen, relative_error: float, absolute_error: float
+) -> tuple[Float[Array, " basis"], Float[Array, " readings"]]:
+    """The image, fitted anew with larger errors where it leaves more of the frame than they tell; and its errors, V."""
+    std = seen.errors(relative_error, absolute_error)
+    found = gauss_newton(physics, penalty, seen.target, std)
     for _ in range(MORE_FITS):
-        misfit = float(jnp.sqrt(jnp.nanmean(((even + change - physics.voltages(found)) / std) ** 2)))
+        misfit = float(jnp.sqrt(jnp.nanmean(((seen.target - physics.voltages(found)) / std) ** 2)))
         if not misfit > BELIEVED_MISFIT:
             break
         absolute_error *= misfit
-        std = _errors(before, change, left, relative_error, absolute_error)
-        found = gauss_newton(physics, penalty, even + change, std)
-    fine = on_grid(found, image.picture, (pixels, pixels))
-    return Segmentation(found, image.picture, half_height_classes(fine, floor, least, weakest))
+        std = seen.errors(relative_error, absolute_error)
+        found = gauss_newton(physics, penalty, seen.target, std)
+    return found, std
 
 
-def _errors(
-    before: Float[Array, " readings"],
-    change: Float[Array, " readings"],
-    left: Float[Array, " readings"],
-    relative_error: float,
-    absolute_error: float,
-) -> Float[Array, " readings"]:
-    """Standard errors of the changes, V, as `segment` describes them."""
-    share = jnp.sqrt(jnp.nansum(change**2) / jnp.nansum(before**2))
-    size = jnp.abs(before) + jnp.sqrt(jnp.nanmean(before**2))
-    return relative_error * jnp.abs(change) + absolute_error * size + share * jnp.abs(left)
+def _shaped(
+    physics: LogConductivity,
+    penalty: AbstractPenalty,
+    seen: _Seen,
+    std: Float[Array, " readings"],
+    classes: Int[np.ndarray, "rows columns"],
+    borders: LevelSet,
+) -> Int[np.ndarray, "rows columns"]:
+    """Classes whose borders explain the readings, from those of the image."""
+    picture, start = physics.image.picture, signed_distances(classes, physics.image.picture)
+    weight, readings = reading_weights(seen.target, std)
+    posterior = ImagePosterior(physics, penalty, readings, weight)
+    level = fitted_level(posterior, start, seen.used(physics.model.dtype), borders)
+    return np.where(on_grid(level, picture, classes.shape) > 0, start.owner + 1, UNCHANGED)
 
 
 def on_grid(

@@ -144,7 +144,7 @@ def gauss_newton(
     """
     weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     start = jnp.zeros(physics.image.size, readings.dtype)
-    return most_probable(_Posterior(physics, penalty, readings, weight), start, steps, tolerance)[0]
+    return most_probable(ImagePosterior(physics, penalty, readings, weight), start, steps, tolerance)[0]
 
 
 class AbstractPosterior(eqx.Module):
@@ -159,7 +159,7 @@ class AbstractPosterior(eqx.Module):
         """Gauss and Newton's quadratic near x."""
 
 
-class _Posterior(AbstractPosterior):
+class ImagePosterior(AbstractPosterior):
     """Minus the logarithm of the posterior probability of an image x, as half a sum of squares."""
 
     physics: LogConductivity
@@ -184,12 +184,16 @@ class _Posterior(AbstractPosterior):
 
 @verb
 def most_probable(
-    posterior: AbstractPosterior, start: Float[Array, " n"], steps: int, tolerance: float
+    posterior: AbstractPosterior, start: Float[Array, " n"], steps: int, tolerance: float, *, damped: bool = False
 ) -> tuple[Float[Array, " n"], LeastSquaresState]:
     """The x of largest posterior probability, by Gauss and Newton's method as `gauss_newton` describes it; and where
-    the fit stands then, whose quadratic is that before the last step, next to nothing."""
+    the fit stands then, whose quadratic is that before the last step, next to nothing.
+
+    With ``damped`` by Levenberg and Marquardt's, where the quadratic holds for small steps only.
+    """
     newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
-    solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance, descent=newton, search=optx.BacktrackingArmijo())
+    choice: dict[str, Any] = {} if damped else {"descent": newton, "search": optx.BacktrackingArmijo()}
+    solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance, **choice)
     found: optx.Solution[Array, Any] = optx.least_squares(
         lambda x, posterior: posterior.residual(x),
         solver,
@@ -235,17 +239,17 @@ def least_squares_image(
     weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     tolerance = 1e-6 if readings.dtype == jnp.float64 else 1e-3
     solver = LevenbergMarquardt(tolerance, tolerance) if solver is None else solver
-    return _solved(_Posterior(physics, penalty, readings, weight), solver, steps)
+    return _solved(ImagePosterior(physics, penalty, readings, weight), solver, steps)
 
 
 @verb
 def _solved(
-    posterior: _Posterior, solver: optx.AbstractLeastSquaresSolver[Any, Any, Any, Any], steps: int
+    posterior: ImagePosterior, solver: optx.AbstractLeastSquaresSolver[Any, Any, Any, Any], steps: int
 ) -> Float[Array, " basis"]:
     def image(z: Float[Array, " rows"], penalty: Quadratic) -> Float[Array, " basis"]:
         return penalty.precision.image(z) / jnp.sqrt(penalty.strength.astype(z.dtype))
 
-    def residual(z: Float[Array, " rows"], posterior: _Posterior) -> Float[Array, " residuals"]:
+    def residual(z: Float[Array, " rows"], posterior: ImagePosterior) -> Float[Array, " residuals"]:
         x = image(z, cast(Quadratic, posterior.penalty))
         missed = posterior.weight * (posterior.readings - _voltages(x, posterior.physics))
         return jnp.concatenate([missed, z])
