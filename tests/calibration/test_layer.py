@@ -1,8 +1,10 @@
 """The gain of the contact layer in a calibration: its file, where it is learned, and where it is used."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -164,7 +166,12 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker
     assert f"learned from {CONTACTS} contacts" in capsys.readouterr().out
     assert main(["apply", new, str(session), "-o", out, "--track"]) == 0
     assert tracker.started[-1].contacts == CONTACTS
-    assert main(["recalibrate", new, str(session), "-o", out, "--learn-layer", "--json"]) == 0
+    assert main(["recalibrate", new, str(session), "-o", out, "--learn-layer", "--json"]) == 2
+    assert "has moved this calibration before" in capsys.readouterr().err
+    later = shutil.copy(session, tmp_path / "later.h5")
+    with h5py.File(later, "r+") as file:
+        file.attrs["title"] = np.bytes_(b"on the day after")
+    assert main(["recalibrate", new, str(later), "-o", out, "--learn-layer", "--json"]) == 0
     assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
 
 
@@ -172,13 +179,13 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker
 def test_calibrate_learns_from_all_its_sessions(tracker, bundled, tmp_path, monkeypatch, capsys):
     recipe = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft(), learn_layer=True)
     stages = []
-    with calib.open_session(bundled[0]) as session:
-        found = calib.calibrate([session, session], recipe=recipe, progress=stages.append, ignore_errors=True)
+    with calib.open_session(bundled[0]) as session, calib.open_session(bundled[1]) as other:
+        found = calib.calibrate([session, other], recipe=recipe, progress=stages.append, ignore_errors=True)
     assert found.layer.contacts == 2 * CONTACTS
     assert stages[-1] == "learning the contact layer"
     monkeypatch.setattr(procedure, "calibrate", lambda *_, **__: found)
     out = str(tmp_path / "calibration.h5")
-    assert main(["calibrate", *2 * [str(bundled[0])], "-o", out, "--learn-layer"]) == 0
+    assert main(["calibrate", *map(str, bundled), "-o", out, "--learn-layer"]) == 0
     assert f"learned from {2 * CONTACTS} contacts" in capsys.readouterr().out
     assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
 
