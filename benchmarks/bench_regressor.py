@@ -15,6 +15,9 @@ the image alone, without any pad.
 unlike: single tips, after 30 presses, on skins or by tips that are not as those of the training. "said": share of the
 frames that the proposal calls outside of its scenes, or whose forces on the pads surprise the regressor (chi-square,
 1 in 1,000).
+
+drift: 48 presses in an hour, in which the gain of the contact layer falls by 26 % with a scatter of 20 %; after two
+thirds a bolt in the middle comes loose, ten times its contact resistance. The untouched frame is that of the time.
 """
 
 import tempfile
@@ -27,6 +30,7 @@ from scipy.stats import chi2
 
 import jaxeit as je
 from calib.calibration.localisation.load_windows import FIDELITY
+from jaxeit.tracking import LearnedLayer
 
 from .clock import seconds
 from .force_ways import Answer, Bench, Way
@@ -34,10 +38,13 @@ from .harness import Question, Run
 from .problems import matched
 from .regressor import STEPS, Adapted, prepared
 from .rows import Row, grouped
-from .worn_skins import Press, Wear
+from .worn_skins import Press, Wear, true_map
 
 FIRST_SEED = 5200
 PRESSES = 120  # of ordinary use
+AGED, WINDOWS = 48, 6  # presses and parts of the hour of a skin that ages
+TAUGHT = {"never taught": 0.0, "taught for 20 minutes": 1 / 3, "always taught": 1.0}  # parts of the presses
+FORGOTTEN = 0.005  # of what was learned, at each press
 UNLIKE = {
     "bolts 3 mm aside": Wear(misplaced=3e-3),
     "tips of 50 mm": Wear(tip=0.05),
@@ -144,6 +151,49 @@ def _unlike(bench: Bench) -> Iterator[Row]:
             yield {"way": way, "said": announced} | row
 
 
+def drift(run: Run) -> Iterator[Row]:
+    """Presses of an hour on skins that age: each is told from its readings alone before it teaches anything."""
+    skins, count = run.sizes((2, (AGED, 1, 0)), (1, (6, 1, 0)))
+    adapted, model = trained(run), je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    rows: list[Row] = []
+    for seed in range(FIRST_SEED + 200, FIRST_SEED + 200 + skins):
+        rows += _aged(Bench(adapted, model, seed, Wear(ages=True), count))
+        print(f"skin that ages, {seed}", flush=True)
+    yield {
+        "drift": [
+            {"way": way, "minutes": minutes, "presses": len(mine)}
+            | {key: round(float(np.nanmedian([row[key] for row in mine])), 4) for key in ("alone", "place_mm")}
+            for (way, minutes), mine in grouped(rows, "way", "minutes").items()
+        ]
+    }
+
+
+def _aged(bench: Bench) -> Iterator[Row]:
+    """Rows of each press, by what is never taught, taught for the first third of the hour, and always."""
+    adapted, tracker, count = bench.adapted, bench.tracker, len(bench.used)
+    codes, layers = (dict.fromkeys(TAUGHT, start) for start in (adapted.prior, LearnedLayer.unknown(tracker.field)))
+    silent = np.full(len(adapted.masks), np.nan)
+    for number, press in enumerate(bench.used):
+        frame = bench.changes[number] + bench.noise * bench.rng.normal(size=bench.noise.size)
+        truth = true_map(press, adapted.centres)
+        (forces,) = bench.told(truth[None])
+        window = WINDOWS * number // count
+        minutes = f"{60 * window // WINDOWS} to {60 * (window + 1) // WINDOWS} min"
+        for taught, until in TAUGHT.items():
+            for way, found in (
+                ("learned: regressor", bench.by_network(codes[taught], frame, silent)),
+                ("physics: contacts followed", bench.by_tracks(layers[taught], frame, silent)),
+            ):
+                one = judged(truth, press, found, found)
+                yield {"way": f"{way}, {taught}", "minutes": minutes} | {
+                    "alone": abs(one["alone"]),
+                    "place_mm": one["place_mm"],
+                }
+            if number < until * count:
+                codes[taught] = adapted.told(codes[taught].aged(FORGOTTEN), frame, forces)
+                layers[taught] = bench.learned_from(layers[taught].aged(FORGOTTEN), number)
+
+
 def tabled(every: list[Row]) -> list[Row]:
     """A row for each way."""
     return [{"way": way} | summary(mine) for way, mine in grouped(every, "way").items()]
@@ -152,7 +202,7 @@ def tabled(every: list[Row]) -> list[Row]:
 main = Question(
     "regressor",
     __doc__,
-    {"compared": compared, "unlike": unlike},
+    {"compared": compared, "unlike": unlike, "drift": drift},
     {"--frames": {"help": "folder that keeps the frames"}},
 )
 

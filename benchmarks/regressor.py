@@ -159,10 +159,16 @@ def _loss(network: Regressor, codes: jax.Array, examples: Examples, key: jax.Arr
 
 
 class Belief(NamedTuple):
-    """What is known of a skin's code: mean (k,) and covariance (k, k)."""
+    """What is known of a skin's code: mean (k,), covariance (k, k), and that before any press."""
 
     mean: np.ndarray
     covariance: np.ndarray
+    prior: np.ndarray
+
+    def aged(self, share: float) -> "Belief":
+        """After this share was forgotten, as `jaxeit.tracking.LearnedLayer.aged` forgets."""
+        kept = 1 - share
+        return self._replace(mean=kept * self.mean, covariance=self.prior + kept**2 * (self.covariance - self.prior))
 
 
 class Errors(NamedTuple):
@@ -262,7 +268,8 @@ def prepared(skin: je.Skin, folder: Path, skins: int, steps: int) -> Adapted:
     network, codes = train(examples, steps)
     image = je.prepare(je.discretise(je.Scene(skin), je.Fidelity.draft()), basis=PIXELS)
     masks, centres = np.asarray(je.pad_masks(skin, image).weights), np.asarray(image.centres, float)
-    prior = Belief(np.zeros(MODES), codes.T @ codes / len(codes))
+    scatter = codes.T @ codes / len(codes)
+    prior = Belief(np.zeros(MODES), scatter, scatter)
     return Adapted(network, compression, prior, masks, centres, _errors(network, codes, examples, masks, centres))
 
 

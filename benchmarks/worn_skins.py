@@ -6,13 +6,16 @@ import numpy as np
 
 from tests.oracles.bench import contact
 from tests.oracles.bench.mesh import make_mesh
-from tests.oracles.bench.session import coating, transfer_frames
-from tests.oracles.bench.sheet import make_sheet, readings
+from tests.oracles.bench.session import coating
+from tests.oracles.bench.sheet import Sheet, green, make_sheet, mean_potentials, readings, touched
+from tests.oracles.bench.skin import Skin
 
 from .bench_proposal import SCATTER, SPACING, Recorded, described
 
 FORCES, TIPS = (4.0, 25.0), (0.006, 0.03)  # N, m
 DISTANCE = 0.03  # m, of two contacts
+AGED, AGED_FIELD = -0.3, 0.2  # change of the log gain from the first press to the last: its mean, standard deviation
+LOOSE, LOOSE_AFTER, LOOSENED = 12, 2 / 3, 10.0  # bolt, part of the presses, and factor of its contact resistance
 SUB = 5  # points along each side of a pixel at which the true stress is taken
 
 
@@ -26,11 +29,12 @@ class Press(NamedTuple):
 
 class Wear(NamedTuple):
     """What a skin is like: standard deviations of the log of its coat and of the bolts' places, m; tips, m, or None:
-    those of `TIPS`."""
+    those of `TIPS`; whether its contact layer ages from press to press, and a bolt comes loose."""
 
     coat: float = 0.15
     misplaced: float = 0.0
     tip: float | None = None
+    ages: bool = False
 
 
 def presses(rng: np.random.Generator, count: int, tip: float | None = None) -> list[Press]:
@@ -54,7 +58,7 @@ def pairs(rng: np.random.Generator, count: int) -> list[Press]:
 
 
 def recorded(seed: int, given: list[Press], wear: Wear) -> Recorded:
-    """A skin of a seed under presses, and the change that each makes."""
+    """A skin of a seed under presses, of which each change is that from the untouched skin of its time."""
     skin, own = described("testbed"), np.random.default_rng([seed, 11])
     bolts = skin.bolts + wear.misplaced * own.standard_normal(skin.bolts.shape)
     layer, mesh = contact.make_layer(skin, bolts, SCATTER, own), make_mesh(skin, bolts, SPACING)
@@ -64,9 +68,29 @@ def recorded(seed: int, given: list[Press], wear: Wear) -> Recorded:
         sum(f * contact.shares(layer, place, "flat", p.tip, f) for place, f in zip(p.places, p.forces, strict=True))
         for p in given
     ]
-    volts = [readings(z, skin.pattern, skin.current) for z in transfer_frames(layer, sheet, np.array(loads))]
-    untouched = readings(sheet.untouched, skin.pattern, skin.current)
-    return Recorded(untouched, np.array(volts) - untouched)
+    conducts, begin = contact.conductances(layer, np.array(loads)), len(given)
+    if wear.ages:
+        field, begin = np.log(coating(layer.places, AGED_FIELD, own)), round(LOOSE_AFTER * len(given))
+        conducts *= np.exp(np.linspace(0, 1, len(given))[:, None] * (AGED + field))
+    changes = [_changes(skin, layer, sheet, conducts[:begin])]
+    if wear.ages:
+        of_bolts = np.where(mesh.bolt[mesh.bolt >= 0] == LOOSE, LOOSENED, 1.0) * skin.contact
+        changes.append(_changes(skin, layer, make_sheet(mesh, sigma, of_bolts[:, None, None]), conducts[begin:]))
+    return Recorded(readings(sheet.untouched, skin.pattern, skin.current), np.concatenate(changes))
+
+
+def _changes(skin: Skin, layer: contact.Layer, sheet: Sheet, conducts: np.ndarray) -> np.ndarray:
+    """Change of the readings (presses, readings) V by the conductances of patches (presses, patches) S."""
+    live = conducts.any(0)
+    chosen = contact.Layer(layer.places[live], layer.island[live], layer.touch[live], layer.gain[live])
+    between, bolts = green(sheet, mean_potentials(sheet.mesh, contact.samples(chosen)))
+    found = []
+    for conductance in conducts[:, live]:
+        on = np.flatnonzero(conductance)
+        joined = contact.joined(conductance[on], chosen.island[on])
+        transfer = touched(sheet, between[np.ix_(on, on)], bolts[on], joined)
+        found.append(readings(transfer - sheet.untouched, skin.pattern, skin.current))
+    return np.array(found)
 
 
 def true_map(press: Press, centres: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ def adapted():
     unit = Compression(
         np.array(1.0), np.eye(READINGS), np.ones(READINGS), np.zeros(READINGS + 1), np.ones(READINGS + 1)
     )
-    prior = Belief(np.zeros(MODES), np.diag([1.0, 0.5, 0.25]))
+    prior = Belief(np.zeros(MODES), *2 * [np.diag([1.0, 0.5, 0.25])])
     return Adapted(network, unit, prior, MASKS, CENTRES, Errors(0.05, 0.01, 0.002))
 
 
@@ -104,3 +104,4 @@ def test_smoke_regressor():
         fused = [row for row in data[part] if "pads" in row["way"] or row["way"].startswith("physics")]
         assert all(row["force"] < 0.2 and 0 <= row["wrong"] <= 1 for row in fused)
     assert {row["skin"] for row in data["unlike"]} == set(bench_regressor.UNLIKE)
+    assert len({row["minutes"] for row in data["drift"]}) == bench_regressor.WINDOWS
