@@ -14,13 +14,13 @@ from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit
 from .electrodes import check_electrodes
 from .evidence import PressEvidence
-from .force import force_findings, is_silent
-from .pad_responses import pad_response_findings
-from .pads import check_pads
-from .places import place_findings
-from .presses import NAMES, list_presses, press_evidence, press_summary
+from .presses.force import force_findings, is_silent
+from .presses.pad_responses import pad_response_findings
+from .presses.pads import check_pads
+from .presses.places import place_findings
+from .presses.responses import reading_response_findings
+from .presses.usable import NAMES, list_presses, press_evidence, press_summary
 from .report import ChannelTable, CheckReport, Finding, Severity
-from .responses import reading_response_findings
 from .skin import check_skin
 from .streams.clipping import clipping_findings
 from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-import calib.check.pads
+import calib.check.presses.pads
 import jaxeit as je
 from calib.check import Severity, check_session, render, to_json, transfer_matrix
 from calib.check.eit.reading_order import predict_readings
@@ -234,8 +234,8 @@ def test_a_healthy_array_has_no_finding_above_a_note(parts, look):
 
 
 def test_an_array_in_a_long_recording_is_searched_in_pieces(parts, look, monkeypatch):
-    monkeypatch.setattr(calib.check.pads, "PIECES", 8)
-    monkeypatch.setattr(calib.check.pads, "PIECE_LENGTH", 100)
+    monkeypatch.setattr(calib.check.presses.pads, "PIECES", 8)
+    monkeypatch.setattr(calib.check.presses.pads, "PIECE_LENGTH", 100)
     array_log(parts, faulty=True)
     report = look(parts)
     for words in ("(dead): 1", "(stuck): 4", "(silent): 7", "(spiking): 9"):

@@ -6,11 +6,11 @@ import numpy as np
 
 import jaxeit as je
 
-from ..fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
-from ..presses.streams import resample
-from ..session import Stream
-from .report import Finding, PadRow, Severity, listed
-from .streams.statistics import MAX_MISSING, StreamStatistics
+from ...fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
+from ...presses.streams import resample
+from ...session import Stream
+from ..report import Finding, PadRow, Severity, listed
+from ..streams.statistics import MAX_MISSING, StreamStatistics
 
 MIN_PRESSURE = 5.0  # Pa; no press is lighter, but bar and kPa recorded as Pa give such numbers
 MAX_BELOW = 0.1  # of the span, by which all values may lie below it

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .evidence import PressEvidence
-from .report import ChannelTable, Finding, Severity, listed
+from ..evidence import PressEvidence
+from ..report import ChannelTable, Finding, Severity, listed
 
 # A touch changes all readings a little, or a few of them much: quantile of the readings, and how many standard errors
 # their changes must exceed there. Chance gives 0.67 and 2.

@@ -6,14 +6,14 @@ import numpy as np
 
 import jaxeit as je
 
-from ..presses.streams import finite_mean, index_ranges, resample, true_runs
-from ..presses.times import PressColumns
-from ..session import PressTable
-from ..session.units import SECOND
-from .evidence import PressEvidence
-from .parts import flagged_part
-from .report import Finding, Severity, counted, listed
-from .streams.statistics import StreamStatistics
+from ...presses.streams import finite_mean, index_ranges, resample, true_runs
+from ...presses.times import PressColumns
+from ...session import PressTable
+from ...session.units import SECOND
+from ..evidence import PressEvidence
+from ..parts import flagged_part
+from ..report import Finding, Severity, counted, listed
+from ..streams.statistics import StreamStatistics
 from .targets import target_findings
 
 WHERE = "/streams/force"

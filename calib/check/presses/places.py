@@ -6,12 +6,12 @@ import numpy as np
 
 import jaxeit as je
 
-from ..presses.means import hold_positions
-from ..presses.times import select
-from ..session import PressTable, Stream
-from .eit.place_comparison import contact_findings
-from .evidence import PressEvidence
-from .report import ChannelTable, Finding, Severity, listed
+from ...presses.means import hold_positions
+from ...presses.times import select
+from ...session import PressTable, Stream
+from ..eit.place_comparison import contact_findings
+from ..evidence import PressEvidence
+from ..report import ChannelTable, Finding, Severity, listed
 
 WHERE = "/presses"
 REMEDY = "give metres in the frame of the skin, not mm and not the frame of the stage"

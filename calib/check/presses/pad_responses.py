@@ -6,10 +6,10 @@ import numpy as np
 
 import jaxeit as je
 
-from .evidence import PressEvidence
-from .parts import flagged_part
+from ..evidence import PressEvidence
+from ..parts import flagged_part
+from ..report import Finding, Severity, counted, listed
 from .places import pads_under
-from .report import Finding, Severity, counted, listed
 
 PRESSURE = "/streams/pressure"
 MIN_PAD_RESPONSE = 0.05  # of the usual change of pressure per newton: a press below it is not felt

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..session import PressTable
-from .evidence import PressEvidence
-from .parts import stepped_part, time_text
-from .report import Finding, Severity
+from ...session import PressTable
+from ..evidence import PressEvidence
+from ..parts import stepped_part, time_text
+from ..report import Finding, Severity
 
 FORCE, PRESSES = "/streams/force", "/presses"
 TARGET_RATIO_RANGE = 0.5, 2.0
