@@ -42,6 +42,18 @@ def test_names_are_headed_as_users_type_them(pages):
     assert "heading: calib.record.Source}" in pages["calib.record"]
 
 
+def test_names_lead_to_the_programs_that_use_them(pages, root):
+    lines = pages["jaxeit.fusion"].splitlines()
+    after = lines[lines.index("::: jaxeit.fusion.fuse") :]
+    said = next(line for line in after if line.startswith("In use: "))
+    assert said.startswith("In use: [image_and_forces](../examples/README.md#image_and_forces)")
+    addresses = {address for page in pages.values() for address in re.findall(r"\]\(\.\./([^)#]+)", page)}
+    assert addresses
+    assert [address for address in addresses if not (root / address).is_file()] == []
+    named = [name for page in pages.values() for name in page.split("::: ")[1:] if "In use: " in name]
+    assert len(named) > 100
+
+
 class Page(HTMLParser):
     """What a browser loads for a page, and the headings that links may lead to."""
 

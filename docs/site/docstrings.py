@@ -33,7 +33,9 @@ def _has_fields(cls: griffe.Class) -> bool:
 def _plain_default(attribute: griffe.Attribute) -> None:
     """Give a field its default alone, in place of the call that declares it."""
     call = attribute.value
-    if isinstance(call, griffe.ExprCall) and call.canonical_path.endswith((".parameter", "equinox.field", ".computed")):
+    if isinstance(call, griffe.ExprCall) and call.canonical_path.endswith(
+        (".parameter", "equinox.field", ".computed", ".limited")
+    ):
         named = {a.name: a.value for a in call.arguments if isinstance(a, griffe.ExprKeyword)}
         plain = [a for a in call.arguments if not isinstance(a, griffe.ExprKeyword)]
         attribute.value = named.get("default", plain[0] if plain else None)

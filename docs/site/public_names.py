@@ -1,14 +1,44 @@
 """Public names by room, and the pages that show them. What several rooms list is shown with the first of them."""
 
 import importlib
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
 from inspect import getdoc, isclass, isroutine
+from pathlib import Path
 from types import ModuleType
 
 SHORT = {"jaxeit": "je", "calib": "calib"}
 GROUPS = ("Functions", "Classes", "Values", "Errors")
 SUBROOMS = ("calib.fitting.logs", "calib.session.importers")
 """Rooms inside of rooms, whose names no other room lists."""
+
+
+ROOT = Path(__file__).parents[2]
+USED = re.compile(r"\b(?:je|calib)\.(?:\w+\.)*(\w+)")
+IMPORTED = re.compile(r"^from (?:jaxeit|calib)\S* import (.*)", re.MULTILINE)
+PROGRAM = re.compile(r"```python.*?\n(.*?)```", re.DOTALL)
+MOST_USES = 4
+
+
+def _programs() -> Iterator[tuple[str, str, str]]:
+    """The name of each example and of each page with programs, its address from the pages of names, and its programs."""
+    for path in sorted(ROOT.glob("examples/*.py")):
+        yield path.stem, f"../examples/README.md#{path.stem}", path.read_text(encoding="utf-8")
+    for path in [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]:
+        text = path.read_text(encoding="utf-8")
+        yield text.partition("\n")[0].lstrip("# "), f"../{path.relative_to(ROOT)}", "\n".join(PROGRAM.findall(text))
+
+
+@cache
+def uses() -> dict[str, list[str]]:
+    """Links to the examples and the pages whose programs use a public name, by name."""
+    found: dict[str, list[str]] = {}
+    for title, address, program in _programs():
+        imported = ", ".join(IMPORTED.findall(program)).split(", ")
+        for name in {*USED.findall(program), *imported}:
+            found.setdefault(name, []).append(f"[{title}]({address})")
+    return found
 
 
 def rooms() -> dict[str, ModuleType]:
@@ -55,6 +85,13 @@ def _summary(thing: object) -> str:
     return " ".join((getdoc(thing) or "").split("\n\n")[0].removesuffix("::").split())
 
 
+def _entry(path: str, name: str) -> list[str]:
+    """A name in full, and where programs use it."""
+    shows = f"::: {path}.{name}\n    options: {{heading: {shown(path, name)}}}\n"
+    links = uses().get(name, [])[:MOST_USES]
+    return [shows, f"In use: {', '.join(links)}.\n"] if links else [shows]
+
+
 def room_page(path: str, names: Mapping[str, object]) -> str:
     """The page of a room: its docstring, its names with a line for each, and each in full, by mkdocstrings."""
     package, _, room = path.partition(".")
@@ -62,6 +99,6 @@ def room_page(path: str, names: Mapping[str, object]) -> str:
     groups = {group: [n for n in names if _group(names[n]) == group] for group in GROUPS}
     lines += [f"- [`{shown(path, n)}`][{path}.{n}]: {_summary(names[n])}" for inside in groups.values() for n in inside]
     for group, inside in groups.items():
-        entries = [f"::: {path}.{name}\n    options: {{heading: {shown(path, name)}}}\n" for name in inside]
+        entries = [entry for name in inside for entry in _entry(path, name)]
         lines += ["", f"## {group}", "", *entries] if entries else []
     return "\n".join(lines) + "\n"
