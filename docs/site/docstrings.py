@@ -7,6 +7,7 @@ import griffe
 from public_names import identifiers
 
 DATACLASS = griffe.Decorator(griffe.ExprName("dataclasses.dataclass"), lineno=None, endlineno=None)
+DECLARES = (".parameter", "equinox.field", ".computed", ".limited")
 MADE_OF_FIELDS = {"equinox.Module", "typing.NamedTuple"}
 NAME = re.compile(r"(?<![`\[])`([A-Za-z]\w*)((?:\.\w+)*)`(?!`)")
 
@@ -33,9 +34,7 @@ def _has_fields(cls: griffe.Class) -> bool:
 def _plain_default(attribute: griffe.Attribute) -> None:
     """Give a field its default alone, in place of the call that declares it."""
     call = attribute.value
-    if isinstance(call, griffe.ExprCall) and call.canonical_path.endswith(
-        (".parameter", "equinox.field", ".computed", ".limited")
-    ):
+    if isinstance(call, griffe.ExprCall) and call.canonical_path.endswith(DECLARES):
         named = {a.name: a.value for a in call.arguments if isinstance(a, griffe.ExprKeyword)}
         plain = [a for a in call.arguments if not isinstance(a, griffe.ExprKeyword)]
         attribute.value = named.get("default", plain[0] if plain else None)

@@ -22,7 +22,7 @@ MOST_USES = 4
 
 
 def _programs() -> Iterator[tuple[str, str, str]]:
-    """The name of each example and of each page with programs, its address from the pages of names, and its programs."""
+    """Name, address from the pages of names, and programs of each example and of each page that has some."""
     for path in sorted(ROOT.glob("examples/*.py")):
         yield path.stem, f"../examples/README.md#{path.stem}", path.read_text(encoding="utf-8")
     for path in [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]:
