@@ -98,7 +98,7 @@ def _lead(calibration: Calibration) -> str:
         f"{len(skin.pads)} pads, {len(skin.electrodes)} electrodes, {skin.protocol.readings} readings a frame, "
         f"image of {columns} x {rows} pixels. {len(found.force)} presses at {_places(found)} places, held at "
         f"{_levels(found.force)}. All forces below are predictions for presses that "
-        f"the fit had not seen (held out by {found.held_out_by})."
+        f"the fit had not seen ({found.held_out})."
     )
 
 

@@ -255,20 +255,19 @@ _PAD_REACH = 1.0  # of the sheet's width and height: a pad may jut out, but not 
 
 def _pad(table: TomlTable, domain: Domain) -> Pad:
     name = table.get("name", lambda v: isinstance(v, str) and v.strip() != "", "the pad's name as text")
-    if table.has("rectangle"):
+    key = "rectangle" if table.has("rectangle") else "polygon"
+    if key == "rectangle":
         x0, y0, x1, y1 = table.vector("rectangle", 4, "[x0, y0, x1, y1] in m")
         if not (x0 < x1 and y0 < y1):
-            raise table.error("rectangle", "the second corner must lie right of and above the first")
+            raise table.error(key, "the second corner must lie right of and above the first")
         outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     else:
-        outline = Polygon(table.array("polygon", 2, "corners [[x, y], ...] in m")).corner_points
+        outline = Polygon(table.array(key, 2, "corners [[x, y], ...] in m")).corner_points
     low, high = np.asarray(domain.bounds)
     beyond = np.maximum(low - np.min(outline, 0), np.max(outline, 0) - high)
     if (beyond > _PAD_REACH * (high - low)).any():
-        key = "rectangle" if table.has("rectangle") else "polygon"
         raise table.error(key, f"reaches {beyond.max():.3g} m beyond the sheet; give its corners in m")
     if (size := np.ptp(outline, 0).min()) < _MIN_PAD_WIDTH * (high - low).min():
-        key = "rectangle" if table.has("rectangle") else "polygon"
         raise table.error(key, f"is {size:.3g} m wide, too little for a pad of this sheet; give its corners in m")
     table.done()
     return Pad(name, np.asarray(outline, float))

@@ -126,7 +126,7 @@ def residuals_by(
         ms=3,
         alpha=0.5,
         color="black",
-        label=f"this calibration, held out by {plain_label(own.held_out_by)}",
+        label=f"this calibration, {plain_label(own.held_out)}",
     )
     for number, (name, other) in enumerate(evaluations.items()):
         colour = MARKS[number % len(MARKS)]
