@@ -144,6 +144,7 @@ def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
     return _length(jnp.asarray(estimated) - jnp.asarray(true))
 
 
+@verb
 def _length(vector: Float[Array, "... n"]) -> Float[Array, "..."]:
     """Euclidean length, with a gradient of zero (not NaN) at zero."""
     square = jnp.sum(vector**2, -1)
@@ -175,7 +176,12 @@ def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) ->
         values: (..., n).
         ddof: degrees of freedom subtracted for the mean, 0 or 1; required, since results differ.
     """
-    values = jnp.asarray(values)
+    found: Array = _variation(jnp.asarray(values), ddof)
+    return found
+
+
+@verb
+def _variation(values: Float[Array, "... n"], ddof: int) -> Float[Array, "..."]:
     mean = jnp.mean(values, -1)
     spread = _length(values - mean[..., None]) / jnp.sqrt(values.shape[-1] - ddof)
     return jnp.where(mean == 0, jnp.nan, spread / jnp.where(mean == 0, 1, mean))

@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 from scipy.optimize import nnls
 from scipy.stats import t as student_t
 
+import jaxeit as je
+
 COVERAGE = 0.9  # of the intervals
 NORMAL_MULTIPLE = 1.6449  # half the width of a normal distribution's 90 % interval, in standard deviations
 MIN_GROUPS = 10  # of held-out readings; fewer determine no multiple, and the normal one is used
@@ -43,12 +45,18 @@ class NoiseLaw(eqx.Module):
 
     def variance(self, force: Float[Array, "*n pads"]) -> Float[Array, "*n pads"]:
         """Variance (N^2) of a new reading about each pad's predicted force (N)."""
-        return self.scale**2 * (self.floor**2 + (self.fraction * force) ** 2)
+        found: Float[Array, "*n pads"] = _variances(self, force)
+        return found
 
     def half_widths(self, force: np.ndarray, error: np.ndarray) -> np.ndarray:
         """Half the 90 % interval of the total of predicted forces (n, pads) N with these standard errors, (n,) N."""
         variance = (np.asarray(self.variance(jnp.asarray(force))) + error**2).sum(1)
         return np.asarray(float(self.multiple) * np.sqrt(variance))
+
+
+@je.verb
+def _variances(law: NoiseLaw, force: Float[Array, "*n pads"]) -> Float[Array, "*n pads"]:
+    return law.scale**2 * (law.floor**2 + (law.fraction * force) ** 2)
 
 
 def fit_noise(

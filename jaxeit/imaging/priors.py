@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._compile import verb
 from ..linalg.lapack import cho_factor, cho_solve, cholesky, solve_triangular
 from ..model.bases import Picture
 from ..registry import AbstractChoice, Registry, limited
@@ -201,6 +202,13 @@ class Laplace(AbstractPrior):
         return Precision(_laplacian(picture, jnp.ones(len(picture.edges), picture.areas.dtype), self.floor))
 
 
+@verb
+def _smooth_field(centres: Float[Array, "pixels 2"], length: Float[Array, ""], nugget: Float[Array, ""]) -> Array:
+    """Covariance of a Gaussian random field of variance one, with the pixels' own variance."""
+    square = jnp.sum((centres[:, None] - centres) ** 2, -1)
+    return jnp.exp(-0.5 * square / length**2) + nugget * jnp.eye(len(square), dtype=square.dtype)
+
+
 class GaussianSmooth(AbstractPrior):
     """The image is a Gaussian random field: ``(R^-1)_ij = s_i s_j exp(-|r_i - r_j|^2 / (2 length^2))``.
 
@@ -221,8 +229,8 @@ class GaussianSmooth(AbstractPrior):
     def precision(
         self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None
     ) -> Covariance:
-        square = jnp.sum((picture.centres[:, None] - picture.centres) ** 2, -1)
-        field = jnp.exp(-0.5 * square / self.length**2) + self.nugget * jnp.eye(len(square), dtype=square.dtype)
+        dtype = picture.centres.dtype
+        field = _smooth_field(picture.centres, jnp.asarray(self.length, dtype), jnp.asarray(self.nugget, dtype))
         if not self.noser:
             return Covariance(field)
         std = 1 / jnp.sqrt(Noser().precision(jacobian, picture).values)

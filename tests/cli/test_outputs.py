@@ -106,6 +106,21 @@ def test_a_simulated_session_takes_the_place_of_a_simulated_one_only(files, monk
     assert main(command) == 0
 
 
+def test_an_import_takes_the_place_of_an_import_but_of_no_recording(files, monkeypatch, capsys):
+    monkeypatch.chdir(files)
+    Path("log.csv").write_text("t,f\n" + "\n".join(f"{k / 100},{k % 7}" for k in range(200)) + "\n")
+    command = ["import", "csv", "log.csv", "--time", "t:s", "--stream", "force=f:N", "-o"]
+    assert main([*command, "imported.h5"]) == 0
+    assert main([*command, "imported.h5"]) == 0
+    capsys.readouterr()
+    with h5py.File("session.h5", "r+") as file:
+        file.attrs["simulated"] = np.uint8(0)
+    before = file_hash("session.h5")
+    assert main([*command, "session.h5"]) == 2
+    assert "session.h5: file: holds a recording, which would be lost; give another name" in capsys.readouterr().err
+    assert file_hash("session.h5") == before
+
+
 def test_a_calibration_is_not_saved_over_a_session(calibration, files):
     with pytest.raises(SessionError, match="holds a session, which would be lost; give another name"):
         calibration.save(files / "session.h5")

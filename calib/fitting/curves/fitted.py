@@ -73,14 +73,19 @@ class FittedCurve(eqx.Module):
 
         `valid` is false for NaN, for a failed fit, and more than `tolerance` of the fitted range outside that range.
         """
-        p = jnp.asarray(pressure, self.parameters.dtype)
-        slope = jax.jacfwd(self.curve)(self.parameters, p.ravel())
-        variance = jnp.einsum("ni,ij,nj->n", slope, self.covariance, slope).reshape(p.shape)
-        low, high = self.pressure_range
-        margin = tolerance * (high - low)
-        inside = (p >= low - margin) & (p <= high + margin)
-        ok = inside & (self.result == FitResult.SUCCESS)
-        return Prediction(self.curve(self.parameters, p), jnp.sqrt(variance), ok)
+        found: Prediction = _predict(self, jnp.asarray(pressure, self.parameters.dtype), tolerance)
+        return found
+
+
+@je.verb
+def _predict(fitted: FittedCurve, p: Float[Array, "..."], tolerance: float) -> Prediction:
+    slope = jax.jacfwd(fitted.curve)(fitted.parameters, p.ravel())
+    variance = jnp.einsum("ni,ij,nj->n", slope, fitted.covariance, slope).reshape(p.shape)
+    low, high = fitted.pressure_range
+    margin = tolerance * (high - low)
+    inside = (p >= low - margin) & (p <= high + margin)
+    ok = inside & (fitted.result == FitResult.SUCCESS)
+    return Prediction(fitted.curve(fitted.parameters, p), jnp.sqrt(variance), ok)
 
 
 @je.verb

@@ -58,9 +58,18 @@ def single_places(
         amplitude: of the contact's bump, (n,) S; 0: not known.
     """
     position = jnp.asarray(position)
+    bump = (jnp.asarray(value, position.dtype) for value in (width, amplitude))
+    found: Places = _single_places(position, pads, *bump)
+    return found
+
+
+@je.verb
+def _single_places(
+    position: Float[Array, "n 2"], pads: int, width: Float[Array, "..."], amplitude: Float[Array, "..."]
+) -> Places:
     known = jnp.all(jnp.isfinite(position), -1)
     weight = jnp.broadcast_to(known[:, None, None], (len(position), 1, pads))
-    bump = (jnp.broadcast_to(jnp.asarray(value, position.dtype), known.shape)[:, None] for value in (width, amplitude))
+    bump = (jnp.broadcast_to(value, known.shape)[:, None] for value in (width, amplitude))
     return Places(position[:, None], weight.astype(position.dtype), *bump)
 
 

@@ -68,11 +68,16 @@ def folder_beside(output: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def require_no_session(path: Path, *, simulated_too: bool = True) -> None:
+IMPORT = "import"
+"""Last word of the creator of an imported session."""
+
+
+def require_no_session(path: Path, *, simulated_too: bool = True, imported_too: bool = True) -> None:
     """Refuse a path at which a session lies: a recording cannot be made again, so that no other file replaces it.
 
     Args:
         simulated_too: whether simulated sessions are refused too.
+        imported_too: whether imported sessions are refused too.
 
     Raises:
         SessionError: naming the file.
@@ -80,10 +85,12 @@ def require_no_session(path: Path, *, simulated_too: bool = True) -> None:
     if not path.is_file():
         return
     with contextlib.suppress(OSError), h5py.File(path) as file:  # of another kind, it is no session
-        kind, simulated = (file.attrs.get(name) for name in ("format", "simulated"))
+        kind, simulated, creator = (file.attrs.get(name) for name in ("format", "simulated", "creator"))
         if not isinstance(kind, str | bytes) or kind not in (FORMAT, FORMAT.encode()):
             return
-        if simulated_too or not np.any(simulated):
+        creator = creator.decode(errors="replace") if isinstance(creator, bytes) else creator
+        imported = isinstance(creator, str) and creator.endswith(f" {IMPORT}")
+        if (simulated_too or not np.any(simulated)) and (imported_too or not imported):
             what = "session" if simulated_too else "recording"
             raise problem(path, "file", f"holds a {what}, which would be lost", "give another name")
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from ..errors import SessionError, printable, problem
 from ..facts import SessionFacts, StreamFacts
-from ..hdf5.storage import file_hash
+from ..hdf5.storage import IMPORT, file_hash, require_no_session
 from ..tables import Status
 from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT
-from ..writer import SessionWriter
+from ..writer import SessionWriter, program
 from .base import About
 from .clocks import Clock, clock_of, clock_of_rate, common_start, join_clocks, nanoseconds
 from .columns import FileSpec, StreamSpec, column_indices, name_and_unit
@@ -78,9 +78,10 @@ def import_tables(
             one column for each reading in the order of its protocol, and the stream pressure one for each pad.
         sort: allow rows that go back in time.
 
-    The same files and options give the same bytes. Raises `SessionError` for what cannot be read or understood, and
-    then writes nothing.
+    The same files and options give the same bytes. An imported session at ``output`` is replaced. Raises
+    `SessionError` for what cannot be read or understood and for a recording at ``output``, and then writes nothing.
     """
+    require_no_session(Path(output), simulated_too=False, imported_too=False)
     _check_specs(files)
     about_skin = _described(files, about.skin)
     loaded: list[_Loaded] = []
@@ -90,6 +91,7 @@ def import_tables(
     _check_columns(loaded, about.skin)
     name = about.title or "import of " + ", ".join(printable(path.name) for f in files for path in f.paths)
     facts: dict[str, Any] = {"title": name, "epoch": start, "license": about.license}
+    facts["creator"] = f"{program()} {IMPORT}"
     facts["session_id"] = _session_id(files, start.isoformat())
     reports: list[FileReport] = []
     with SessionWriter(output, SessionFacts(**about_skin, **facts)) as writer:

@@ -103,11 +103,16 @@ def _is_known(value: Any) -> bool:
 
 def sheet_level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) -> Float[Array, ""]:
     """Conductivity of the even sheet nearest to a frame, over that of the model; ``even``: the model's readings."""
-    there = jnp.isfinite(v0)
-    level = jnp.sum(jnp.where(there, even**2, 0)) / (even @ jnp.where(there, v0, 0))
+    level: Float[Array, ""] = _level(v0, even)
     if _is_known(level) and not level > 0:
         raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
     return level
+
+
+@verb
+def _level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) -> Float[Array, ""]:
+    there = jnp.isfinite(v0)
+    return jnp.sum(jnp.where(there, even**2, 0)) / (even @ jnp.where(there, v0, 0))
 
 
 @verb
@@ -134,11 +139,19 @@ def require_positive(**values: Any) -> None:
             raise InverseError(f"{name} is {value}; give a number above zero")
 
 
+@verb
+def _unexplained(
+    found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
+) -> Float[Array, ""]:
+    left: Array = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
+    return left
+
+
 def require_explained(
     what: str, found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
 ) -> None:
     """Raise InverseError if too much of a frame is left by the readings that were found for it."""
-    left = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
+    left: Array = _unexplained(found, known, there)
     if _is_known(left) and not left < MAX_UNEXPLAINED:
         raise InverseError(
             f"no {what} explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "

@@ -207,6 +207,7 @@ def most_probable(
     return found.value, found.state
 
 
+@verb
 def reading_weights(
     readings: Float[Array, "*frames readings"], std: Float[Array, "*frames readings"]
 ) -> tuple[Float[Array, "*frames readings"], Float[Array, "*frames readings"]]:
