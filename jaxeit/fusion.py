@@ -1,4 +1,26 @@
-"""Fusion: force maps with the shape of the contact from the image and its force from the pads."""
+"""Fusion: force maps with the shape of the contact from the image and its force from the pads.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+
+    import jaxeit as je
+
+    jax.config.update("jax_enable_x64", True)
+
+    skin = je.load_skin("testbed")
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    recon = je.prepare(model, basis=je.Pixels(20))
+    masks = je.pad_masks(skin, recon)
+
+    near = jnp.linalg.norm(model.centroids - jnp.array([0.06, 0.13]), axis=1) < 0.01
+    image = recon(
+        je.forward(model, model.background * jnp.where(near, 1.5, 1.0)) - je.forward(model)
+    )  # S
+    forces = jnp.array([0.0, 0.0, 12.0, 0.0])  # N on each pad
+    fmap = je.fuse(image, masks, forces, pad_errors=jnp.full(4, 0.1))
+    print(f"{fmap.force.sum():.1f} N; the image shows where on pads {jnp.flatnonzero(fmap.valid)}")
+"""
 
 import equinox as eqx
 import jax
@@ -170,6 +192,16 @@ def contact_shares(
         amplitude: (..., K) S, or any other unit; 0 where there is no contact.
         centres: of the pixels, (pixels, 2) m.
         masks: from `pad_masks`.
+
+    Example:
+        places = jnp.array(
+            [[0.03, 0.13], [0.07, 0.15]]
+        )  # m, two contacts on one pad, such as je.prepare_contacts finds
+        shares = je.fusion.contact_shares(
+            places, jnp.full(2, 0.012), jnp.array([1e-3, 5e-4]), recon.centres, masks
+        )
+        both = je.fuse(image, masks, forces, contacts=shares)
+        print(shares.share[:, 2])  # share of each contact in the force on pad 2
     """
     there = (amplitude > 0) & jnp.all(jnp.isfinite(position), -1) & (width > 0)
     place, size = jnp.where(there[..., None], position, 0), jnp.where(there, width, 1)[..., None]

@@ -21,7 +21,14 @@ from .streams import finite_mean
 
 
 class CorrectionError(ValueError):
-    """The correction cannot be applied to this stream."""
+    """The correction cannot be applied to this stream.
+
+    Example:
+        try:
+            presses.LowPass(cutoff=50.0).sections(rate=100.0)  # Hz
+        except presses.CorrectionError as error:
+            print(error)
+    """
 
 
 class AbstractCorrection(abc.ABC):

@@ -22,6 +22,15 @@ def real_time(wanted: bool = True) -> Iterator[None]:
 
     Raises:
         PriorityError: if the system refuses; the scheduling is then unchanged.
+
+    Example:
+        from calib.record import PriorityError, real_time
+
+        try:
+            with real_time():  # around record_session: no frame waits for other programs
+                pass
+        except PriorityError as error:
+            print(error)
     """
     before = _raise_priority() if wanted else {}
     try:

@@ -41,6 +41,10 @@ def write_report(
     Raises:
         ReportError: matplotlib is not installed.
         SessionError, OSError: a file cannot be written.
+
+    Example:
+        for path in calib.write_report(calibration, "report.html"):
+            print(path)  # the page, and its figures as PNG
     """
     require_matplotlib()
     page = Path(path)

@@ -32,7 +32,13 @@ class AbstractFrames(eqx.Module):
 
 
 class Solved(AbstractFrames):
-    """Every frame is a solution of the sheet; exact up to the fidelity."""
+    """Every frame is a solution of the sheet; exact up to the fidelity.
+
+    Example:
+        exact = simulators.prepare_skin(
+            scene, 50.0, je.Fidelity.draft(), simulators.Solved()
+        )  # the default
+    """
 
     def prepared(self, model: je.Model) -> "Solved":
         return self

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator
 
 import griffe
+from programs import with_fences
 from public_names import identifiers
 
 DATACLASS = griffe.Decorator(griffe.ExprName("dataclasses.dataclass"), lineno=None, endlineno=None)
@@ -70,4 +71,4 @@ class Docstrings(griffe.Extension):
                 _plain_default(thing)
             if thing.docstring:
                 text = re.sub(r" ?::$", ":", thing.docstring.value, flags=re.MULTILINE)
-                thing.docstring.value = _linked(_joined(text), paths)
+                thing.docstring.value = _linked(_joined(with_fences(text)), paths)

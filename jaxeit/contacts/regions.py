@@ -60,6 +60,13 @@ def find_regions(
 
     Raises:
         RegionError: if the image is not one picture of finite numbers, or a setting is out of range.
+
+    Example:
+        recon = je.prepare(model, basis=je.Pixels(20))
+        regions = je.contacts.find_regions(
+            np.asarray(recon(dv)), recon
+        )  # no model of contacts: what stands out
+        print(regions.centres, regions.sums)  # m, S m^2
     """
     require_known("find_regions", RegionError, image, recon.areas, recon.centres)
     _check_settings(level, least)

@@ -27,7 +27,14 @@ _RANGE = np.logspace(-4, 2, 241)
 
 
 class HyperparameterError(ValueError):
-    """No hyperparameter can be chosen in this way; the message says why."""
+    """No hyperparameter can be chosen in this way; the message says why.
+
+    Example:
+        try:
+            je.prepare(model, basis=je.Pixels(2), noise=noise, hyperparameter=je.imaging.Discrepancy(dv))
+        except je.imaging.HyperparameterError as error:
+            print(error)
+    """
 
 
 class Spectrum(eqx.Module):
@@ -150,6 +157,12 @@ class Discrepancy(AbstractFrameChoice):
     """The largest with ``|y - J x|^2 <= factor^2 m``: the misfit is that of the noise (Morozov 1966).
 
     Needs ``noise`` in `prepare`. ``factor`` multiplies the standard deviations; default 1.
+
+    Example:
+        fitted = je.prepare(
+            model, basis=je.Pixels(20), noise=noise, hyperparameter=je.imaging.Discrepancy(dv)
+        )
+        print(fitted.provenance["hyperparameter"])
     """
 
     needs_noise: ClassVar[bool] = True

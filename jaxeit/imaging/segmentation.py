@@ -98,6 +98,15 @@ def segment(
 
     Raises:
         InverseError: if a shape or a value is wrong.
+
+    Example:
+        from jaxeit.imaging import LevelSet, segment
+
+        dark = model.background * jnp.where(near, 0.2, 1.0)  # S: an object that hardly conducts
+        found = segment(
+            model, v0, je.forward(model, dark), je.Pixels(16), borders=LevelSet(widths=(0.5,)), pixels=64
+        )
+        print(f"{(found.classes == 1).mean():.1%} of the picture is resistive")  # 2: conductive
     """
     require_known("segment", InverseError, model.background)
     before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
@@ -206,6 +215,12 @@ def half_height_classes(
     Args:
         least: smallest region, over the area of the picture.
         weakest: sum of the image over the weakest region, over that of the strongest.
+
+    Example:
+        picture = je.imaging.on_grid(image, recon.picture, (64, 64))  # S, on a grid of its own
+        classes = je.imaging.half_height_classes(
+            picture, floor=0.2 * picture.max(), least=0.002
+        )  # 0, 1 or 2
     """
     classes, regions = np.full(image.shape, UNCHANGED), []
     for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):

@@ -181,7 +181,13 @@ def solve_spd(
 def inverse_columns(
     solver: AbstractLinearSolver, plan: AbstractPlan, values: Float[Array, " nnz"]
 ) -> Float[Array, "n r"]:
-    """X = A^-1 on the columns of the root, differentiable as `solve_spd` is: dX = -A^-1 dA X."""
+    """X = A^-1 on the columns of the root, differentiable as `solve_spd` is: dX = -A^-1 dA X.
+
+    Example:
+        ends = linalg.SparsityPattern(n, rows, cols, root=np.array([0, n - 1]))
+        plan = linalg.Dense().analyse(ends)
+        print(linalg.inverse_columns(linalg.Dense(), plan, values).shape)  # (n, 2): one column for each end
+    """
     factor = solver.factor(plan, jax.lax.stop_gradient(values))
     found: Float[Array, "n r"] = _columns(values, factor, plan, solver)
     return found

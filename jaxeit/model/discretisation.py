@@ -168,7 +168,14 @@ def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:
 
 
 def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
-    """The mesh that `discretise` makes: graded around the electrodes, checked."""
+    """The mesh that `discretise` makes: graded around the electrodes, checked.
+
+    Example:
+        mesh = je.model.make_mesh(je.Scene(skin), fidelity)
+        ideal = je.discretise(
+            je.Scene(skin), fidelity, mesh=mesh
+        )  # scenes on one mesh differ by their physics alone
+    """
     length = _edge_length(scene.skin, fidelity)
     return _mesh(scene.skin, _footprints(scene.skin, fidelity), length, fidelity.growth)
 

@@ -64,6 +64,19 @@ def limited(
         finite: whether infinite numbers are refused.
         whole: whether fractions are refused; by default where the default is a whole number.
         options: of `equinox.field`, such as ``static`` and ``converter``.
+
+    Example:
+        from jaxeit.registry import AbstractChoice, limited
+
+
+        class Firmness(AbstractChoice):  # a choice of your own, with a limit
+            share: float = limited(0.5, above=0.0, most=1.0)
+
+
+        try:
+            Firmness(share=2.0)
+        except je.registry.SettingError as error:
+            print(error)
     """
     whole = type(default) is int if whole is None else whole
     limits = Limits(least if above is None else above, most, above is not None, finite, whole)

@@ -181,8 +181,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     def text(self, thing: T) -> str:
         """The word from which `make` makes the object again: its name, and settings that differ from their defaults."""
         known = settings_of(type(thing), self.parts).values()
-        values = {setting: getattr(thing, setting.name) for setting in known}
-        words = [f"{s.name}={word(s.plain(value))}" for s, value in values.items() if not s.is_default(value)]
+        values = [(setting, getattr(thing, setting.name)) for setting in known]
+        words = [f"{s.name}={word(s.plain(value))}" for s, value in values if not s.is_default(value)]
         return self.name_of(thing) + (":" + ",".join(words) if words else "")
 
 
@@ -224,7 +224,11 @@ def _loaded(point: EntryPoint, kind: str) -> Any:
 
 
 def split_word(text: str) -> tuple[str, dict[str, Any]]:
-    """The name, which may be an import path, and the settings of ``name:key=value,...``."""
+    """The name, which may be an import path, and the settings of ``name:key=value,...``.
+
+    Example:
+        print(je.registry.split_word("sparse-bayes:steps=30"))
+    """
     name, _, rest = text.partition(":")
     head, _, tail = rest.partition(":")
     if head and "=" not in head:

@@ -169,6 +169,18 @@ def locate(
     """`Places` of the contacts in difference frames (n, readings) V.
 
     `image`: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
+
+    Example:
+        noise, channels = frames[rest].std(0), mine.recon.channels
+        for choice in (
+            calib.ImageCentroid("half"),
+            calibration.FittedContact(most=1),
+        ):  # names: calibration.LOCATORS
+            model = je.discretise(je.Scene(mine.skin), je.Fidelity.draft())
+            locator = choice.prepare(model, noise, channels)
+            print(
+                calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position
+            )  # m
     """
     frames = np.asarray(dv, recon.dtype)
     images = np.asarray(recon(jnp.asarray(frames)) if image is None else image)

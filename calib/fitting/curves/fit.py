@@ -249,6 +249,13 @@ def fit_curves(
       other pads.
 
     Raises: `FitError` for shapes that do not fit together, or sigma not above zero.
+
+    Example:
+        for loss in (fitting.Squared(), fitting.SoftL1(), fitting.Cauchy()):  # names: fitting.LOSSES
+            print(
+                fitting.LOSSES.text(loss),
+                calib.fit_curves(calib.Affine(), pressures, forces, loss=loss).parameters[0],
+            )
     """
     shape = np.shape(pressures)
     length = bucket(shape[1]) if len(shape) == 2 else None
@@ -267,7 +274,17 @@ def fit_curve(
     mask: Numbers | None = None,
     **options: Any,
 ) -> FittedCurve:
-    """`fit_curves` for one pad: pressure (n,) Pa, force (n,) N."""
+    """`fit_curves` for one pad: pressure (n,) Pa, force (n,) N.
+
+    Example:
+        up_and_down = np.concatenate(
+            [np.linspace(0, 6000, 100), np.linspace(6000, 0, 100)]
+        )  # Pa, in order of time
+        force = 2e-3 * np.concatenate([up_and_down[:100], 0.9 * up_and_down[100:]])  # N
+        for curve in (fitting.Play(), fitting.AffinePlay(), fitting.PlaySpline()):  # names: fitting.CURVES
+            looped = fitting.fit_curve(curve, up_and_down, force)
+            print(curve.name, looped.parameters, looped.message())
+    """
     p, f = np.asarray(pressure), np.asarray(force)
     if p.ndim != 1 or p.shape != f.shape:
         raise FitError(f"pressure and force must both be (samples,), not {p.shape} and {f.shape}.")

@@ -55,6 +55,13 @@ def convert_journal(
     Raises:
         JournalError: if nothing was recorded, or the file is no journal.
         SessionError: if the session cannot be written.
+
+    Example:
+        from calib.record import convert_journal
+
+        print(
+            convert_journal("crashed.h5.part", "rescued.h5", recovered=True).render()
+        )  # what `jaxeit recover` does
     """
     reader = JournalReader(journal)
     plan = _plan(reader)
