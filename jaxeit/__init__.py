@@ -22,9 +22,8 @@ Example:
     dv = je.forward(model, model.background * jnp.where(pressed, 1.5, 1.0)) - je.forward(model)  # V
 
     recon = je.prepare(model, basis=je.Pixels(20))
-    fmap = je.fuse(
-        recon(dv), je.pad_masks(skin, recon), jnp.array([0.0, 0.0, 12.0, 0.0])
-    )  # N on each pad
+    # N on each pad
+    fmap = je.fuse(recon(dv), je.pad_masks(skin, recon), jnp.array([0.0, 0.0, 12.0, 0.0]))
     print(f"{fmap.force.sum():.1f} N in all, at most {fmap.pressure.max() / 1e3:.0f} kPa")
 """
 

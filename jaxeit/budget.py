@@ -56,9 +56,8 @@ class Budget:
 
     Example:
         limits = je.Budget()
-        print(
-            limits.mesh_nodes, limits.scaled(4).mesh_nodes
-        )  # the second with JAXEIT_BUDGET=4 in the environment
+        # the second with JAXEIT_BUDGET=4 in the environment
+        print(limits.mesh_nodes, limits.scaled(4).mesh_nodes)
     """
 
     text_bytes: int = _limit(1 << 20, "bytes of text", "describe less, such as outlines of fewer corners")

@@ -14,9 +14,8 @@ Example:
     masks = je.pad_masks(skin, recon)
 
     near = jnp.linalg.norm(model.centroids - jnp.array([0.06, 0.13]), axis=1) < 0.01
-    image = recon(
-        je.forward(model, model.background * jnp.where(near, 1.5, 1.0)) - je.forward(model)
-    )  # S
+    # S
+    image = recon(je.forward(model, model.background * jnp.where(near, 1.5, 1.0)) - je.forward(model))
     forces = jnp.array([0.0, 0.0, 12.0, 0.0])  # N on each pad
     fmap = je.fuse(image, masks, forces, pad_errors=jnp.full(4, 0.1))
     print(f"{fmap.force.sum():.1f} N; the image shows where on pads {jnp.flatnonzero(fmap.valid)}")
@@ -194,9 +193,8 @@ def contact_shares(
         masks: from `pad_masks`.
 
     Example:
-        places = jnp.array(
-            [[0.03, 0.13], [0.07, 0.15]]
-        )  # m, two contacts on one pad, such as je.prepare_contacts finds
+        # m, two contacts on one pad, such as je.prepare_contacts finds
+        places = jnp.array([[0.03, 0.13], [0.07, 0.15]])
         shares = je.fusion.contact_shares(
             places, jnp.full(2, 0.012), jnp.array([1e-3, 5e-4]), recon.centres, masks
         )

@@ -119,7 +119,11 @@ class LevelCentroid(AbstractEstimator):
 
 
 class PositiveCentroid(AbstractEstimator):
-    """The centroid of the positive part, weighted by its value."""
+    """The centroid of the positive part, weighted by its value.
+
+    Example:
+        print(je.metrics.PositiveCentroid()(images, recon))  # m
+    """
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         return _positive_centroid(jnp.asarray(image), recon.centres, recon.areas)
@@ -181,9 +185,8 @@ def inward_bias(
     The position error PE of the GREIT figures of merit, with the origin at ``centre``.
 
     Example:
-        print(
-            je.metrics.inward_bias(je.metrics.Peak()(images, recon), places, [0.1, 0.1])
-        )  # m, above 0: inward
+        found = je.metrics.Peak()(images, recon)
+        print(je.metrics.inward_bias(found, places, [0.1, 0.1]))  # m, above 0: inward
     """
     return localisation_error(true, centre) - localisation_error(estimated, centre)
 
@@ -204,9 +207,8 @@ def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) ->
         ddof: degrees of freedom subtracted for the mean, 0 or 1; required, since results differ.
 
     Example:
-        print(
-            je.metrics.coefficient_of_variation(je.metrics.image_sum(images, recon.areas), ddof=1)
-        )  # evenness, 1
+        sums = je.metrics.image_sum(images, recon.areas)  # S m^2
+        print(je.metrics.coefficient_of_variation(sums, ddof=1))  # of equal touches at several places
     """
     values = jnp.asarray(values)
     mean = jnp.mean(values, -1)
@@ -362,9 +364,8 @@ def structural_similarity(
     Example:
         truth = jnp.linalg.norm(recon.centres - places[0], axis=1) < 0.015
         found = jnp.clip(image / image.max(), 0, 1).reshape(recon.shape)
-        print(
-            je.metrics.structural_similarity(found, truth.reshape(recon.shape).astype(float), width=3.0)
-        )  # 1: equal
+        truth = truth.reshape(recon.shape).astype(float)
+        print(je.metrics.structural_similarity(found, truth, width=3.0))  # 1: equal
     """
     a, b = _pictures(image, truth)
     if not is_traced(width, c1, c2) and not (width > 0 and c1 > 0 and c2 > 0):

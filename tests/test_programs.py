@@ -77,6 +77,14 @@ def folder(tmp_path_factory):
     write_log(folder / "log.h5", 400)
     write_log(folder / "later.h5", 420)
     journal(folder / "crashed.h5.part", both(), end=False)
+    os.chdir(folder)
+    yield folder
+    os.chdir(before)
+
+
+@pytest.fixture(scope="module")
+def tanks(folder):
+    """The same folder, with recordings of tanks."""
     tank = tank_with_rod()
     write_mat(folder / "model.mat", tank)
     write_csv(folder / "table.csv", tank.frames)
@@ -84,9 +92,6 @@ def folder(tmp_path_factory):
     (folder / "sciospec").mkdir()
     write_sciospec(folder / "sciospec", tank)
     (folder / "chest.get").write_bytes(goe_get(tank.frames))
-    os.chdir(folder)
-    yield folder
-    os.chdir(before)
 
 
 def run(site, room, skipped=frozenset()):
@@ -98,7 +103,7 @@ def run(site, room, skipped=frozenset()):
 
 
 @pytest.mark.parametrize("room", [room for room in CONTENTS if room not in SLOW])
-def test_programs_of_a_room(site, folder, room):
+def test_quick_programs_of_a_room(site, folder, room):
     run(site, room, SLOW)
 
 
@@ -112,5 +117,5 @@ def test_names_in_programs_exist(site):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("room", [*FIRST, *(room for room in CONTENTS if room not in FIRST)])
-def test_all_programs_of_a_room(site, folder, room):
+def test_all_programs_of_a_room(site, tanks, room):
     run(site, room)

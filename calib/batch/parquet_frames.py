@@ -55,9 +55,8 @@ def export_training_frames(
         bench, one = calib.load_bench("paper_bench"), ThreadPoolExecutor(1)  # default: a pool of processes
         fidelity, pixels = je.Fidelity.draft(dtype="float32"), je.Pixels(10)
         calib.write_training_frames(bench, "frames", 1024, fidelity=fidelity, pixels=pixels, executor=one)
-        print(
-            calib.export_training_frames("frames", "parquet")
-        )  # for pandas, Polars, DuckDB and Hugging Face datasets
+        # for pandas, Polars, DuckDB and Hugging Face datasets
+        print(calib.export_training_frames("frames", "parquet"))
     """
     library("pyarrow.parquet", EXTRA)
     frames, output = open_training_frames(folder), Path(output)

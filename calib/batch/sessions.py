@@ -119,9 +119,7 @@ def calibrate_many(
 
         one = ThreadPoolExecutor(1)  # default: a pool of processes, one per core
         for outcome in calib.calibrate_many(["session.h5"], "out", recipe=recipe, executor=one):
-            print(
-                outcome.calibration, outcome.reason or f"force within {outcome.summary['force_rmse']:.2f} N"
-            )
+            print(outcome.calibration, outcome.reason or outcome.summary["force_rmse"])  # N
     """
     if report:
         require_matplotlib()

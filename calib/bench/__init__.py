@@ -23,9 +23,8 @@ Example:
     short = replace(bench, sites=sites, timing=quick, blank=5.0, eit_rate=10.0, pad_rate=50.0)
     finer = je.Fidelity.draft(edge_length=0.05)  # than that of the calibration
     calib.simulate(short, "session.h5", fidelity=finer)
-    calib.simulate(
-        replace(short, sites=sites[::4] + 0.006, seed=2), "other.h5", fidelity=finer
-    )  # for a test
+    # for a test
+    calib.simulate(replace(short, sites=sites[::4] + 0.006, seed=2), "other.h5", fidelity=finer)
     print(f"{len(sites)} presses in {short.duration:.0f} s")
 """
 

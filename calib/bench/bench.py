@@ -48,9 +48,8 @@ class Companion:
     """A further tip at ``offset`` (2,) m from the first one, which presses with ``force`` N, ``delay`` s later.
 
     Example:
-        second = calib.bench.Companion(
-            offset=(0.05, 0.0), force=8.0
-        )  # m, N: a tip that presses together with the first
+        # m, N: a tip that presses together with the first
+        second = calib.bench.Companion(offset=(0.05, 0.0), force=8.0)
         two_tips = replace(short, sites=sites[:1], companions=(second,))
     """
 

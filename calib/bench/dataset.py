@@ -50,6 +50,7 @@ def simulate_contacts(
     Example:
         model = je.discretise(je.Scene(bench.scene.skin), je.Fidelity.draft())
         places = calib.bench.grid(bench.scene.skin, columns=4, rows=4)  # m
+        print("simulated sessions have", calib.bench.SIMULATION)  # calib.simulate's own fidelity
         frames = calib.bench.simulate_contacts(model, places, np.array([0.0, 0.5]), width=0.012)  # V
         print(frames.shape, "places, amplitudes, readings")
     """

@@ -13,9 +13,8 @@ Example:
     print(mine.provenance["created_utc"], mine.recipe.to_toml(), mine.curves.parameters)
     with calib.open_session("other.h5") as session:
         frames, pressures = session.stream("eit").read(), session.stream("pressure").read()
-        at = [
-            round(k * len(pressures) / len(frames)) for k in range(len(frames))
-        ]  # both streams begin together
+        # both streams begin together
+        at = [round(k * len(pressures) / len(frames)) for k in range(len(frames))]
     rest = slice(0, 20)  # frames without contact
     dv, dp = frames - frames[rest].mean(0), pressures[at] - pressures[rest].mean(0)  # V, Pa
     found = calib.force_map(mine, dv, dp)

@@ -45,9 +45,8 @@ def learn_layer(
 
     Example:
         with calib.open_session("session.h5") as session:
-            wiser = calibration.learn_layer(
-                mine, session
-            )  # by which calib.apply(..., track=True) and live follow contacts
+            # by which calib.apply(..., track=True) and live follow contacts
+            wiser = calibration.learn_layer(mine, session)
         print(wiser.layer.contacts, "contacts learned from")
     """
     processing = processing or calibration.processing

@@ -9,9 +9,7 @@ Example:
 
     mine = calib.load_calibration("calibration.h5")
     sizes = calib.export_c(mine, "skin.h", place="half")  # C99, for a microcontroller
-    print(
-        f"{sizes.flash} bytes of flash, {sizes.ram} of memory, {sizes.operations} multiply-adds a frame"
-    )
+    print(f"{sizes.flash} bytes of flash, {sizes.ram} of memory")
     bag = calib.export_mcap("forcemap.h5", "forcemap.mcap")  # of calib.apply, as messages of ROS 2
     print(bag.topics)
     data = calib.export_lerobot(["forcemap.h5"], "dataset", task="press the skin")

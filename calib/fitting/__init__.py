@@ -18,9 +18,7 @@ Example:
     forces[:, ::50] += 5.0  # spikes, which a robust loss leaves out
     for curve in (calib.Linear(), calib.PowerLaw(), calib.MonotoneSpline()):
         fitted = calib.fit_curves(curve, pressures, forces, loss=fitting.Huber())
-        print(
-            curve.name, fitted.scale, [fitting.FitResult(int(result)).name for result in fitted.result]
-        )
+        print(curve.name, fitted.scale, [fitting.FitResult(int(r)).name for r in fitted.result])  # N
     found = fitted.pad(0).predict(np.array([1000.0, 9000.0]))
     print(found.force, found.standard_error, found.valid)  # N, N; the second is beyond what was fitted
 """

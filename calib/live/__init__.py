@@ -13,9 +13,8 @@ Example:
     jax.config.update("jax_enable_x64", True)
 
     mine = calib.load_calibration("calibration.h5")
-    urls = {
-        name: "replay://other.h5?speed=10" for name in ("eit", "pressure")
-    }  # your devices: tcp://HOST:PORT
+    # your devices: tcp://HOST:PORT
+    urls = {name: "replay://other.h5?speed=10" for name in ("eit", "pressure")}
     plan, sources = plan_recording(urls, mine.skin)
     control = LiveControl()
 

@@ -230,9 +230,8 @@ class Engine:
 
         engine = Engine(mine, rest=0.0)  # frame by frame, without devices
         for k in range(3):
-            frame = ReceivedFrame(
-                np.zeros(550), np.array([0.0, 0.0, 500.0 * k, 0.0]), time.monotonic_ns()
-            )  # V, Pa
+            # V, Pa
+            frame = ReceivedFrame(np.zeros(550), np.array([0.0, 0.0, 500.0 * k, 0.0]), time.monotonic_ns())
             result = engine.step(frame)
         print(result.force, result.to_json()[:80])
     """

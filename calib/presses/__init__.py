@@ -10,11 +10,12 @@ Example:
 
     jax.config.update("jax_enable_x64", True)
 
+    print(list(presses.CORRECTIONS), list(presses.BASELINES))  # names for recipes
     with calib.open_session("session.h5") as session:
         skin = je.skin.parse_skin(session.skin_toml)
         processing = presses.Processing(
-            corrections=(presses.LowPass(cutoff=2.0),),  # Hz; names: presses.CORRECTIONS
-            baseline=presses.PreOnly(),  # or TwoSided, the default; names: presses.BASELINES
+            corrections=(presses.LowPass(cutoff=2.0),),  # Hz
+            baseline=presses.TwoSided(),  # the default; as in real time: PreOnly()
             windows=presses.WindowLengths(hold=0.8, rest=0.4),
         )
         found = presses.measure(session, skin, processing)
@@ -23,9 +24,7 @@ Example:
         times = presses.find_presses(
             force.time, force.read()[:, 0], limits=presses.DetectionLimits(min_hold=0.8)
         )
-    print(
-        f"{len(found.force)} presses of {found.force.mean():.1f} N; {len(times)} detected by the force"
-    )
+    print(f"{len(found.force)} presses of {found.force.mean():.1f} N; {len(times)} in the force alone")
     print(f"readings change by up to {1e3 * np.abs(found.dv).max():.1f} mV")
     print(pooled.data.pressure.shape, "presses and pads")
 """

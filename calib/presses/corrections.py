@@ -182,7 +182,11 @@ class TwoSided(AbstractBaseline):
 
 @dataclass(frozen=True)
 class PreOnly(AbstractBaseline):
-    """The rest mean before the press: the only baseline available in real time. Drift during the press stays."""
+    """The rest mean before the press: the only baseline available in real time. Drift during the press stays.
+
+    Example:
+        as_in_real_time = presses.Processing(baseline=presses.PreOnly())
+    """
 
     def weights(
         self, time: np.ndarray | float, before: np.ndarray | float, after: np.ndarray | float

@@ -24,10 +24,8 @@ Example:
     state = skin.start(seed=0)
     step = je.bind(simulators.step, skin)
     for k in range(3):  # in the loop of your simulator
-        points, forces = (
-            np.array([[0.06 + 0.001 * k, 0.13, 0.0]]),
-            np.array([[0.0, 0.0, -5.0]]),
-        )  # m, N, in space
+        # m, N, in space
+        points, forces = np.array([[0.06 + 0.001 * k, 0.13, 0.0]]), np.array([[0.0, 0.0, -5.0]])
         placed = simulators.place_contacts(scene.skin, points, forces)
         state, readings = step(state, placed.contacts)
         print(f"{readings.load:.2f} N on the sheet, {readings.pressure} Pa, {readings.frame[0]:.4f} V")

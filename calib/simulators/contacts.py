@@ -37,9 +37,8 @@ class ContactPoints(NamedTuple):
     | diameter of what presses, for effects that spread by it        | (..., contacts)       | m    |
 
     Example:
-        contacts = simulators.ContactPoints(
-            np.array([[0.06, 0.13]]), np.array([5.0]), np.array([0.02])
-        )  # m, N, m
+        # m, N, m
+        contacts = simulators.ContactPoints(np.array([[0.06, 0.13]]), np.array([5.0]), np.array([0.02]))
         state, readings = step(state, contacts)
     """
 

@@ -35,9 +35,8 @@ class Solved(AbstractFrames):
     """Every frame is a solution of the sheet; exact up to the fidelity.
 
     Example:
-        exact = simulators.prepare_skin(
-            scene, 50.0, je.Fidelity.draft(), simulators.Solved()
-        )  # the default
+        # the default
+        exact = simulators.prepare_skin(scene, 50.0, je.Fidelity.draft(), simulators.Solved())
     """
 
     def prepared(self, model: je.Model) -> "Solved":

@@ -14,16 +14,15 @@ Example:
     tank = je.Skin("tank", disc, 1.0, rim, je.Protocol(je.skin.adjacent(16), 1e-3))
     model = je.discretise(je.Scene(tank), je.Fidelity.draft(edge_length=0.05))
     rod = np.linalg.norm(model.centroids - np.array([0.04, 0.02]), axis=1) < 0.015
+    # V
     frames = np.stack(
         [je.forward(model), je.forward(model, np.where(rod, 0.1, 1.0) * model.background)]
-    )  # V
-    np.savez(
-        "tank.npz", frames=frames, pattern=tank.protocol.pattern, amplitude=1e-3
-    )  # a file as yours may be
+    )
+    # a file as yours may be
+    np.savez("tank.npz", frames=frames, pattern=tank.protocol.pattern, amplitude=1e-3)
 
-    found = calib.tanks.difference_image(
-        calib.tanks.load_tank("tank.npz", disc)
-    )  # the last frame less the first
+    # the last frame less the first
+    found = calib.tanks.difference_image(calib.tanks.load_tank("tank.npz", disc))
     place = je.LevelCentroid(0.5)(-found.change, found.recon)
     print(f"the rod is at {1e3 * place} mm")
 """

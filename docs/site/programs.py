@@ -15,6 +15,9 @@ PROGRAM = re.compile(r"^( *)```python.*?\n(.*?)^\1```", re.DOTALL | re.MULTILINE
 EXAMPLE = re.compile(r"^Example:(.*)\n((?:\n*^ +\S.*\n?)+)", re.MULTILINE)
 """A section of a docstring; its indented lines are a program."""
 
+WRAPPED = ("__func__", "fget", "func")
+"""Where class methods, properties and cached properties keep their function."""
+
 RAISED = re.compile(r"^Raises:\n((?:\n*^ +\S.*\n?)+)", re.MULTILINE)
 ERRORS = re.compile(r"^ {2,4}((?:\w+, )*\w+):", re.MULTILINE)
 
@@ -102,12 +105,13 @@ def _annotated(annotation: object, known: set[str]) -> set[str]:
 
 
 def _functions(name: str, thing: object) -> Iterator[tuple[str, FunctionType]]:
-    """The name and the function itself, or of a class those of its own public methods."""
+    """The name and the function itself, or of a class its own methods with a docstring; ``__call__`` as the class."""
     if isclass(thing):
         for method, found in vars(thing).items():
-            inner = getattr(found, "__func__", getattr(found, "fget", found))
-            if not method.startswith("_") and isroutine(inner):
-                yield f"{name}.{method}", inner
+            inner = next((getattr(found, part) for part in WRAPPED if getattr(found, part, None)), found)
+            own = isroutine(inner) and inner.__qualname__.startswith(f"{name}.") and inner.__doc__
+            if own and (method == "__call__" or not method.startswith("_")):
+                yield f"{name}.{method}".removesuffix(".__call__"), inner
     elif callable(thing):
         yield name, thing
 

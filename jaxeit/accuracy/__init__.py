@@ -14,10 +14,8 @@ Example:
         accuracy.Choice("draft, float32", je.Fidelity.draft(dtype="float32"), imaging=None),
     ]
     touch = accuracy.Touch("finger", position=(0.06, 0.13), width=0.008)  # m
-    reference = (
-        je.Fidelity.draft(edge_length=0.05),
-        je.Fidelity.draft(edge_length=0.04),
-    )  # coarse and fine
+    # coarse and fine
+    reference = (je.Fidelity.draft(edge_length=0.05), je.Fidelity.draft(edge_length=0.04))
     table = je.ladder(scene, rungs, touches=[touch], reference=reference, budget=0.01)
     print(table.table(width=80))
     best = table.recommend(error=0.5)

@@ -68,9 +68,8 @@ def fidelity_choices() -> tuple[Choice, ...]:
     """Rungs over edge length, order, precision and solver; some have images, which differ little between rungs.
 
     Example:
-        everything = (
-            accuracy.fidelity_choices() + accuracy.image_choices()
-        )  # what je.ladder compares by default
+        # what je.ladder compares by default
+        everything = accuracy.fidelity_choices() + accuracy.image_choices()
         quick = accuracy.few_choices()  # in less than a minute
         print(len(everything), "rungs, or", len(quick))
     """

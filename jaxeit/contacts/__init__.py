@@ -24,11 +24,8 @@ Example:
     for place, width, present in zip(found.position, found.width, found.present, strict=True):
         if present:
             print(f"at {1e3 * place[0]:.1f}, {1e3 * place[1]:.1f} mm, {1e3 * width:.1f} mm wide")
-    print(
-        "the strongest one:",
-        je.contacts.strongest(found),
-        je.contacts.ContactResult(int(found.result[0])).name,
-    )
+    print("the strongest one at", je.contacts.strongest(found))  # m
+    print(je.contacts.ContactResult(int(found.result[0])).name)
     je.plot.show_contacts(found, je.plot.show_skin(skin)).figure.savefig("contacts.png")
 """
 

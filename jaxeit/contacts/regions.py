@@ -63,9 +63,8 @@ def find_regions(
 
     Example:
         recon = je.prepare(model, basis=je.Pixels(20))
-        regions = je.contacts.find_regions(
-            np.asarray(recon(dv)), recon
-        )  # no model of contacts: what stands out
+        # no model of contacts: what stands out
+        regions = je.contacts.find_regions(np.asarray(recon(dv)), recon)
         print(regions.centres, regions.sums)  # m, S m^2
     """
     require_known("find_regions", RegionError, image, recon.areas, recon.centres)

@@ -12,6 +12,7 @@ Example:
 
     jax.config.update("jax_enable_x64", True)
 
+    print(list(effects.EFFECTS))  # the names for scene files
     skin = je.load_skin("testbed")
     scene = je.Scene(
         skin,
@@ -29,12 +30,10 @@ Example:
         ),
     )
     model = je.discretise(scene, je.Fidelity.draft())
-    pressure = 10.0 * je.model.load_spread(
-        model, jnp.array([0.06, 0.13]), 0.02
-    )  # Pa: 10 N under a tip of 20 mm
-    warm = je.conductivity(
-        model, pressure, temperature=5.0
-    )  # S, 5 K above the temperature of the skin's file
+    # Pa: 10 N under a tip of 20 mm
+    pressure = 10.0 * je.model.load_spread(model, jnp.array([0.06, 0.13]), 0.02)
+    # S, 5 K above the temperature of the skin's file
+    warm = je.conductivity(model, pressure, temperature=5.0)
     print(f"{1e3 * jnp.abs(je.forward(model, warm) - je.forward(model)).max():.2f} mV")
     print(f"{(je.pad_response(skin, model) @ pressure).max():.0f} Pa")
 

@@ -305,9 +305,8 @@ def laid(effects: Iterable[AbstractEffect], centroids: Float[Array, "elements 2"
     """The effects, with sheet effects prepared by `AbstractSheetEffect.laid`, for many states of one mesh.
 
     Example:
-        once = effects.laid(
-            scene.effects, model.centroids
-        )  # random fields computed once, for many states of one mesh
+        # Random fields are computed once, for many states of one mesh.
+        once = effects.laid(scene.effects, model.centroids)
     """
     return tuple(e.laid(centroids) if isinstance(e, AbstractSheetEffect) else e for e in effects)
 

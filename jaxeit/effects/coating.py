@@ -30,9 +30,8 @@ class ContinuousCoating(AbstractCoatEffect):
 
     Example:
         bridged = je.discretise(je.Scene(skin, (effects.ContinuousCoating(),)), je.Fidelity.draft())
-        two_sheets = je.conductivity(
-            bridged, 1e4 * jnp.ones(len(bridged.areas))
-        )  # a CoatedSheet, for je.forward
+        # a CoatedSheet, for je.forward
+        two_sheets = je.conductivity(bridged, 1e4 * jnp.ones(len(bridged.areas)))
     """
 
     alternative: ClassVar[str] = "how pressure makes the sheet conduct"

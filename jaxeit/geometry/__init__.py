@@ -13,9 +13,8 @@ Example:
     touched = np.array([[0.01, 0.05, 0.039]])  # m in space, as a motion capture tells it
     for surface in (je.geometry.Plane(), forearm):
         seen = surface.project(touched)
-        print(
-            type(surface).__name__, seen.chart[0], seen.height[0]
-        )  # m on the flat sheet, m above the surface
+        # m on the flat sheet, m above the surface
+        print(type(surface).__name__, seen.chart[0], seen.height[0])
 """
 
 from .shapes import Disc, Domain, Polygon, Rectangle

@@ -14,9 +14,8 @@ Example:
     dv = je.forward(model, model.background * jnp.where(near, 1.5, 1.0)) - v0  # V
     noise = jnp.full(len(v0), 1e-4 * jnp.abs(v0).max())  # V, of each reading
     dv = dv + noise * jax.random.normal(jax.random.key(0), dv.shape)
-    quiet = v0 + noise * jax.random.normal(
-        jax.random.key(1), (50, len(v0))
-    )  # V, frames without contact
+    # V, frames without contact
+    quiet = v0 + noise * jax.random.normal(jax.random.key(1), (50, len(v0)))
 
     recon = je.prepare(model, je.Laplace(), je.OneStep(), je.Pixels(20), noise, hyperparameter=0.3)
     image = recon(dv)  # S; frames along leading axes are imaged together
@@ -38,7 +37,7 @@ Example: priors and methods compared
     for prior, method in ways:
         found = je.prepare(model, prior, method, coarse)
         error = je.localisation_error(je.LevelCentroid(0.5)(found(dv), found), jnp.array([0.06, 0.13]))
-        print(f"{type(method).__name__} with {type(prior).__name__}: {1e3 * error:.1f} mm")
+        print(f"{je.imaging.METHODS.text(method)}, {type(prior).__name__}: {1e3 * error:.1f} mm")
 """
 
 from .absolute.background import fit_background

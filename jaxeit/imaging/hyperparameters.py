@@ -162,7 +162,7 @@ class Discrepancy(AbstractFrameChoice):
         fitted = je.prepare(
             model, basis=je.Pixels(20), noise=noise, hyperparameter=je.imaging.Discrepancy(dv)
         )
-        print(fitted.provenance["hyperparameter"])
+        print(fitted.provenance["hyperparameter"], "by one of", list(je.imaging.HYPERPARAMETERS))
     """
 
     needs_noise: ClassVar[bool] = True

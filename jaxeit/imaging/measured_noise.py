@@ -38,9 +38,8 @@ class EqualNoise(AbstractNoise):
     """All readings alike, of unknown size. Images then have no standard deviations.
 
     Example:
-        print(
-            list(je.imaging.NOISES)
-        )  # equal, measured, correlated: names for recipes and the command line
+        # equal, measured, correlated: names for recipes and the command line
+        print(list(je.imaging.NOISES))
         plain = je.Imaging(je.Pixels(10), noise=je.imaging.EqualNoise())
     """
 

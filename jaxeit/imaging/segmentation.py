@@ -218,9 +218,8 @@ def half_height_classes(
 
     Example:
         picture = je.imaging.on_grid(image, recon.picture, (64, 64))  # S, on a grid of its own
-        classes = je.imaging.half_height_classes(
-            picture, floor=0.2 * picture.max(), least=0.002
-        )  # 0, 1 or 2
+        # 0, 1 or 2
+        classes = je.imaging.half_height_classes(picture, floor=0.2 * picture.max(), least=0.002)
     """
     classes, regions = np.full(image.shape, UNCHANGED), []
     for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):

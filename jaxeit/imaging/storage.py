@@ -73,9 +73,8 @@ def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.nd
         StorageError: for a protocol of matrices (`Protocol.from_matrices`), or amplifiers with a `CommonMode`.
 
     Example:
-        numbers = je.imaging.to_numbers(
-            recon
-        )  # for a file format of your own; NUMBERS has shapes, units and meanings
+        # for a file format of your own; NUMBERS has shapes, units and meanings
+        numbers = je.imaging.to_numbers(recon)
         for name, array in numbers.items():
             print(name, array.shape, je.imaging.NUMBERS[name][1:])
         again = je.imaging.from_numbers(numbers, recon.shape, recon.extent, recon.provenance)

@@ -21,7 +21,14 @@ from ..registry import AbstractChoice
 
 
 class PatternError(ValueError):
-    """A sparsity pattern that does not describe a symmetric positive definite matrix."""
+    """A sparsity pattern that does not describe a symmetric positive definite matrix.
+
+    Example:
+        try:
+            linalg.SparsityPattern(2, np.array([0, 0, 1]), np.array([0, 1, 1]))  # above the diagonal
+        except linalg.PatternError as error:
+            print(error)
+    """
 
 
 def _no_indices() -> np.ndarray:

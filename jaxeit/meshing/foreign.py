@@ -28,12 +28,10 @@ def flat_mesh(
         MeshError: for nodes that lie in no such plane, or triangles that name others.
 
     Example:
-        corners = np.array(
-            [[0, 0, 0.5], [0.1, 0, 0.5], [0.1, 0.1, 0.5], [0, 0.1, 0.5]]
-        )  # m, all at one height
-        square, numbers = je.meshing.flat_mesh(
-            corners, np.array([[0, 2, 1], [0, 2, 3]])
-        )  # one is clockwise
+        # m, all at one height
+        corners = np.array([[0, 0, 0.5], [0.1, 0, 0.5], [0.1, 0.1, 0.5], [0, 0.1, 0.5]])
+        # one is clockwise
+        square, numbers = je.meshing.flat_mesh(corners, np.array([[0, 2, 1], [0, 2, 3]]))
     """
     if nodes.shape[1] not in (2, 3) or not (nodes[:, 2:] == nodes[:1, 2:]).all():
         raise MeshError(
@@ -60,9 +58,8 @@ def read_mesh(path: str | Path) -> Mesh:
         MeshError: if meshio is not installed or cannot read the file, or it has no flat triangles.
 
     Example:
-        mesh = je.meshing.read_mesh("patch.vtu").check(
-            min_angle=15
-        )  # degrees; the error names the worst triangle
+        # degrees; the error names the worst triangle
+        mesh = je.meshing.read_mesh("patch.vtu").check(min_angle=15)
     """
     found = _meshio(path, "read", path)
     triangles = [block.data for block in found.cells if block.type == "triangle"]

@@ -14,16 +14,13 @@ Example:
     print(je.model.expected_mesh_nodes(skin, fidelity), "nodes")
     model = je.discretise(je.Scene(skin, effects), fidelity)
 
-    pressure = 10.0 * je.model.load_spread(
-        model, jnp.array([0.06, 0.13]), 0.02
-    )  # Pa: 10 N under a tip of 20 mm
+    # Pa: 10 N under a tip of 20 mm
+    pressure = 10.0 * je.model.load_spread(model, jnp.array([0.06, 0.13]), 0.02)
     dv = je.forward(model, je.conductivity(model, pressure)) - je.forward(model)  # V
     gage = je.pad_response(skin, model) @ pressure  # Pa in each pad
     J = je.jacobian(model, basis=je.Bumps(20))  # V/S, (readings, bumps)
     lost = je.model.rounding(model)  # V
-    print(
-        f"{1e3 * jnp.abs(dv).max():.2f} mV, {gage.max():.0f} Pa, rounding {jnp.abs(lost).max():.1e} V"
-    )
+    print(f"{1e3 * jnp.abs(dv).max():.2f} mV, {gage.max():.0f} Pa; rounding {lost.max():.1e} V")
 """
 
 from .bases import (

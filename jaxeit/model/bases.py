@@ -93,9 +93,8 @@ class BasisMap(AbstractPictured):
     | single: whether each coefficient has one line         |             |      |
 
     Example:
-        pixels = je.Pixels(20).on(
-            model
-        )  # once, on the host; then it can be an argument of a jitted function
+        # once, on the host; then it can be an argument of a jitted function
+        pixels = je.Pixels(20).on(model)
         image = jnp.zeros(pixels.size).at[210].set(1e-3)  # S
         sigma = model.background + pixels.expand(image)
     """

@@ -172,9 +172,8 @@ def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
 
     Example:
         mesh = je.model.make_mesh(je.Scene(skin), fidelity)
-        ideal = je.discretise(
-            je.Scene(skin), fidelity, mesh=mesh
-        )  # scenes on one mesh differ by their physics alone
+        # scenes on one mesh differ by their physics alone
+        ideal = je.discretise(je.Scene(skin), fidelity, mesh=mesh)
     """
     length = _edge_length(scene.skin, fidelity)
     return _mesh(scene.skin, _footprints(scene.skin, fidelity), length, fidelity.growth)

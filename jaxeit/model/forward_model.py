@@ -227,7 +227,16 @@ def four_terminal(z: Any, pattern: Any) -> Any:
 
 
 class DerivativeError(ValueError):
-    """A derivative with respect to an array that is not a parameter of the physics."""
+    """A derivative with respect to an array that is not a parameter of the physics.
+
+    Example:
+        import equinox as eqx
+
+        try:
+            eqx.filter_grad(lambda model: je.forward(model).sum())(model)  # of the mesh, too
+        except je.model.DerivativeError as error:
+            print(error)
+    """
 
 
 @jax.custom_jvp

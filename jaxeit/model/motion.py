@@ -208,9 +208,8 @@ def moved(
 
     Example:
         motion = je.model.electrode_motion(model)
-        there = je.model.moved(
-            model, motion, jnp.zeros((25, 2)).at[7, 0].set(1e-3)
-        )  # electrode 7, 1 mm along x
+        # electrode 7, 1 mm along x
+        there = je.model.moved(model, motion, jnp.zeros((25, 2)).at[7, 0].set(1e-3))
         print(jnp.abs(je.forward(there) - je.forward(model)).max())  # V
     """
     shift = jnp.zeros((model.electrodes, 2), model.dtype) if shift is None else jnp.asarray(shift, model.dtype)

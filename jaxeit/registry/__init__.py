@@ -9,9 +9,7 @@ Example:
 
     print(list(je.imaging.PRIORS))  # the names that files and the command line use
     prior = je.imaging.PRIORS.make("gaussian-smooth:length=0.02,noser=true")
-    print(
-        prior, "is", je.imaging.PRIORS.text(prior), "or, as a table,", je.imaging.PRIORS.settings(prior)
-    )
+    print(je.imaging.PRIORS.text(prior), je.imaging.PRIORS.settings(prior))  # a word, or a table
     print(je.registry.settings_of(je.GaussianSmooth, ()).keys())
     try:
         je.imaging.PRIORS.make("gausian-smooth")

@@ -88,6 +88,19 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
 
     Raises:
         SettingError: or the given ``error``.
+
+    Example:
+        from dataclasses import dataclass
+
+        from jaxeit.registry import limited, require_limits
+
+
+        @dataclass
+        class Speed:  # a dataclass with limits
+            speed: float = limited(0.1, above=0.0)  # m/s
+
+            def __post_init__(self):
+                require_limits(self)
     """
     for field in dataclasses.fields(thing):
         limits, value = field.metadata.get("limits"), getattr(thing, field.name)

@@ -39,6 +39,17 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         group: the group of entry points by which other packages add classes.
         spell: makes the name of a class that states none; default: `TotalVariation` is "total-variation".
         parts: registries of the objects that settings may hold.
+
+    Example:
+        from jaxeit.registry import AbstractChoice, Registry, computed
+
+
+        class AbstractFirmness(AbstractChoice):  # a kind of choice of your own
+            bulk: float | None = computed()  # found later by the class itself, never by text
+
+
+        FIRMNESSES = Registry(AbstractFirmness, "firmness", "my_package.firmnesses")
+        print(list(FIRMNESSES))  # its classes in your package, and those of entry points
     """
 
     def __init__(

@@ -12,9 +12,8 @@ Example:
     model = je.discretise(je.Scene(skin), je.Fidelity.draft())
     pixels = je.Pixels(10).on(model)
 
-    signal = je.scan.signal_covariance(
-        model, basis=pixels
-    )  # what readings share, in units of their noise
+    # what readings share, in units of their noise
+    signal = je.scan.signal_covariance(model, basis=pixels)
     for rule in (je.scan.DOptimal(), je.scan.Sensitive(), je.scan.Volume()):
         chosen = je.scan.choose_readings(signal, 80, rule)
         pairs = set(je.scan.drives(skin.protocol.pattern[chosen.rows]))

@@ -41,7 +41,8 @@ class PlaceError(AbstractCriterion):
     is convex for every power, since the inverse of the sum of variances is concave in the information.
 
     Example:
-        worst = je.scan.PlaceError(power=8.0)  # or PlaceVolume(), or the default; names: je.scan.CRITERIA
+        print(list(je.scan.CRITERIA))  # names for the command line
+        worst = je.scan.PlaceError(power=8.0)
         few = je.skin.all_pairs(25)[::40]  # candidates
         sensitivity = je.scan.place_sensitivity(model, je.scan.DesignSettings(columns=4))
         design = je.scan.design_scan(sensitivity, 60, worst, candidates=few)

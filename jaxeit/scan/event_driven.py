@@ -175,16 +175,12 @@ def prepare_event_scan(
         ProtocolError: if the skin has no pads, or a setting is out of range.
 
     Example:
-        settings = je.scan.EventScanSettings(
-            onset=100.0, idle=24, local=80, radius=0.06
-        )  # Pa, readings, readings, m
+        # Pa, readings, readings, m
+        settings = je.scan.EventScanSettings(onset=100.0, idle=24, local=80, radius=0.06)
         scan = je.scan.prepare_event_scan(model, skin, settings, basis=pixels)
         state = scan.start()
-        for pressure in (
-            [0.0, 0, 0, 0],
-            [0.0, 0, 0, 0],
-            [0.0, 0, 400, 0],
-        ):  # Pa on each pad, frame by frame
+        # Pa on each pad, frame by frame
+        for pressure in ([0.0, 0, 0, 0], [0.0, 0, 0, 0], [0.0, 0, 400, 0]):
             state, readings = scan.step(state, jnp.array(pressure))
             print(int(readings.sum()), "readings to take next")
     """

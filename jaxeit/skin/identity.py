@@ -23,9 +23,8 @@ def skin_hash(skin: Skin) -> str:
     the same hash as the same electrodes in a list.
 
     Example:
-        print(
-            je.skin.skin_hash(je.load_skin("testbed"))[:12]
-        )  # session and calibration files name their skin so
+        # session and calibration files name their skin so
+        print(je.skin.skin_hash(je.load_skin("testbed"))[:12])
     """
     text = json.dumps(_plain(skin), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

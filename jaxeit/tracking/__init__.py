@@ -28,9 +28,8 @@ Example:
         )
         for track in now.tracks:
             print(f"contact {track.number} at {1e3 * track.position} mm, {track.force:.1f} N")
-        later = list(
-            smoother.add(10_000_000 * k, now, 0.01)
-        )  # TimedTracks, better known and some frames late
+        # TimedTracks, better known and some frames late
+        later = list(smoother.add(10_000_000 * k, now, 0.01))
     later += smoother.end()
 """
 

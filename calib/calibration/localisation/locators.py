@@ -172,15 +172,12 @@ def locate(
 
     Example:
         noise, channels = frames[rest].std(0), mine.recon.channels
-        for choice in (
-            calib.ImageCentroid("half"),
-            calibration.FittedContact(most=1),
-        ):  # names: calibration.LOCATORS
+        for choice in (calib.ImageCentroid("half"), calibration.FittedContact(most=1)):
             model = je.discretise(je.Scene(mine.skin), je.Fidelity.draft())
             locator = choice.prepare(model, noise, channels)
-            print(
-                calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position
-            )  # m
+            print(calibration.LOCATORS.text(choice))
+            # m
+            print(calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position)
     """
     frames = np.asarray(dv, recon.dtype)
     images = np.asarray(recon(jnp.asarray(frames)) if image is None else image)

@@ -284,9 +284,8 @@ def assess(
     Example:
         with calib.open_session("other.h5") as session:
             change = calibration.assess(mine, session)  # KnownForces, as the session has a load cell
-            unloaded = calibration.assess(
-                mine, session, calibration.OrdinaryUse()
-            )  # pads against the image
+            # pads against the image
+            unloaded = calibration.assess(mine, session, calibration.OrdinaryUse())
         print(change.health, change.log_gain, unloaded.advice)
     """
     if session.skin_name and session.skin_name != calibration.skin.name:

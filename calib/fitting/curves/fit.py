@@ -252,10 +252,8 @@ def fit_curves(
 
     Example:
         for loss in (fitting.Squared(), fitting.SoftL1(), fitting.Cauchy()):  # names: fitting.LOSSES
-            print(
-                fitting.LOSSES.text(loss),
-                calib.fit_curves(calib.Affine(), pressures, forces, loss=loss).parameters[0],
-            )
+            lines = calib.fit_curves(calib.Affine(), pressures, forces, loss=loss)
+            print(fitting.LOSSES.text(loss), lines.parameters)  # N/Pa and N of each pad
     """
     shape = np.shape(pressures)
     length = bucket(shape[1]) if len(shape) == 2 else None
@@ -277,13 +275,12 @@ def fit_curve(
     """`fit_curves` for one pad: pressure (n,) Pa, force (n,) N.
 
     Example:
-        up_and_down = np.concatenate(
-            [np.linspace(0, 6000, 100), np.linspace(6000, 0, 100)]
-        )  # Pa, in order of time
+        # Pa, in order of time
+        up_and_down = np.concatenate([np.linspace(0, 6000, 100), np.linspace(6000, 0, 100)])
         force = 2e-3 * np.concatenate([up_and_down[:100], 0.9 * up_and_down[100:]])  # N
-        for curve in (fitting.Play(), fitting.AffinePlay(), fitting.PlaySpline()):  # names: fitting.CURVES
+        for curve in (fitting.Play(), fitting.AffinePlay(), fitting.PlaySpline()):
             looped = fitting.fit_curve(curve, up_and_down, force)
-            print(curve.name, looped.parameters, looped.message())
+            print(fitting.CURVES.text(curve), looped.parameters, looped.message())
     """
     p, f = np.asarray(pressure), np.asarray(force)
     if p.ndim != 1 or p.shape != f.shape:

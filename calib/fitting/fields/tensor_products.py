@@ -115,9 +115,8 @@ class GaussianProcess(_TensorProduct):
     `modes` modes per axis resolve the length. `lengths` to average over are multiples of half the size of the pad.
 
     Example:
-        recipe = calib.Recipe(
-            location=(calib.PadEdge(), fitting.GaussianProcess())
-        )  # cross-validation chooses
+        # cross-validation chooses
+        recipe = calib.Recipe(location=(calib.PadEdge(), fitting.GaussianProcess()))
     """
 
     name: ClassVar[str] = "gp"

@@ -79,9 +79,8 @@ class WithPlace:
     """Make one signal in N of all channels and of the two coordinates of the place, which are the last columns.
 
     Example:
-        with_place = logs.WithPlace(
-            logs.BlendChannels()
-        )  # the last two columns of the channels are the place
+        # the last two columns of the channels are the place
+        with_place = logs.WithPlace(logs.BlendChannels())
     """
 
     way: Any

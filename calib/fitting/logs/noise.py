@@ -61,9 +61,8 @@ def fit_log_noise(
 
     Example:
         residual = force - fit.predicted
-        noise = logs.fit_log_noise(
-            residual, time, fit.predicted, np.zeros(2000), np.arange(2000) // 100, repetitions=5
-        )
+        stretch = np.arange(2000) // 100  # of a second
+        noise = logs.fit_log_noise(residual, time, fit.predicted, np.zeros(2000), stretch, repetitions=5)
         print(noise.floor, noise.fraction, noise.lag)  # N, 1, s
     """
     terms = _terms(force, force_rate(time, force))

@@ -26,9 +26,8 @@ class LogTracker:
     the rate is taken.
 
     Example:
-        tracker = logs.LogTracker(
-            found.model
-        )  # one reading after the other, as a running sensor sends them
+        # one reading after the other, as a running sensor sends them
+        tracker = logs.LogTracker(found.model)
         for at, reading in zip(time[:3], channels[:3], strict=True):
             print(tracker.step(at, reading).force)  # N
     """

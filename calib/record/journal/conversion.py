@@ -59,9 +59,8 @@ def convert_journal(
     Example:
         from calib.record import convert_journal
 
-        print(
-            convert_journal("crashed.h5.part", "rescued.h5", recovered=True).render()
-        )  # what `jaxeit recover` does
+        # what `jaxeit recover` does
+        print(convert_journal("crashed.h5.part", "rescued.h5", recovered=True).render())
     """
     reader = JournalReader(journal)
     plan = _plan(reader)

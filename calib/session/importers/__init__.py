@@ -24,9 +24,8 @@ Example:
     print(report.summary())
     with calib.open_session("imported.h5") as session:
         print({name: stream.shape for name, stream in session.streams.items()})
-    print(
-        list(importers.importers()), importers.find_importer("csv").summary
-    )  # formats: CsvImporter and so on
+    # formats: CsvImporter and so on
+    print(list(importers.importers()), importers.find_importer("csv").summary)
 """
 
 import argparse
@@ -105,6 +104,18 @@ def find_importer(name: str) -> type[AbstractImporter]:
 
     Raises:
         SessionError: for an import path that leads to no concrete format.
+
+    Example:
+        kinds = (
+            importers.CsvImporter,
+            importers.NpzImporter,
+            importers.MatImporter,
+            importers.Hdf5Importer,
+            importers.ParquetImporter,
+            importers.McapImporter,
+        )
+        for kind in kinds:
+            print(f"{kind.name}: {kind.summary}", importers.find_importer(kind.name) is kind)
     """
     if name in importers():
         return importers()[name]

@@ -80,6 +80,14 @@ def import_tables(
 
     The same files and options give the same bytes. Raises `SessionError` for what cannot be read or understood, and
     then writes nothing.
+
+    Example:
+        from calib.session.importers.formats.csv_tables import CsvFile
+
+        streams = (importers.StreamSpec("force", ("load",), "N"),)
+        table = importers.FileSpec(Path("bench.csv"), time="time", time_unit="s", streams=streams)
+        about = importers.About(title="a bench of ours", license="CC0-1.0")
+        report = importers.import_tables(CsvFile, [table], "by_hand.h5", about)  # or a file of your own
     """
     _check_specs(files)
     about_skin = _described(files, about.skin)

@@ -63,9 +63,8 @@ def fit_background(
         real = je.discretise(uneven, je.Fidelity.draft())
         frame = je.forward(real, je.conductivity(real))  # V, of the untouched skin
         sigma = je.fit_background(model, frame, columns=12)  # S, for je.prepare and je.prepare_contacts
-        print(
-            jnp.std(jnp.log(sigma / je.conductivity(real))), jnp.std(jnp.log(je.conductivity(real)))
-        )  # left of, 1
+        truth = je.conductivity(real)
+        print(jnp.std(jnp.log(sigma / truth)), "of", jnp.std(jnp.log(truth)), "left")
     """
     v0, even = jnp.asarray(v0, model.dtype), forward(model, model.background)
     require_frame(v0, even)

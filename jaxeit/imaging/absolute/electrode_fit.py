@@ -131,9 +131,8 @@ def fit_electrodes(
     Example:
         second = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft(order=2))
         settings = je.imaging.ElectrodeFitSettings(shift=1e-3)  # m
-        fit = je.imaging.fit_electrodes(
-            second, frame, settings=settings
-        )  # better with `presses`, `KnownPresses`
+        # better with `presses`, `KnownPresses`
+        fit = je.imaging.fit_electrodes(second, frame, settings=settings)
         print(1e3 * fit.shift[0], 1e3 * fit.standard_error[0])  # mm
     """
     require_known("fit_electrodes", InverseError, model.nodes, v0)

@@ -144,9 +144,8 @@ def gauss_newton(
 
     Example:
         physics = je.imaging.LogConductivity(model, coarse, model.background.mean())
-        x = je.gauss_newton(
-            physics, je.imaging.IsotropicVariation(), v0 + dv, noise, steps=3
-        )  # log of a ratio
+        # log of a ratio
+        x = je.gauss_newton(physics, je.imaging.IsotropicVariation(), v0 + dv, noise, steps=3)
         sigma = physics.sigma(x)  # S, of each element
     """
     weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
