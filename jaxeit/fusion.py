@@ -56,6 +56,9 @@ class PadMasks(eqx.Module):
     | weights: share of each pad in each pixel; the sum over pads is at most 1 | (pads, pixels) | |
     | areas of the pixels                                      | (pixels,)      | m^2  |
     | shape: (rows, columns) of the image; None: not known     |                |      |
+
+    Example:
+        print(masks.weights @ fmap.force)  # N on each pad, as it was given
     """
 
     weights: Float[Array, "pads pixels"]
@@ -78,6 +81,11 @@ class ForceMap(eqx.Module):
 
     The standard error propagates the errors of the pads' forces alone, with the shape taken as exact; within a pad the
     errors of all pixels are fully correlated.
+
+    Example:
+        # N on each pixel; the first row is the lowest of the sheet
+        picture = fmap.force.reshape(fmap.shape)
+        print(f"{fmap.pressure.max() / 1e3:.0f} kPa, standard error {fmap.standard_error.max():.3f} N")
     """
 
     force: Float[Array, "... pixels"]

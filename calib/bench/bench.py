@@ -80,6 +80,10 @@ class Bench:
     Raises:
         BenchError: for a tip that would leave the sheet or is wider than it, forces that do not press, and rates at
             which nothing can be recorded.
+
+    Example:
+        print(f"{len(bench.sites)} presses to {bench.press_forces.max():.0f} N in {bench.duration:.0f} s")
+        print([type(effect).__name__ for effect in bench.scene.effects])
     """
 
     scene: je.Scene

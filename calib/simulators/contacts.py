@@ -20,6 +20,7 @@ class SimulatorError(ValueError):
     """A scene, or contacts of a simulator, from which no readings can be computed.
 
     Example:
+        print([family.__name__ for family in simulators.NOT_IN_A_STEP], "have no part in a step")
         try:
             simulators.prepare_skin(je.Scene(scene.skin), rate=50.0)
         except simulators.SimulatorError as error:

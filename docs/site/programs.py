@@ -105,13 +105,14 @@ def _annotated(annotation: object, known: set[str]) -> set[str]:
 
 
 def _functions(name: str, thing: object) -> Iterator[tuple[str, FunctionType]]:
-    """The name and the function itself, or of a class its own methods with a docstring; ``__call__`` as the class."""
+    """The name and the function itself, or of a class its own methods; those that have no entry, as the class."""
     if isclass(thing):
         for method, found in vars(thing).items():
             inner = next((getattr(found, part) for part in WRAPPED if getattr(found, part, None)), found)
-            own = isroutine(inner) and inner.__qualname__.startswith(f"{name}.") and inner.__doc__
+            own = isroutine(inner) and inner.__qualname__.startswith(f"{name}.")
             if own and (method == "__call__" or not method.startswith("_")):
-                yield f"{name}.{method}".removesuffix(".__call__"), inner
+                shown = inner.__doc__ and method != "__call__"
+                yield f"{name}.{method}" if shown else name, inner
     elif callable(thing):
         yield name, thing
 

@@ -91,9 +91,10 @@ def _documented_programs() -> Iterator[tuple[str, Program]]:
 
 @cache
 def uses() -> dict[str, list[str]]:
-    """Links to the programs that use a public name, by name: examples, pages, rooms, and other names."""
+    """Links to the programs that use a public name, by name: whole ones, the shortest first, then those of names."""
     public, found = identifiers(), {}
-    for owner, program in [*(("", program) for program in written_programs()), *_documented_programs()]:
+    programs = [*(("", program) for program in written_programs()), *_documented_programs()]
+    for owner, program in sorted(programs, key=lambda pair: (bool(pair[1].above), len(pair[1].text))):
         for name in used_in(program.text, public, rooms(), program.above):
             if owner != public[name]:
                 found.setdefault(name, []).append(program.link)
@@ -122,18 +123,21 @@ def leads_to_program(name: str, steps: int = 3) -> bool:
     return has_program(name) or (steps > 0 and any(leads_to_program(other, steps - 1) for other in related))
 
 
-def _related(name: str) -> Iterator[str]:
-    """Sentences on the functions and classes that a name belongs to."""
+def related(name: str) -> list[str]:
+    """Sentences on the functions and classes that a name belongs to, those with programs first."""
+    said, paths = [], identifiers()
     words = ("Returned by", "Raised by", "Argument of", "Kinds", "Part of")
     for word, kind in zip(words, _relations(), strict=True):
-        others = sorted(kind.get(name, []), key=lambda path: not has_program(path.partition(".")[0]))[:MOST_LINKS]
-        links = []
-        for other in others:
+        others: list[tuple[bool, bool, int, str]] = []
+        for other in kind.get(name, []):
             owner, dot, method = other.partition(".")
-            path = identifiers()[owner].rpartition(".")[0]
-            links.append(f"[`{shown(path, owner)}{dot}{method}`][{path}.{owner}{dot}{method}]")
-        if links:
-            yield f"{word}: {', '.join(links)}."
+            room = paths[owner].rpartition(".")[0]
+            typed = f"{shown(room, owner)}{dot}{method}"
+            far = room.partition(".")[0] != paths[name].partition(".")[0]
+            others.append((not has_program(owner), far, typed.count("."), f"[`{typed}`][{room}.{other}]"))
+        if others:
+            said.append(f"{word}: {', '.join(link for *_, link in sorted(set(others))[:MOST_LINKS])}.")
+    return said
 
 
 def _entry(path: str, name: str) -> list[str]:
@@ -141,7 +145,7 @@ def _entry(path: str, name: str) -> list[str]:
     shows = f"::: {path}.{name}\n    options: {{heading: {shown(path, name)}}}\n"
     links = uses().get(name, [])[:MOST_LINKS]
     said = [f"In use: {', '.join(links)}."] if links else []
-    return [shows, " ".join([*said, *_related(name)]) + "\n"]
+    return [shows, " ".join([*said, *related(name)]) + "\n"]
 
 
 GO_ON = "The examples of single names below go on from this program.\n"

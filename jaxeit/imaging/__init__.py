@@ -3,6 +3,7 @@
 Example:
     import jax
     import jax.numpy as jnp
+    import numpy as np
 
     import jaxeit as je
 

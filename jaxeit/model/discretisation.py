@@ -53,6 +53,11 @@ class Model(eqx.Module):
     | current                                             | ()              | A                 |
     | effects of the scene                                |                 |                   |
     | coat: the second sheet, if an effect asks for one   |                 |                   |
+
+    Example:
+        print(model.readings, "readings of", model.electrodes, "electrodes,", len(model.nodes), "nodes")
+        # a sheet that conducts 10 % better
+        print(je.forward(model, 1.1 * model.background) / je.forward(model))
     """
 
     nodes: Float[Array, "nodes d"]

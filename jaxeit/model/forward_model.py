@@ -98,6 +98,7 @@ def forward(
 
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model, or has a coat and the model none.
+        DerivativeError: if JAX differentiates with respect to the mesh of the model or arrays made of it.
     """
     sigma = conductivity(model) if sigma is None else sigma  # one program, with or without a conductivity given
     return _forward(model, sigma if isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))

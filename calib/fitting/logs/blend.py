@@ -60,6 +60,9 @@ class BlendChannels:
 
     Example:
         blended = logs.fit_log(calib.Linear(), time, channels, force, channels=logs.BlendChannels())
+        best = found.model.combination  # a Blend, OneChannel or SmoothSignal
+        print(isinstance(best, (logs.OneChannel, logs.Blend, logs.SmoothSignal)), best.words)
+        print("kinds in a file:", list(logs.COMBINATIONS))
     """
 
     def __call__(self, time: np.ndarray, signals: np.ndarray, force: np.ndarray, curve: AbstractCurve | None) -> Blend:
