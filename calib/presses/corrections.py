@@ -90,8 +90,9 @@ class LowPass(AbstractCorrection):
     cutoff. With `causal=True` (online) it has -3 dB at the cutoff and a delay; it starts at rest at the first sample.
     The default of 50 Hz is that of the paper which this bench reproduces.
 
-    Raises: `CorrectionError` if the cutoff is not below half the sample rate. At 50 Hz this refuses a stream of
-    100 Hz, where the paper's filter would be exactly at the Nyquist frequency.
+    Raises:
+        CorrectionError: if the cutoff is not below half the sample rate. At 50 Hz this refuses a stream of 100 Hz,
+            where the paper's filter would be exactly at the Nyquist frequency.
     """
 
     cutoff: float = limited(50.0, above=0)

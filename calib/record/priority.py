@@ -20,6 +20,9 @@ class PriorityError(OSError):
 def real_time(wanted: bool = True) -> Iterator[None]:
     """Schedule the threads of this process, and those that they start, before all ordinary ones within this context.
 
+    Args:
+        wanted: False: leave the scheduling as it is.
+
     Raises:
         PriorityError: if the system refuses; the scheduling is then unchanged.
 

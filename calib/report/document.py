@@ -36,7 +36,8 @@ def write_report(
             ``report_loops.png``, with a correction by location ``report_gain.png``.
         evaluations: of the calibration on other sessions, by name.
 
-    Returns: the paths written, the page first.
+    Returns:
+        The paths written, the page first.
 
     Raises:
         ReportError: matplotlib is not installed.

@@ -28,7 +28,8 @@ def open_session(path: str | os.PathLike[str]) -> "Session":
     Only descriptions are read and checked here. Samples are read on request and in bounded pieces, so that a
     session may be larger than memory. Use the session as a context manager, or call ``close``.
 
-    Raises `SessionError` with one line that says what is wrong with the file, where, and what to do.
+    Raises:
+        SessionError: with one line that says what is wrong with the file, where, and what to do.
     """
     where = Path(path)
     file = open_guarded(where)

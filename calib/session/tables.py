@@ -68,7 +68,8 @@ class PressTable:
     | pad                                  | index of the pad under the tip, -1 unknown         |      |
     | accepted, reason                     | whether the press may be used; if not, why         |      |
 
-    Raises `SessionError` for columns of unequal length, times out of order, or numbers that are not finite.
+    Raises:
+        SessionError: for columns of unequal length, times out of order, or numbers that are not finite.
 
     Example:
         column = np.array([0.06, 0.14])  # m
@@ -168,7 +169,8 @@ class ClockTable:
     | latency_ns      | smallest latency, which was subtracted; accurate to half of ``rtt_ns``   | ns   |
     | rtt_ns          | shortest round trip; both are 0 if they were not measured                | ns   |
 
-    Raises `SessionError` if the numbers of times and ticks differ, or a number is not finite.
+    Raises:
+        SessionError: if the numbers of times and ticks differ, or a number is not finite.
     """
 
     host_ns: np.ndarray

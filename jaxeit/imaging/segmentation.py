@@ -213,8 +213,13 @@ def half_height_classes(
     """Classes of an image that is zero where nothing changed: regions beyond ``floor``, each cut at half its own peak.
 
     Args:
+        image: change, in any unit; row 0 at low y.
+        floor: least absolute value of a pixel of a region, in the unit of the image.
         least: smallest region, over the area of the picture.
         weakest: sum of the image over the weakest region, over that of the strongest.
+
+    Returns:
+        (rows, columns): 0 unchanged, 1 below zero, 2 above zero.
 
     Example:
         picture = je.imaging.on_grid(image, recon.picture, (64, 64))  # S, on a grid of its own

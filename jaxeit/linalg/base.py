@@ -47,8 +47,8 @@ class SparsityPattern:
     | root: unknowns that may couple to every other, eliminated last;  | (r,)   |      |
     |   the inverse is wanted on them (`AbstractLinearSolver.corner`)  |        |      |
 
-    Raises `PatternError` for an upper-triangle, repeated or out-of-range entry, or a hole in the
-    diagonal.
+    Raises:
+        PatternError: for an upper-triangle, repeated or out-of-range entry, or a hole in the diagonal.
     """
 
     n: int

@@ -103,7 +103,8 @@ class AbstractLocatorChoice(abc.ABC):
 class ImageCentroid(AbstractLocatorChoice):
     """A named estimator of the image: quick to prepare; "half" has a mean error of 5 mm on the simulated testbed.
 
-    Raises: `ValueError` for a name that is not in `jaxeit.metrics.ESTIMATORS`.
+    Raises:
+        ValueError: for a name that is not in `jaxeit.metrics.ESTIMATORS`.
     """
 
     estimator: str = "half"

@@ -245,10 +245,12 @@ def fit_curves(
       max_steps: limit of the solver's steps in each round.
       dtype: of the fit; default: that of the input. float64 is refused where JAX has 64-bit numbers off.
 
-    Returns: a `FittedCurve` with a leading pad axis. Check `result` first. A bad pad does not change the numbers of
-      other pads.
+    Returns:
+        A `FittedCurve` with a leading pad axis. Check `result` first. A bad pad does not change the numbers of other
+        pads.
 
-    Raises: `FitError` for shapes that do not fit together, or sigma not above zero.
+    Raises:
+        FitError: for shapes that do not fit together, or sigma not above zero.
 
     Example:
         for loss in (fitting.Squared(), fitting.SoftL1(), fitting.Cauchy()):  # names: fitting.LOSSES
