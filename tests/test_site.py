@@ -62,13 +62,16 @@ def test_names_lead_to_the_programs_that_use_them(pages, root):
 
 
 def test_everyday_names_are_used_in_programs(names):
-    """An error that only raises, and what functions return or take, are named by the pages of these functions."""
     everyday = {name: getattr(package, name) for package in (je, calib) for name in package.__all__}
     listed = [name for name, thing in everyday.items() if not isinstance(thing, ModuleType)]
     assert len(listed) > 90
-    assert [name for name in listed if not (names.has_program(name) or names.related(name))] == []
-    functions = [name for name in listed if isroutine(everyday[name])]
-    assert [name for name in functions if not names.has_program(name)] == []
+    assert [name for name in listed if not names.has_program(name)] == []
+
+
+def test_every_function_is_used_in_a_program_and_the_links_of_every_other_name_lead_to_one(names):
+    public = {name: thing for listed in names.public_names().values() for name, thing in listed.items()}
+    assert [name for name, thing in public.items() if isroutine(thing) and not names.has_program(name)] == []
+    assert [name for name in public if not names.leads_to_program(name)] == []
 
 
 def test_every_room_begins_with_a_program(names, pages):

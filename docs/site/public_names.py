@@ -117,7 +117,7 @@ def has_program(name: str) -> bool:
     return name in uses() or _own(name)
 
 
-def leads_to_program(name: str, steps: int = 3) -> bool:
+def leads_to_program(name: str, steps: int = 2) -> bool:
     """Whether the links of a name lead to a program that uses it, or what returns, takes, raises or holds it."""
     related = {path.partition(".")[0] for kind in _relations() for path in kind.get(name, [])}
     return has_program(name) or (steps > 0 and any(leads_to_program(other, steps - 1) for other in related))
