@@ -186,7 +186,7 @@ def _untransformed_state() -> Any:
 
 @cache
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` with which programs compile in half the time on a CPU and take up to a third less.
+    """Options for `jax.jit` with which programs on a CPU compile in half the time and run in up to a third less.
 
     Options that this version of XLA does not know are left out. Pass them to your own
     ``jax.jit(..., compiler_options=je.compiler_options())``.
@@ -226,7 +226,7 @@ def reuse_memory() -> bool:
 
 
 def limit_blas_threads(count: int = 1) -> None:
-    """Let the BLAS libraries of this process use so many threads, from now on.
+    """Limit the number of threads of the BLAS libraries of this process, from now on.
 
     On a CPU JAX gives small factorisations to the LAPACK of SciPy, which by default starts a thread for each core and
     makes the threads of XLA wait. A batch of forward solutions loses a third of its speed by that. The commands call

@@ -22,11 +22,9 @@ from .tanks.tank_files import write_csv, write_ktc, write_mat, write_sciospec
 ROOT = Path(__file__).parents[1]
 CONTENTS = re.findall(r"^ +- api/(.*)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
 FIRST = ("calib.bench", "calib")
-"""The programs of these rooms write the recordings and the calibration that others read."""
+"""Rooms whose programs write the recordings and the calibration that the slow ones of other rooms read."""
 
 SLOW = {
-    "calib",
-    "calib.bench",
     "calib.calibration",
     "calib.check",
     "calib.export",
@@ -36,17 +34,18 @@ SLOW = {
     "calib.live",
     "calib.tanks",
     "jaxeit.accuracy",
-    "jaxeit.bind",
-    "jaxeit.compiler_options",
     "jaxeit.contacts",
     "jaxeit.effects",
     "jaxeit.imaging",
     "jaxeit.metrics",
     "jaxeit.scan",
     "jaxeit.tracking",
-    "jaxeit.verb",
+    *FIRST,
 }
-"""Rooms, and names, whose programs take more than a second or two."""
+"""Rooms whose programs take more than a few seconds."""
+
+SLOW_NAMES = {"jaxeit.bind", "jaxeit.compiler_options", "jaxeit.verb"}
+"""Names of other rooms whose programs do."""
 
 
 @pytest.fixture(scope="module")
@@ -96,15 +95,22 @@ def tanks(folder):
 
 def run(site, room, skipped=frozenset()):
     """Run the programs of a page from top to bottom, each with what the ones above it defined."""
-    names = {"__name__": room}
+    names = {"__name__": "__main__"}
     for name, program in site.programs_of(room):
         if f"{room}.{name}" not in skipped:
             exec(compile(program, f"{room} {name}", "exec"), names)
 
 
+@pytest.fixture(scope="module")
+def calibrated(site, tanks):
+    """The same folder, with a short recording and its calibration, by the programs that make them."""
+    for room in FIRST:
+        run(site, room)
+
+
 @pytest.mark.parametrize("room", [room for room in CONTENTS if room not in SLOW])
 def test_quick_programs_of_a_room(site, folder, room):
-    run(site, room, SLOW)
+    run(site, room, SLOW_NAMES)
 
 
 def test_names_in_programs_exist(site):
@@ -116,6 +122,6 @@ def test_names_in_programs_exist(site):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", [*FIRST, *(room for room in CONTENTS if room not in FIRST)])
-def test_all_programs_of_a_room(site, tanks, room):
+@pytest.mark.parametrize("room", ["jaxeit", *(room for room in CONTENTS if room in SLOW and room not in FIRST)])
+def test_slow_programs_of_a_room(site, calibrated, room):
     run(site, room)
