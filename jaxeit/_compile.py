@@ -186,7 +186,7 @@ def _untransformed_state() -> Any:
 
 @cache
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` with which programs on a CPU compile in half the time and run in up to a third less.
+    """Options for `jax.jit` with which programs on a CPU compile in half the time and run up to a third faster.
 
     Options that this version of XLA does not know are left out. Pass them to your own
     ``jax.jit(..., compiler_options=je.compiler_options())``.

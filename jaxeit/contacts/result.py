@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class ContactResult(IntEnum):
-    """What became of a slot of `Contacts`."""
+    """Outcome of the fit of one slot of `Contacts`."""
 
     CONVERGED = 0
     AT_BOUND = 1  # the width or the position ended on its bound: the covariance is a guess

@@ -39,7 +39,7 @@ MIRRORED = 1e-3  # of the sheet's size, within which a mirrored electrode is ano
 
 @dataclass(frozen=True)
 class PlacementLimits:
-    """What the hardware asks of the places of electrodes.
+    """Limits of the hardware on the places of electrodes.
 
     | meaning                                                                           | default | unit |
     |-----------------------------------------------------------------------------------|---------|------|

@@ -43,7 +43,7 @@ FLATNESS_STD = 0.5  # of the logarithm of the exponent over that of a Gaussian
 
 
 class ElectrodeFitSettings(AbstractChoice):
-    """What is believed before the readings are seen.
+    """Assumptions before the readings are seen.
 
     | meaning                                                              | default | unit |
     |----------------------------------------------------------------------|---------|------|

@@ -65,7 +65,7 @@ class GainField(eqx.Module):
 
 
 class LearnedLayer(NamedTuple):
-    """What contacts have told of the contact layer's gain: a normal distribution of its modes.
+    """Gain of the contact layer as learned from contacts: a normal distribution of its modes.
 
     | meaning                                                          | shape  | unit |
     |------------------------------------------------------------------|--------|------|
