@@ -2,6 +2,7 @@
 
 Example:
     import jax
+    import numpy as np
 
     import calib
     import jaxeit as je
@@ -13,8 +14,7 @@ Example:
     print(mine.provenance["created_utc"], mine.recipe.to_toml(), mine.curves.parameters)
     with calib.open_session("other.h5") as session:
         frames, pressures = session.stream("eit").read(), session.stream("pressure").read()
-        # both streams begin together
-        at = [round(k * len(pressures) / len(frames)) for k in range(len(frames))]
+        at = np.arange(len(frames)) * len(pressures) // len(frames)  # both streams begin together
     rest = slice(0, 20)  # frames without contact
     dv, dp = frames - frames[rest].mean(0), pressures[at] - pressures[rest].mean(0)  # V, Pa
     found = calib.force_map(mine, dv, dp)

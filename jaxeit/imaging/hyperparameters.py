@@ -119,7 +119,8 @@ class AbstractFrameChoice(AbstractHyperparameter):
 class GeneralisedCrossValidation(AbstractFrameChoice):
     """The hyperparameter with the least ``m |y - J x|^2 / tr(I - J Q)^2`` (Golub et al. 1979).
 
-    Each reading is then best predicted from the others. m is the number of independent numbers in a frame, here and below.
+    Each reading is then best predicted from the others. m is the number of independent numbers in a frame, here and
+    below.
     """
 
     name: ClassVar[str] = "gcv"

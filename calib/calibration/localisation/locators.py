@@ -172,7 +172,7 @@ def locate(
     `image`: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
 
     Example:
-        noise, channels = frames[rest].std(0), mine.recon.channels
+        noise, channels = frames[rest].std(0), np.asarray(mine.recon.channels)
         for choice in (calib.ImageCentroid("half"), calibration.FittedContact(most=1)):
             model = je.discretise(je.Scene(mine.skin), je.Fidelity.draft())
             locator = choice.prepare(model, noise, channels)
