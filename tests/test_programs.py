@@ -37,6 +37,7 @@ SLOW = {
     "jaxeit.contacts",
     "jaxeit.effects",
     "jaxeit.imaging",
+    "jaxeit.least_squares",
     "jaxeit.metrics",
     "jaxeit.scan",
     "jaxeit.tracking",

@@ -17,6 +17,7 @@ SUBROOMS = ("calib.fitting.logs", "calib.session.importers")
 MOST_LINKS = 4
 
 
+@cache
 def rooms() -> dict[str, ModuleType]:
     """The packages, and the rooms that they show, by their paths; the packages come last."""
     packages = {path: importlib.import_module(path) for path in SHORT}
@@ -25,6 +26,7 @@ def rooms() -> dict[str, ModuleType]:
     return listing | {path: importlib.import_module(path) for path in SUBROOMS} | packages
 
 
+@cache
 def public_names() -> dict[str, dict[str, object]]:
     """Names of each room, and what they stand for."""
     seen: set[str] = set()
@@ -36,6 +38,7 @@ def public_names() -> dict[str, dict[str, object]]:
     return found
 
 
+@cache
 def identifiers() -> dict[str, str]:
     """Public name -> its path, under which its page shows it."""
     return {name: f"{path}.{name}" for path, names in public_names().items() for name in names}
