@@ -138,8 +138,10 @@ def related(name: str) -> list[str]:
             typed = f"{shown(room, owner)}{dot}{method}"
             far = room.partition(".")[0] != paths[name].partition(".")[0]
             others.append((not has_program(owner), far, typed.count("."), f"[`{typed}`][{room}.{other}]"))
-        if others:
-            said.append(f"{word}: {', '.join(link for *_, link in sorted(set(others))[:MOST_LINKS])}.")
+        links = [link for *_, link in sorted(set(others))]
+        more = f" and {len(links) - MOST_LINKS} more" if len(links) > MOST_LINKS else ""
+        if links:
+            said.append(f"{word}: {', '.join(links[:MOST_LINKS])}{more}.")
     return said
 
 
