@@ -64,6 +64,11 @@ def _summary(thing: object) -> str:
     return " ".join((getdoc(thing) or "").split("\n\n")[0].removesuffix("::").split())
 
 
+def _programs(thing: object) -> list[str]:
+    """The programs in the docstring of a thing itself; that of a value is its class's."""
+    return [] if _group(thing) == "Values" else examples(getdoc(thing))
+
+
 def _link(path: str, name: str) -> str:
     """A link to where a name is shown."""
     return f"[`{shown(path, name)}`][{path}.{name}]"
@@ -73,8 +78,8 @@ def programs_of(path: str) -> Iterator[tuple[str, str]]:
     """The programs on the page of a room, from top to bottom, each after the name whose docstring holds it."""
     names = public_names()[path]
     in_order = [name for group in GROUPS for name in names if _group(names[name]) == group]
-    for name, thing in [("", rooms()[path]), *((name, names[name]) for name in in_order)]:
-        yield from ((name, program) for program in examples(getdoc(thing)))
+    yield from (("", program) for program in examples(getdoc(rooms()[path])))
+    yield from ((name, program) for name in in_order for program in _programs(names[name]))
 
 
 def room_program(path: str) -> str:
@@ -89,7 +94,7 @@ def _documented_programs() -> Iterator[tuple[str, Program]]:
         yield path, Program(f"[`{short}`]({path}.md)", room_program(path))
     for path, names in public_names().items():
         for name, thing in names.items():
-            yield f"{path}.{name}", Program(_link(path, name), "\n".join(examples(getdoc(thing))), room_program(path))
+            yield f"{path}.{name}", Program(_link(path, name), "\n".join(_programs(thing)), room_program(path))
 
 
 @cache
@@ -112,7 +117,7 @@ def _relations() -> Relations:
 def _own(name: str) -> bool:
     """Whether the docstring of a name holds a program."""
     path = identifiers()[name].rpartition(".")[0]
-    return bool(examples(getdoc(public_names()[path][name])))
+    return bool(_programs(public_names()[path][name]))
 
 
 def has_program(name: str) -> bool:
@@ -159,7 +164,7 @@ GO_ON = "The examples of single names below go on from this program.\n"
 def _introduction(path: str, names: Mapping[str, object]) -> str:
     """The docstring of a room with its program."""
     text = with_fences(getdoc(rooms()[path]) or "")
-    goes_on = "```python" in text and any(examples(getdoc(thing)) for thing in names.values())
+    goes_on = "```python" in text and any(_programs(thing) for thing in names.values())
     return text + (f"\n{GO_ON}" if goes_on else "")
 
 
