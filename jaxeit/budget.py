@@ -16,7 +16,14 @@ OR_RAISE = f"or raise all limits with {VARIABLE}=4"
 
 
 class BudgetError(ValueError):
-    """More is asked for than the budget allows; the message says what, where, how much, the limit, and what to do."""
+    """More is asked for than the budget allows; the message says what, where, how much, the limit, and what to do.
+
+    Example:
+        try:
+            je.discretise(je.Scene(skin), je.Fidelity(edge_length=1e-4))
+        except je.BudgetError as error:
+            print(error)
+    """
 
 
 def _limit(default: int, unit: str, todo: str) -> Any:
@@ -46,6 +53,11 @@ class Budget:
     | import_numbers  | all files of an import together                                         |
     | child_bytes     | address space of the process that reads a foreign binary file           |
     | child_seconds   | time of that process                                                    |
+
+    Example:
+        limits = je.Budget()
+        # the second with JAXEIT_BUDGET=4 in the environment
+        print(limits.mesh_nodes, limits.scaled(4).mesh_nodes)
     """
 
     text_bytes: int = _limit(1 << 20, "bytes of text", "describe less, such as outlines of fewer corners")

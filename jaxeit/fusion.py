@@ -1,4 +1,25 @@
-"""Fusion: force maps with the shape of the contact from the image and its force from the pads."""
+"""Fusion: force maps with the shape of the contact from the image and its force from the pads.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+
+    import jaxeit as je
+
+    jax.config.update("jax_enable_x64", True)
+
+    skin = je.load_skin("testbed")
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    recon = je.prepare(model, basis=je.Pixels(20))
+    masks = je.pad_masks(skin, recon)
+
+    near = jnp.linalg.norm(model.centroids - jnp.array([0.06, 0.13]), axis=1) < 0.01
+    # S
+    image = recon(je.forward(model, model.background * jnp.where(near, 1.5, 1.0)) - je.forward(model))
+    forces = jnp.array([0.0, 0.0, 12.0, 0.0])  # N on each pad
+    fmap = je.fuse(image, masks, forces, pad_errors=jnp.full(4, 0.1))
+    print(f"{fmap.force.sum():.1f} N; the image shows where on pads {jnp.flatnonzero(fmap.valid)}")
+"""
 
 import equinox as eqx
 import jax
@@ -35,6 +56,9 @@ class PadMasks(eqx.Module):
     | weights: share of each pad in each pixel; the sum over pads is at most 1 | (pads, pixels) | |
     | areas of the pixels                                      | (pixels,)      | m^2  |
     | shape: (rows, columns) of the image; None: not known     |                |      |
+
+    Example:
+        print(masks.weights @ fmap.force)  # N on each pad, as it was given
     """
 
     weights: Float[Array, "pads pixels"]
@@ -57,6 +81,11 @@ class ForceMap(eqx.Module):
 
     The standard error propagates the errors of the pads' forces alone, with the shape taken as exact; within a pad the
     errors of all pixels are fully correlated.
+
+    Example:
+        # N on each pixel; the first row is the lowest of the sheet
+        picture = fmap.force.reshape(fmap.shape)
+        print(f"{fmap.pressure.max() / 1e3:.0f} kPa, standard error {fmap.standard_error.max():.3f} N")
     """
 
     force: Float[Array, "... pixels"]
@@ -170,6 +199,15 @@ def contact_shares(
         amplitude: (..., K) S, or any other unit; 0 where there is no contact.
         centres: of the pixels, (pixels, 2) m.
         masks: from `pad_masks`.
+
+    Example:
+        # m, two contacts on one pad, such as je.prepare_contacts finds
+        places = jnp.array([[0.03, 0.13], [0.07, 0.15]])
+        shares = je.fusion.contact_shares(
+            places, jnp.full(2, 0.012), jnp.array([1e-3, 5e-4]), recon.centres, masks
+        )
+        both = je.fuse(image, masks, forces, contacts=shares)
+        print(shares.share[:, 2])  # share of each contact in the force on pad 2
     """
     there = (amplitude > 0) & jnp.all(jnp.isfinite(position), -1) & (width > 0)
     place, size = jnp.where(there[..., None], position, 0), jnp.where(there, width, 1)[..., None]

@@ -1,4 +1,27 @@
-"""Figures of merit: the position of a contact in an image, the fidelity of the image, the evenness of sensitivity."""
+"""Figures of merit: the position of a contact in an image, the fidelity of the image, the evenness of sensitivity.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+
+    import jaxeit as je
+
+    jax.config.update("jax_enable_x64", True)
+
+    model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
+    recon = je.prepare(model, basis=je.Pixels(20))
+    places = jnp.array([[0.06, 0.13], [0.1, 0.1], [0.15, 0.05]])  # m
+    bumps = jnp.exp(-jnp.sum((model.centroids - places[:, None]) ** 2, -1) / (2 * 0.008**2))
+    touched = jax.vmap(lambda bump: je.forward(model, model.background * (1 + 0.5 * bump)))(bumps)
+    images = recon(touched - je.forward(model))  # S, one for each place
+    image = images[0]
+
+    for name, estimator in je.metrics.ESTIMATORS.items():  # Peak, two LevelCentroid, PositiveCentroid
+        errors = je.localisation_error(estimator(images, recon), places)
+        print(f"{name}: {1e3 * errors.mean():.1f} mm")
+    figures = je.metrics.greit_figures(images, recon, places, [0.1, 0.1])
+    print(figures.resolution, figures.ringing)  # 1
+"""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -96,7 +119,11 @@ class LevelCentroid(AbstractEstimator):
 
 
 class PositiveCentroid(AbstractEstimator):
-    """The centroid of the positive part, weighted by its value."""
+    """The centroid of the positive part, weighted by its value.
+
+    Example:
+        print(je.metrics.PositiveCentroid()(images, recon))  # m
+    """
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
         return _positive_centroid(jnp.asarray(image), recon.centres, recon.areas)
@@ -157,6 +184,10 @@ def inward_bias(
     """Shift of the estimate towards the sheet's centre, m; negative if outward.
 
     The position error PE of the GREIT figures of merit, with the origin at ``centre``.
+
+    Example:
+        found = je.metrics.Peak()(images, recon)
+        print(je.metrics.inward_bias(found, places, [0.1, 0.1]))  # m, above 0: inward
     """
     return localisation_error(true, centre) - localisation_error(estimated, centre)
 
@@ -175,6 +206,10 @@ def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) ->
     Args:
         values: (..., n).
         ddof: degrees of freedom subtracted for the mean, 0 or 1; required, since results differ.
+
+    Example:
+        sums = je.metrics.image_sum(images, recon.areas)  # S m^2
+        print(je.metrics.coefficient_of_variation(sums, ddof=1))  # of equal touches at several places
     """
     found: Array = _variation(jnp.asarray(values), ddof)
     return found
@@ -331,6 +366,12 @@ def structural_similarity(
 
     Raises:
         MetricError: if the shapes differ, there is no picture, or a setting is not above zero.
+
+    Example:
+        truth = jnp.linalg.norm(recon.centres - places[0], axis=1) < 0.015
+        found = jnp.clip(image / image.max(), 0, 1).reshape(recon.shape)
+        truth = truth.reshape(recon.shape).astype(float)
+        print(je.metrics.structural_similarity(found, truth, width=3.0))  # 1: equal
     """
     a, b = _pictures(image, truth)
     if not is_traced(width, c1, c2) and not (width > 0 and c1 > 0 and c2 > 0):
@@ -430,6 +471,13 @@ def otsu_thresholds(
     Raises:
         MetricError: if there are fewer than two classes, fewer bins than classes, no values, or
             weights of another shape.
+
+    Example:
+        thresholds = je.metrics.otsu_thresholds(image, classes=2)
+        pressed = jnp.searchsorted(thresholds, image, side="right")  # 0 or 1 for each pixel
+        truth = jnp.linalg.norm(recon.centres - places[0], axis=1) < 0.015
+        shape = recon.shape
+        print(je.metrics.ktc_score(pressed.reshape(shape), truth.astype(int).reshape(shape)))  # 1 is best
     """
     values = jnp.asarray(values)
     weights = jnp.ones(values.shape) if weights is None else jnp.asarray(weights)

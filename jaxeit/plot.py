@@ -2,6 +2,25 @@
 
 Every function draws on ``axes``, or on a new figure of `matplotlib.pyplot`, and returns the Axes; save the picture by
 ``axes.figure.savefig("picture.png")``. Lengths are drawn in mm. Install ``jaxeit[plot]``.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+
+    import jaxeit as je
+
+    jax.config.update("jax_enable_x64", True)
+
+    skin = je.load_skin("testbed")
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    axes = je.plot.show_mesh(model)
+    je.plot.show_skin(skin, axes)  # on top of the mesh
+    axes.figure.savefig("mesh.png")
+    je.plot.show_sensitivity(model, reading=0).figure.savefig("sensitivity.png")
+    sigma = model.background * jnp.where(
+        jnp.linalg.norm(model.centroids - 0.06, axis=1) < 0.01, 1.5, 1.0
+    )
+    je.plot.show_image(model, sigma - model.background, label="S").figure.savefig("change.png")
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,26 @@
-"""TOML files read key by key: errors name the key that is missing, wrong or unknown, and the reason."""
+"""TOML files read key by key: errors name the key that is missing, wrong or unknown, and the reason.
+
+Example:
+    from pathlib import Path
+
+    import jaxeit as je
+
+    Path("stage.toml").write_text("speed = 0.01\\nhome = [0, 0]\\n")
+
+
+    def build(table):  # a stage of your own, from its file
+        found = table.positive("speed", "speed in m/s"), table.vector("home", 2, "place in m")
+        table.done()  # refuses keys that nobody reads
+        return found
+
+
+    text = je.toml.read_text(Path("stage.toml"))
+    print(je.toml.parse_toml(text, "stage.toml", build), je.toml.parse_values(text, "stage.toml"))
+    try:
+        je.toml.parse_toml(text + "sped = 1", "stage.toml", build)
+    except je.toml.TomlError as error:
+        print(error)
+"""
 
 import codecs
 import difflib

@@ -7,18 +7,27 @@ import sys
 from collections import Counter
 from html.parser import HTMLParser
 from importlib import import_module, util
+from inspect import isroutine
 from types import ModuleType
 
 import pytest
 
+import calib
+import jaxeit as je
 from tests.test_laws import _public_names
 
 
-@pytest.fixture
-def pages(root, monkeypatch):
+@pytest.fixture(scope="module")
+def names(root):
+    """The module of the site that knows the public names."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(root / "docs" / "site"))
+        yield import_module("public_names")
+
+
+@pytest.fixture(scope="module")
+def pages(names):
     """Path of each room -> its page as it is given to MkDocs."""
-    monkeypatch.syspath_prepend(str(root / "docs" / "site"))
-    names = import_module("public_names")
     return {path: names.room_page(path, listed) for path, listed in names.public_names().items()}
 
 
@@ -50,8 +59,44 @@ def test_names_lead_to_the_programs_that_use_them(pages, root):
     addresses = {address for page in pages.values() for address in re.findall(r"\]\(\.\./([^)#]+)", page)}
     assert addresses
     assert [address for address in addresses if not (root / address).is_file()] == []
-    named = [name for page in pages.values() for name in page.split("::: ")[1:] if "In use: " in name]
-    assert len(named) > 80
+
+
+def test_everyday_names_are_used_in_programs(names):
+    everyday = {name: getattr(package, name) for package in (je, calib) for name in package.__all__}
+    listed = [name for name, thing in everyday.items() if not isinstance(thing, ModuleType)]
+    assert len(listed) > 90
+    assert [name for name in listed if not names.has_program(name)] == []
+
+
+def test_every_function_is_used_in_a_program_and_the_links_of_every_other_name_lead_to_one(names):
+    public = {name: thing for listed in names.public_names().values() for name, thing in listed.items()}
+    assert [name for name, thing in public.items() if isroutine(thing) and not names.has_program(name)] == []
+    assert [name for name in public if not names.leads_to_program(name)] == []
+
+
+def test_every_room_begins_with_a_program(names, pages):
+    for path, page in pages.items():
+        head = page.partition("\n## ")[0]
+        assert "```python\n" in head, f"give the docstring of {path} a section Example"
+        assert names.room_program(path).count("\n") >= 5, path
+
+
+def test_programs_are_found_by_what_they_import(names):
+    used = sys.modules["programs"].used_in
+    public, rooms = names.identifiers(), names.rooms()
+    text = "from jaxeit.imaging import (\n    Laplace,\n    Noser as Prior,\n)\nje.Fidelity.draft()\n"
+    text += "calib.session.importers.About"
+    assert used(text, public, rooms) == {"Laplace", "Noser", "Fidelity", "About"}
+    assert used("effects.Creep()", public, rooms) == set()
+    assert used("effects.Creep()", public, rooms, "from jaxeit import effects") == {"Creep"}
+
+
+def test_pages_name_what_returns_takes_and_raises(pages):
+    entries = {name.split("\n")[0]: name for page in pages.values() for name in page.split("::: ")[1:]}
+    assert "Returned by: [`je.prepare_contacts`]" in entries["jaxeit.contacts.ContactFinder"]
+    assert "Kinds: " in entries["jaxeit.imaging.AbstractPrior"]
+    assert "Raised by: " in entries["jaxeit.imaging.InverseError"]
+    assert "[`je.prepare`][jaxeit.imaging.prepare]" in entries["jaxeit.imaging.InverseError"]
 
 
 class Page(HTMLParser):

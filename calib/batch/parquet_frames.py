@@ -48,6 +48,15 @@ def export_training_frames(
     Raises:
         BenchError: the folder has no frames, or the output holds other files.
         ImportError: without the library `pyarrow`, of the extra ``tables``.
+
+    Example:
+        from concurrent.futures import ThreadPoolExecutor
+
+        bench, one = calib.load_bench("paper_bench"), ThreadPoolExecutor(1)  # default: a pool of processes
+        fidelity, pixels = je.Fidelity.draft(dtype="float32"), je.Pixels(10)
+        calib.write_training_frames(bench, "frames", 1024, fidelity=fidelity, pixels=pixels, executor=one)
+        # for pandas, Polars, DuckDB and Hugging Face datasets
+        print(calib.export_training_frames("frames", "parquet"))
     """
     library("pyarrow.parquet", EXTRA)
     frames, output = open_training_frames(folder), Path(output)

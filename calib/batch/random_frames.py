@@ -105,6 +105,17 @@ def write_training_frames(
         BenchError: nothing can be simulated so; the folder holds something else; the disk has too little space; a
             process died.
         ImportError: ``parquet`` without the library `pyarrow`.
+
+    Example:
+        from concurrent.futures import ThreadPoolExecutor
+
+        bench, one = calib.load_bench("paper_bench"), ThreadPoolExecutor(1)  # default: a pool of processes
+        fidelity, pixels = je.Fidelity.draft(dtype="float32"), je.Pixels(10)
+        calib.write_training_frames(bench, "frames", 1024, fidelity=fidelity, pixels=pixels, executor=one)
+        for readings, maps in calib.open_training_frames("frames").batches(
+            64, "frames", "force_map", seed=0
+        ):
+            pass  # a step of the training
     """
     if jobs < 1:
         raise BenchError(f"{jobs} jobs; give one or more")

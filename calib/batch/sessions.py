@@ -113,6 +113,13 @@ def calibrate_many(
     Raises:
         SessionError: two sessions would have one result, or the folder cannot be made.
         ReportError: a report is wanted and matplotlib is not installed.
+
+    Example:
+        from concurrent.futures import ThreadPoolExecutor
+
+        one = ThreadPoolExecutor(1)  # default: a pool of processes, one per core
+        for outcome in calib.calibrate_many(["session.h5"], "out", recipe=recipe, executor=one):
+            print(outcome.calibration, outcome.reason or outcome.summary["force_rmse"])  # N
     """
     if report:
         require_matplotlib()

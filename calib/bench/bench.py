@@ -13,7 +13,14 @@ from jaxeit.budget import require
 
 
 class BenchError(ValueError):
-    """A bench cannot be simulated as described."""
+    """A bench cannot be simulated as described.
+
+    Example:
+        try:
+            replace(short, sites=np.array([[0.3, 0.1]]))  # m
+        except calib.bench.BenchError as error:
+            print(error)
+    """
 
 
 MAX_FORCE = 1e5  # N: more is another unit
@@ -38,7 +45,13 @@ class Timing:
 
 @dataclass(frozen=True)
 class Companion:
-    """A further tip at ``offset`` (2,) m from the first one, which presses with ``force`` N, ``delay`` s later."""
+    """A further tip at ``offset`` (2,) m from the first one, which presses with ``force`` N, ``delay`` s later.
+
+    Example:
+        # m, N: a tip that presses together with the first
+        second = calib.bench.Companion(offset=(0.05, 0.0), force=8.0)
+        two_tips = replace(short, sites=sites[:1], companions=(second,))
+    """
 
     offset: tuple[float, float]
     force: float
@@ -67,6 +80,10 @@ class Bench:
     Raises:
         BenchError: for a tip that would leave the sheet or is wider than it, forces that do not press, and rates at
             which nothing can be recorded.
+
+    Example:
+        print(f"{len(bench.sites)} presses to {bench.press_forces.max():.0f} N in {bench.duration:.0f} s")
+        print([type(effect).__name__ for effect in bench.scene.effects])
     """
 
     scene: je.Scene

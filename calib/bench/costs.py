@@ -36,7 +36,12 @@ class PartCost:
 
 
 def measure_costs(bench: Bench, fidelity: je.Fidelity | None = None) -> tuple[PartCost, ...]:
-    """Measure each part of the simulation of a scene separately, without compilation; in order of stages."""
+    """Measure each part of the simulation of a scene separately, without compilation; in order of stages.
+
+    Example:
+        costs = calib.bench.measure_costs(short, je.Fidelity.draft())
+        print(calib.bench.render_costs(short, costs))  # what `jaxeit simulate --explain` prints
+    """
     made = simulated_streams(bench, je.Fidelity(edge_length=0.02) if fidelity is None else fidelity)
     parts = [*_session_costs(made), *_solve_costs(made), *_block_costs(made)]
     return tuple(sorted(parts, key=lambda part: STAGES.index(part.stage)))

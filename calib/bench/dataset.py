@@ -46,6 +46,13 @@ def simulate_contacts(
         amplitudes: largest relative change of the conductivity.
         width: of the Gaussian, m.
         progress: wraps the iteration over pieces of the data set.
+
+    Example:
+        model = je.discretise(je.Scene(bench.scene.skin), je.Fidelity.draft())
+        places = calib.bench.grid(bench.scene.skin, columns=4, rows=4)  # m
+        print("simulated sessions have", calib.bench.SIMULATION)  # calib.simulate's own fidelity
+        frames = calib.bench.simulate_contacts(model, places, np.array([0.0, 0.5]), width=0.012)  # V
+        print(frames.shape, "places, amplitudes, readings")
     """
     devices = Mesh(np.array(jax.devices()), ("contacts",))
     piece = CONTACTS_PER_DEVICE * devices.size
@@ -100,6 +107,12 @@ def write_data_set(
 
     Raises:
         BenchError: for less than one column or row, or less than two steps.
+
+    Example:
+        draft = je.Fidelity.draft()
+        places, steps = calib.bench.write_data_set(
+            bench.scene.skin, "contacts.h5", columns=4, rows=4, steps=2, fidelity=draft
+        )
     """
     if columns < 1 or rows < 1 or steps < 2:
         raise BenchError(f"{columns} x {rows} places in {steps} steps make no data set; give one place and two steps")

@@ -58,6 +58,12 @@ class RandomScenes:
 
     Raises:
         BenchError: for probabilities that do not sum to 1, or an empty or impossible range.
+
+    Example:
+        print([arrangement.name for arrangement in calib.bench.Footprint])  # tip, disc, ring and edge
+        edges_only = calib.bench.RandomScenes(
+            counts=(0.0, 1.0, 0.0, 0.0), footprints=(0.0, 0.0, 0.0, 1.0), force=(1.0, 20.0)
+        )
     """
 
     counts: tuple[float, float, float, float] = (0.1, 0.5, 0.25, 0.15)

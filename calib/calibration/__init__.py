@@ -1,4 +1,26 @@
-"""Calibrations: made from sessions, evaluated, applied to frames, saved and loaded."""
+"""Calibrations: made from sessions, evaluated, applied to frames, saved and loaded.
+
+Example:
+    import jax
+    import numpy as np
+
+    import calib
+    import jaxeit as je
+    from calib import calibration
+
+    jax.config.update("jax_enable_x64", True)
+
+    mine = calib.load_calibration("calibration.h5")
+    print(mine.provenance["created_utc"], mine.recipe.to_toml(), mine.curves.parameters)
+    with calib.open_session("other.h5") as session:
+        frames, pressures = session.stream("eit").read(), session.stream("pressure").read()
+        at = np.arange(len(frames)) * len(pressures) // len(frames)  # both streams begin together
+    rest = slice(0, 20)  # frames without contact
+    dv, dp = frames - frames[rest].mean(0), pressures[at] - pressures[rest].mean(0)  # V, Pa
+    found = calib.force_map(mine, dv, dp)
+    strongest = found.force.sum(1).argmax()
+    print(found.force[strongest], found.standard_error[strongest], found.position[strongest])  # N, N, m
+"""
 
 from .application import apply
 from .archives.opening import load_calibration

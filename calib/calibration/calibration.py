@@ -65,6 +65,12 @@ class Calibration:
     |   not learned (`learn_layer`)                                            |
     | electrodes: how far they sit from where the skin's file said; None:      |
     |   taken from the file                                                    |
+
+    Example:
+        force, error, valid = mine.pad_forces(dp[strongest : strongest + 1])  # N, N: without images
+        print(force, error, valid, mine.skin.name, mine.simulated)
+        places = mine.locate(dv[strongest : strongest + 1])  # None without a correction by location
+        mine.save("copy.h5")
     """
 
     skin: je.Skin

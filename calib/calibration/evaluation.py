@@ -70,6 +70,12 @@ class Evaluation:
     | recipe: curve and location of the calibration, in words            |                 |      |
     | splits: errors with pads, indenters or sessions held out           |                 |      |
     | notes: remarks for the reader of the results                       |                 |      |
+
+    Example:
+        print(mine.evaluation.held_out)  # what the fits had not seen
+        for method in mine.evaluation.by_method():
+            print(method)
+        print(mine.evaluation.summary()["force_rmse"])  # N
     """
 
     position: np.ndarray

@@ -37,6 +37,11 @@ class ForceEstimate(NamedTuple):
     Contacts are found by a calibration with a correction by location; otherwise K is 0. The force of a pad is divided
     among contacts by the parts of their fitted bumps on the pad. Forces of pads without a contact are noise or
     crosstalk and belong to no contact.
+
+    Example:
+        pressed = found.force.sum(1) > 1.0  # N
+        print(f"{pressed.sum()} of {len(pressed)} frames are pressed; maps {found.map.force.shape}")
+        print(found.contact_force[strongest])  # N of each contact
     """
 
     map: je.ForceMap

@@ -42,6 +42,12 @@ def learn_layer(
             without contact, which would tell the noise; or if the presses that the calibration kept are less probable
             with what was learned.
         RecordingError: if `check_session` finds an error in its skin, frames or pressures.
+
+    Example:
+        with calib.open_session("session.h5") as session:
+            # by which calib.apply(..., track=True) and live follow contacts
+            wiser = calibration.learn_layer(mine, session)
+        print(wiser.layer.contacts, "contacts learned from")
     """
     processing = processing or calibration.processing
     levels = resting_levels(session, calibration.skin, processing)

@@ -16,7 +16,14 @@ from .recipe_text import recipe_fields, recipe_to_toml
 
 
 class RecipeError(ValueError):
-    """Choices that do not fit together; the message names them and says what to give."""
+    """Choices that do not fit together; the message names them and says what to give.
+
+    Example:
+        try:
+            calib.Recipe(folds=0)
+        except calibration.RecipeError as error:
+            print(error)
+    """
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,13 @@ def accept(
 
     Raises:
         RecordingError: naming the first error of the first session that has one, and how many more there are.
+
+    Example:
+        try:
+            with calib.open_session("session.h5") as session:
+                calib.check.accept([session], je.load_skin("chest"))  # another skin
+        except calib.check.RecordingError as error:
+            print(error)
     """
     transfer = None
     if skin is not None and any("eit" in session.streams for session in sessions):

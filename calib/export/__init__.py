@@ -1,4 +1,20 @@
-"""Calibrations, force maps and sessions for other programs: a C header, bags of ROS 2, and LeRobot datasets."""
+"""Calibrations, force maps and sessions for other programs: a C header, bags of ROS 2, and LeRobot datasets.
+
+Example:
+    import jax
+
+    import calib
+
+    jax.config.update("jax_enable_x64", True)
+
+    mine = calib.load_calibration("calibration.h5")
+    sizes = calib.export_c(mine, "skin.h", place="half")  # C99, for a microcontroller
+    print(f"{sizes.flash} bytes of flash, {sizes.ram} of memory")
+    bag = calib.export_mcap("forcemap.h5", "forcemap.mcap")  # of calib.apply, as messages of ROS 2
+    print(bag.topics)
+    data = calib.export_lerobot(["forcemap.h5"], "dataset", task="press the skin")
+    print(f"{data.episodes} episode of {data.frames} frames, {data.fps} a second")
+"""
 
 from .c import HeaderSizes, export_c
 from .errors import ExportError

@@ -2,6 +2,25 @@
 
 `curves` are functions of the pressure of a pad, `fields` gains over the place of the contact, `logs` fits without
 presses. `pads` fits curves and field together, and `response` chooses among them.
+
+Example:
+    import jax
+    import numpy as np
+
+    import calib
+    from calib import fitting
+
+    jax.config.update("jax_enable_x64", True)
+
+    rng = np.random.default_rng(0)
+    pressures = np.sort(rng.uniform(0, 6000, (2, 300)))  # Pa, of two pads
+    forces = np.array([[1.6e-3], [1.2e-3]]) * pressures**1.05 + 0.1 * rng.normal(size=(2, 300))  # N
+    forces[:, ::50] += 5.0  # spikes, which a robust loss leaves out
+    for curve in (calib.Linear(), calib.PowerLaw(), calib.MonotoneSpline()):
+        fitted = calib.fit_curves(curve, pressures, forces, loss=fitting.Huber())
+        print(curve.name, fitted.scale, [fitting.FitResult(int(r)).name for r in fitted.result])  # N
+    found = fitted.pad(0).predict(np.array([1000.0, 9000.0]))
+    print(found.force, found.standard_error, found.valid)  # N, N; the second is beyond what was fitted
 """
 
 from .curves import (

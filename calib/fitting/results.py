@@ -4,7 +4,14 @@ import enum
 
 
 class FitError(ValueError):
-    """Samples that no fit can take, such as wrong shapes or weights that are not positive."""
+    """Samples that no fit can take, such as wrong shapes or weights that are not positive.
+
+    Example:
+        try:
+            calib.fit_curves(calib.Linear(), pressures, forces[:, :10])
+        except fitting.FitError as error:
+            print(error)
+    """
 
 
 class FitResult(enum.IntEnum):

@@ -218,7 +218,23 @@ def _touch_estimates(found: je.Contacts) -> TouchEstimates:
 
 
 class Engine:
-    """Turns frames into results with one calibration. Only the thread that created it may use it."""
+    """Turns frames into results with one calibration. Only the thread that created it may use it.
+
+    Example:
+        import time
+
+        import numpy as np
+
+        from calib.live import Engine
+        from calib.live.engine import ReceivedFrame
+
+        engine = Engine(mine, rest=0.0)  # frame by frame, without devices
+        for k in range(3):
+            # V, Pa
+            frame = ReceivedFrame(np.zeros(550), np.array([0.0, 0.0, 500.0 * k, 0.0]), time.monotonic_ns())
+            result = engine.step(frame)
+        print(result.force, result.to_json()[:80])
+    """
 
     def __init__(
         self,

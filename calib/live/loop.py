@@ -40,7 +40,16 @@ PERIOD_SMOOTHING = 0.1  # weight of a new interval in the mean interval between 
 
 
 class LiveError(ValueError):
-    """The streams do not fit the calibration, do not begin, or fail."""
+    """The streams do not fit the calibration, do not begin, or fail.
+
+    Example:
+        from calib.live import LiveError
+
+        try:
+            run_live(mine, plan, sources[::-1], [], control)  # pressure before eit
+        except LiveError as error:
+            print(error)
+    """
 
 
 class FrameQueue:

@@ -58,6 +58,14 @@ def present(
 
     Raises:
         LiveError, PriorityError: as `run_live`. RecordError: as `session_journal`. OSError: if a port is in use.
+
+    Example:
+        from calib.live import Presentation, present
+
+        control.stop.clear()
+        plan, sources = plan_recording(urls, mine.skin)
+        page = Presentation(port=0, publish=0)  # any free ports: of the page, and of lines of JSON
+        present(mine, plan, sources, control, page, LiveSettings(rest=0.3), also=[show], tell=print)
     """
     where = where or Presentation()
     with ExitStack() as stack:

@@ -21,7 +21,14 @@ from .streams import finite_mean
 
 
 class CorrectionError(ValueError):
-    """The correction cannot be applied to this stream."""
+    """The correction cannot be applied to this stream.
+
+    Example:
+        try:
+            presses.LowPass(cutoff=50.0).sections(rate=100.0)  # Hz
+        except presses.CorrectionError as error:
+            print(error)
+    """
 
 
 class AbstractCorrection(abc.ABC):
@@ -83,8 +90,9 @@ class LowPass(AbstractCorrection):
     cutoff. With `causal=True` (online) it has -3 dB at the cutoff and a delay; it starts at rest at the first sample.
     The default of 50 Hz is that of the paper which this bench reproduces.
 
-    Raises: `CorrectionError` if the cutoff is not below half the sample rate. At 50 Hz this refuses a stream of
-    100 Hz, where the paper's filter would be exactly at the Nyquist frequency.
+    Raises:
+        CorrectionError: if the cutoff is not below half the sample rate. At 50 Hz this refuses a stream of 100 Hz,
+            where the paper's filter would be exactly at the Nyquist frequency.
     """
 
     cutoff: float = limited(50.0, above=0)
@@ -175,7 +183,11 @@ class TwoSided(AbstractBaseline):
 
 @dataclass(frozen=True)
 class PreOnly(AbstractBaseline):
-    """The rest mean before the press: the only baseline available in real time. Drift during the press stays."""
+    """The rest mean before the press: the only baseline available in real time. Drift during the press stays.
+
+    Example:
+        as_in_real_time = presses.Processing(baseline=presses.PreOnly())
+    """
 
     def weights(
         self, time: np.ndarray | float, before: np.ndarray | float, after: np.ndarray | float

@@ -143,13 +143,16 @@ def find_presses(
     sample above the whole of it (hysteresis).
 
     Args:
-      time: (n,) ns.
-      force: (n,) N, NaN where missing; pressing is positive.
-      threshold: N. Default: 8 times the noise or 5 % of the strongest force, whichever is larger.
-      limits: lengths and tolerances.
+        time: (n,) ns.
+        force: (n,) N, NaN where missing; pressing is positive.
+        threshold: N. Default: 8 times the noise or 5 % of the strongest force, whichever is larger.
+        limits: lengths and tolerances.
 
-    Returns: `PressTimes`, empty if nothing was found. It includes damaged and cut-off presses, not accepted.
-    Raises: `PressError` for fewer than ten finite samples, or for times that do not increase.
+    Returns:
+        `PressTimes`, empty if nothing was found. It includes damaged and cut-off presses, which are not accepted.
+
+    Raises:
+        PressError: for fewer than ten finite samples, or for times that do not increase.
     """
     limits = DetectionLimits() if limits is None else limits
     time, force = np.asarray(time), np.asarray(force, float)

@@ -10,7 +10,14 @@ MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its me
 
 
 class PressError(ValueError):
-    """The streams or the times do not allow a search for presses."""
+    """The streams or the times do not allow a search for presses.
+
+    Example:
+        try:
+            presses.find_presses(np.arange(3), np.zeros(3))
+        except presses.PressError as error:
+            print(error)
+    """
 
 
 @runtime_checkable

@@ -18,7 +18,16 @@ PLAN_FORMAT = "jaxeit-journal"
 
 
 class PlanError(ValueError):
-    """A recording cannot be planned in this way."""
+    """A recording cannot be planned in this way.
+
+    Example:
+        from calib.record import PlanError
+
+        try:
+            plan_recording({}, skin=None)
+        except PlanError as error:
+            print(error)
+    """
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,20 @@ class PriorityError(OSError):
 def real_time(wanted: bool = True) -> Iterator[None]:
     """Schedule the threads of this process, and those that they start, before all ordinary ones within this context.
 
+    Args:
+        wanted: False: leave the scheduling as it is.
+
     Raises:
         PriorityError: if the system refuses; the scheduling is then unchanged.
+
+    Example:
+        from calib.record import PriorityError, real_time
+
+        try:
+            with real_time():  # around record_session: no frame waits for other programs
+                pass
+        except PriorityError as error:
+            print(error)
     """
     before = _raise_priority() if wanted else {}
     try:

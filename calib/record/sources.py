@@ -46,7 +46,16 @@ PYSERIAL_SCHEMES = ("loop", "socket")
 
 
 class SourceError(ValueError):
-    """A URL does not name a source."""
+    """A URL does not name a source.
+
+    Example:
+        from calib.record import SourceError
+
+        try:
+            plan_recording({"pressure": "ftp://192.168.0.7?channels=4"}, skin=None)
+        except SourceError as error:
+            print(error)
+    """
 
 
 class Link(abc.ABC):

@@ -36,11 +36,16 @@ def write_report(
             ``report_loops.png``, with a correction by location ``report_gain.png``.
         evaluations: of the calibration on other sessions, by name.
 
-    Returns: the paths written, the page first.
+    Returns:
+        The paths written, the page first.
 
     Raises:
         ReportError: matplotlib is not installed.
         SessionError, OSError: a file cannot be written.
+
+    Example:
+        for path in calib.write_report(calibration, "report.html"):
+            print(path)  # the page, and its figures as PNG
     """
     require_matplotlib()
     page = Path(path)

@@ -72,6 +72,16 @@ def write_archive(
     ``arrays`` maps a name, which may be nested (``pads/0/covariance``), to (values, units, long name). Values are
     numbers, bools or texts of rank 0 to 4. ``dims`` names axes, as for `ArchiveWriter`.
     Raises `SessionError` for names, types and attributes that the format cannot hold.
+
+    Example:
+        from calib.session import open_archive, read_archive, write_archive
+
+        arrays = {"force": (np.array([1.0, 2.0]), "N", "force on each pad")}
+        write_archive("result.h5", "my-result", {"sensor": "left hand"}, arrays)
+        again = read_archive("result.h5", "my-result")
+        print(again.attrs["sensor"], again.arrays["force"], again.units["force"])
+        with open_archive("result.h5", "my-result") as large:
+            print(large.arrays["force"].read(0, 1))  # rows
     """
     with ArchiveWriter(path, format, attrs) as writer:
         for name, (values, units, long_name) in arrays.items():
@@ -106,6 +116,12 @@ class ArchiveWriter(FileWriter):
     than memory. ``dims`` names the axes of an array after arrays of the file's root that were added before, its
     coordinates; an array with the name of its only axis is such a coordinate. Axes without names are numbered. The
     file appears under its name only after a successful end.
+
+    Example:
+        with calib.session.ArchiveWriter("long.h5", "my-result", {}) as writer:  # larger than memory
+            writer.add_rows("force", (2,), "N", "force on each pad")
+            for _ in range(10):
+                writer.append("force", np.ones((1000, 2)))
     """
 
     def __init__(self, path: str | os.PathLike[str], format: str, attrs: Mapping[str, AttributeValue]):

@@ -4,7 +4,14 @@ from pathlib import Path
 
 
 class SessionError(ValueError):
-    """A file or a value cannot be used: ``<file name>: <where>: <what>; <what to do>``."""
+    """A file or a value cannot be used: ``<file name>: <where>: <what>; <what to do>``.
+
+    Example:
+        try:
+            calib.open_session("nowhere.h5")
+        except calib.SessionError as error:
+            print(error)
+    """
 
 
 def printable(text: object, limit: int = 80) -> str:

@@ -28,7 +28,8 @@ def open_session(path: str | os.PathLike[str]) -> "Session":
     Only descriptions are read and checked here. Samples are read on request and in bounded pieces, so that a
     session may be larger than memory. Use the session as a context manager, or call ``close``.
 
-    Raises `SessionError` with one line that says what is wrong with the file, where, and what to do.
+    Raises:
+        SessionError: with one line that says what is wrong with the file, where, and what to do.
     """
     where = Path(path)
     file = open_guarded(where)
@@ -48,13 +49,20 @@ class Session:
     | current, frequency | A and Hz, None if not stated                                              |
     | offset             | when in the scan a reading is taken (readings,) s, or None                |
     | streams            | by name                                                                   |
-    | presses, events    | tables, or None                                                           |
-    | clocks             | by name of the stream                                                     |
+    | presses, events    | tables, or None; see `PressTable` and `Events`                            |
+    | clocks             | by name of the stream; see `ClockTable`                                   |
     | truth              | arrays by name; empty unless simulated                                    |
     | complete           | False for a recording that was interrupted, or whose devices failed       |
     | recovered          | whether the session was restored after a crash                            |
     | created, epoch     | ISO texts in UTC                                                          |
     | epoch_ns           | ns since 1970                                                             |
+
+    Example:
+        with calib.open_session("session.h5") as session:
+            print(session.title, session.epoch, session.pattern.shape, session.current)  # A
+            print(len(session.presses.x), "presses;", session.complete)
+            for name, stream in session.streams.items():
+                print(name, stream.shape, stream.unit, stream.nominal_rate)  # Hz
     """
 
     def __init__(self, path: Path, file: h5py.File):

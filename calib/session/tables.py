@@ -68,7 +68,24 @@ class PressTable:
     | pad                                  | index of the pad under the tip, -1 unknown         |      |
     | accepted, reason                     | whether the press may be used; if not, why         |      |
 
-    Raises `SessionError` for columns of unequal length, times out of order, or numbers that are not finite.
+    Raises:
+        SessionError: for columns of unequal length, times out of order, or numbers that are not finite.
+
+    Example:
+        column = np.array([0.06, 0.14])  # m
+        table = calib.session.PressTable(
+            x=column,
+            y=column,
+            tip_diameter=np.full(2, 0.02),
+            target_force=np.full(2, 10.0),
+            t_press=np.array([1, 6]) * 10**9,
+            t_hold0=np.array([2, 7]) * 10**9,
+            t_hold1=np.array([4, 9]) * 10**9,
+            t_release=np.array([5, 10]) * 10**9,
+            pad=np.array([0, 3]),
+            accepted=np.ones(2, bool),
+            reason=("", ""),
+        )  # for SessionWriter.set_presses
     """
 
     x: np.ndarray
@@ -152,7 +169,8 @@ class ClockTable:
     | latency_ns      | smallest latency, which was subtracted; accurate to half of ``rtt_ns``   | ns   |
     | rtt_ns          | shortest round trip; both are 0 if they were not measured                | ns   |
 
-    Raises `SessionError` if the numbers of times and ticks differ, or a number is not finite.
+    Raises:
+        SessionError: if the numbers of times and ticks differ, or a number is not finite.
     """
 
     host_ns: np.ndarray

@@ -17,7 +17,15 @@ Numbers = np.ndarray | Array
 
 
 class SimulatorError(ValueError):
-    """A scene, or contacts of a simulator, from which no readings can be computed."""
+    """A scene, or contacts of a simulator, from which no readings can be computed.
+
+    Example:
+        print([family.__name__ for family in simulators.NOT_IN_A_STEP], "have no part in a step")
+        try:
+            simulators.prepare_skin(je.Scene(scene.skin), rate=50.0)
+        except simulators.SimulatorError as error:
+            print(error)
+    """
 
 
 class ContactPoints(NamedTuple):
@@ -28,6 +36,11 @@ class ContactPoints(NamedTuple):
     | position in the sheet's flat coordinates                       | (..., contacts, 2)    | m    |
     | force that presses into the sheet; 0 or less: an empty row     | (..., contacts)       | N    |
     | diameter of what presses, for effects that spread by it        | (..., contacts)       | m    |
+
+    Example:
+        # m, N, m
+        contacts = simulators.ContactPoints(np.array([[0.06, 0.13]]), np.array([5.0]), np.array([0.02]))
+        state, readings = step(state, contacts)
     """
 
     position: Float[Numbers, "*environments contacts 2"]

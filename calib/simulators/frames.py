@@ -32,7 +32,12 @@ class AbstractFrames(eqx.Module):
 
 
 class Solved(AbstractFrames):
-    """Every frame is a solution of the sheet; exact up to the fidelity."""
+    """Every frame is a solution of the sheet; exact up to the fidelity.
+
+    Example:
+        # the default
+        exact = simulators.prepare_skin(scene, 50.0, je.Fidelity.draft(), simulators.Solved())
+    """
 
     def prepared(self, model: je.Model) -> "Solved":
         return self

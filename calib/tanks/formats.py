@@ -65,6 +65,10 @@ def load_eidors(path: str | Path, protocol: je.Protocol | None = None) -> Tank:
 
     Raises:
         TankError: for a volume, or electrodes inside the mesh.
+
+    Example:
+        tank = calib.tanks.load_eidors("model.mat")  # imdl, vh and vi, as saved by EIDORS
+        print(tank.names, tank.frames.shape, tank.mesh is not None)
     """
     path = Path(path)
     return eidors_tank(path, read_matlab(path), protocol)
@@ -75,6 +79,10 @@ def load_ktc(path: str | Path) -> Tank:
 
     Raises:
         TankError: for a file without Inj, Mpat and Uel.
+
+    Example:
+        tank = calib.tanks.load_ktc("data1.mat")  # ref.mat lies beside it
+        print(tank.names, tank.skin.protocol.readings)
     """
     path = Path(path)
     return ktc_tank(path, read_matlab(path))
@@ -84,6 +92,10 @@ def load_pyeidors(path: str | Path, domain: Domain | None = None, rim: Rim | Non
     """A CSV table of PyEIDORS: one row a reading, real and imaginary part of each frame, adjacent rotating order.
 
     Arguments as for `load_tank`.
+
+    Example:
+        tank = calib.tanks.load_pyeidors("table.csv", je.Disc(0.03))
+        print(tank.frames.shape, tank.quadrature.shape)
     """
     return pyeidors_tank(Path(path), domain, rim)
 
@@ -92,6 +104,12 @@ def load_sciospec(paths: Sequence[str | Path], domain: Domain | None = None, rim
     """Text files of Sciospec's software, a frame each; readings are of neighbouring channels that do not drive.
 
     Arguments as for `load_tank`.
+
+    Example:
+        from pathlib import Path
+
+        tank = calib.tanks.load_sciospec(sorted(Path("sciospec").glob("*.eit")), je.Disc(0.03))
+        print(tank.names, tank.skin.protocol.frequency)  # Hz
     """
     return sciospec_tank([Path(path) for path in paths], domain, rim)
 
@@ -104,6 +122,10 @@ def load_instrument(path: str | Path, domain: Domain | None = None, rim: Rim | N
 
     Raises:
         TankError: for a file that was cut short, of an unknown version, or without frames.
+
+    Example:
+        tank = calib.tanks.load_instrument("chest.get", je.Disc(0.15))
+        print(tank.frames.shape)
     """
     path = Path(path)
     if path.suffix.lower() != ".get" and not is_instrument(path):
@@ -116,6 +138,10 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
     ``current`` (electrodes, drives) A and ``measurement`` (electrodes, senses) as for `Protocol.from_matrices`.
 
     Arguments as for `load_tank`.
+
+    Example:
+        tank = calib.tanks.load_npz("tank.npz", disc)
+        print(tank.names, tank.frames.shape, tank.skin.protocol.readings)
     """
     path = Path(path)
     arrays = read_archive(path)

@@ -11,7 +11,14 @@ from jaxeit.skin import AbstractElectrode
 
 
 class TankError(ValueError):
-    """A file that is no recording of a tank, or frames that its model cannot explain."""
+    """A file that is no recording of a tank, or frames that its model cannot explain.
+
+    Example:
+        try:
+            calib.tanks.load_tank("tank.xyz", disc)
+        except calib.tanks.TankError as error:
+            print(error)
+    """
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,11 +4,13 @@ import re
 from collections.abc import Iterator
 
 import griffe
+from programs import with_fences
 from public_names import identifiers
 
 DATACLASS = griffe.Decorator(griffe.ExprName("dataclasses.dataclass"), lineno=None, endlineno=None)
 DECLARES = (".parameter", "equinox.field", ".computed", ".limited")
 MADE_OF_FIELDS = {"equinox.Module", "typing.NamedTuple"}
+PROGRAM = re.compile(r"(```python\n.*?^```$)", re.DOTALL | re.MULTILINE)
 NAME = re.compile(r"(?<![`\[])`([A-Za-z]\w*)((?:\.\w+)*)`(?!`)")
 
 
@@ -53,11 +55,14 @@ def _joined(text: str) -> str:
 
 
 def _linked(text: str, paths: dict[str, str]) -> str:
+    """The text with names in code linked; programs stay as they are."""
+
     def link(found: re.Match[str]) -> str:
         path = paths.get(found[1])
         return f"[{found[0]}][{path}]" if path else found[0]
 
-    return NAME.sub(link, text)
+    parts = PROGRAM.split(text)
+    return "".join(part if part.startswith("```") else NAME.sub(link, part) for part in parts)
 
 
 class Docstrings(griffe.Extension):
@@ -70,4 +75,4 @@ class Docstrings(griffe.Extension):
                 _plain_default(thing)
             if thing.docstring:
                 text = re.sub(r" ?::$", ":", thing.docstring.value, flags=re.MULTILINE)
-                thing.docstring.value = _linked(_joined(text), paths)
+                thing.docstring.value = _linked(_joined(with_fences(text)), paths)

@@ -13,7 +13,14 @@ from ..skin.description import Skin
 
 
 class LadderError(ValueError):
-    """Rungs that cannot be compared, or a limit that no rung meets; the message says what to change."""
+    """Rungs that cannot be compared, or a limit that no rung meets; the message says what to change.
+
+    Example:
+        try:
+            table.recommend(error=1e-9)
+        except accuracy.LadderError as error:
+            print(error)
+    """
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,14 @@ def few_choices() -> tuple[Choice, ...]:
 
 
 def fidelity_choices() -> tuple[Choice, ...]:
-    """Rungs over edge length, order, precision and solver; some have images, which differ little between rungs."""
+    """Rungs over edge length, order, precision and solver; some have images, which differ little between rungs.
+
+    Example:
+        # what je.ladder compares by default
+        everything = accuracy.fidelity_choices() + accuracy.image_choices()
+        quick = accuracy.few_choices()  # in less than a minute
+        print(len(everything), "rungs, or", len(quick))
+    """
     draft, standard, reference = Fidelity.draft, Fidelity.standard, Fidelity.reference
     single = Single(NestedDissection())
     named = {

@@ -1,4 +1,33 @@
-"""Where the skin is touched, and by how many contacts."""
+"""Where the skin is touched, and by how many contacts.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxeit as je
+
+    jax.config.update("jax_enable_x64", True)
+
+    skin = je.load_skin("testbed")
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    v0 = je.forward(model)  # V
+    noise = jnp.full(len(v0), 1e-4 * jnp.abs(v0).max())  # V, of each reading
+    places = jnp.array([[0.05, 0.13], [0.15, 0.06]])  # m
+    bumps = sum(
+        jnp.exp(-jnp.sum((model.centroids - place) ** 2, 1) / (2 * 0.01**2)) for place in places
+    )
+    dv = je.forward(model, model.background * (1 + 0.4 * bumps)) - v0
+
+    finder = je.prepare_contacts(model, je.contacts.ContactSettings(most=2, columns=21), noise=noise)
+    found = finder(dv)  # under jit and vmap, too
+    for place, width, present in zip(found.position, found.width, found.present, strict=True):
+        if present:
+            print(f"at {1e3 * place[0]:.1f}, {1e3 * place[1]:.1f} mm, {1e3 * width:.1f} mm wide")
+    print("the strongest one at", je.contacts.strongest(found))  # m
+    print(je.contacts.ContactResult(int(found.result[0])).name)
+    je.plot.show_contacts(found, je.plot.show_skin(skin)).figure.savefig("contacts.png")
+"""
 
 from .loads import (
     LoadFitter,

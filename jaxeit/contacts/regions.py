@@ -60,6 +60,12 @@ def find_regions(
 
     Raises:
         RegionError: if the image is not one picture of finite numbers, or a setting is out of range.
+
+    Example:
+        recon = je.prepare(model, basis=je.Pixels(20))
+        # no model of contacts: what stands out
+        regions = je.contacts.find_regions(np.asarray(recon(dv)), recon)
+        print(regions.centres, regions.sums)  # m, S m^2
     """
     require_known("find_regions", RegionError, image, recon.areas, recon.centres)
     _check_settings(level, least)

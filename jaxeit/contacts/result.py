@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class ContactResult(IntEnum):
-    """What became of a slot of `Contacts`."""
+    """Outcome of the fit of one slot of `Contacts`."""
 
     CONVERGED = 0
     AT_BOUND = 1  # the width or the position ended on its bound: the covariance is a guess
@@ -30,6 +30,11 @@ class Contacts(eqx.Module):
     | covariance of x, y, log width, amplitude; times misfit if above one | (..., K, 4, 4) | mixed |
     | misfit: chi-square of the frame over its degrees of freedom         | (...)          |       |
     | result: a `ContactResult`                                           | (..., K)       |       |
+
+    Example:
+        print(found.strength)  # S m^2: what grows with the force
+        sure = jnp.sqrt(jnp.diagonal(found.covariance, axis1=-2, axis2=-1))  # of x, y, log width, amplitude
+        print(1e3 * sure[found.present, :2], "mm")
     """
 
     present: Bool[Array, "... K"]

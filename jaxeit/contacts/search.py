@@ -81,6 +81,10 @@ class ContactFinder(eqx.Module):
     | separation: least distance of two contacts, in mean widths                | ()           | 1     |
     | root, whole: of a frame without missing readings, see `Bumps`             | (r, r), ()   | 1     |
     | most: contacts looked for, K                                              |              |       |
+
+    Example:
+        quick = jax.jit(finder)  # a finder holds numbers alone: no mesh, no solver
+        several = jax.vmap(finder)(jnp.stack([dv, 2 * dv]))  # frames along a leading axis
     """
 
     whitening: Whitening

@@ -18,7 +18,7 @@ class ContactSettings:
     | columns: nodes of the table along x, from rim to rim                 | 41            |      |
     | false_alarm: fraction of blank frames in which a contact is found    | 0.01          |      |
     | model_error: fraction of the signal that a bump may fail to explain  | 0.015         |      |
-    | ratio: fraction of the rest that a further contact must explain more | 0.8           |      |
+    | ratio: fraction of the rest that a further contact must explain      | 0.8           |      |
     | separation: least distance of two contacts, in mean widths           | 1.2           |      |
 
     A table whose pitch is above the smallest width loses accuracy there.

@@ -302,18 +302,41 @@ class AbstractClockEffect(AbstractEffect):
 
 
 def laid(effects: Iterable[AbstractEffect], centroids: Float[Array, "elements 2"]) -> tuple[AbstractEffect, ...]:
-    """The effects, with sheet effects prepared by `AbstractSheetEffect.laid`, for many states of one mesh."""
+    """The effects, with sheet effects prepared by `AbstractSheetEffect.laid`, for many states of one mesh.
+
+    Example:
+        # Random fields are computed once, for many states of one mesh.
+        once = effects.laid(scene.effects, model.centroids)
+    """
     return tuple(e.laid(centroids) if isinstance(e, AbstractSheetEffect) else e for e in effects)
 
 
 def chosen(effects: Iterable[AbstractEffect], family: type, stream: StreamKind | None = None) -> tuple[Any, ...]:
-    """The effects of one family (and one stream, if given) in the order in which they act."""
+    """The effects of one family (and one stream, if given) in the order in which they act.
+
+    Example:
+        print(effects.chosen(scene.effects, effects.AbstractSheetEffect))  # in the order in which they act
+    """
     mine = (e for e in effects if isinstance(e, family) and (stream is None or getattr(e, "stream", None) is stream))
     return tuple(sorted(mine, key=lambda e: e.rank))
 
 
 def fold(effects: Iterable[AbstractEffect], family: type, state: Any, *context: Any) -> Any:
-    """Apply the effects of one family in order of rank, each in a scope with its name in the compiled program."""
+    """Apply the effects of one family in order of rank, each in a scope with its name in the compiled program.
+
+    Example:
+        when = jnp.asarray(skin.protocol.reading_offsets)  # s
+        late = effects.fold(
+            (effects.ScanSkew(stretch=1.2),), effects.AbstractScanEffect, jnp.zeros_like(when), when
+        )
+        sent = effects.Packets(when, when, jnp.zeros(len(when), bool))
+        links = (effects.ClockError(skew=5e-5), effects.DropOut(probability=0.01))
+        for link, key in zip(links, effects.keys(links, jax.random.key(1)), strict=True):
+            sent = link(sent, key)
+        plan = effects.Path(jnp.full((9, 2), 0.1), jnp.zeros(9), jnp.ones(9))  # m, s, 1, of nine presses
+        pressed = effects.StageError(position=2e-5)(plan, jax.random.key(2))
+        print(late[-1], sent.lost.sum(), pressed.places[0])  # s, samples, m
+    """
     for effect in chosen(effects, family):
         with jax.named_scope(type(effect).__name__):
             state = effect(state, *context)

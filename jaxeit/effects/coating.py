@@ -27,6 +27,11 @@ class ContinuousCoating(AbstractCoatEffect):
     | reference_pressure p_r, over the area      | 64      |            | kPa     | 20 N on a 20 mm tip |
     | exponent n                                 | 1       | 0.6 to 1.2 | 1       | many spots          |
     | coverage f: share of the area that touches | 1/3     | 0 to 1     | 1       | that of the islands |
+
+    Example:
+        bridged = je.discretise(je.Scene(skin, (effects.ContinuousCoating(),)), je.Fidelity.draft())
+        # a CoatedSheet, for je.forward
+        two_sheets = je.conductivity(bridged, 1e4 * jnp.ones(len(bridged.areas)))
     """
 
     alternative: ClassVar[str] = "how pressure makes the sheet conduct"

@@ -23,7 +23,7 @@ class ScanSkew(AbstractScanEffect):
 
     | meaning                                        | default | range    | unit | source                            |
     |------------------------------------------------|---------|----------|------|-----------------------------------|
-    | stretch: true times over the protocol's        | 1       | 0.5 to 2 | 1    | the skin's protocol as it is told |
+    | stretch: true times over the protocol's        | 1       | 0.5 to 2 | 1    | the skin's protocol               |
     """
 
     stretch: Float[Array, ""] = parameter(1.0)

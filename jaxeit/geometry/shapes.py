@@ -176,7 +176,8 @@ class Rectangle(_Polygonal):
     | width, along x  | () | m    |
     | height, along y | () | m    |
 
-    Raises ValueError unless both are positive and finite.
+    Raises:
+        ValueError: unless both are positive and finite.
     """
 
     width: float
@@ -208,7 +209,8 @@ class Disc(Domain):
     | radius  | ()    | m    |
     | centre  | (2,)  | m    |
 
-    Raises ValueError unless the radius is positive and all values are finite.
+    Raises:
+        ValueError: unless the radius is positive and all values are finite.
     """
 
     radius: float
@@ -269,8 +271,9 @@ class Polygon(_Polygonal):
     |----------|-------------|------|
     | vertices | (corners, 2) | m   |
 
-    Raises ValueError for fewer than three vertices, repeated ones, values that are not finite, and
-    sides that cross, touch or fold back on each other.
+    Raises:
+        ValueError: for fewer than three vertices, repeated ones, values that are not finite, and sides that cross,
+            touch or fold back on each other.
     """
 
     vertices: ArrayLike

@@ -27,7 +27,14 @@ _RANGE = np.logspace(-4, 2, 241)
 
 
 class HyperparameterError(ValueError):
-    """No hyperparameter can be chosen in this way; the message says why."""
+    """No hyperparameter can be chosen in this way; the message says why.
+
+    Example:
+        try:
+            je.prepare(model, basis=je.Pixels(2), noise=noise, hyperparameter=je.imaging.Discrepancy(dv))
+        except je.imaging.HyperparameterError as error:
+            print(error)
+    """
 
 
 class Spectrum(eqx.Module):
@@ -110,9 +117,10 @@ class AbstractFrameChoice(AbstractHyperparameter):
 
 
 class GeneralisedCrossValidation(AbstractFrameChoice):
-    """Least ``m |y - J x|^2 / tr(I - J Q)^2``: each reading is best predicted from the others (Golub et al. 1979).
+    """The hyperparameter with the least ``m |y - J x|^2 / tr(I - J Q)^2`` (Golub et al. 1979).
 
-    m is the number of independent numbers in a frame, here and below.
+    Each reading is then best predicted from the others. m is the number of independent numbers in a frame, here and
+    below.
     """
 
     name: ClassVar[str] = "gcv"
@@ -127,7 +135,7 @@ class GeneralisedCrossValidation(AbstractFrameChoice):
 
 
 class LCurve(AbstractFrameChoice):
-    """The corner of log |y - J x| against log x^T R x: where its curvature is largest (Hansen 1992)."""
+    """The hyperparameter at the corner of log |y - J x| against log x^T R x (Hansen 1992): of the largest curvature."""
 
     frames: Float[ArrayLike, "... readings"] | None = None
 
@@ -147,9 +155,15 @@ def _slopes(*curves: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 class Discrepancy(AbstractFrameChoice):
-    """The largest with ``|y - J x|^2 <= factor^2 m``: the misfit is that of the noise (Morozov 1966).
+    """The largest hyperparameter with ``|y - J x|^2 <= factor^2 m``: the misfit is that of the noise (Morozov 1966).
 
     Needs ``noise`` in `prepare`. ``factor`` multiplies the standard deviations; default 1.
+
+    Example:
+        fitted = je.prepare(
+            model, basis=je.Pixels(20), noise=noise, hyperparameter=je.imaging.Discrepancy(dv)
+        )
+        print(fitted.provenance["hyperparameter"], "by one of", list(je.imaging.HYPERPARAMETERS))
     """
 
     needs_noise: ClassVar[bool] = True

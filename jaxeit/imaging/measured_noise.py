@@ -35,7 +35,13 @@ class AbstractNoise(eqx.Module):
 
 
 class EqualNoise(AbstractNoise):
-    """All readings alike, of unknown size. Images then have no standard deviations."""
+    """All readings alike, of unknown size. Images then have no standard deviations.
+
+    Example:
+        # equal, measured, correlated: names for recipes and the command line
+        print(list(je.imaging.NOISES))
+        plain = je.Imaging(je.Pixels(10), noise=je.imaging.EqualNoise())
+    """
 
     name: ClassVar[str] = "equal"
     needs_frames: ClassVar[bool] = False
@@ -61,7 +67,13 @@ class MeasuredNoise(AbstractNoise):
 
 
 class CorrelatedNoise(AbstractNoise):
-    """The readings by their covariance without contact, see `noise_covariance`: for an instrument with crosstalk."""
+    """The readings by their covariance without contact, see `noise_covariance`: for an instrument with crosstalk.
+
+    Example:
+        crosstalk = je.Imaging(je.Pixels(10), noise=je.imaging.CorrelatedNoise()).prepare(
+            model, quiet=quiet
+        )
+    """
 
     name: ClassVar[str] = "correlated"
 

@@ -377,6 +377,9 @@ def noise_covariance(blank: Float[ArrayLike, "frames readings"]) -> np.ndarray:
 
     Raises:
         InverseError: for fewer frames, or readings that are not finite or do not change at all.
+
+    Example:
+        crosstalk = je.prepare(model, basis=je.Pixels(10), noise=je.imaging.noise_covariance(quiet))
     """
     require_known("noise_covariance", InverseError, blank)
     blank = np.asarray(blank, float)

@@ -114,8 +114,8 @@ def prepare(
     Raises:
         InverseError: if a value is out of range or no channel is left, or the result is not finite; if both
             ``untouched`` and ``sigma`` are given, or no coating explains the untouched frame; if prior, method or
-            basis is none, such as a method in the place of the prior; or if jit, grad or vmap hides the protocol or the
-            channels.
+            basis is an object of another kind, such as a method in the place of the prior; or if jit, grad or vmap
+            hides the protocol or the channels.
         HyperparameterError: if the hyperparameter is to be chosen by values that jit, grad or vmap hides.
     """
     method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()

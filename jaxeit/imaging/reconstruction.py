@@ -158,6 +158,12 @@ class Reconstructor(AbstractReconstructor):
     | factor: image per pair sum                                                       | (basis, k) | S V  |
     | variance left to each coefficient by readings and prior; infinite where not known | (basis,)  | S^2  |
     | the rest: `AbstractReconstructor`                                                |            |      |
+
+    Example:
+        quick = recon.on_host("float32")  # NumPy to NumPy: for one frame after the other
+        images = recon(quiet)  # (frames, pixels) S
+        broken = recon.without(jnp.arange(len(v0)) == 7)  # reading 7 has died; nothing else changes
+        print(recon.matrix.shape, quick(np.asarray(dv)).dtype)
     """
 
     factor: Float[Array, "basis k"]

@@ -98,6 +98,15 @@ def segment(
 
     Raises:
         InverseError: if a shape or a value is wrong.
+
+    Example:
+        from jaxeit.imaging import LevelSet, segment
+
+        dark = model.background * jnp.where(near, 0.2, 1.0)  # S: an object that hardly conducts
+        found = segment(
+            model, v0, je.forward(model, dark), je.Pixels(16), borders=LevelSet(widths=(0.5,)), pixels=64
+        )
+        print(f"{(found.classes == 1).mean():.1%} of the picture is resistive")  # 2: conductive
     """
     require_known("segment", InverseError, model.background)
     before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
@@ -204,8 +213,18 @@ def half_height_classes(
     """Classes of an image that is zero where nothing changed: regions beyond ``floor``, each cut at half its own peak.
 
     Args:
+        image: change, in any unit; row 0 at low y.
+        floor: least absolute value of a pixel of a region, in the unit of the image.
         least: smallest region, over the area of the picture.
         weakest: sum of the image over the weakest region, over that of the strongest.
+
+    Returns:
+        (rows, columns): 0 unchanged, 1 below zero, 2 above zero.
+
+    Example:
+        picture = je.imaging.on_grid(image, recon.picture, (64, 64))  # S, on a grid of its own
+        # 0, 1 or 2
+        classes = je.imaging.half_height_classes(picture, floor=0.2 * picture.max(), least=0.002)
     """
     classes, regions = np.full(image.shape, UNCHANGED), []
     for sign, kind in ((-1, RESISTIVE), (1, CONDUCTIVE)):

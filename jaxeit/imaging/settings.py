@@ -31,6 +31,10 @@ class Imaging:
     Raises:
         InverseError: for a hyperparameter that is not above zero, a choice in the place of another, or a prior that
             changes with the image and a method that takes it only once.
+
+    Example:
+        settings = je.Imaging(je.Pixels(10), prior=je.Tikhonov(), noise=je.imaging.MeasuredNoise())
+        same_for_any_skin = settings.prepare(model, quiet=quiet)
     """
 
     basis: AbstractBasis = field(default_factory=Pixels)

@@ -56,7 +56,14 @@ _WORDS = {"f": "floating point", "iu": "integers", "b": "boolean"}
 
 
 class StorageError(ValueError):
-    """A file or numbers that are no reconstructor; the message says what is wrong, and where."""
+    """A file or numbers that are no reconstructor; the message says what is wrong, and where.
+
+    Example:
+        try:
+            je.load_reconstructor("recon.toml")
+        except je.imaging.StorageError as error:
+            print(error)
+    """
 
 
 def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.ndarray]:
@@ -64,6 +71,13 @@ def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.nd
 
     Raises:
         StorageError: for a protocol of matrices (`Protocol.from_matrices`), or amplifiers with a `CommonMode`.
+
+    Example:
+        # for a file format of your own; NUMBERS has shapes, units and meanings
+        numbers = je.imaging.to_numbers(recon)
+        for name, array in numbers.items():
+            print(name, array.shape, je.imaging.NUMBERS[name][1:])
+        again = je.imaging.from_numbers(numbers, recon.shape, recon.extent, recon.provenance)
     """
     require_known("to_numbers", StorageError, recon)
     if recon.whitening.shares is not None:

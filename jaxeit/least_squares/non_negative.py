@@ -131,6 +131,12 @@ class DualNewton(optx.AbstractMinimiser[Data, Any, DualState]):
 
     The objective is a parabola while the set of positive parameters stays the same, so that the method ends exactly: a
     whole step to the same set is the last one. The ``args`` of `optimistix.minimise` are the problem.
+
+    Example:
+        J = jax.random.normal(jax.random.key(0), (15, 24))
+        problem = ls.DiagonalProblem(J, jnp.full(24, 0.1), jnp.ones(15))
+        found = optx.minimise(lambda a, p: p.dual(a), ls.DualNewton(), jnp.zeros(15), problem, max_steps=40)
+        image = problem.solution(found.state.positive)  # (24,), nowhere negative
     """
 
     rtol: float = 0.0
@@ -172,6 +178,12 @@ class InteriorPoint(optx.AbstractMinimiser[Parameters, Any, Parameters]):
     Solves ``H x - b = z``, ``x z = 0`` with x, z > 0. Each step divides the duality gap, the mean of x z, by about ten
     whatever the condition of H. Ends where the gap is ``atol``, for a problem of order one, which is the ``args`` of
     `optimistix.minimise`. The state is the multiplier z.
+
+    Example:
+        dense = problem.dense().of_order_one()
+        found = optx.minimise(
+            lambda x, p: p.value(x), ls.InteriorPoint(0.0, 1e-12), jnp.ones(24), dense, max_steps=40
+        )
     """
 
     rtol: float

@@ -44,7 +44,11 @@ MIN_CURVATURE = 0.01
 
 
 def quadratic(value: Scalar, gradient: Parameters, hessian: Matrix) -> Quadratic:
-    """An objective near a point, ``value + gradient . d + d^T hessian d / 2``."""
+    """An objective near a point, ``value + gradient . d + d^T hessian d / 2``.
+
+    Example:
+        bowl = ls.quadratic(jnp.array(0.0), jnp.ones(2), 2 * jnp.eye(2))  # d . (1, 1) + |d|^2
+    """
     return Quadratic(value, gradient, lx.MatrixLinearOperator(hessian, lx.positive_semidefinite_tag))
 
 
@@ -55,6 +59,11 @@ def normal_equations(
 
     Args:
         weight: part of Gauss and Newton's curvature that a robust loss leaves to each residual; default: all.
+
+    Example:
+        x = fit.value
+        near = ls.normal_equations(residual(x, force), jax.jacfwd(residual)(x, force))
+        print(jnp.abs(near.grad).max())  # next to nothing at the minimum
     """
     weighed = slopes if weight is None else slopes * jnp.maximum(weight, MIN_CURVATURE)[:, None]
     return quadratic(0.5 * residual @ residual, slopes.T @ residual, weighed.T @ slopes)
@@ -94,6 +103,10 @@ class Cholesky(lx.Cholesky):  # type: ignore[misc]  # lineax has annotations but
     """`lineax.Cholesky` of a positive operator, by our factors, which are safe under `jax.vmap`.
 
     For the descents of optimistix, such as ``optimistix.NewtonDescent(linear_solver=Cholesky())``.
+
+    Example:
+        newton = optx.NewtonDescent(linear_solver=ls.Cholesky())
+        unbounded = ls.LevenbergMarquardt(1e-8, 1e-8, descent=newton, search=optx.BacktrackingArmijo())
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> tuple[Matrix, None]:
@@ -119,6 +132,9 @@ class BoundedDescent(optx.AbstractDescent[Parameters, Quadratic, _AtPoint]):
 
     A parameter that is pushed against its bound rests there. One that the step would take out of the box goes to its
     bound, and the others take the step that is best then.
+
+    Example:
+        solver = ls.LevenbergMarquardt(1e-8, 1e-8, descent=ls.BoundedDescent(lower=jnp.zeros(2)))
     """
 
     lower: Parameters | None = None

@@ -1,4 +1,29 @@
-"""Linear solvers as objects: symmetric positive definite, pattern fixed, values traced."""
+"""Linear solvers as objects: symmetric positive definite, pattern fixed, values traced.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxeit as je
+    from jaxeit import linalg
+
+    jax.config.update("jax_enable_x64", True)
+
+    n = 200  # a chain of springs: 2.1 on the diagonal, -1 beside it
+    rows = np.concatenate([np.arange(n), np.arange(1, n)])
+    cols = np.concatenate([np.arange(n), np.arange(n - 1)])
+    pattern = linalg.SparsityPattern(n, rows, cols)
+    values = jnp.concatenate([jnp.full(n, 2.1), jnp.full(n - 1, -1.0)])
+    load = jnp.ones((n, 1))
+    solve = je.verb(linalg.solve_spd)
+    for solver in (linalg.Dense(), linalg.NestedDissection(), linalg.ConjugateGradient()):
+        plan = solver.analyse(pattern)  # once, on the host
+        x = solve(solver, plan, values, load)  # as often as needed, also under vmap and grad
+        left = jnp.abs(linalg.matvec(plan, values, x) - load).max()
+        print(f"{linalg.SOLVERS.text(solver)}: {left:.1e} left of the load")
+    print(je.Fidelity.draft(solver=linalg.default_solver(n)))
+"""
 
 from ..registry import Registry
 from .base import AbstractLinearSolver, AbstractPlan, PatternError, SparsityPattern, inverse_columns, matvec, solve_spd

@@ -21,7 +21,14 @@ from ..registry import AbstractChoice
 
 
 class PatternError(ValueError):
-    """A sparsity pattern that does not describe a symmetric positive definite matrix."""
+    """A sparsity pattern that does not describe a symmetric positive definite matrix.
+
+    Example:
+        try:
+            linalg.SparsityPattern(2, np.array([0, 0, 1]), np.array([0, 1, 1]))  # above the diagonal
+        except linalg.PatternError as error:
+            print(error)
+    """
 
 
 def _no_indices() -> np.ndarray:
@@ -40,8 +47,8 @@ class SparsityPattern:
     | root: unknowns that may couple to every other, eliminated last;  | (r,)   |      |
     |   the inverse is wanted on them (`AbstractLinearSolver.corner`)  |        |      |
 
-    Raises `PatternError` for an upper-triangle, repeated or out-of-range entry, or a hole in the
-    diagonal.
+    Raises:
+        PatternError: for an upper-triangle, repeated or out-of-range entry, or a hole in the diagonal.
     """
 
     n: int
@@ -181,7 +188,13 @@ def solve_spd(
 def inverse_columns(
     solver: AbstractLinearSolver, plan: AbstractPlan, values: Float[Array, " nnz"]
 ) -> Float[Array, "n r"]:
-    """X = A^-1 on the columns of the root, differentiable as `solve_spd` is: dX = -A^-1 dA X."""
+    """X = A^-1 on the columns of the root, differentiable as `solve_spd` is: dX = -A^-1 dA X.
+
+    Example:
+        ends = linalg.SparsityPattern(n, rows, cols, root=np.array([0, n - 1]))
+        plan = linalg.Dense().analyse(ends)
+        print(linalg.inverse_columns(linalg.Dense(), plan, values).shape)  # (n, 2): one column for each end
+    """
     factor = solver.factor(plan, jax.lax.stop_gradient(values))
     found: Float[Array, "n r"] = _columns(values, factor, plan, solver)
     return found

@@ -11,6 +11,10 @@ def is_covariance(matrices: np.ndarray) -> bool:
 
     The test is the Cholesky factorisation of the correlations with a small multiple of the identity added, which takes
     a fraction of the time for eigenvalues. A matrix with values that are not finite is no covariance.
+
+    Example:
+        for correlation in (0.5, 2.0):
+            print(correlation, linalg.is_covariance(np.array([[1.0, correlation], [correlation, 1.0]])))
     """
     matrices = np.asarray(matrices)
     variance = np.diagonal(matrices, axis1=-2, axis2=-1).astype(np.float64)

@@ -26,6 +26,12 @@ def flat_mesh(
 
     Raises:
         MeshError: for nodes that lie in no such plane, or triangles that name others.
+
+    Example:
+        # m, all at one height
+        corners = np.array([[0, 0, 0.5], [0.1, 0, 0.5], [0.1, 0.1, 0.5], [0, 0.1, 0.5]])
+        # one is clockwise
+        square, numbers = je.meshing.flat_mesh(corners, np.array([[0, 2, 1], [0, 2, 3]]))
     """
     if nodes.shape[1] not in (2, 3) or not (nodes[:, 2:] == nodes[:1, 2:]).all():
         raise MeshError(
@@ -50,6 +56,10 @@ def read_mesh(path: str | Path) -> Mesh:
 
     Raises:
         MeshError: if meshio is not installed or cannot read the file, or it has no flat triangles.
+
+    Example:
+        # degrees; the error names the worst triangle
+        mesh = je.meshing.read_mesh("patch.vtu").check(min_angle=15)
     """
     found = _meshio(path, "read", path)
     triangles = [block.data for block in found.cells if block.type == "triangle"]
@@ -69,6 +79,9 @@ def write_mesh(path: str | Path, mesh: Mesh, **values: Float[Any, " m"]) -> None
 
     Raises:
         MeshError: if meshio is not installed or cannot write the file, or values do not fit the mesh.
+
+    Example:
+        je.meshing.write_mesh("patch.vtu", mesh, smallest_angle=mesh.min_angles)  # for ParaView
     """
     data = {name: np.asarray(array, float) for name, array in values.items()}
     wrong = [name for name, array in data.items() if array.shape != (len(mesh.triangles),)]

@@ -33,7 +33,8 @@ class Mesh:
     | triangles: node numbers, int32, counter-clockwise in the chart | (m, 3) |  |
     | chart: positions on the flat sheet; nodes if not given and nodes are plane | (n, 2) | m |
 
-    Raises MeshError for wrong shapes; `check` tests the values.
+    Raises:
+        MeshError: for wrong shapes; `check` tests the values.
     """
 
     nodes: np.ndarray

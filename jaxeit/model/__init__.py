@@ -1,4 +1,27 @@
-"""From a scene and a fidelity to voltages, and their derivatives with respect to the sheet conductivity."""
+"""From a scene and a fidelity to voltages, and their derivatives with respect to the sheet conductivity.
+
+Example:
+    import jax
+    import jax.numpy as jnp
+
+    import jaxeit as je
+
+    jax.config.update("jax_enable_x64", True)
+
+    skin = je.load_skin("testbed")
+    effects = (je.effects.LoadSpreading(), je.effects.ContactPiezoresistance())
+    fidelity = je.Fidelity.draft()
+    print(je.model.expected_mesh_nodes(skin, fidelity), "nodes")
+    model = je.discretise(je.Scene(skin, effects), fidelity)
+
+    # Pa: 10 N under a tip of 20 mm
+    pressure = 10.0 * je.model.load_spread(model, jnp.array([0.06, 0.13]), 0.02)
+    dv = je.forward(model, je.conductivity(model, pressure)) - je.forward(model)  # V
+    gage = je.pad_response(skin, model) @ pressure  # Pa in each pad
+    J = je.jacobian(model, basis=je.Bumps(20))  # V/S, (readings, bumps)
+    lost = je.model.rounding(model)  # V
+    print(f"{1e3 * jnp.abs(dv).max():.2f} mV, {gage.max():.0f} Pa; rounding {lost.max():.1e} V")
+"""
 
 from .bases import (
     BASES,

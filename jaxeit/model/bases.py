@@ -91,6 +91,12 @@ class BasisMap(AbstractPictured):
     | stiffness of each line                                |             |      |
     | picture: where the coefficients lie                   |             |      |
     | single: whether each coefficient has one line         |             |      |
+
+    Example:
+        # once, on the host; then it can be an argument of a jitted function
+        pixels = je.Pixels(20).on(model)
+        image = jnp.zeros(pixels.size).at[210].set(1e-3)  # S
+        sigma = model.background + pixels.expand(image)
     """
 
     element: Int[Array, "lines c"]
@@ -194,6 +200,10 @@ class Bumps(AbstractBasis):
     |----------------------------------------------------------|---------|------|
     | columns, rows: centres from rim to rim; rows None: square | 41      |      |
     | width: standard deviation of a bump                      | 0.012   | m    |
+
+    Example:
+        bumps = je.Bumps(columns=20, width=0.008).on(model)
+        print(je.model.BASES.text(je.Bumps(20)))  # as a recipe and the command line name it
     """
 
     columns: int = limited(41, least=2, most=500)

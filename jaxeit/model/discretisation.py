@@ -53,6 +53,11 @@ class Model(eqx.Module):
     | current                                             | ()              | A                 |
     | effects of the scene                                |                 |                   |
     | coat: the second sheet, if an effect asks for one   |                 |                   |
+
+    Example:
+        print(model.readings, "readings of", model.electrodes, "electrodes,", len(model.nodes), "nodes")
+        # a sheet that conducts 10 % better
+        print(je.forward(model, 1.1 * model.background) / je.forward(model))
     """
 
     nodes: Float[Array, "nodes d"]
@@ -168,7 +173,13 @@ def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:
 
 
 def make_mesh(scene: Scene, fidelity: Fidelity) -> Mesh:
-    """The mesh that `discretise` makes: graded around the electrodes, checked."""
+    """The mesh that `discretise` makes: graded around the electrodes, checked.
+
+    Example:
+        mesh = je.model.make_mesh(je.Scene(skin), fidelity)
+        # scenes on one mesh differ by their physics alone
+        ideal = je.discretise(je.Scene(skin), fidelity, mesh=mesh)
+    """
     length = _edge_length(scene.skin, fidelity)
     return _mesh(scene.skin, _footprints(scene.skin, fidelity), length, fidelity.growth)
 

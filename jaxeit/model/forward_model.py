@@ -98,6 +98,7 @@ def forward(
 
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model, or has a coat and the model none.
+        DerivativeError: if JAX differentiates with respect to the mesh of the model or arrays made of it.
     """
     sigma = conductivity(model) if sigma is None else sigma  # one program, with or without a conductivity given
     return _forward(model, sigma if isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
@@ -227,7 +228,16 @@ def four_terminal(z: Any, pattern: Any) -> Any:
 
 
 class DerivativeError(ValueError):
-    """A derivative with respect to an array that is not a parameter of the physics."""
+    """A derivative with respect to an array that is not a parameter of the physics.
+
+    Example:
+        import equinox as eqx
+
+        try:
+            eqx.filter_grad(lambda model: je.forward(model).sum())(model)  # of the mesh, too
+        except je.model.DerivativeError as error:
+            print(error)
+    """
 
 
 @jax.custom_jvp

@@ -191,10 +191,7 @@ def moved(
 ) -> Model:
     """The model with its electrodes moved and grown, differentiable with respect to both under jit, vmap and grad.
 
-    Conductivities, and a basis that was laid over the model, move with the elements. ::
-
-        motion = je.model.electrode_motion(model)
-        slopes = jax.jacfwd(lambda shift: je.forward(je.model.moved(model, motion, shift)))(jnp.zeros((25, 2)))
+    Conductivities, and a basis that was laid over the model, move with the elements.
 
     Args:
         model: with which `electrode_motion` made the motion.
@@ -208,6 +205,12 @@ def moved(
     Raises:
         MotionError: if shift or growth has another shape, an electrode that is a point should grow, or (unless JAX
             traces it) a triangle turns over.
+
+    Example:
+        motion = je.model.electrode_motion(model)
+        # electrode 7, 1 mm along x
+        there = je.model.moved(model, motion, jnp.zeros((25, 2)).at[7, 0].set(1e-3))
+        print(jnp.abs(je.forward(there) - je.forward(model)).max())  # V
     """
     shift = jnp.zeros((model.electrodes, 2), model.dtype) if shift is None else jnp.asarray(shift, model.dtype)
     if shift.shape != (model.electrodes, 2):

@@ -62,5 +62,9 @@ def read_effects(table: TomlTable) -> tuple[AbstractEffect, ...]:
 
     Raises:
         TomlError: for an effect or a parameter that does not exist, naming the nearest.
+
+    Example:
+        text = '[[effects]]\\ntype = "LoadSpreading"\\nwidth = 0.01'
+        print(je.toml.parse_toml(text, "scene", je.model.read_effects))
     """
     return tuple(map(EFFECTS.read, table.tables("effects")))

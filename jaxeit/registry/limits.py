@@ -64,6 +64,19 @@ def limited(
         finite: whether infinite numbers are refused.
         whole: whether fractions are refused; by default where the default is a whole number.
         options: of `equinox.field`, such as ``static`` and ``converter``.
+
+    Example:
+        from jaxeit.registry import AbstractChoice, limited
+
+
+        class Firmness(AbstractChoice):  # a choice of your own, with a limit
+            share: float = limited(0.5, above=0.0, most=1.0)
+
+
+        try:
+            Firmness(share=2.0)
+        except je.registry.SettingError as error:
+            print(error)
     """
     whole = type(default) is int if whole is None else whole
     limits = Limits(least if above is None else above, most, above is not None, finite, whole)
@@ -75,6 +88,19 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
 
     Raises:
         SettingError: or the given ``error``.
+
+    Example:
+        from dataclasses import dataclass
+
+        from jaxeit.registry import limited, require_limits
+
+
+        @dataclass
+        class Speed:  # a dataclass with limits
+            speed: float = limited(0.1, above=0.0)  # m/s
+
+            def __post_init__(self):
+                require_limits(self)
     """
     for field in dataclasses.fields(thing):
         limits, value = field.metadata.get("limits"), getattr(thing, field.name)

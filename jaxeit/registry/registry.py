@@ -39,6 +39,17 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         group: the group of entry points by which other packages add classes.
         spell: makes the name of a class that states none; default: `TotalVariation` is "total-variation".
         parts: registries of the objects that settings may hold.
+
+    Example:
+        from jaxeit.registry import AbstractChoice, Registry, computed
+
+
+        class AbstractFirmness(AbstractChoice):  # a kind of choice of your own
+            bulk: float | None = computed()  # found later by the class itself, never by text
+
+
+        FIRMNESSES = Registry(AbstractFirmness, "firmness", "my_package.firmnesses")
+        print(list(FIRMNESSES))  # its classes in your package, and those of entry points
     """
 
     def __init__(
@@ -181,8 +192,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     def text(self, thing: T) -> str:
         """The word from which `make` makes the object again: its name, and settings that differ from their defaults."""
         known = settings_of(type(thing), self.parts).values()
-        values = {setting: getattr(thing, setting.name) for setting in known}
-        words = [f"{s.name}={word(s.plain(value))}" for s, value in values.items() if not s.is_default(value)]
+        values = [(setting, getattr(thing, setting.name)) for setting in known]
+        words = [f"{s.name}={word(s.plain(value))}" for s, value in values if not s.is_default(value)]
         return self.name_of(thing) + (":" + ",".join(words) if words else "")
 
 
@@ -224,7 +235,11 @@ def _loaded(point: EntryPoint, kind: str) -> Any:
 
 
 def split_word(text: str) -> tuple[str, dict[str, Any]]:
-    """The name, which may be an import path, and the settings of ``name:key=value,...``."""
+    """The name, which may be an import path, and the settings of ``name:key=value,...``.
+
+    Example:
+        print(je.registry.split_word("sparse-bayes:steps=30"))
+    """
     name, _, rest = text.partition(":")
     head, _, tail = rest.partition(":")
     if head and "=" not in head:

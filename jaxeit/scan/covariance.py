@@ -106,6 +106,12 @@ def _signal(
 def around(
     picture: Picture | BasisMap, place: Float[ArrayLike, "2"] | Sequence[float], radius: float
 ) -> Float[Array, " basis"]:
-    """A region for `signal_covariance`: ``exp(-d^2 / (2 radius^2))`` with the distance d from a place, m."""
+    """A region for `signal_covariance`: ``exp(-d^2 / (2 radius^2))`` with the distance d from a place, m.
+
+    Example:
+        place = je.scan.around(pixels, [0.06, 0.13], radius=0.03)  # 1 at the place, less around it
+        local = je.scan.signal_covariance(model, basis=pixels, region=place)
+        best_there = je.scan.choose_readings(local, 40).rows
+    """
     square = jnp.sum((picture.centres - jnp.asarray(place, picture.centres.dtype)) ** 2, -1)
     return jnp.exp(-0.5 * square / radius**2)

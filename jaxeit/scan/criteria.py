@@ -39,6 +39,14 @@ class PlaceError(AbstractCriterion):
 
     A power of 1 is the mean error over sites, 2 the mean variance (A-optimal); a larger one looks at the worst sites. h
     is convex for every power, since the inverse of the sum of variances is concave in the information.
+
+    Example:
+        print(list(je.scan.CRITERIA))  # names for the command line
+        worst = je.scan.PlaceError(power=8.0)
+        few = je.skin.all_pairs(25)[::40]  # candidates
+        sensitivity = je.scan.place_sensitivity(model, je.scan.DesignSettings(columns=4))
+        design = je.scan.design_scan(sensitivity, 60, worst, candidates=few)
+        print(f"{1e3 * design.error:.2f} mm; no 60 of these readings are below {1e3 * design.bound:.2f} mm")
     """
 
     name: ClassVar[str] = "place-error"
@@ -56,7 +64,11 @@ class PlaceError(AbstractCriterion):
 
 
 class PlaceVolume(AbstractCriterion):
-    """D-optimal: h is the log determinant of the covariance, the area of the ellipse of place."""
+    """D-optimal: h is the log determinant of the covariance, the area of the ellipse of place.
+
+    Example:
+        smallest_ellipses = je.scan.design_scan(sensitivity, 60, je.scan.PlaceVolume(), candidates=few)
+    """
 
     name: ClassVar[str] = "d-optimal"
 

@@ -173,6 +173,16 @@ def prepare_event_scan(
 
     Raises:
         ProtocolError: if the skin has no pads, or a setting is out of range.
+
+    Example:
+        # Pa, readings, readings, m
+        settings = je.scan.EventScanSettings(onset=100.0, idle=24, local=80, radius=0.06)
+        scan = je.scan.prepare_event_scan(model, skin, settings, basis=pixels)
+        state = scan.start()
+        # Pa on each pad, frame by frame
+        for pressure in ([0.0, 0, 0, 0], [0.0, 0, 0, 0], [0.0, 0, 400, 0]):
+            state, readings = scan.step(state, jnp.array(pressure))
+            print(int(readings.sum()), "readings to take next")
     """
     require_known(
         "prepare_event_scan", ProtocolError, model, settings.onset, settings.release, noise, hyperparameter, sigma

@@ -39,7 +39,7 @@ MIRRORED = 1e-3  # of the sheet's size, within which a mirrored electrode is ano
 
 @dataclass(frozen=True)
 class PlacementLimits:
-    """What the hardware asks of the places of electrodes.
+    """Limits of the hardware on the places of electrodes.
 
     | meaning                                                                           | default | unit |
     |-----------------------------------------------------------------------------------|---------|------|
@@ -112,6 +112,13 @@ def move_electrodes(
         ProtocolError: if the electrodes break the limits where they sit now.
         MotionError: if the electrodes cannot be moved.
         TomlError: if the skin's text gives no positions of electrodes.
+
+    Example:
+        limits = je.scan.PlacementLimits(distance=0.02, farthest=0.01)  # m
+        coarse = je.scan.DesignSettings(columns=4)
+        placed = je.scan.move_electrodes(skin, limits=limits, settings=coarse, meshes=2)
+        print(f"{1e3 * placed.before:.2f} mm before, {1e3 * placed.after:.2f} mm after")
+        print(placed.skin.toml.count("\\n"), "lines, for a file of its own")
     """
     criterion, limits = criterion or PlaceError(), limits or PlacementLimits()
     settings, fidelity = settings or DesignSettings(), fidelity or Fidelity.draft()

@@ -127,7 +127,7 @@ def _spans_less(chosen: Chosen) -> bool:
 
 
 def drives(pattern: Integer[ArrayLike, "readings 4"]) -> Int[np.ndarray, " readings"]:
-    """Number of the driven pair of each row."""
+    """Number of the driven pair of each row, (readings,)."""
     require_known("drives", ProtocolError, pattern)
     return np.asarray(np.unique(np.asarray(pattern)[:, :2], axis=0, return_inverse=True)[1]).ravel()
 

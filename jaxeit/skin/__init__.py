@@ -1,4 +1,20 @@
-"""The hardware of a skin: electrodes, protocol, pads and pressure sensors, read from one TOML file."""
+"""The hardware of a skin: electrodes, protocol, pads and pressure sensors, read from one TOML file.
+
+Example:
+    import numpy as np
+
+    import jaxeit as je
+
+    print(je.skin.shipped_skins())  # names for je.load_skin
+
+    sheet = je.Rectangle(0.12, 0.08)  # m
+    bolts = tuple(je.AreaPatch((x, y), radius=0.003) for y in (0.02, 0.06) for x in (0.02, 0.06, 0.1))
+    scan = je.Protocol(je.skin.adjacent(6), current=1e-3, reading_time=1e-5)
+    square = np.array([[0, 0], [0.06, 0], [0.06, 0.08], [0, 0.08]])  # m
+    pads = (je.Pad("left", square), je.Pad("right", square + np.array([0.06, 0])))
+    skin = je.Skin("patch", sheet, 150.0, bolts, scan, pads, je.skin.PressureSensor(maximum=34474.0))
+    print(f"{scan.readings} readings in {1e3 * scan.frame_time:.2f} ms; {len(skin.pads)} pads")
+"""
 
 from .bolts import AreaPatch
 from .description import (

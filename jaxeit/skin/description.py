@@ -55,7 +55,11 @@ def _require_apart(pads: Sequence[Pad]) -> None:
 
 
 def pad_overlap(first: Pad, second: Pad) -> float:
-    """Share of the smaller of two pads that lies within the other, by points on a grid over what their boxes share."""
+    """Share of the smaller of two pads that lies within the other, by points on a grid over what their boxes share.
+
+    Example:
+        print(je.skin.pad_overlap(*skin.pads))  # 0 for pads side by side
+    """
     low = np.maximum(first.outline.min(0), second.outline.min(0))
     high = np.minimum(first.outline.max(0), second.outline.max(0))
     if (high <= low).any():
@@ -176,6 +180,11 @@ def parse_skin(text: str, source: str = "skin", allow_import: bool = False) -> S
 
     Raises:
         TomlError: naming ``source``, the key and the reason.
+
+    Example:
+        text = je.load_skin("testbed").toml.replace("radius = 0.003", "radius = 0.004")
+        wider = je.skin.parse_skin(text, "testbed with wider bolts")
+        print(wider.electrodes[0].radius)  # m
     """
     return parse_toml(text, source, lambda table: _skin(table, text), allow_import)
 

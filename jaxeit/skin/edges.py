@@ -21,6 +21,10 @@ class BoundaryPatch(AbstractElectrode):
     |------------------------------------------------------|-------|-------|
     | start, stop: arc length along the domain's boundary  | ()    | m     |
     | contact: contact impedance z in  u + z sigma du/dn = U | ()  | ohm m |
+
+    Example:
+        strip = je.BoundaryPatch(start=0.03, stop=0.05, contact=1e-3)  # along the bottom, from 30 to 50 mm
+        print(strip.centre(sheet))  # m
     """
 
     name: ClassVar[str] = "edge"

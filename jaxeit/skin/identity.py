@@ -21,6 +21,10 @@ def skin_hash(skin: Skin) -> str:
 
     Names, comments, the order of keys and the way in which numbers are written do not count. Electrodes on a grid have
     the same hash as the same electrodes in a list.
+
+    Example:
+        # session and calibration files name their skin so
+        print(je.skin.skin_hash(je.load_skin("testbed"))[:12])
     """
     text = json.dumps(_plain(skin), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

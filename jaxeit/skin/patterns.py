@@ -30,6 +30,12 @@ def named_protocol(
 
     Raises:
         ProtocolError: for another name, too few electrodes, or a current that is not positive.
+
+    Example:
+        scan = je.skin.named_protocol("trigonometric", 16, current=1e-3)
+        rim = je.skin.rim_electrodes(je.Disc(0.1), 16)
+        tank = je.Skin("tank", je.Disc(0.1), 1.0, rim, scan)
+        print(f"{scan.readings} readings of drives through all electrodes")
     """
     if name != "trigonometric":
         return Protocol(named_pattern(name, electrodes), current, frequency, reading_time)
@@ -53,6 +59,11 @@ def trigonometric(electrodes: int) -> Float[np.ndarray, "electrodes drives"]:
 
     Raises:
         ProtocolError: for fewer than four electrodes.
+
+    Example:
+        current = 1e-3 * je.skin.trigonometric(16)  # A, (16, 15)
+        voltmeter = np.eye(16) - np.roll(np.eye(16), -1, axis=1)  # each electrode less the next one
+        scan = je.Protocol.from_matrices(current, voltmeter)
     """
     if electrodes < 4:
         raise ProtocolError(f"the trigonometric pattern needs four electrodes; got {electrodes}")
@@ -69,6 +80,10 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
 
     Raises:
         ProtocolError: for another name, or too few electrodes.
+
+    Example:
+        for name in ("adjacent", "opposite", "skip-3"):
+            print(name, len(je.skin.named_pattern(name, 16)), "readings")
     """
     if name == "trigonometric":
         raise ProtocolError("the trigonometric pattern has no rows of four electrodes; use named_protocol")
@@ -127,6 +142,9 @@ def skip(electrodes: int, skipped: int) -> np.ndarray:
 
     Raises:
         ProtocolError: for fewer than four electrodes, or if a pair reaches half way round or farther.
+
+    Example:
+        print(je.skin.skip(16, 3)[0])  # drives and senses pairs (s, s + 4)
     """
     if electrodes < 4:
         raise ProtocolError(f"four-terminal readings need four electrodes; got {electrodes}")
@@ -154,6 +172,9 @@ def opposite(electrodes: int) -> np.ndarray:
 
     Raises:
         ProtocolError: for fewer than six electrodes, where no pair of neighbours is left to sense.
+
+    Example:
+        print(je.skin.opposite(16)[0])  # drive+, drive-, sense+, sense- of the first reading
     """
     if electrodes < 6:
         raise ProtocolError(f"the opposite pattern needs six electrodes; got {electrodes}")

@@ -28,6 +28,10 @@ class PolygonPatch(AbstractAreaElectrode):
     The mesh generator needs the electrode wholly inside the sheet; on a mesh of your own whose edges follow
     the electrode, it may reach the rim or run from rim to rim.  There is no closed form: the mesh must resolve the
     transfer length along the sides if the resistance of the electrode matters.
+
+    Example:
+        copper = je.Polygon([(0.05, 0.01), (0.07, 0.01), (0.06, 0.02)])  # m
+        electrodes = (*bolts, je.PolygonPatch(copper, contact=1e-6))
     """
 
     name: ClassVar[str] = "polygon"
@@ -80,7 +84,12 @@ class PolygonPatch(AbstractAreaElectrode):
 
 
 class RectanglePatch(PolygonPatch):
-    """A `PolygonPatch` that a skin file describes by its centre, its size and its angle."""
+    """A `PolygonPatch` that a skin file describes by its centre, its size and its angle.
+
+    Example:
+        pad = je.skin.RectanglePatch(je.Polygon([(0.05, 0.01), (0.07, 0.01), (0.07, 0.02), (0.05, 0.02)]))
+        print(pad.outline.area, "m^2; kind of a file:", je.skin.ELECTRODES.name_of(pad))
+    """
 
     name: ClassVar[str] = "rectangle"
 

@@ -33,6 +33,13 @@ def with_positions(skin: Skin, positions: Float[np.ndarray, "electrodes 2"]) -> 
 
     Raises:
         TomlError: if the skin has no text, its electrodes have no positions, or one would lie outside the sheet.
+
+    Example:
+        testbed = je.load_skin("testbed")
+        shift = np.zeros((25, 2))
+        shift[7] = 1e-3  # m: electrode 7 was drilled 1 mm off in x and in y
+        as_drilled = je.skin.with_positions(testbed, testbed.electrode_positions + shift)
+        print(as_drilled.toml.count("\\n"), "lines, to be written to a file of its own")
     """
     if np.shape(positions) != (len(skin.electrodes), 2):
         raise TomlError(

@@ -117,6 +117,9 @@ class RingPatch(AbstractAreaElectrode):
 
     Another electrode may lie in the hole.  There is no closed form: the mesh must resolve the transfer length
     ``sqrt(contact / sheet resistance)`` along both circles if the resistance of the ring matters.
+
+    Example:
+        guarded = (je.AreaPatch((0.06, 0.04), 0.002), je.skin.RingPatch((0.06, 0.04), 0.004, 0.006))
     """
 
     name: ClassVar[str] = "ring"

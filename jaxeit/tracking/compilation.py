@@ -17,6 +17,9 @@ def compile_tracker(tracker: Tracker) -> None:
 
     Each number of contacts has programs of its own: for an ordinary frame, and for the events that explain an
     unexpected one. A frame that no contact explains is shown to each number of contacts, so that all of them run.
+
+    Example:
+        tracking.compile_tracker(tracker)  # before frames arrive
     """
     finder, start = tracker.filter.finder, tracker.start()
     places, belief = np.asarray(finder.starts)[:, :2], start.belief

@@ -42,6 +42,11 @@ def fit_model_error(
 
     Raises:
         InverseError: if there is no frame, an array has another shape, or jit hides the values.
+
+    Example:
+        presses = jnp.stack(frames[:2])  # one contact in each
+        humble = tracking.fit_model_error(tracker, presses)
+        print(humble.settings.loads.model_error, tracking.press_evidence(humble, presses))
     """
     require_known("fit_model_error", InverseError, dv, pad_forces, pad_errors)
     seen = _seen(tracker, dv, pad_forces, pad_errors)

@@ -109,17 +109,21 @@ class _Frame:
 
 
 class Smoother:
-    """Smooths tracks while they come, in bounded memory: a frame is told by at least `LAG` frames after it. ::
-
-        smoother = Smoother(tracker)
-        for time, frame, seconds in ...:
-            now = tracker.step(now, frame, seconds)
-            for time, tracks in smoother.add(time, now, seconds):
-                ...
-        for time, tracks in smoother.end():
-            ...
+    """Smooths tracks while they come, in bounded memory: each frame is smoothed by at least ``lag`` frames after it.
 
     The numbers of contacts, and which of them are edges, are those of the filter.
+
+    Args:
+        lag: number of frames, default `LAG`.
+
+    Example:
+        smoother, now = tracking.Smoother(tracker), tracker.start()
+        for k, frame in enumerate(frames):
+            now = tracker.step(now, frame, seconds=0.01)
+            for time, tracks in smoother.add(10_000_000 * k, now, 0.01):  # ns
+                print(time, tracks)  # of a frame some time ago
+        for time, tracks in smoother.end():
+            print(time, tracks)  # of the last frames
     """
 
     def __init__(self, tracker: Tracker, lag: int = LAG):

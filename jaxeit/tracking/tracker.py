@@ -37,12 +37,13 @@ PATIENCE, WORSE = 10, 1.3
 
 
 class Tracker:
-    """Follows contacts through the frames of a skin; made by `prepare_tracker`. ::
+    """Follows contacts through the frames of a skin; made by `prepare_tracker`.
 
-    now = tracker.start()
-    for frame, forces in ...:
-        now = tracker.step(now, frame, seconds=0.01, pad_forces=forces, pad_errors=errors)
-        print(now.tracks)
+    Example:
+        now = tracker.start()
+        for frame in frames:  # without the forces on the pads
+            now = tracker.step(now, frame, seconds=0.01)
+        print(len(now.tracks), now.misfit)
     """
 
     def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float, field: GainField):

@@ -15,6 +15,7 @@ from calib.fitting import CURVES, FIELDS, LOSSES
 from calib.presses import BASELINES, CORRECTIONS
 from jaxeit.effects import EFFECTS
 from jaxeit.imaging import HYPERPARAMETERS, METHODS, NOISES, PRIORS
+from jaxeit.linalg import SOLVERS
 from jaxeit.model import BASES
 from jaxeit.registry import registry as module
 from jaxeit.skin import ELECTRODES
@@ -85,6 +86,11 @@ def test_what_cannot_be_made_is_said_in_one_line(registry, text, message):
     with pytest.raises(ValueError, match=message) as caught:
         registry.make(text)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["conjugate-gradient", "conjugate-gradient:max_steps=9", "dense"])
+def test_solvers_that_may_hold_another_are_described(text):
+    assert SOLVERS.text(SOLVERS.make(text)) == text
 
 
 def test_fields_that_text_cannot_give_are_given_beside_it():

@@ -14,60 +14,13 @@ import jaxeit as je
 from calib.cli import main
 from calib.tanks import TankError, difference_image, load_tank
 
-from ..helpers import REAL_DATA, skin_of
+from ..helpers import REAL_DATA
 from ..test_docs import blocks, run
 from .rods import COUNT, CURRENT, PLACE, RADIUS, sees_the_rod
+from .tank_files import forward_model, struct, write_csv, write_ktc, write_mat, write_sciospec
 
 pytest.importorskip("matplotlib")
-RING = np.eye(COUNT) - np.roll(np.eye(COUNT), 1, 0)
 CSV = "tank_55uA_1000Hz.csv"
-
-
-def _write_csv(path, frames):
-    """Real and imaginary part by turns, of the polarity of PyEIDORS."""
-    np.savetxt(path, np.stack([-frames[0], 0.1 * frames[0], -frames[1], 0.1 * frames[1]], 1), delimiter=",")
-    return path
-
-
-def _struct(name, values):
-    """A structure array of MATLAB."""
-    out = np.empty((1, len(values)), dtype=[(key, object) for key in values[0]])
-    for number, value in enumerate(values):
-        out[0, number] = tuple(value[key] for key in values[0])
-    return {name: out}
-
-
-def _forward_model(bench, change=None):
-    """A model as EIDORS has it: counted from 1, some triangles clockwise, a node without triangles."""
-    model = bench.model
-    nodes = np.concatenate([[[9.0, 9.0]], np.asarray(model.nodes)])
-    elems = np.asarray(model.triangles) + 2
-    elems[::3] = elems[::3][:, ::-1]
-    electrodes = []
-    for number, electrode in enumerate(bench.skin.electrodes):
-        ends = je.Disc(RADIUS).boundary_coordinate(nodes[1:])
-        on = np.abs(np.linalg.norm(nodes[1:], axis=1) - RADIUS) < 1e-9
-        along = (ends - electrode.start + 1e-9) % bench.skin.domain.perimeter
-        under = np.flatnonzero(on & (along < electrode.stop - electrode.start + 2e-9))
-        electrodes.append({"nodes": under[:: -1 if number % 2 else 1] + 2.0, "z_contact": 2e-3})
-    stimulation = [
-        {
-            "stimulation": "Amp",
-            "stim_pattern": CURRENT * RING[:, [d]],
-            "meas_pattern": RING[:, [(d + k) % COUNT for k in range(2, COUNT - 1)]].T,
-        }
-        for d in range(COUNT)
-    ]
-    fields = {"nodes": nodes, "elems": elems.astype(float), "gnd_node": 1.0, "type": "fwd_model"}
-    found = fields | _struct("electrode", electrodes) | _struct("stimulation", stimulation)
-    return found | (change or {})
-
-
-def _write_mat(path, bench, **change):
-    """The later frame comes first in the file."""
-    frames = {"vi": {"meas": bench.frames[1]}, "vh": {"meas": bench.frames[0], "type": "data"}, "note": "none"}
-    savemat(path, frames | {"imdl": {"fwd_model": _forward_model(bench, change), "name": "mine"}})
-    return path
 
 
 def _put(group, name, value, number):
@@ -106,25 +59,25 @@ def _write_v73(path, variables):
 
 
 def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
-    tank = load_tank(_write_mat(tmp_path / "tank.mat", bench))
+    tank = load_tank(write_mat(tmp_path / "tank.mat", bench))
     assert tank.names == ("vh", "vi")
     np.testing.assert_array_equal(tank.frames, bench.frames)
     np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
     np.testing.assert_allclose(je.forward(tank.model()), bench.frames[0], rtol=1e-9)
     found = sees_the_rod(tank)
     assert found.background == pytest.approx(1.0)
-    sparse = _forward_model(bench)["stimulation"].copy()
+    sparse = forward_model(bench)["stimulation"].copy()
     for stimulation in sparse.flat:
         stimulation["stim_pattern"] = sp.csc_array(stimulation["stim_pattern"])
         stimulation["meas_pattern"] = sp.csc_array(stimulation["meas_pattern"])
-    variables = {"fmdl": _forward_model(bench, {"stimulation": sparse}), "vh": {"meas": bench.frames[0][:, None]}}
+    variables = {"fmdl": forward_model(bench, {"stimulation": sparse}), "vh": {"meas": bench.frames[0][:, None]}}
     later = load_tank(_write_v73(tmp_path / "later.mat", variables))
     np.testing.assert_array_equal(later.frames, bench.frames[:1])
     np.testing.assert_array_equal(later.mesh.triangles, tank.mesh.triangles)
     assert later.skin.electrodes == tank.skin.electrodes
     np.testing.assert_array_equal(later.skin.protocol.pattern, tank.skin.protocol.pattern)
-    points = _struct("electrode", [{"nodes": 2.0 + k, "z_contact": 0.0} for k in range(COUNT)])
-    as_points = load_tank(_write_mat(tmp_path / "points.mat", bench, **points))
+    points = struct("electrode", [{"nodes": 2.0 + k, "z_contact": 0.0} for k in range(COUNT)])
+    as_points = load_tank(write_mat(tmp_path / "points.mat", bench, **points))
     assert all(isinstance(electrode, je.PointElectrode) for electrode in as_points.skin.electrodes)
 
 
@@ -134,17 +87,17 @@ def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
         ({"elems": np.ones((9, 4))}, "elements have 4 nodes; a sheet is a plane mesh of triangles"),
         ({"elems": np.full((9, 3), 1e4)}, "its triangles name nodes outside 0 to"),
         ({"electrode": []}, "electrode: missing"),
-        ({"electrode": _struct("e", [{"nodes": [2.0, 9.0]}])["e"]}, r"electrode\(1\): its nodes are no single stretch"),
-        ({"stimulation": _struct("s", [{"stim_pattern": "{ad}"}])["s"]}, r"stimulation\(1\).stim_pattern: is '{ad}'"),
+        ({"electrode": struct("e", [{"nodes": [2.0, 9.0]}])["e"]}, r"electrode\(1\): its nodes are no single stretch"),
+        ({"stimulation": struct("s", [{"stim_pattern": "{ad}"}])["s"]}, r"stimulation\(1\).stim_pattern: is '{ad}'"),
     ],
 )
 def test_what_is_no_tank_of_eidors_is_refused(bench, tmp_path, change, message):
     with pytest.raises(TankError, match=message):
-        load_tank(_write_mat(tmp_path / "tank.mat", bench, **change))
+        load_tank(write_mat(tmp_path / "tank.mat", bench, **change))
 
 
 def test_files_that_do_not_describe_their_tank(bench, tmp_path):
-    csv = load_tank(_write_csv(tmp_path / CSV, bench.frames), je.Disc(RADIUS))
+    csv = load_tank(write_csv(tmp_path / CSV, bench.frames), je.Disc(RADIUS))
     assert (csv.skin.protocol.current, csv.skin.protocol.frequency) == (pytest.approx(CURRENT), 1000)
     np.testing.assert_allclose(csv.frames, bench.frames)
     np.testing.assert_allclose(csv.quadrature, -0.1 * bench.frames)
@@ -237,7 +190,7 @@ def test_matlab_files_without_a_model(bench, tmp_path, capsys):
         assert tank.names == ("vvRef", "data(1)", "data(2)")
         expected = bench.frames[0] if pattern == "adjacent" else kept[:, 0]
         np.testing.assert_array_equal(tank.frames[:2], [expected, 2 * expected])
-    told = {"vh": bench.frames[0], "vi": bench.frames[1], "stim": _forward_model(bench)["stimulation"]}
+    told = {"vh": bench.frames[0], "vi": bench.frames[1], "stim": forward_model(bench)["stimulation"]}
     savemat(tmp_path / "told.mat", told)
     tank = load_tank(tmp_path / "told.mat", skin=skin)
     np.testing.assert_array_equal(tank.skin.protocol.pattern, bench.skin.protocol.pattern)
@@ -266,27 +219,16 @@ def test_matlab_files_that_do_not_fit_their_skin(bench, tmp_path, capsys):
     savemat(path, {"text": "none"})
     with pytest.raises(TankError, match="holds no numbers; the protocol of the skin has 208"):
         load_tank(path, skin=skin)
-    savemat(path, {"vh": np.ones(9), "stim": _forward_model(bench)["stimulation"]})
+    savemat(path, {"vh": np.ones(9), "stim": forward_model(bench)["stimulation"]})
     with pytest.raises(TankError, match="holds vh 9 x 1; the protocol of stim has 208 readings"):
         load_tank(path, skin=skin)
     with pytest.raises(TankError, match=r"tank\.mat: has a tank of its own; leave the skin out"):
-        load_tank(_write_mat(tmp_path / "tank.mat", bench), skin=skin)
+        load_tank(write_mat(tmp_path / "tank.mat", bench), skin=skin)
 
 
 def test_potentials_of_sciospec(bench, tmp_path):
-    """Potentials above an unknown ground; two frequencies, of which the first is taken."""
-    mean = je.Protocol.from_matrices(CURRENT * RING, np.eye(COUNT) - 1 / COUNT)
-    skin = skin_of(bench.skin.domain, bench.skin.electrodes, mean.pattern)
-    model = je.discretise(je.Scene(je.Skin("", skin.domain, 1.0, skin.electrodes, mean)), je.Fidelity(edge_length=0.06))
-    potential = np.asarray(je.forward(model)).reshape(COUNT, COUNT) + 2e-5
-    head = ["18", "2", "setup", "2024-01-01", "1000", "2000", "0", "2", f"{CURRENT:.6E}"] + ["1"] * 7
-    lines = [*head, "MeasurementChannels: 1,2", "MeasurementChannelsIndependentFromInjectionPattern: 1,2"]
-    for drive in range(COUNT):
-        rows = np.stack([potential[drive], 0.2 * potential[drive]], 1).ravel()
-        twice = ["\t".join(f"{value:.9E}" for value in factor * rows) for factor in (1, 7)]
-        lines += [f"{drive + 1} {(drive + 1) % COUNT + 1}", *twice]
-    for name in ("setup_00001.eit", "setup_00002.eit"):
-        (tmp_path / name).write_text("\n".join(lines) + "\n")
+    """Of two frequencies the first is taken."""
+    write_sciospec(tmp_path, bench)
     tank = load_tank(tmp_path, bench.skin.domain, bench.skin.electrodes)
     assert tank.names == ("setup_00001", "setup_00002")
     assert (tank.skin.protocol.readings, tank.skin.protocol.frequency) == (208, 1000)
@@ -299,15 +241,7 @@ def test_potentials_of_sciospec(bench, tmp_path):
 
 
 def test_frames_of_the_kuopio_challenge(tmp_path):
-    """Each drive has its own current, in mA; the reference lies beside the frame."""
-    disc = je.Disc(0.115)
-    rim = je.skin.rim_electrodes(disc, COUNT, contact=1e-4, start=np.pi / 2)
-    current = RING[:, ::2] * np.linspace(1.4, 1.6, 8)
-    protocol = je.Protocol.from_matrices(1e-3 * current, RING[:, :15])
-    tank = je.Skin("", disc, 1.0, rim, protocol)
-    readings = np.asarray(je.forward(je.discretise(je.Scene(tank), je.Fidelity.draft())))
-    savemat(tmp_path / "ref.mat", {"Injref": current, "Mpat": RING[:, :15], "Uelref": readings[:, None]})
-    savemat(tmp_path / "data1.mat", {"Inj": current, "Mpat": RING[:, :15], "Uel": 1.1 * readings[:, None]})
+    readings = write_ktc(tmp_path)
     found = load_tank(tmp_path / "data1.mat")
     assert found.names == ("ref", "data1")
     np.testing.assert_allclose(je.forward(found.model()), readings, rtol=1e-12)
@@ -337,8 +271,8 @@ def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypat
     first = next(text for language, _, text in blocks(page) if language == "python")
     assert len([line for line in first.splitlines() if line]) <= 10
     monkeypatch.chdir(tmp_path)
-    _write_csv(tmp_path / CSV, bench.frames)
-    _write_mat(tmp_path / "tank.mat", bench)
+    write_csv(tmp_path / CSV, bench.frames)
+    write_mat(tmp_path / "tank.mat", bench)
     names = run(page, {})
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
     assert "('vh', 'vi'), 1.0000" in capsys.readouterr().out

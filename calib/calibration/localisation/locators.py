@@ -103,7 +103,8 @@ class AbstractLocatorChoice(abc.ABC):
 class ImageCentroid(AbstractLocatorChoice):
     """A named estimator of the image: quick to prepare; "half" has a mean error of 5 mm on the simulated testbed.
 
-    Raises: `ValueError` for a name that is not in `jaxeit.metrics.ESTIMATORS`.
+    Raises:
+        ValueError: for a name that is not in `jaxeit.metrics.ESTIMATORS`.
     """
 
     estimator: str = "half"
@@ -169,6 +170,15 @@ def locate(
     """`Places` of the contacts in difference frames (n, readings) V.
 
     `image`: images (n, pixels) S of the frames, if they are known; otherwise they are computed.
+
+    Example:
+        noise, channels = frames[rest].std(0), np.asarray(mine.recon.channels)
+        for choice in (calib.ImageCentroid("half"), calibration.FittedContact(most=1)):
+            model = je.discretise(je.Scene(mine.skin), je.Fidelity.draft())
+            locator = choice.prepare(model, noise, channels)
+            print(calibration.LOCATORS.text(choice))
+            # m
+            print(calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position)
     """
     frames = np.asarray(dv, recon.dtype)
     images = np.asarray(recon(jnp.asarray(frames)) if image is None else image)

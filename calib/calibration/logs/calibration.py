@@ -34,6 +34,13 @@ class LogCalibration:
     | notes: remarks for the reader of the results                                                 |
     | shift: how the sensor has moved since, by the last recalibration; None: it was not recalibrated |
     | why, tried: reason for the choice of channels and curve, and the candidates                  |
+
+    Example:
+        with calib.open_session("later.h5") as log:
+            stream = log.stream(sensor.stream)
+            said = sensor.predict(stream.time, stream.read())
+        print(said.force[-1], said.low[-1], said.high[-1], said.valid.all())  # N
+        sensor.save("sensor.h5")
     """
 
     model: LogModel

@@ -67,6 +67,13 @@ def calibrate_logs(
         SessionError: if a stream is missing, a session is given twice, or the sessions differ in the sensor.
         FitError: if nothing can be fitted.
         RecordingError: if `check_session` finds an error in a session, unless errors are ignored.
+
+    Example:
+        with calib.open_session("log.h5") as log:  # a stream of force and one of a sensor's channels
+            sensor = calibration.calibrate_logs([log], calib.Recipe(calib.Affine()))
+            print(calibration.evaluate_log(sensor, log).summary())
+            forces = calibration.apply_log(sensor, log, "forces.h5")
+            print(forces.force[-1], forces.low[-1], forces.high[-1])  # N
     """
     require_each_once(sessions)
     recipe = recipe or Recipe()

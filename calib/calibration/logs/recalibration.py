@@ -63,6 +63,11 @@ def recalibrate_log(
         SessionError: if a stream is missing, the sensor is another, the log does not determine the gain, or
             has moved the calibration before.
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
+
+    Example:
+        with calib.open_session("later.h5") as log:
+            print(calibration.assess_log(sensor, log))
+            sensor = calibration.recalibrate_log(sensor, log)
     """
     require_not_moved_by(calibration.provenance, session)
     found = assess_log(calibration, session, drift, ignore_errors=ignore_errors)

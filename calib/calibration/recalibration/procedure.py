@@ -114,7 +114,13 @@ class AbstractEvidence(abc.ABC):
 
 @dataclass(frozen=True)
 class KnownForces(AbstractEvidence):
-    """Presses with a load cell; a pad that is not pressed stays as it is. `drift`: how far gains may have moved."""
+    """Presses with a load cell; a pad that is not pressed stays as it is. `drift`: how far gains may have moved.
+
+    Example:
+        with calib.open_session("other.h5") as session:
+            moved = calib.recalibrate(mine, session, calibration.KnownForces())
+        print(moved.recalibration.gains)
+    """
 
     drift: GainDrift = field(default_factory=GainDrift)
 
@@ -273,7 +279,15 @@ def assess(
     *,
     ignore_errors: bool = False,
 ) -> Recalibration:
-    """How far a session is off a calibration, without changing it; arguments and errors as for `recalibrate`."""
+    """How far a session is off a calibration, without changing it; arguments and errors as for `recalibrate`.
+
+    Example:
+        with calib.open_session("other.h5") as session:
+            change = calibration.assess(mine, session)  # KnownForces, as the session has a load cell
+            # pads against the image
+            unloaded = calibration.assess(mine, session, calibration.OrdinaryUse())
+        print(change.health, change.log_gain, unloaded.advice)
+    """
     if session.skin_name and session.skin_name != calibration.skin.name:
         raise SessionError(
             f"{session.name}: recorded on the skin {session.skin_name!r}, but the calibration is of "

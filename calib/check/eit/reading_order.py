@@ -31,6 +31,9 @@ def transfer_matrix(skin: je.Skin) -> np.ndarray:
 
     Raises:
         ValueError: if the skin cannot be meshed.
+
+    Example:
+        z = calib.check.transfer_matrix(je.load_skin("testbed"))  # ohm, (electrodes, electrodes)
     """
     count = len(skin.electrodes)
     row = np.repeat(np.arange(1, count), count - 1)

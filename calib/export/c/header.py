@@ -33,7 +33,7 @@ _TYPES: dict[str, tuple[DTypeLike, int]] = {
 
 @dataclass(frozen=True)
 class HeaderSizes:
-    """What a header takes.
+    """Memory and computation that a header needs.
 
     | meaning                                                                     | unit  |
     |-----------------------------------------------------------------------------|-------|

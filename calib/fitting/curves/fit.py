@@ -245,10 +245,17 @@ def fit_curves(
       max_steps: limit of the solver's steps in each round.
       dtype: of the fit; default: that of the input. float64 is refused where JAX has 64-bit numbers off.
 
-    Returns: a `FittedCurve` with a leading pad axis. Check `result` first. A bad pad does not change the numbers of
-      other pads.
+    Returns:
+        A `FittedCurve` with a leading pad axis. Check `result` first. A bad pad does not change the numbers of other
+        pads.
 
-    Raises: `FitError` for shapes that do not fit together, or sigma not above zero.
+    Raises:
+        FitError: for shapes that do not fit together, or sigma not above zero.
+
+    Example:
+        for loss in (fitting.Squared(), fitting.SoftL1(), fitting.Cauchy()):  # names: fitting.LOSSES
+            lines = calib.fit_curves(calib.Affine(), pressures, forces, loss=loss)
+            print(fitting.LOSSES.text(loss), lines.parameters)  # N/Pa and N of each pad
     """
     shape = np.shape(pressures)
     length = bucket(shape[1]) if len(shape) == 2 else None
@@ -267,7 +274,16 @@ def fit_curve(
     mask: Numbers | None = None,
     **options: Any,
 ) -> FittedCurve:
-    """`fit_curves` for one pad: pressure (n,) Pa, force (n,) N."""
+    """`fit_curves` for one pad: pressure (n,) Pa, force (n,) N.
+
+    Example:
+        # Pa, in order of time
+        up_and_down = np.concatenate([np.linspace(0, 6000, 100), np.linspace(6000, 0, 100)])
+        force = 2e-3 * np.concatenate([up_and_down[:100], 0.9 * up_and_down[100:]])  # N
+        for curve in (fitting.Play(), fitting.AffinePlay(), fitting.PlaySpline()):
+            looped = fitting.fit_curve(curve, up_and_down, force)
+            print(fitting.CURVES.text(curve), looped.parameters, looped.message())
+    """
     p, f = np.asarray(pressure), np.asarray(force)
     if p.ndim != 1 or p.shape != f.shape:
         raise FitError(f"pressure and force must both be (samples,), not {p.shape} and {f.shape}.")

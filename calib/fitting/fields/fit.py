@@ -116,6 +116,26 @@ def fit_field(
       weight: of each press; 0 leaves it out. k presses at one place have 1 / k each, because they share the error of
         the place.
       reach: lowest and highest corner of the box of all presses, m.
+
+    Example:
+        import jax.numpy as jnp
+
+        import jaxeit as je
+        from calib.fitting.fields import geometry_of
+
+        skin = je.load_skin("testbed")
+        lines = np.linspace(0.01, 0.19, 8)
+        sites = np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)  # m, one press at each
+        share = np.eye(4)[2 * (sites[:, 1] > 0.1) + (sites[:, 0] > 0.1)]  # each press on one pad
+        distance = np.minimum(sites % 0.1, 0.1 - sites % 0.1).min(1)  # m, to the walls of its pad
+        dip = jnp.asarray(-0.4 * np.exp(-distance / 0.01))  # log of true force over that of the curve
+        presses = fitting.single_places(sites, pads=4)
+        reach = jnp.array([[0.01, 0.01], [0.19, 0.19]])  # m
+        for field in (fitting.Constant(), calib.PadEdge(), fitting.Bilinear()):
+            found = fitting.fit_field(
+                field, geometry_of(skin), presses, dip, jnp.asarray(share), jnp.ones(64), reach
+            )
+            print(f"{fitting.FIELDS.text(field)}: scatter {found.noise:.3f} of {found.spread:.3f}")
     """
     finite = jnp.isfinite(log_ratio) & jnp.all(jnp.isfinite(share), -1)
     known = jnp.all(places.known | (share <= 0), -1)

@@ -60,6 +60,9 @@ class PadEdgeSize(PadEdge):
     """`PadEdge`, times a power of the contact's estimated width, for pads that respond differently to broad contacts.
 
     Press with tips of several diameters to determine the power.
+
+    Example:
+        recipe = calib.Recipe(location=fitting.PadEdgeSize())
     """
 
     name: ClassVar[str] = "edge-size"

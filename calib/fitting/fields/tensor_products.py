@@ -68,7 +68,11 @@ class Bilinear(_Grid):
 
 
 class RadialBasis(_Grid):
-    """Gaussian bumps on a grid over the pad; their standard deviation is one pitch."""
+    """Gaussian bumps on a grid over the pad; their standard deviation is one pitch.
+
+    Example:
+        recipe = calib.Recipe(location=fitting.RadialBasis(nodes=5, shared=True))
+    """
 
     name: ClassVar[str] = "rbf"
 
@@ -80,7 +84,11 @@ class RadialBasis(_Grid):
 
 
 class TensorSpline(_Grid):
-    """Products of uniform cubic B-splines over `nodes` knots along each axis."""
+    """Products of uniform cubic B-splines over `nodes` knots along each axis.
+
+    Example:
+        recipe = calib.Recipe(location=fitting.TensorSpline(nodes=4))
+    """
 
     name: ClassVar[str] = "spline"
 
@@ -105,6 +113,10 @@ class GaussianProcess(_TensorProduct):
     The features are the modes of the Laplacian on a box around the pad, and their prior variances are the spectral
     density of the process (Solin and Särkkä 2020, Statistics and Computing 30). The fit is linear, and exact as far as
     `modes` modes per axis resolve the length. `lengths` to average over are multiples of half the size of the pad.
+
+    Example:
+        # cross-validation chooses
+        recipe = calib.Recipe(location=(calib.PadEdge(), fitting.GaussianProcess()))
     """
 
     name: ClassVar[str] = "gp"

@@ -56,7 +56,14 @@ def _held_out_error(signals: np.ndarray, force: np.ndarray, held: np.ndarray, ri
 
 @dataclass(frozen=True)
 class BlendChannels:
-    """Make one signal of all channels by `fit_blend` (needs a few hundred samples)."""
+    """Make one signal of all channels by `fit_blend` (needs a few hundred samples).
+
+    Example:
+        blended = logs.fit_log(calib.Linear(), time, channels, force, channels=logs.BlendChannels())
+        best = found.model.combination  # a Blend, OneChannel or SmoothSignal
+        print(isinstance(best, (logs.OneChannel, logs.Blend, logs.SmoothSignal)), best.words)
+        print("kinds in a file:", list(logs.COMBINATIONS))
+    """
 
     def __call__(self, time: np.ndarray, signals: np.ndarray, force: np.ndarray, curve: AbstractCurve | None) -> Blend:
         """The combination, from the samples (n, channels) whose force (n,) N is finite."""
@@ -72,7 +79,12 @@ class BlendChannels:
 
 @dataclass(frozen=True)
 class WithPlace:
-    """Make one signal in N of all channels and of the two coordinates of the place, which are the last columns."""
+    """Make one signal in N of all channels and of the two coordinates of the place, which are the last columns.
+
+    Example:
+        # the last two columns of the channels are the place
+        with_place = logs.WithPlace(logs.BlendChannels())
+    """
 
     way: Any
 

@@ -20,7 +20,13 @@ class Travel(NamedTuple):
 
 
 def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> Travel:
-    """Rise and fall of forces (N); NaN: not known. `log`: number (n,) of the log of each sample; default: one log."""
+    """Rise and fall of forces (N); NaN: not known. `log`: number (n,) of the log of each sample; default: one log.
+
+    Example:
+        seen, loading = logs.travel_of(force), logs.travel_of(force[:100])  # N, rise and fall
+        print(logs.missing_direction(loading))  # a log that only rises tells no unloading branch
+        print(logs.unseen_direction(loading, seen))
+    """
     parts = _logs(force, log)
     rises = [(part - np.minimum.accumulate(part)).max(initial=0.0) for part in parts]
     falls = [(np.maximum.accumulate(part) - part).max(initial=0.0) for part in parts]

@@ -20,7 +20,11 @@ Channels = Callable[[np.ndarray, np.ndarray, np.ndarray, AbstractCurve], Abstrac
 
 
 def time_split(time: Numbers, fraction: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (n,) of the samples in the first `fraction` of the time span, and of the other samples."""
+    """Masks (n,) of the samples in the first `fraction` of the time span, and of the other samples.
+
+    Example:
+        first, rest = logs.time_split(time, 0.5)  # masks
+    """
     at = np.asarray(time)
     first = (at - at[0]) < fraction * (at[-1] - at[0])
     return first, ~first

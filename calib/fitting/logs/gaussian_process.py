@@ -51,6 +51,11 @@ class SmoothChannels:
     | max_steps: of the minimiser                           | 60        |      |
     | coordinates: last columns that are no channels, but   | 0         |      |
     |   coordinates of the place, each an input of its own  |           |      |
+
+    Example:
+        creeping = logs.fit_log(
+            calib.Affine(), time, channels, force, channels=logs.SmoothChannels((2,), lags=(3.0,))
+        )
     """
 
     directions: tuple[int, ...] = (2, 3, 4, 5, 6)

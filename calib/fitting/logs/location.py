@@ -37,6 +37,9 @@ class LogLocation:
     |--------|-------------------------------------------------------------------------------|--------|------|
     | box    | lowest and highest corner of the fitted presses                               | (2, 2) | m    |
     | gain   | field of log-gain; None: the combination takes the place as two further inputs |        |      |
+
+    Example:
+        print(logs.MIN_PLACES, "places are needed at least")
     """
 
     box: Float[np.ndarray, "2 2"]

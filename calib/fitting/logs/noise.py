@@ -58,6 +58,12 @@ def fit_log_noise(
         group: stretch of time (n,) of each row. Rows of a group count as one, because they err together.
         repetitions: cycles of load, or places, that the residuals are of. The fewer they are, the less is known of how
             much the next one differs: the interval is wider, as that of Student's distribution.
+
+    Example:
+        residual = force - fit.predicted
+        stretch = np.arange(2000) // 100  # of a second
+        noise = logs.fit_log_noise(residual, time, fit.predicted, np.zeros(2000), stretch, repetitions=5)
+        print(noise.floor, noise.fraction, noise.lag)  # N, 1, s
     """
     terms = _terms(force, force_rate(time, force))
     sound = np.isfinite(residual) & np.isfinite(terms).all(1) & np.isfinite(variance)

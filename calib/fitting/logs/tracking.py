@@ -24,6 +24,12 @@ class LogTracker:
 
     It keeps the states of lags, the turning points that a curve with hysteresis remembers, and the forces over which
     the rate is taken.
+
+    Example:
+        # one reading after the other, as a running sensor sends them
+        tracker = logs.LogTracker(found.model)
+        for at, reading in zip(time[:3], channels[:3], strict=True):
+            print(tracker.step(at, reading).force)  # N
     """
 
     def __init__(self, model: LogModel):

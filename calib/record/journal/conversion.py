@@ -55,6 +55,12 @@ def convert_journal(
     Raises:
         JournalError: if nothing was recorded, or the file is no journal.
         SessionError: if the session cannot be written.
+
+    Example:
+        from calib.record import convert_journal
+
+        # what `jaxeit recover` does
+        print(convert_journal("crashed.h5.part", "rescued.h5", recovered=True).render())
     """
     reader = JournalReader(journal)
     plan = _plan(reader)

@@ -103,6 +103,15 @@ def replacing(path: Path, *, session: bool = False) -> Iterator[Path]:
 
     A process that is killed leaves its temporary file; the next one that writes to `path` removes it. A lock on the
     temporary file, which ends with its process, tells whether the process still runs.
+
+    Example:
+        from pathlib import Path
+
+        from calib.session import replacing, require_no_session
+
+        require_no_session(Path("loads.csv"))
+        with replacing(Path("loads.csv")) as unfinished:  # whole or not at all
+            unfinished.write_text("time,force\\n0,1\\n")
     """
     if not path.parent.is_dir():
         raise problem(path, "file", f"the folder {path.parent} does not exist", "create the folder first")

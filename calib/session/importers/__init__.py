@@ -5,6 +5,27 @@ there; another package adds one by an entry point of the group ``calib.importers
 by its import path, ``my_package.my_module:MyImporter``. A format of tables derives from
 `AbstractTableImporter`, or from `AbstractArrayImporter` where a file holds named arrays: it then has the options of all
 tables.
+
+Example:
+    from pathlib import Path
+
+    import calib
+    from calib.session import importers
+
+    Path("bench.csv").write_text(
+        "time,load,left,right\\n" + "".join(f"{k / 100},{k % 7},{3 * k},{k}\\n" for k in range(200))
+    )
+    streams = (
+        importers.StreamSpec("force", ("load",), "N"),
+        importers.StreamSpec("pressure", ("left", "right"), "Pa"),
+    )
+    table = importers.FileSpec(Path("bench.csv"), time="time", time_unit="s", streams=streams)
+    report = importers.import_csv([table], "imported.h5", title="a bench of ours")
+    print(report.summary())
+    with calib.open_session("imported.h5") as session:
+        print({name: stream.shape for name, stream in session.streams.items()})
+    # formats: CsvImporter and so on
+    print(list(importers.importers()), importers.find_importer("csv").summary)
 """
 
 import argparse
@@ -83,6 +104,18 @@ def find_importer(name: str) -> type[AbstractImporter]:
 
     Raises:
         SessionError: for an import path that leads to no concrete format.
+
+    Example:
+        kinds = (
+            importers.CsvImporter,
+            importers.NpzImporter,
+            importers.MatImporter,
+            importers.Hdf5Importer,
+            importers.ParquetImporter,
+            importers.McapImporter,
+        )
+        for kind in kinds:
+            print(f"{kind.name}: {kind.summary}", importers.find_importer(kind.name) is kind)
     """
     if name in importers():
         return importers()[name]
@@ -101,6 +134,14 @@ def add_arguments(parser: argparse.ArgumentParser, own: Sequence[str] = ()) -> N
 
     Args:
         own: import paths of formats beside the known ones.
+
+    Example:
+        import argparse
+
+        parser = argparse.ArgumentParser()
+        importers.add_arguments(parser)  # those of `jaxeit import`
+        words = ["csv", "bench.csv", "--time", "time:s", "--stream", "force=load:N", "-o", "again.h5"]
+        importers.run(parser.parse_args(words))
     """
     formats = parser.add_subparsers(title="formats", dest="format", required=True, metavar="FORMAT")
     for name, kind in {**importers(), **{path: find_importer(path) for path in own}}.items():

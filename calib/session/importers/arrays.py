@@ -51,6 +51,24 @@ class AbstractArrayImporter(AbstractTableImporter):
     """A format whose files hold named arrays.
 
     ``isolated`` formats are read in a child process of bounded memory and time.
+
+    Example:
+        import numpy as np
+
+        from calib.session.importers import AbstractArrayImporter
+        from calib.session.importers.arrays import ArrayShape
+
+
+        class RawImporter(AbstractArrayImporter):  # jaxeit import my_module:RawImporter FILE ...
+            name, summary = "raw", "float32 numbers of two channels, one row after the other"
+
+            @classmethod
+            def outline(cls, path):
+                return {"channels": ArrayShape(path.stat().st_size // 8, 2)}
+
+            @classmethod
+            def arrays(cls, path, names):
+                return [np.fromfile(path, "<f4").reshape(-1, 2).astype(float)]
     """
 
     isolated: ClassVar[bool] = True

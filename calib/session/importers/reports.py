@@ -42,7 +42,14 @@ class FileReport:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import read, left out and found suspicious."""
+    """What an import read, left out and found suspicious.
+
+    Example:
+        for file in report.files:
+            for stream in file.streams:
+                print(stream.name, stream.rows, "rows,", stream.not_numbers, "cells that are no numbers")
+        print(report.warnings)
+    """
 
     output: Path
     epoch: datetime

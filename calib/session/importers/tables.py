@@ -35,6 +35,27 @@ class AbstractTableFile(ABC):
     | counted   | what ``Table.line`` counts: "line" or "row"           |
     | dates     | columns of text that hold dates and times, read as s  |
     |           | since 1970, and whether these state a time zone       |
+
+    Example:
+        from calib.session.importers import AbstractTableFile, AbstractTableImporter, Table
+
+
+        class Spreadsheet(AbstractTableFile):  # a file of your own that holds one table
+            def __init__(self, path):
+                self.path, self.header, self.columns, self.counted = path, ["time", "load"], 2, "row"
+                self.dates = {}
+
+            def read(self, columns, used, progress):
+                values = np.array([[0.0, 1.0], [0.1, 2.0]])[:, list(columns)]
+                return Table(values, line=np.arange(1, 3), bad=np.zeros(values.shape, bool))
+
+
+        class SpreadsheetImporter(AbstractTableImporter):
+            name, summary = "spreadsheet", "a table of a program of mine"
+
+            @classmethod
+            def opener(cls, args):
+                return Spreadsheet
     """
 
     path: Path

@@ -45,6 +45,13 @@ class LoadFitter(eqx.Module):
     | difference: standard deviation of their differences between loads   | (2,)             |      |
     | least: distance of two loads, length of an edge, that is not one load | (2,)           | m    |
     | length, prior, model_error, shapes: see `LoadSettings`              | (), (5,), (), (factors,) | |
+
+    Example:
+        settings = je.contacts.LoadSettings(force=5.0)  # N, usual here
+        fitter = je.contacts.prepare_loads(model, settings, noise=noise, sigma=model.background)
+        loads = fitter(dv, found)
+        print(loads.kind.name, loads.probability)
+        print(loads.of(je.contacts.LoadKind.TWO).force)  # N, as the law of pressure in the settings has it
     """
 
     sheet: PressedSheet

@@ -92,6 +92,11 @@ class Proposal:
     | limits of squared distance and of chi-square over the readings              | (2,)                 | 1    |
     | pads: number of pads, whose forces are inputs                               |                      |      |
     | about: skin and its hash, seed, scenes, versions, figures on held-out scenes |                     |      |
+
+    Example:
+        proposal = je.contacts.shipped_proposal(skin)
+        said = proposal(np.asarray(dv))  # microseconds: a network that was trained for this skin
+        print(said.kind.name, said.probability, "unlike its training:", said.outside)
     """
 
     noise: np.ndarray

@@ -16,7 +16,7 @@ POSITIVE = (
 
 @dataclass(frozen=True)
 class LoadSettings:
-    """What is known of loads before a frame, and of how the sheet answers to pressure.
+    """Prior knowledge of loads, and the response of the sheet to pressure.
 
     | meaning                                                                      | default      | unit |
     |------------------------------------------------------------------------------|--------------|------|

@@ -57,6 +57,14 @@ def fit_background(
     Raises:
         InverseError: if the shape or a value is wrong, or no coating explains the readings: then the order or the
             polarity of the readings is not that of the skin's protocol.
+
+    Example:
+        uneven = je.Scene(je.load_skin("testbed"), (je.effects.CoatingNonUniformity(0.15, seed=7),))
+        real = je.discretise(uneven, je.Fidelity.draft())
+        frame = je.forward(real, je.conductivity(real))  # V, of the untouched skin
+        sigma = je.fit_background(model, frame, columns=12)  # S, for je.prepare and je.prepare_contacts
+        truth = je.conductivity(real)
+        print(jnp.std(jnp.log(sigma / truth)), "of", jnp.std(jnp.log(truth)), "left")
     """
     v0, even = jnp.asarray(v0, model.dtype), forward(model, model.background)
     require_frame(v0, even)

@@ -43,7 +43,7 @@ FLATNESS_STD = 0.5  # of the logarithm of the exponent over that of a Gaussian
 
 
 class ElectrodeFitSettings(AbstractChoice):
-    """What is believed before the readings are seen.
+    """Assumptions before the readings are seen.
 
     | meaning                                                              | default | unit |
     |----------------------------------------------------------------------|---------|------|
@@ -75,6 +75,10 @@ class KnownPresses(eqx.Module):
     | change of the readings by each press; NaN: missing                 | (presses, readings) | V    |
     | place of each, in the sheet's flat coordinates                     | (presses, 2)        | m    |
     | noise: standard deviation of a change                              | (readings,)         | V    |
+
+    Example:
+        change, place = dv[None], jnp.array([[0.06, 0.13]])  # V, m; give ten to forty presses
+        presses = je.imaging.KnownPresses(change, place, noise)
     """
 
     change: Float[Array, "presses readings"] = eqx.field(converter=jnp.asarray)
@@ -123,6 +127,13 @@ def fit_electrodes(
     Raises:
         InverseError: if a shape or a value is wrong.
         MotionError: if the electrodes cannot be moved on this mesh.
+
+    Example:
+        second = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft(order=2))
+        settings = je.imaging.ElectrodeFitSettings(shift=1e-3)  # m
+        # better with `presses`, `KnownPresses`
+        fit = je.imaging.fit_electrodes(second, frame, settings=settings)
+        print(1e3 * fit.shift[0], 1e3 * fit.standard_error[0])  # mm
     """
     require_known("fit_electrodes", InverseError, model.nodes, v0)
     settings = ElectrodeFitSettings() if settings is None else settings

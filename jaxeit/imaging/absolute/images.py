@@ -141,6 +141,12 @@ def gauss_newton(
 
     Args:
         steps: largest number of steps.
+
+    Example:
+        physics = je.imaging.LogConductivity(model, coarse, model.background.mean())
+        # log of a ratio
+        x = je.gauss_newton(physics, je.imaging.IsotropicVariation(), v0 + dv, noise, steps=3)
+        sigma = physics.sigma(x)  # S, of each element
     """
     weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     start = jnp.zeros(physics.image.size, readings.dtype)
@@ -236,6 +242,12 @@ def least_squares_image(
 
     Returns:
         (basis,); NaN throughout if the solver did not converge.
+
+    Example:
+        prior = je.Tikhonov().precision(physics.slopes(jnp.zeros(coarse.size)), coarse.picture)
+        x = je.imaging.least_squares_image(
+            physics, je.imaging.Quadratic(prior, strength=1.0), v0 + dv, noise
+        )
     """
     weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
     tolerance = 1e-6 if readings.dtype == jnp.float64 else 1e-3

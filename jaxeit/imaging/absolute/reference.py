@@ -88,7 +88,7 @@ class ReferenceParameters(NamedTuple):
 
 
 class ReferenceFit(eqx.Module):
-    """What a frame of even content tells. NaN throughout if the fit did not converge.
+    """Parameters fitted to a frame of even content; NaN throughout if the fit did not converge.
 
     | meaning                                                                            | shape  |
     |------------------------------------------------------------------------------------|--------|

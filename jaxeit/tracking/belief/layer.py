@@ -65,7 +65,7 @@ class GainField(eqx.Module):
 
 
 class LearnedLayer(NamedTuple):
-    """What contacts have told of the contact layer's gain: a normal distribution of its modes.
+    """Gain of the contact layer as learned from contacts: a normal distribution of its modes.
 
     | meaning                                                          | shape  | unit |
     |------------------------------------------------------------------|--------|------|
@@ -73,6 +73,11 @@ class LearnedLayer(NamedTuple):
     | mean of the modes, in units of their prior standard deviations   | (g,)   | 1    |
     | covariance of the modes                                          | (g, g) | 1    |
     | contacts: number of contacts that it was learned from            |        |      |
+
+    Example:
+        layer = tracker.learned(now)  # the gain of the contact layer, as contacts tell it
+        mean, deviation = layer.at(np.array([[0.06, 0.13]]))  # of its logarithm
+        another_day = tracker.start(layer.aged(0.2))  # a fifth forgotten
     """
 
     field: GainField
