@@ -28,6 +28,8 @@ import pytest
 
 import jaxeit as je
 
+from .scheduling import RoomScheduling
+
 pytest_plugins = ["tests.hard_cases"]
 
 # What a shell runs in the background ignores this, and so would the processes that tests start and interrupt.
@@ -44,6 +46,11 @@ if jax.devices()[0].platform != "cpu":
 # Programs compiled once serve all later tests, and the next run.
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+@pytest.hookimpl(optionalhook=True)  # without pytest-xdist, -p no:xdist, nobody asks
+def pytest_xdist_make_scheduler(config, log):
+    return RoomScheduling(config, log)
 
 
 MOST_MAPS = 40_000
