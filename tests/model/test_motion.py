@@ -51,41 +51,39 @@ def test_a_model_whose_electrodes_stay_is_the_model(case):
     assert still.system.moved
 
 
-def test_derivatives_are_those_of_the_moved_readings(case):
-    """Forward, reverse and by `shift_jacobian`, at electrodes that have moved already, against differences."""
+def test_derivatives_are_those_of_the_moved_and_grown_readings(case):
+    """Forward, reverse and by `shift_jacobian`, at electrodes that have moved and grown already, against differences."""
     model, motion, direction = case
-    start = 0.05 * float(motion.reach.min()) * direction
+    reach = float(motion.reach.min())
+    start = 0.05 * reach * direction, 0.03 * direction[:, 0]
+    to_places, to_sizes = (direction, 0 * start[1]), (0 * direction, direction[:, 1])
 
     @jax.jit
-    def readings(shift):
-        return je.forward(moved(model, motion, shift))
-
-    step = 1e-6 * float(motion.reach.min())
-    expected = (readings(start + step * direction) - readings(start - step * direction)) / (2 * step)
-    value, forwards = jax.jvp(readings, (start,), (direction,))
-    np.testing.assert_allclose(forwards, expected, rtol=1e-6, atol=1e-7 * float(jnp.abs(expected).max()))
-    weight = jnp.arange(1.0, len(value) + 1)
-    backwards = jax.grad(lambda shift: weight @ readings(shift))(start)
-    np.testing.assert_allclose(jnp.sum(backwards * direction), weight @ forwards, rtol=1e-9)
-    slopes = shift_jacobian(moved(model, motion, start), motion)
-    np.testing.assert_allclose(jnp.einsum("res,es->r", slopes, direction), forwards, rtol=1e-9, atol=1e-12)
-
-
-def test_derivatives_by_sizes_are_those_of_the_grown_readings(case):
-    """Forward and reverse, at electrodes that have moved and grown already, against differences."""
-    model, motion, shift = case
-    start, direction = 0.03 * shift[:, 0], shift[:, 1]
+    def readings(shift, growth):
+        return je.forward(moved(model, motion, shift, growth))
 
     @jax.jit
-    def readings(growth):
-        return je.forward(moved(model, motion, 0.02 * motion.reach.min() * shift, growth))
+    def both(shifts, growths):
+        return jax.vmap(lambda *tangents: jax.jvp(readings, start, tangents))(shifts, growths)
 
-    expected = (readings(start + 1e-5 * direction) - readings(start - 1e-5 * direction)) / 2e-5
-    value, forwards = jax.jvp(readings, (start,), (direction,))
-    np.testing.assert_allclose(forwards, expected, rtol=1e-6, atol=1e-7 * float(jnp.abs(expected).max()))
-    weight = jnp.arange(1.0, len(value) + 1)
-    backwards = jax.grad(lambda growth: weight @ readings(growth))(start)
-    np.testing.assert_allclose(jnp.sum(backwards * direction), weight @ forwards, rtol=1e-9)
+    @jax.jit
+    def weighted(shift, growth):
+        return weight @ readings(shift, growth)
+
+    values, forwards = both(*map(jnp.stack, zip(to_places, to_sizes, strict=True)))
+    weight = jnp.arange(1.0, len(values[0]) + 1)
+    backwards = jax.grad(weighted, (0, 1))(*start)
+    for tangents, step, found in zip((to_places, to_sizes), (1e-6 * reach, 1e-5), forwards, strict=True):
+        there, back = (
+            readings(*(at + sign * step * tangent for at, tangent in zip(start, tangents, strict=True)))
+            for sign in (1, -1)
+        )
+        expected = (there - back) / (2 * step)
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * float(jnp.abs(expected).max()))
+        slope = sum(jnp.sum(one * tangent) for one, tangent in zip(backwards, tangents, strict=True))
+        np.testing.assert_allclose(slope, weight @ found, rtol=1e-9)
+    slopes = shift_jacobian(jax.jit(moved)(model, motion, *start), motion)
+    np.testing.assert_allclose(jnp.einsum("res,es->r", slopes, direction), forwards[0], rtol=1e-9, atol=1e-12)
 
 
 def test_derivatives_are_those_of_greens_function():
