@@ -1,8 +1,8 @@
-"""Start-up times of fresh processes: imports, help, and the README's first program.
+"""Start-up times of fresh processes: imports, help, the README's first program, and the command of `make demo`.
 
 Times are from the start of a process to its end.  The program runs without a cache of compiled programs, with an empty
-cache, and with the cache that this run filled; `phases` says what JAX spends of it on tracing, on lowering, and on
-compiling or on reading the cache.
+cache, and with the cache that this run filled; the command with an empty and with a full one.  `phases` says what JAX
+spends of the program's time on tracing, on lowering, and on compiling or on reading the cache.
 """
 
 import json
@@ -51,6 +51,7 @@ def measure(run: Run) -> Iterator[Row]:
     yield {"rows": [{"start": name, **spread(taken[1:])} for name, taken in times.items()]}
     if not run.smoke:
         yield {"rows": programs(3)}
+        yield {"rows": demos(3)}
         yield {"phases": phases(3)}
 
 
@@ -72,6 +73,22 @@ def programs(repeats: int) -> list[Row]:
             for name in ("empty cache", "full cache"):
                 times[name].append(fresh(code, cache=folder)[0])
     return [{"start": f"the README's program, {name}", **spread(taken)} for name, taken in times.items()]
+
+
+def demos(repeats: int) -> list[Row]:
+    """The command of `make demo`, once all is installed."""
+    recipe = re.search(r"^demo:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    if recipe is None:
+        raise SystemExit("the Makefile has no demo")
+    times = defaultdict(list)
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            words = recipe[1].replace("\\\n", " ").replace("$(OUT)", folder).split()[1:]
+            code = "import os, sys; os.environ['XDG_CACHE_HOME'] = "
+            code += f"{folder!r}; sys.argv = ['jaxeit', *{words}]; from calib.cli import main; main()"
+            for name in ("empty cache", "full cache"):
+                times[name].append(fresh(code)[0])
+    return [{"start": f"the command of `make demo`, {name}", **spread(taken)} for name, taken in times.items()]
 
 
 def phases(repeats: int) -> list[Row]:

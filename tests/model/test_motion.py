@@ -52,7 +52,7 @@ def test_a_model_whose_electrodes_stay_is_the_model(case):
 
 
 def test_derivatives_are_those_of_the_moved_and_grown_readings(case):
-    """Forward, reverse and by `shift_jacobian`, at electrodes that have moved and grown already, against differences."""
+    """Forward, reverse and by `shift_jacobian`, at electrodes that have moved and grown, against differences."""
     model, motion, direction = case
     reach = float(motion.reach.min())
     start = 0.05 * reach * direction, 0.03 * direction[:, 0]
