@@ -102,7 +102,8 @@ def coat_precision(image: BasisMap, length: Float[ArrayLike, ""]) -> AbstractPre
     """Precision of the logarithm of the conductivity of a coat that varies over a length, m, for a variance of one."""
     # The setting of a prior is a number; a length that JAX traces takes its place.
     smooth = eqx.tree_at(lambda prior: prior.length, GaussianSmooth(), jnp.asarray(length, image.picture.centres.dtype))
-    return smooth.precision(jnp.zeros((1, image.size), image.picture.centres.dtype), image.picture)
+    found: AbstractPrecision = smooth.precision(jnp.zeros((1, image.size), smooth.length.dtype), image.picture)
+    return found
 
 
 def sheet_of(

@@ -7,8 +7,8 @@ about the sheet that explains the frame best, the readings are Gaussian under bo
 
 where J and S are the derivatives by the logarithm of the conductivity and by the shifts of the electrodes, P is the
 correlation of the coat over the sheet, R has the errors of a good model, and f are the readings, whose common gain is
-not known, so that g is as large as e allows. The standard deviations c of the coat, s of the shifts and e of the errors are the most probable ones
-(MacKay 1992, Neural Comput. 4: the evidence), so that an uneven coat or a rough model is not taken for misplaced
+not known: g is large. The standard deviations c of the coat, s of the shifts and e of the errors are the most probable
+ones (MacKay 1992, Neural Comput. 4: the evidence), so that an uneven coat or a rough model is not taken for misplaced
 electrodes. Under the first belief s is zero. `fit_electrodes` tells the shifts better, through the full forward map,
 and takes longer.
 """
@@ -34,6 +34,7 @@ from .images import LogConductivity
 COAT_LENGTH = 0.03  # m, over which a coat varies
 USUAL_COAT, COAT_SPREAD = 0.15, 0.7  # of the logarithm of the conductivity, and of the logarithm of that
 MODEL_ERROR = 1e-3  # relative, of which e is a multiple
+LEAST_ERROR = 0.1  # e: derivatives hold no better
 MOST_COAT, MOST_SHIFT = 1.0, 5e-3  # c, and s in m; beyond them, derivatives say nothing of a size
 # Candidates of c / e, and of s / e in m; a step of 1.4 moves the logarithm of the evidence by less than two.
 COATS, SHIFTS = np.geomspace(1e-4, 60, 40), np.append(0, np.geomspace(1e-6, 0.1, 90))
@@ -118,13 +119,13 @@ def _compared(
 ) -> Misplacement:
     """The more probable beliefs about readings y (n,) and their derivatives, all in errors of a good model."""
     of_coat, of_gain = by_coat @ by_coat.T, np.outer(by_gain, by_gain)
-    beliefs = []
+    beliefs: list[_Belief] = []
     for ratio in COATS:
         root = cholesky(np.eye(len(y)) + ratio**2 * of_coat + of_gain, lower=True)
         white, slopes = (solve_triangular(root, part, lower=True) for part in (y, by_shift))
         beliefs += _beliefs(ratio, white, slopes, float(np.log(np.diag(root)).sum()))
     unshifted, shifted = (min(beliefs[k::2], key=lambda belief: belief.surprise) for k in (0, 1))
-    return Misplacement(
+    parts = (
         shifted.size,
         2 * (unshifted.surprise - shifted.surprise),
         shifted.shift.reshape(-1, 2),
@@ -132,6 +133,7 @@ def _compared(
         MODEL_ERROR * shifted.error,
         MODEL_ERROR * unshifted.error,
     )
+    return Misplacement(*(jnp.asarray(part) for part in parts))
 
 
 class _Belief(NamedTuple):
@@ -154,8 +156,9 @@ def _beliefs(
     left, values, right = svd(slopes, full_matrices=False)
     along = left.T @ y
     seen = (SHIFTS[:, None] * values) ** 2
-    error = np.sqrt(np.maximum(y @ y - (seen / (1 + seen)) @ along**2, 1e-12) / len(y))
-    surprise = len(y) * np.log(error) + 0.5 * np.log1p(seen).sum(1) + root
+    square = y @ y - (seen / (1 + seen)) @ along**2
+    error = np.sqrt(np.maximum(square / len(y), LEAST_ERROR**2))
+    surprise = len(y) * np.log(error) + 0.5 * (square / error**2 + np.log1p(seen).sum(1)) + root
     surprise += 0.5 * (np.log(ratio * error / USUAL_COAT) / COAT_SPREAD) ** 2
     size = SHIFTS * error
     surprise = np.where((ratio * error > MOST_COAT) | (size > MOST_SHIFT), np.inf, surprise)
