@@ -6,9 +6,10 @@ nothing of that; by the same file with the electrodes fitted; and by the skin as
 the seeds.
 
 announced: skins of the second simulator (`tests/oracles/bench`), on which nothing was tuned, whose bolts sit aside by
-so much in each direction (standard deviation). A session of 32 presses is checked and calibrated, by the skin's file
-and with the electrodes fitted, and the calibration is applied to another session of the skin: which of these announce
-it, and how far contacts and loads are told from where they are.
+so much in each direction (standard deviation). "said": share of untouched frames that `check`, `calibrate` and `apply`
+announce, which ask the same function; "found": the median size that it tells. On some of these skins: median error of
+the place of single contacts, and of the strongest load by fits, with the places of the file and with those fitted to
+the untouched frame and nine presses.
 
 honest: sessions of skins whose electrodes sit where the file says: bundled ones, shipped scenes, and those of the
 second simulator with other coats, tips and noise. None should be announced.
@@ -25,18 +26,16 @@ import numpy as np
 import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
-from calib.calibration.application import FORMAT
-from calib.calibration.localisation.load_windows import left_by_fits
 from calib.check import check_session
-from calib.check.placement import FIDELITY, WHERE, noted, placement_finding, with_placement
+from calib.check.electrodes import FIDELITY as PLACING
+from calib.check.placement import FIDELITY, WHERE, placement_finding, with_placement
 from calib.check.report import CheckReport
-from calib.session import open_archive
-from jaxeit.imaging import find_misplacement
+from jaxeit.imaging import KnownPresses, find_misplacement, fit_electrodes
 from tests.oracles import bench as oracle
 
-from . import worn_skins
 from .harness import ROOT, Question, Run
 from .rows import Row, averaged, grouped
+from .worn_skins import Wear, presses, recorded
 
 SCENE = ROOT / "data" / "sessions" / "testbed_grid.toml"
 MISPLACED = 1.1e-3  # m
@@ -79,75 +78,83 @@ def calibrated(bench: Bench, skin: je.Skin, there: je.Skin, ways: tuple[str, ...
 # --- what announces it
 
 ASIDE = (0.0, 0.5e-3, 1e-3, 2e-3, 3e-3)  # m
-ANNOUNCED_SEED, FRAMES = 7400, 20
-DRILLED = oracle.Bench(places=16, levels=(8.0, 16.0), spacing=3e-3)
-LATER = replace(DRILLED, places=6, levels=(12.0,), seed=2)
+ANNOUNCED_SEED = 7400
 NOISE = 1e-3 / np.sqrt(20)  # of a mean of twenty frames, 60 dB below the readings
-WINDOW = 4.0  # s, of loads: one for each press
+LOADS = 4  # presses whose loads are fitted
 
 
 def announced(run: Run) -> Iterator[Row]:
-    """Skins whose bolts sit aside: what says so, and what it costs without and with fitted electrodes."""
-    skins, frames = run.sizes((2, FRAMES), (1, 1))
-    for aside in run.sizes(ASIDE, ASIDE[:1]):
-        rows = []
-        for seed in range(ANNOUNCED_SEED, ANNOUNCED_SEED + skins):
-            rows.append(
-                {"aside_mm": 1e3 * aside} | drilled(oracle.Faults(misplaced=aside, coating=0.15), seed, run.smoke)
-            )
-            print(rows[-1], flush=True)
-        yield {"announced": [averaged(rows) | {"skins": skins} | untouched(aside, frames)]}
-
-
-def untouched(aside: float, count: int) -> Row:
-    """How many untouched frames of further skins are announced, and the median size that is found in them."""
-    skin, sizes, said = je.load_skin("testbed"), [], 0
+    """Skins whose bolts sit aside: how many are announced, and what it costs without and with fitted electrodes."""
+    frames, skins, known, later = run.sizes((20, 2, 9, 12), (1, 1, 2, 1))
+    skin, seeds = je.load_skin("testbed"), range(ANNOUNCED_SEED, ANNOUNCED_SEED + frames)
     model = je.discretise(je.Scene(skin), FIDELITY)
-    for seed in range(ANNOUNCED_SEED + 100, ANNOUNCED_SEED + 100 + count):
-        rng = np.random.default_rng(seed)
-        frame = worn_skins.recorded(seed, worn_skins.presses(rng, 1), worn_skins.Wear(misplaced=aside)).untouched
-        rms = np.sqrt(np.mean(frame**2))
-        frame = frame + NOISE * rms * rng.normal(size=frame.size)
-        sizes.append(1e3 * float(find_misplacement(model, frame).size))
-        said += placement_finding(skin, frame, np.ones(frame.size, bool)) is not None
-    found = {"frames": count, "frames_said": said / count, "found_mm": round(float(np.median(sizes)), 3)}
-    print(found, flush=True)
-    return found
+    for aside in run.sizes(ASIDE, ASIDE[-1:]):
+        rows = []
+        for seed in seeds:
+            fits = seed - ANNOUNCED_SEED < skins
+            drilled = Drilled(seed, aside, *((known, later) if fits else (1, 0)))
+            found = find_misplacement(model, drilled.untouched)
+            row = {"said": float(drilled.said(skin)), "found_mm": 1e3 * float(found.size)}
+            rows.append(row | (drilled.errors(skin, model, run.smoke) if fits else {}))
+            print(aside, seed, rows[-1], flush=True)
+        yield {"announced": [{"aside_mm": 1e3 * aside, "frames": frames, "skins": skins} | summary(rows, rows[:skins])]}
 
 
-def drilled(faults: oracle.Faults, seed: int, smoke: bool) -> Row:
-    """What is said of a skin, by each command as 0 or 1, and errors of places in mm."""
-    first, later = (replace(one, faults=faults, skin_seed=seed) for one in (DRILLED, LATER))
-    with recorded(first) as session, recorded(later) as other:
-        row: Row = {"check": float(bool(said_by_check(session)))}
-        for name, fitted in [("", False), ("_fitted", True)][: 1 if smoke else 2]:
-            recipe = calib.Recipe(location=calib.PadEdge(), curve=calib.Linear(), folds=2, fit_electrodes=fitted)
-            found = calib.calibrate([session], recipe=recipe)
-            row |= {f"calibrate{name}": float(bool(noted(found.notes)))}
-            row |= {f"{what}{name}": value for what, value in applied(found, other).items()}
-    return row
+def summary(every: list[Row], fitted: list[Row]) -> Row:
+    """Shares that are announced, and medians, rounded."""
+    found = {"said": np.mean([row["said"] for row in every]), "found_mm": np.median([row["found_mm"] for row in every])}
+    found["said_fitted"] = np.mean([row["said_fitted"] for row in fitted])
+    for name in filter(lambda name: "place" in name, fitted[0]):
+        found[name] = np.median([each for row in fitted for each in row[name]])
+    return {name: round(float(value), 3) for name, value in found.items()}
 
 
-def applied(found: calib.Calibration, session: calib.Session) -> Row:
-    """Whether an application says it, and errors of the places of contacts and of loads, medians in mm."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = calib.apply(found, session, Path(folder) / "maps.h5", loads=WINDOW, proposal=None)
-        with open_archive(path, FORMAT) as file:
-            outside = str(file.attrs.get("outside", "")).split("\n")
-            time, place, misfit = (file.arrays[f"loads/{name}"].read() for name in ("time", "position", "misfit"))
-    tried = calib.evaluate(found, session)
-    presses = session.presses
-    middle = time.mean(1)
-    own = np.abs(middle[:, None] - 0.5 * (presses.t_hold0 + presses.t_hold1)).argmin(1)
-    truth = np.stack([presses.x, presses.y], 1)[own]
-    away = np.nan_to_num(np.linalg.norm(place - truth[:, None], axis=2), nan=np.inf).min(1)
-    single = np.linalg.norm(tried.estimated["fitted"] - tried.position, axis=1)
-    return {
-        "apply": float(bool(noted(outside))),
-        "contact_mm": 1e3 * float(np.median(single)),
-        "load_mm": 1e3 * float(np.median(away)),
-        "left": float(bool(left_by_fits(misfit))),
-    }
+class Drilled:
+    """A skin of the second simulator whose bolts sit aside: its untouched frame, presses at known places and others."""
+
+    def __init__(self, seed: int, aside: float, known: int, later: int):
+        rng = np.random.default_rng([seed, 5])
+        self.presses, self.known = presses(rng, known + later), known
+        seen = recorded(seed, self.presses, Wear(misplaced=aside))
+        self.noise = NOISE * np.sqrt(np.mean(seen.untouched**2))
+        self.untouched = seen.untouched + self.noise * rng.normal(size=seen.untouched.shape)
+        self.change = seen.change + self.noise * rng.normal(size=seen.change.shape)
+
+    def said(self, skin: je.Skin) -> bool:
+        """Whether `check`, `calibrate` and `apply` announce it: all of them ask this."""
+        return placement_finding(skin, self.untouched, np.ones(len(self.untouched), bool)) is not None
+
+    def errors(self, skin: je.Skin, model: je.Model, smoke: bool) -> Row:
+        """Errors of places of presses that were not fitted, mm, with the places of the file and with fitted ones."""
+        known = slice(self.known)
+        place = np.concatenate([press.places for press in self.presses])
+        noise = np.full(len(self.untouched), self.noise)
+        given = KnownPresses(self.change[known], place[known], noise)
+        fit = None if smoke else fit_electrodes(je.discretise(je.Scene(skin), PLACING), self.untouched, given)
+        moved = skin.electrode_positions + (0 if fit is None else np.asarray(fit.shift))
+        there = je.skin.with_positions(skin, moved)
+        fitted = je.discretise(je.Scene(there), FIDELITY)
+        row = dict(self._told(model, place, noise, ""))
+        row |= dict(self._told(fitted, place, noise, "_fitted"))
+        return row | {"said_fitted": float(self.said(there))}
+
+    def _told(
+        self, model: je.Model, place: np.ndarray, noise: np.ndarray, way: str
+    ) -> Iterator[tuple[str, list[float]]]:
+        """Errors of places of the presses after the known ones, mm, by contacts and by loads."""
+        sheet, one = je.fit_background(model, self.untouched), je.contacts.ContactSettings(most=1)
+        single = je.prepare_contacts(model, one, noise=noise, sigma=sheet)
+        later, true = self.change[self.known :], place[self.known :]
+        away = np.linalg.norm(np.asarray(single(later).position)[:, 0] - true, axis=1)
+        yield f"place{way}_mm", list(1e3 * away)
+        fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
+        finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
+        loads = [fitter(frame, finder(frame)).best for frame in later[:LOADS]]
+        nearest = [
+            np.nan if load is None else np.linalg.norm(np.asarray(load.position)[load.force.argmax()] - at)
+            for load, at in zip(loads, true, strict=False)
+        ]
+        yield f"load_place{way}_mm", [1e3 * float(one) for one in nearest if np.isfinite(one)]
 
 
 def said_by_check(session: calib.Session) -> str:
@@ -162,7 +169,7 @@ def said_by(report: CheckReport, session: calib.Session) -> str:
 
 
 @contextmanager
-def recorded(bench: oracle.Bench) -> Iterator[calib.Session]:
+def session_of(bench: oracle.Bench) -> Iterator[calib.Session]:
     """A session of the second simulator."""
     with tempfile.TemporaryDirectory() as folder:
         oracle.write(Path(folder) / "session.h5", oracle.simulate(bench))
@@ -199,7 +206,7 @@ def honest(run: Run) -> Iterator[Row]:
             sizes.append(size_of(session))
     for name, bench in run.sizes(list(HONEST.items()), []):
         for seed in range(HONEST_SEED, HONEST_SEED + 2):
-            with recorded(replace(bench, skin_seed=seed, seed=seed)) as session:
+            with session_of(replace(bench, skin_seed=seed, seed=seed)) as session:
                 sizes.append(size_of(session))
             print(name, seed, sizes[-1], flush=True)
     said, size, evidence = np.array(sizes).T
