@@ -95,8 +95,8 @@ def _what(found: Misplacement) -> str:
     times = float(found.unshifted / found.error)
     return (
         f"they seem to sit {about} from where the skin's file says (in x and in y, root mean square){_named(found)}; "
-        f"where the file says, a coat leaves {times:.1f} times the errors of the untouched frame that it leaves there. "
-        "Places of single contacts err by about as much as the electrodes, those of several loads by several times that"
+        f"with the places of the file, a coat leaves {times:.1f} times as large errors of the untouched frame. Places "
+        "of single contacts may err by about as much as the electrodes, and those of loads by several times that"
     )
 
 

@@ -35,7 +35,7 @@ def _said(skin, monkeypatch, found):
 def test_what_is_said_depends_on_evidence_and_size(skin, monkeypatch):
     found = _said(skin, monkeypatch, lambda *_: ASIDE)
     assert found.what.startswith("they seem to sit about 1 mm from where the skin's file says")
-    assert "most surely no. 7 (x +2.0, y -1.0 mm); where the file says, a coat leaves 15.0 times" in found.what
+    assert "most surely no. 7 (x +2.0, y -1.0 mm); with the places of the file, a coat leaves 15.0 times" in found.what
     assert "--fit-electrodes" in found.remedy
     note = placement_note(skin, np.ones(550), np.ones(550, bool))
     assert noted(["another", note]) == note
