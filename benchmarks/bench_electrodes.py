@@ -79,13 +79,13 @@ def calibrated(bench: Bench, skin: je.Skin, there: je.Skin, ways: tuple[str, ...
 
 ASIDE = (0.0, 0.5e-3, 1e-3, 2e-3, 3e-3)  # m
 ANNOUNCED_SEED = 7400
-NOISE = 1e-3  # of a reading of a press: 60 dB below the readings; the untouched frame is a mean of twenty
+NOISE = 1e-3 / np.sqrt(20)  # of a mean of twenty frames, 60 dB below the readings
 LOADS = 4  # presses whose loads are fitted
 
 
 def announced(run: Run) -> Iterator[Row]:
     """Skins whose bolts sit aside: how many are announced, and what it costs without and with fitted electrodes."""
-    frames, skins, known, later = run.sizes((20, 3, 9, 12), (1, 1, 2, 1))
+    frames, skins, known, later = run.sizes((20, 2, 9, 12), (1, 1, 2, 1))
     skin, seeds = je.load_skin("testbed"), range(ANNOUNCED_SEED, ANNOUNCED_SEED + frames)
     model = je.discretise(je.Scene(skin), FIDELITY)
     for aside in run.sizes(ASIDE, ASIDE[-1:]):
@@ -117,7 +117,7 @@ class Drilled:
         self.presses, self.known = presses(rng, known + later), known
         seen = recorded(seed, self.presses, Wear(misplaced=aside))
         self.noise = NOISE * np.sqrt(np.mean(seen.untouched**2))
-        self.untouched = seen.untouched + self.noise / np.sqrt(20) * rng.normal(size=seen.untouched.shape)
+        self.untouched = seen.untouched + self.noise * rng.normal(size=seen.untouched.shape)
         self.change = seen.change + self.noise * rng.normal(size=seen.change.shape)
 
     def said(self, skin: je.Skin) -> bool:

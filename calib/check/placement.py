@@ -96,7 +96,7 @@ def _what(found: Misplacement) -> str:
     return (
         f"they seem to sit {about} from where the skin's file says (in x and in y, root mean square){_named(found)}; "
         f"with the places of the file, a coat leaves {times:.1f} times as large errors of the untouched frame. Places "
-        "of single contacts may err by about as much as the electrodes, and those of loads by several times that"
+        "of single contacts may err by about as much as the electrodes, and those of loads by more"
     )
 
 
