@@ -8,6 +8,8 @@ import numpy as np
 import jaxeit as je
 
 from ..check.acceptance import accept
+from ..check.placement import placement_note
+from ..presses.streams import finite_mean
 from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from .calibration import Calibration
@@ -22,6 +24,9 @@ from .recalibration.agreement import agreement_of_use
 FORMAT = "skin-forcemap"
 TRACKS = "tracks/"  # group of the arrays of contacts that were followed
 LOADS = "loads/"  # group of the arrays of loads in windows
+LEVELS = 64  # times at which the level without contact is averaged
+
+Level = Callable[[np.ndarray], np.ndarray]
 
 
 def apply(
@@ -62,6 +67,8 @@ def apply(
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     calibration, outside = agreement_of_use(calibration, session)
+    doubt = placement_note(calibration.skin, _untouched(session, levels), np.asarray(calibration.recon.channels))
+    outside = (*outside, doubt) if doubt else outside
     attrs = _attributes(calibration, session) | {"ignored_errors": "\n".join(ignored), "outside": "\n".join(outside)}
     for line in outside:
         tell(f"note: {line}")
@@ -81,6 +88,13 @@ def apply(
         for one in also:
             tell(one.end())
     return Path(path)
+
+
+def _untouched(session: Session, levels: Mapping[str, Level]) -> np.ndarray:
+    """Mean frame without contact, (readings,) V."""
+    time = session.stream("eit").time
+    level = levels["eit"](np.linspace(time[0], time[-1], LEVELS))
+    return np.asarray(finite_mean(level))
 
 
 def _attributes(calibration: Calibration, session: Session) -> dict[str, str | int]:

@@ -11,6 +11,7 @@ import numpy as np
 import jaxeit as je
 
 from ..check.acceptance import accept
+from ..check.placement import placement_note
 from ..fitting.fields import single_places
 from ..fitting.pads import PadModel
 from ..fitting.response import (
@@ -114,6 +115,7 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
 def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
     presses, imager, response = found.presses, found.imager, found.response
     choice, model = response.choice, response.model
+    doubt = placement_note(found.skin, presses.untouched, presses.channels)
     return Calibration(
         skin=found.skin,
         recon=imager.recon,
@@ -126,6 +128,7 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
             *ignored,
             *presses.notes,
             *([found.placed.note] if found.placed else []),
+            *([doubt] if doubt else []),
             *([f"chosen: {choice.why}"] if choice.why else []),
             *imager.notes,
         ),

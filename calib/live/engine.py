@@ -25,6 +25,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of
 from ..calibration.localisation.ellipses import placement_covariance
 from ..calibration.localisation.locators import ContactLocator
+from ..check.placement import noted
 from ..fitting.curves.play_operators import remembered
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
@@ -256,6 +257,7 @@ class Engine:
         self._used_readings, self._centres = np.asarray(recon.channels), np.asarray(recon.centres)
         self._pad_weights = np.asarray(calibration.masks.weights)
         self._recalibrator, self._follower = recalibrator, follower
+        self._doubt = noted(calibration.notes)
         self._multiple = calibration.pads.multiple
         self._law = law_of(calibration) if recalibrator is None else recalibrator.moved(law_of(calibration))
         self._programs = programs(self._law) if follower is None else programs(self._law, follower.most)
@@ -282,8 +284,14 @@ class Engine:
 
     @property
     def health(self) -> str:
-        """How far off the calibration is; empty unless it is being recalibrated."""
-        return "" if self._recalibrator is None else self._recalibrator.health
+        """How far off the calibration is, if it is being recalibrated, and what makes places doubtful."""
+        moved = "" if self._recalibrator is None else self._recalibrator.health
+        return "; ".join(filter(None, (moved, self.doubt)))
+
+    @property
+    def doubt(self) -> str:
+        """What is to be said of the places of the electrodes: of the first rest, or by the calibration."""
+        return self._doubt if self._follower is None else self._follower.doubt
 
     def tare(self) -> None:
         """Measure the rest levels again."""

@@ -10,6 +10,7 @@ from jaxeit.tracking import LearnedLayer, Track, Tracker, TrackerSettings, Track
 from ..calibration.calibration import Calibration
 from ..calibration.localisation.contact_tracks import MIN_SECONDS, pad_errors, prepare_calibrated_tracker
 from ..calibration.localisation.quiet_frames import QuietFrames
+from ..check.placement import noted, placement_note
 from .results import TouchEstimates
 
 FIRST_SECONDS = 0.01  # before the first frame that is followed
@@ -32,7 +33,7 @@ class LiveFollower:
         self._calibration, self._prepare = calibration, prepare
         self._tracker: Tracker | None = None
         self._now: Tracking | None = None
-        self._layer = calibration.layer
+        self._layer, self.doubt = calibration.layer, noted(calibration.notes)
         self._last: int | None = None
         self._looked, self._piece = 0.0, 0.0  # s: end of the last piece of a look, and how long pieces take
 
@@ -59,6 +60,8 @@ class LiveFollower:
         spread.add(resting, resting - quiet.untouched, untouched)
         self._tracker = self._prepare(self._calibration, quiet.untouched, spread.noise)
         compile_tracker(self._tracker)
+        used = np.asarray(self._calibration.recon.channels)
+        self.doubt = placement_note(self._calibration.skin, quiet.untouched, used)
         self.restart()
 
     def learned(self) -> LearnedLayer | None:

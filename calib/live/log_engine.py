@@ -44,6 +44,8 @@ class LogEngine:
             return "running"
         return f"{'waiting for the sensor to be at rest' if self.restless else 'measuring the zero'}: do not touch it"
 
+    doubt = ""  # of places: a log has none
+
     @property
     def health(self) -> str:
         """How far off the calibration is: not known without known forces."""

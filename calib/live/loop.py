@@ -120,7 +120,8 @@ class LiveControl:
     tare: threading.Event = field(default_factory=threading.Event)
     state: str = "waiting for the devices"
     lost: int = 0  # frames that were sent and did not arrive
-    health: str = ""  # of the calibration, while it is being recalibrated
+    health: str = ""  # of the calibration, while it is being recalibrated or its places are doubtful
+    doubt: str = ""  # about places of contacts, as told to the operator
     simulated: bool = False  # whether a device reports that its values are simulated
     warn: Callable[[str], object] = _ignore  # called with what the operator should know
 
@@ -295,4 +296,6 @@ def _tell_state(control: LiveControl, engine: Engine | LogEngine, recorder: Reco
     control.simulated = any(receiver.counters.simulated for receiver in recorder.receivers)
     if engine.state != control.state and engine.restless:
         control.warn(engine.state)
-    control.state, control.health = engine.state, engine.health
+    if engine.doubt not in ("", control.doubt):
+        control.warn(engine.doubt)
+    control.state, control.health, control.doubt = engine.state, engine.health, engine.doubt

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxeit.contacts import LoadKind
 
+from ..calibration.localisation.load_windows import left_by_fits
 from .figures.force_series import SERIES
 from .figures.panels import WIDER, Panel, chart_axes, panel
 from .figures.parts import MM
@@ -67,6 +68,11 @@ def panel_of_kinds(windows: Windows, *, simulated: bool) -> Panel:
 
 
 def _notes(windows: Windows) -> list[str]:
+    left = left_by_fits(windows["misfit"]) if "misfit" in windows else ""  # a file of an early version has none
+    return [*_of_network(windows), *([f"<p>Of these windows, {escape(left)}.</p>"] if left else [])]
+
+
+def _of_network(windows: Windows) -> list[str]:
     unlike = int(np.sum(windows["distance"] > 1))
     if np.isnan(windows["distance"]).all():
         return ["<p>Fits alone tell these probabilities; no network was used.</p>"]

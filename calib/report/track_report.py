@@ -60,6 +60,7 @@ def _page(rows: Rows, loads: Windows, attrs: Mapping[str, Any], skin: je.Skin) -
     parts = [f"<h1>{escape(title)}</h1>"]
     if simulated:
         parts.append('<p class="banner" role="note"><strong>SIMULATED</strong> The recording is simulated.</p>')
+    parts += [f"<p>Note: {escape(line)}</p>" for line in str(attrs.get("outside", "")).split("\n") if line]
     told = load_parts(loads, simulated=simulated)
     if not rows or not len(rows["time"]):
         parts += [] if told else ["<p>No contact was followed.</p>"]

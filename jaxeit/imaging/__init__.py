@@ -51,6 +51,7 @@ from .absolute.images import (
     gauss_newton,
     least_squares_image,
 )
+from .absolute.misplacement import Misplacement, find_misplacement
 from .absolute.reference import ReferenceFit, ReferenceParameters, ReferenceSettings, fit_reference
 from .hyperparameters import (
     HYPERPARAMETERS,
@@ -143,6 +144,7 @@ __all__ = [
     "LevelSet",
     "LogConductivity",
     "MeasuredNoise",
+    "Misplacement",
     "NoiseFigure",
     "NonNegative",
     "Noser",
@@ -162,6 +164,7 @@ __all__ = [
     "Tikhonov",
     "TotalVariation",
     "TruncatedSvd",
+    "find_misplacement",
     "fit_background",
     "fit_electrodes",
     "fit_reference",

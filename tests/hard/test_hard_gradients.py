@@ -43,6 +43,7 @@ HOST = {
     "electrode_motion": _PREPARES,
     "expected_mesh_nodes": _GEOMETRY,
     "few_choices": _PREPARES,
+    "find_misplacement": _PREPARES,
     "fit_electrodes": _PREPARES,
     "fit_model_error": _PREPARES,
     "is_covariance": "says yes or no",

@@ -25,6 +25,7 @@ from calib.bench import Bench, Timing, simulate
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.force_maps import ForceLaw, fused
 from calib.calibration.localisation.contact_tracks import PAD_SHARE, NotFollowed, prepare_calibrated_tracker
+from calib.check.placement import NOTE
 from calib.cli import main
 from calib.fitting.curves.fitted import FittedCurve
 from calib.fitting.fields.places import single_places
@@ -32,7 +33,7 @@ from calib.fitting.pads import PadModel
 from calib.live import engine as live_engine, loop as live_module
 from calib.live.engine import PREPARING, Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
 from calib.live.follower import PIECES, LiveFollower
-from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, run_live
+from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, _tell_state, run_live
 from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
 from calib.live.results import TouchEstimates
@@ -42,7 +43,7 @@ from calib.record.device import SimulatedDevice, frame_packets, recording_packet
 from calib.record.plan import StreamPlan
 from calib.record.planning import plan_recording
 from calib.record.priority import PriorityError, real_time
-from calib.record.recorder import StopRequest, record_session
+from calib.record.recorder import Recorder, StopRequest, record_session
 from calib.record.wire import encoding
 from calib.record.wire.messages import Frame
 from jaxeit import effects as fx
@@ -388,6 +389,7 @@ class FakeTracker(Tracker):
 def following(calibration, monkeypatch):
     """An engine that follows contacts, at rest, and its tracker."""
     monkeypatch.setattr("calib.live.follower.compile_tracker", lambda tracker: compiled.append(tracker))
+    monkeypatch.setattr("calib.live.follower.placement_note", lambda skin, frame, used: f"aside by {frame[0]:.3f}")
     compiled, made = [], []
 
     def prepare(calibration, untouched, noise):
@@ -402,6 +404,18 @@ def following(calibration, monkeypatch):
     assert engine.state == "running"
     assert compiled == made
     return engine, made[0]
+
+
+def test_doubts_about_the_electrodes_are_told(following, calibration):
+    """Of the first rest, where contacts are followed; otherwise those of the calibration, and to the operator once."""
+    assert following[0].health == "aside by 0.455"
+    noted = f"{NOTE}they seem to sit about 1 mm from where the skin's file says"
+    object.__setattr__(calibration, "notes", ("another", noted))
+    engine, show, told = rested(calibration), LiveControl(), []
+    show.warn = told.append
+    for _ in range(2):
+        _tell_state(show, engine, stand_in(Recorder, receivers=()))
+    assert (show.health, told) == (noted, [noted])
 
 
 def test_the_tracker_knows_the_sheet_and_the_noise_of_the_rest(following):

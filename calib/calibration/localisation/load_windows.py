@@ -15,14 +15,16 @@ from jaxtyping import Float
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Loads, Proposal
 
+from ...check.placement import FIDELITY
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
 from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 
-# The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
-FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
 MOST = 3  # loads of a window
+# Chi-square over the number of readings of a fit, and part of the windows beyond it from which it is worth a line. On
+# honest skins of another simulator the median reaches 2; where bolts are 2 mm aside it begins at 25.
+SURPRISING, MIN_SURPRISING = 6.0, 0.5
 MAX_WINDOW_FRAMES = 4096  # of a window, so that memory stays bounded
 
 
@@ -83,6 +85,7 @@ class SeenLoads:
     stated: tuple[float, ...]  # probability of each of these kinds
     why_none: str = ""
     outside: int = 0  # windows that are unlike the scenes of the proposal
+    left: str = ""  # what their fits leave, if that is more than is believed
 
     def render(self) -> str:
         """What touched the skin, in one line."""
@@ -90,7 +93,7 @@ class SeenLoads:
             return f"loads: none fitted: {self.why_none}"
         seen = ", ".join(self._told(kind) for kind in LoadKind if kind in self.kinds)
         unlike = f"; {self.outside} are unlike what the proposal was trained on" if self.outside else ""
-        return f"loads of {len(self.kinds)} windows: {seen}{unlike}"
+        return f"loads of {len(self.kinds)} windows: {seen}{unlike}" + (f"; {self.left}" if self.left else "")
 
     def _told(self, kind: LoadKind) -> str:
         """How many windows are of a kind, and its mean probability there."""
@@ -117,7 +120,24 @@ def fit_windows(
     loads, distance = zip(*found, strict=True)
     outside = int(np.sum(np.array(distance) > 1))
     kinds, stated = zip(*((one.kind, float(np.max(one.probability))) for one in loads), strict=True)
-    return SeenLoads(_arrays(seen.windows, found), kinds, stated, outside=outside)
+    arrays = _arrays(seen.windows, found)
+    return SeenLoads(arrays, kinds, stated, outside=outside, left=left_by_fits(arrays["misfit"][0]))
+
+
+def left_by_fits(misfit: np.ndarray) -> str:
+    """Words for fits of windows whose readings are not those of the skin's model; empty for few or none of them.
+
+    Args:
+        misfit: chi-square over the number of readings of each window, (windows,); NaN: nothing touches the skin.
+    """
+    known = misfit[np.isfinite(misfit)]
+    far = known > SURPRISING
+    if not far.any() or far.mean() < MIN_SURPRISING:
+        return ""
+    return (
+        f"in {far.mean():.0%} of them fits leave {np.sqrt(np.median(known[far])):.1f} times their errors: the readings "
+        "are not those of this skin's model, and places and kinds may be wrong"
+    )
 
 
 # Loads of a window, and how far it is from the scenes of a proposal; NaN: there is none.
@@ -148,6 +168,7 @@ def _arrays(windows: list[Window], found: list[Found]) -> dict[str, tuple[Any, s
 ABOUT = {
     "time": ("ns", "begin and end of each window, since time_epoch_utc"),
     "probability": ("1", "of none, one, two, an edge and more"),
+    "misfit": ("1", "chi-square over the number of readings of the most probable kind; about 1 or less; NaN: none"),
     "distance": ("1", "from the scenes of the proposal; above 1: unlike them; NaN: no proposal"),
     "position": ("m", "of each load of the most probable kind; of an edge, its middle; NaN: none"),
     "position_covariance": ("m2", "of each position"),
@@ -171,6 +192,7 @@ EMPTY = {
 def _row(window: Window, found: Loads, distance: float) -> Iterator[tuple[str, np.ndarray]]:
     yield "time", np.array([window.begin, window.end])
     yield "probability", np.asarray(found.probability)
+    yield "misfit", np.array(np.nan if found.best is None else found.best.misfit, float)
     yield "distance", np.array(distance)
     out = {name: np.full(shape, np.nan) for name, shape in EMPTY.items()}
     best = found.best

@@ -75,7 +75,8 @@ def _calibrate_together(args: argparse.Namespace) -> int:
 
         write_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
-        results = {"calibration": calibration.evaluation.summary()} | {n: e.summary() for n, e in tried.items()}
+        own = calibration.evaluation.summary() | {"notes": list(calibration.notes)}
+        results = {"calibration": own} | {n: e.summary() for n, e in tried.items()}
         print(json.dumps(results, indent=2, sort_keys=True))
         return 0
     names = ", ".join(Path(path).name for path in args.sessions)

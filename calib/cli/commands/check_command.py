@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
     set_up()
     from ...check import check_session, render, to_json
+    from ...check.placement import with_placement
     from ...check.report import with_health
     from ...session import SessionError, open_session
 
@@ -40,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
             with open_session(path) as session:
                 bar = progress_bar(session.name)
                 report = check_session(session, skin, electrodes=args.electrodes, progress=bar)
+                report = report if args.electrodes else with_placement(report, session, skin)
                 report = report if health is None else with_health(report, health(session))
         except SessionError as error:
             print(f"jaxeit: {one_line(error)}", file=sys.stderr)

@@ -14,7 +14,7 @@ from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
 from ...model.forward_model import forward
 from ..noise import InverseError
-from ..priors import GaussianSmooth
+from ..priors import AbstractPrecision, GaussianSmooth
 from .images import LogConductivity, Quadratic, gauss_newton
 
 # Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
@@ -66,21 +66,44 @@ def fit_background(
         truth = je.conductivity(real)
         print(jnp.std(jnp.log(sigma / truth)), "of", jnp.std(jnp.log(truth)), "left")
     """
-    v0, even = jnp.asarray(v0, model.dtype), forward(model, model.background)
+    frame = jnp.asarray(v0, model.dtype)
+    physics, x = fitted_coat(model, frame, std, length, model_error, columns, basis, tolerance)
+    there = jnp.isfinite(frame)
+    require_explained("coating", physics.voltages(x), jnp.where(there, frame, 0), there)
+    return physics.sigma(x)
+
+
+def fitted_coat(
+    model: Model,
+    v0: Float[Array, "..."],
+    std: Float[ArrayLike, ""] = 0.15,
+    length: Float[ArrayLike, ""] = 0.03,
+    model_error: Float[ArrayLike, ""] = 0.01,
+    columns: int = 20,
+    basis: BasisMap | None = None,
+    tolerance: float = 2e-3,
+) -> tuple[LogConductivity, Float[Array, " basis"]]:
+    """The physics of a coat, and its image that `fit_background` finds, whether or not it explains the frame.
+
+    Raises:
+        InverseError: if the shape or a value is wrong.
+    """
+    even = forward(model, model.background)
     require_frame(v0, even)
     require_positive(std=std, length=length, model_error=model_error, columns=columns)
     level = sheet_level(v0, even)
     image = Pixels(columns).on(model) if basis is None else basis
     physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
+    penalty = Quadratic(coat_precision(image, length), 1 / jnp.asarray(std) ** 2)
+    return physics, gauss_newton(physics, penalty, v0, frame_error(v0, model_error), tolerance=tolerance)
+
+
+def coat_precision(image: BasisMap, length: Float[ArrayLike, ""]) -> AbstractPrecision:
+    """Precision of the logarithm of the conductivity of a coat that varies over a length, m, for a variance of one."""
     # The setting of a prior is a number; a length that JAX traces takes its place.
-    smooth = eqx.tree_at(lambda prior: prior.length, GaussianSmooth(), jnp.asarray(length, model.dtype))
-    prior = smooth.precision(jnp.zeros((1, image.size), model.dtype), image.picture)
-    error = frame_error(v0, model_error)
-    penalty = Quadratic(prior, 1 / jnp.asarray(std) ** 2)
-    x = gauss_newton(physics, penalty, v0, error, tolerance=tolerance)
-    there = jnp.isfinite(v0)
-    require_explained("coating", physics.voltages(x), jnp.where(there, v0, 0), there)
-    return physics.sigma(x)
+    smooth = eqx.tree_at(lambda prior: prior.length, GaussianSmooth(), jnp.asarray(length, image.picture.centres.dtype))
+    found: AbstractPrecision = smooth.precision(jnp.zeros((1, image.size), smooth.length.dtype), image.picture)
+    return found
 
 
 def sheet_of(

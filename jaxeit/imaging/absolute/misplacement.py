@@ -1,0 +1,179 @@
+"""Whether the electrodes sit where the model has them, told from one untouched frame by a comparison of two beliefs.
+
+Either the coat of the sheet alone makes the frame differ from the model, or the electrodes sit elsewhere too. Linear
+about the sheet that explains the frame best, the readings are Gaussian under both beliefs, with the covariance
+
+    K = c^2 J P J' + s^2 S S' + e^2 R + g^2 f f',
+
+where J and S are the derivatives by the logarithm of the conductivity and by the shifts of the electrodes, P is the
+correlation of the coat over the sheet, R has the errors of a good model, and f are the readings, whose common gain is
+not known: g is large. The standard deviations c of the coat, s of the shifts and e of the errors are the most probable
+ones (MacKay 1992, Neural Comput. 4: the evidence), so that an uneven coat or a rough model is not taken for misplaced
+electrodes. Under the first belief s is zero. `fit_electrodes` tells the shifts better, through the full forward map,
+and takes longer.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+from scipy.linalg import cholesky, solve_triangular, svd
+
+from ..._compile import require_known, verb
+from ...model.discretisation import Model
+from ...model.forward_model import coefficients, fields, terminal_matrix, voltages
+from ...model.motion import Motion, electrode_motion, field_shift_jacobian
+from ...model.sensitivity import field_jacobian
+from ..noise import InverseError
+from .background import coat_precision, fitted_coat, frame_error
+from .images import LogConductivity
+
+COAT_LENGTH = 0.03  # m, over which a coat varies
+USUAL_COAT, COAT_SPREAD = 0.15, 0.7  # of the logarithm of the conductivity, and of the logarithm of that
+MODEL_ERROR = 1e-3  # relative, of which e is a multiple
+LEAST_ERROR = 0.1  # e: derivatives hold no better
+MOST_COAT, MOST_SHIFT = 1.0, 5e-3  # c, and s in m; beyond them, derivatives say nothing of a size
+# Candidates of c / e, and of s / e in m; a step of 1.4 moves the logarithm of the evidence by less than two.
+COATS, SHIFTS = np.geomspace(1e-4, 60, 40), np.append(0, np.geomspace(1e-6, 0.1, 90))
+
+
+class Misplacement(eqx.Module):
+    """How far electrodes seem to sit from where the model has them, by an untouched frame.
+
+    | meaning                                                                             | shape           | unit |
+    |-------------------------------------------------------------------------------------|-----------------|------|
+    | size: standard deviation of the shifts in each direction; 5 mm: that or more        | ()              | m    |
+    | evidence: twice the gain in log probability by shifts; above about 20: they are real | ()             | 1    |
+    | shift: the most probable one of each electrode, of shifts of that size              | (electrodes, 2) | m    |
+    | standard_error of each shift                                                        | (electrodes, 2) | m    |
+    | error: relative error of a reading that neither coat nor shifts explain             | ()              | 1    |
+    | unshifted: the same, if no electrode is shifted                                     | ()              | 1    |
+    """
+
+    size: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    evidence: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    shift: Float[Array, "electrodes 2"] = eqx.field(converter=jnp.asarray)
+    standard_error: Float[Array, "electrodes 2"] = eqx.field(converter=jnp.asarray)
+    error: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    unshifted: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+
+def find_misplacement(
+    model: Model, v0: Float[ArrayLike, " readings"], noise: Float[ArrayLike, " readings"] | None = None
+) -> Misplacement:
+    """Tell from an untouched frame whether electrodes sit elsewhere than in the model, and about how far.
+
+    Args:
+        v0: untouched frame, V, best a mean over many; readings that are not finite are left out.
+        noise: standard deviation of each reading of v0, V; default: none.
+
+    Raises:
+        InverseError: if a shape or a value is wrong.
+        MotionError: if the electrodes cannot be moved on this mesh.
+
+    Example:
+        skin = je.load_skin("testbed")
+        places = skin.electrode_positions
+        drilled = places + np.random.default_rng(0).normal(0, 1e-3, places.shape)  # m
+        real = je.discretise(je.Scene(je.skin.with_positions(skin, drilled)), je.Fidelity.draft())
+        doubt = je.imaging.find_misplacement(model, je.forward(real))
+        print(f"bolts sit {1e3 * doubt.size:.1f} mm aside, with a log evidence of {0.5 * doubt.evidence:.0f}")
+    """
+    require_known("find_misplacement", InverseError, model.nodes, v0, noise)
+    frame = jnp.asarray(v0, model.dtype)
+    physics, coat = fitted_coat(model, frame)
+    linear = _linear(physics, electrode_motion(model), coat)
+    error = np.asarray(frame_error(frame, MODEL_ERROR), float)
+    spread = np.zeros_like(error) if noise is None else np.asarray(noise, float)
+    if spread.shape != error.shape or not (spread >= 0).all():
+        raise InverseError("noise is not one number of zero or more for each reading of v0; give volts")
+    known = np.isfinite(np.asarray(frame))
+    by_coat, by_shift, *levels = (np.asarray(part, float)[known] for part in linear)
+    at_start, found = levels
+    rows = np.hypot(error, spread)[known]
+    missed = (np.asarray(frame, float)[known] - at_start) / rows
+    return _compared(missed, by_coat / rows[:, None], by_shift / rows[:, None], found / rows)
+
+
+@verb
+def _linear(
+    physics: LogConductivity, motion: Motion, coat: Float[Array, " basis"]
+) -> tuple[
+    Float[Array, "readings basis"],
+    Float[Array, "readings both"],
+    Float[Array, " readings"],
+    Float[Array, " readings"],
+]:
+    """About a coat: derivatives of the readings by independent parts of the coat, and by all shifts, V and V/m; the
+    readings of an even sheet by these derivatives; and the readings, V."""
+    model, sigma = physics.model, physics.sigma(coat)
+    theta = coefficients(model, sigma)
+    x = fields(model, theta)
+    by_coat = field_jacobian(model, theta, x, physics.image, sigma)
+    by_shift = field_shift_jacobian(model, motion, theta, x)
+    found = voltages(model, terminal_matrix(model, theta, x))
+    parts = coat_precision(physics.image, COAT_LENGTH).seen(by_coat)
+    return parts, by_shift.reshape(len(by_shift), -1), found - by_coat @ coat, found
+
+
+def _compared(
+    y: Float[np.ndarray, " n"],
+    by_coat: Float[np.ndarray, "n basis"],
+    by_shift: Float[np.ndarray, "n both"],
+    by_gain: Float[np.ndarray, " n"],
+) -> Misplacement:
+    """The more probable beliefs about readings y (n,) and their derivatives, all in errors of a good model."""
+    of_coat, of_gain = by_coat @ by_coat.T, np.outer(by_gain, by_gain)
+    beliefs: list[_Belief] = []
+    for ratio in COATS:
+        root = cholesky(np.eye(len(y)) + ratio**2 * of_coat + of_gain, lower=True)
+        white, slopes = (solve_triangular(root, part, lower=True) for part in (y, by_shift))
+        beliefs += _beliefs(ratio, white, slopes, float(np.log(np.diag(root)).sum()))
+    unshifted, shifted = (min(beliefs[k::2], key=lambda belief: belief.surprise) for k in (0, 1))
+    parts = (
+        shifted.size,
+        2 * (unshifted.surprise - shifted.surprise),
+        shifted.shift.reshape(-1, 2),
+        np.sqrt(shifted.variance).reshape(-1, 2),
+        MODEL_ERROR * shifted.error,
+        MODEL_ERROR * unshifted.error,
+    )
+    return Misplacement(*(jnp.asarray(part) for part in parts))
+
+
+class _Belief(NamedTuple):
+    """Minus the log probability of readings, deviations of shifts, m, and errors, and shifts with their variances."""
+
+    surprise: float
+    size: float
+    error: float
+    shift: np.ndarray
+    variance: np.ndarray
+
+
+def _beliefs(
+    ratio: float, y: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n both"], root: float
+) -> tuple[_Belief, _Belief]:
+    """The belief without shifts, and that with the most probable size of shifts, for one ratio of coat to errors.
+
+    The singular values of the whitened slopes serve all sizes; that of the errors is known in closed form.
+    """
+    left, values, right = svd(slopes, full_matrices=False)
+    along = left.T @ y
+    seen = (SHIFTS[:, None] * values) ** 2
+    square = y @ y - (seen / (1 + seen)) @ along**2
+    error = np.sqrt(np.maximum(square / len(y), LEAST_ERROR**2))
+    surprise = len(y) * np.log(error) + 0.5 * (square / error**2 + np.log1p(seen).sum(1)) + root
+    surprise += 0.5 * (np.log(ratio * error / USUAL_COAT) / COAT_SPREAD) ** 2
+    size = SHIFTS * error
+    surprise = np.where((ratio * error > MOST_COAT) | (size > MOST_SHIFT), np.inf, surprise)
+
+    def belief(k: int) -> _Belief:
+        part = seen[k] / (1 + seen[k])
+        shift = right.T @ (part / values * along)
+        return _Belief(surprise[k], size[k], error[k], shift, size[k] ** 2 * (1 - part @ right**2))
+
+    return belief(0), belief(int(np.argmin(surprise)))
