@@ -18,8 +18,8 @@ from ..session import Session
 from .electrodes import WHERE
 from .report import CheckReport, Finding, Severity
 
-# The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
-FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
+# The mesh of a calibration, whose programs are compiled for its coat already.
+FIDELITY = je.Fidelity.standard()
 # Of the evidence, and of the size in m. On honest skins of two simulators, at 30 to 80 dB, with coats of deviations up
 # to 0.6, they reach 110 and 0.17 mm, and never both; skins whose bolts are 0.5 mm aside begin at 110 and 0.43 mm.
 MIN_EVIDENCE, MIN_SIZE = 50.0, 3e-4
