@@ -1,5 +1,6 @@
 """Description of a simulated bench: a scene, the presses on it, and the streams that are recorded."""
 
+import os
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import resources
@@ -114,7 +115,9 @@ class Bench:
                 outside = ~self.scene.skin.domain.contains(places)
                 if outside.any():
                     number = int(np.argmax(outside))
-                    raise BenchError(f"site {number}{name}{way} at {places[number]} m lies outside the sheet")
+                    x, y = places[number]
+                    where = f"site {number}{name}{way} at ({x:g}, {y:g}) m lies outside the sheet"
+                    raise BenchError(f"{where}; give sites = [[x, y], ...] in m on the sheet, from its origin")
 
     def _require_possible(self) -> None:
         forces, (low, high) = np.asarray(self.forces), np.asarray(self.scene.skin.domain.bounds)
@@ -152,6 +155,8 @@ class Bench:
 def load_bench(path: str | Path) -> Bench:
     """Load a bench from a scene file, or a shipped preset by its name (see `presets`).
 
+    The path of the skin in a scene file starts at the folder of the scene, or else at the working directory.
+
     Raises:
         ValueError: naming the file, the key and the reason.
     """
@@ -162,7 +167,7 @@ def load_bench(path: str | Path) -> Bench:
         raise BenchError(f"{path}: no such scene file or preset; presets: {', '.join(presets())}")
     else:
         text = je.toml.read_text(Path(path))
-    return je.toml.parse_toml(text, path, lambda table: _bench(table, text), allow_import=True)
+    return je.toml.parse_toml(text, path, lambda table: _bench(table, text, Path(path).parent), allow_import=True)
 
 
 SCENE_FOLDER = resources.files(__package__) / "scenes"
@@ -175,10 +180,10 @@ def presets() -> tuple[str, ...]:
     )
 
 
-def _bench(top: je.toml.TomlTable, text: str) -> Bench:
+def _bench(top: je.toml.TomlTable, text: str, folder: Path) -> Bench:
     top.choice("format", "jaxeit-scene")
     top.get("version", lambda v: v == 1, "1, the version this jaxeit reads")
-    skin = je.load_skin(top.get("skin", lambda v: isinstance(v, str), "a skin's name or path"))
+    skin = _skin(top.get("skin", lambda v: isinstance(v, str), "a skin's name or path"), folder)
     title = top.get("title", lambda v: isinstance(v, str), "the session's title")
     seed = top.get("seed", lambda v: type(v) is int and 0 <= v < 2**31, "a whole number")
     effects = je.model.read_effects(top)
@@ -203,6 +208,12 @@ def _bench(top: je.toml.TomlTable, text: str) -> Bench:
     return Bench(scene, sites, forces, title, timing=timing, seed=seed, toml=text, **numbers)
 
 
+def _skin(name_or_path: str, folder: Path) -> je.Skin:
+    """A skin by its path from the scene's folder, by its path from the working directory, or by a shipped name."""
+    beside = folder / name_or_path
+    return je.load_skin(beside if os.path.isfile(beside) else name_or_path)
+
+
 def _sites(table: je.toml.TomlTable, domain: je.geometry.Domain) -> np.ndarray:
     if table.has("sites"):
         return table.array("sites", 2, "[[x, y], ...] in m")
@@ -214,8 +225,14 @@ def _sites(table: je.toml.TomlTable, domain: je.geometry.Domain) -> np.ndarray:
         raise table.error("margin", f"is {margin:g} m, which leaves no place on a sheet of {x1 - x0:g} x {y1 - y0:g} m")
     x = np.linspace(x0 + margin, x1 - margin, columns)
     y = np.linspace(y0 + margin, y1 - margin, rows)
-    grid = np.stack(np.meshgrid(x, y), -1)
-    return grid.reshape(-1, 2)
+    places = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    # the grid fills the bounding box, in whose corners a disc or a polygon has no sheet
+    kept = domain.contains(places) & (domain.boundary_distance(places) >= margin - domain.tolerance)
+    if not kept.any():
+        raise table.error(
+            "margin", f"is {margin:g} m, and no place of the {columns} x {rows} grid is so far inside the sheet"
+        )
+    return places[kept]
 
 
 def _companion(table: je.toml.TomlTable) -> Companion:

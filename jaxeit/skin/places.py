@@ -20,7 +20,9 @@ def read_positions_inside(table: TomlTable, domain: Domain) -> list[tuple[float,
     outside = ~domain.contains(np.array(positions))
     if outside.any():
         number = int(np.argmax(outside))
-        raise table.error("positions", f"electrode {number} at {positions[number]} m lies outside the sheet")
+        problem = f"electrode {number} at {positions[number]} m lies outside the sheet"
+        hint = "" if table.has("positions") else "; list positions = [[x, y], ...] where the sheet is no rectangle"
+        raise table.error("positions", problem + hint)
     return positions
 
 

@@ -35,10 +35,13 @@ def rim_electrodes(
         clockwise: whether electrodes or angles follow each other clockwise.
 
     Raises:
-        ElectrodeError: if electrodes overlap, or the middle of the sheet does not lie inside it.
+        ElectrodeError: if there is no electrode, if electrodes overlap, or the middle of the sheet does not lie
+            inside it.
     """
     turn = -1.0 if clockwise else 1.0
     if isinstance(places, (int, np.integer)):
+        if places < 1:
+            raise ElectrodeError(f"{places} electrodes around the rim; give 1 or more")
         require("electrodes", int(places), "rim_electrodes", ElectrodeError)
         pitch = domain.perimeter / places
         middles = _at_angle(domain, start) + turn * pitch * np.arange(places)

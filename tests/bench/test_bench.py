@@ -353,6 +353,28 @@ def test_the_chest_from_scene_to_force_map(tmp_path):
     assert found["pad_force"].sum(1).max() == pytest.approx(25, rel=0.3)  # 15 N and 10 N, without a correction
 
 
+def test_a_grid_of_presses_keeps_what_an_l_shaped_sheet_holds(tmp_path):
+    corners = [[0, 0], [0.18, 0], [0.18, 0.06], [0.09, 0.06], [0.09, 0.12], [0, 0.12]]
+    (tmp_path / "skin.toml").write_text(
+        'format = "jaxeit-skin"\nversion = 1\nname = "l"\n'
+        f'[sheet]\nshape = "polygon"\nvertices = {corners}\nsheet_resistance = 200.0\n'
+        '[electrodes]\nkind = "point"\npositions = [[0.02, 0.02], [0.1, 0.02], [0.16, 0.04], [0.04, 0.1]]\n'
+        '[protocol]\npattern = "adjacent"\ncurrent = 1e-3\n[[pads]]\nname = "a"\nrectangle = [0.0, 0.0, 0.09, 0.06]\n'
+    )
+    scene = (
+        'format = "jaxeit-scene"\nversion = 1\ntitle = "t"\nskin = "skin.toml"\nseed = 1\n'
+        "[bench]\ncolumns = 9\nrows = 6\nmargin = MARGIN\nforces = [3.0]\neit_rate = 5.0\n"
+    )
+    (tmp_path / "scene.toml").write_text(scene.replace("MARGIN", "0.012"))
+    x, y = load_bench(str(tmp_path / "scene.toml")).sites.T
+    assert len(x) > 20
+    assert (np.maximum(x - 0.168, y - 0.108) <= 1e-9).all()
+    assert (np.minimum(x - 0.078, y - 0.048) <= 1e-9).all()  # at least the margin from the sides that turn inwards
+    (tmp_path / "scene.toml").write_text(scene.replace("MARGIN", "0.059"))
+    with pytest.raises(je.toml.TomlError, match=r"margin: is 0.059 m, and no place of the 9 x 6 grid is so far inside"):
+        load_bench(str(tmp_path / "scene.toml"))
+
+
 def test_an_unknown_preset_is_named():
     with pytest.raises(ValueError, match=r"papr_bench: no such scene file or preset; presets: .*paper_bench"):
         load_bench("papr_bench")

@@ -180,6 +180,11 @@ def test_wrong_matrices_are_refused(change, message):
         je.Protocol.from_matrices(**{"current": CURRENT, "measurement": MEASURED["above the mean"]} | change)
 
 
+def test_no_electrode_around_the_rim_is_refused():
+    with pytest.raises(je.skin.ElectrodeError, match="0 electrodes around the rim; give 1 or more"):
+        je.skin.rim_electrodes(DISC, 0)
+
+
 def test_rim_electrodes_are_where_they_are_asked_for():
     square = je.Polygon(np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
     top = je.skin.rim_electrodes(square, 8, 0.1, start=np.pi / 2, clockwise=True)
