@@ -164,7 +164,9 @@ class Evaluation:
     def _spread(
         self, values: np.ndarray, statistic: Callable[[np.ndarray, np.ndarray], np.ndarray]
     ) -> dict[str, float]:
-        """Standard error and 90 % interval of a statistic, by the bootstrap over places."""
+        """Standard error and 90 % interval of a statistic, by the bootstrap over places; nothing from one place."""
+        if len(np.unique(np.round(self.position, 6), axis=0)) < 2:
+            return {}
         drawn = statistic(values, self._draws)
         low, high = interval(drawn)
         return {"se": float(drawn.std(ddof=1)), "low": low, "high": high}
@@ -197,7 +199,7 @@ class Evaluation:
         inward = np.asarray(je.metrics.inward_bias(estimate, self.position, self.centre))
         return {
             "mean": float(error.mean()),
-            "mean_se": self._spread(error, _mean)["se"],
+            **{f"mean_{k}": v for k, v in self._spread(error, _mean).items() if k == "se"},
             "median": float(np.median(error)),
             "p95": float(np.percentile(error, 95)),
             "inward_bias": float(inward.mean()),
@@ -285,9 +287,10 @@ def render_table(evaluation: Evaluation, title: str) -> str:
     lines.append("  localisation, mm        mean  (+- SE)  median     p95   inward bias")
     for name in evaluation.estimated:
         mean, error, median, p95, inward = (
-            1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
+            1e3 * s.get(f"localisation_{name}_{k}", np.nan) for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
-        lines.append(f"    {name:<16}{mean:12.1f}  ({error:5.2f}) {median:7.1f} {p95:7.1f} {inward:13.1f}")
+        spread = " " * 7 if np.isnan(error) else f"({error:5.2f})"  # one place does not tell it
+        lines.append(f"    {name:<16}{mean:12.1f}  {spread} {median:7.1f} {p95:7.1f} {inward:13.1f}")
     lines += ["", *_force_lines(evaluation), *_split_lines(evaluation)]
     return "\n".join(lines + [f"  note: {note}" for note in evaluation.notes])
 
@@ -296,7 +299,8 @@ def _force_lines(evaluation: Evaluation) -> list[str]:
     """One row per method: evenness, and errors of the total force."""
     out = ["  total force                       CV    (+- SE)   RMSE, N  % of largest  mean abs., N  worst, N"]
     for label, cv, error, *errors in evaluation.by_method():
-        spread = " " * 15 if np.isnan(cv) else f"{cv:6.3f}  ({error:.3f})"
+        shown_error = " " * 7 if np.isnan(error) else f"({error:.3f})"
+        spread = " " * 15 if np.isnan(cv) else f"{cv:6.3f}  {shown_error}"
         shown = ["" if np.isnan(e) else f"{e:.2f}" for e in errors]
         numbers = "".join(f"{text:>{width}}" for text, width in zip(shown, (10, 14, 14, 10), strict=True))
         out.append(f"    {label:<28}{spread}{numbers}")

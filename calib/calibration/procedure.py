@@ -23,6 +23,7 @@ from ..fitting.response import (
     require_every_pad_pressed,
 )
 from ..presses.pooled import PooledPresses, pool_presses
+from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
 from .archives.storage import describe
@@ -70,7 +71,7 @@ def calibrate(
         raise SessionError("calibrate: no session given; give one or more session files")
     require_each_once(sessions)
     recipe = recipe or Recipe()
-    skin = skin or je.skin.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
+    skin = skin or _one_skin(sessions)
     progress("reading")
     presses = pool_presses(sessions, skin, recipe.processing)
     ignored = accept(sessions, skin, ignore_errors=ignore_errors)
@@ -81,6 +82,18 @@ def calibrate(
         for session in sessions:
             calibration = learn_layer(calibration, session, ignore_errors=ignore_errors)
     return calibration
+
+
+def _one_skin(sessions: Sequence[Session]) -> je.Skin:
+    """The skin that the first session describes; SessionError if another session describes another skin."""
+    skin = je.skin.parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml")
+    for session in sessions[1:]:
+        if parts := differing_parts(session, skin):
+            raise SessionError(
+                f"{session.name}: another skin than that of {sessions[0].name}: its {' and '.join(parts)} "
+                "differ; calibrate each skin by its own sessions, or give the skin of all (--skin FILE)"
+            )
+    return skin
 
 
 class _Found(NamedTuple):
@@ -130,6 +143,7 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
             *([found.placed.note] if found.placed else []),
             *([doubt] if doubt else []),
             *([f"chosen: {choice.why}"] if choice.why else []),
+            *_not_predicted(found.skin, found.held_out.pad_force),
             *imager.notes,
         ),
         field=model.field,
@@ -145,6 +159,19 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         probes=press_probes(presses),
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
         electrodes=found.placed,
+    )
+
+
+def _not_predicted(skin: je.Skin, pad_force: np.ndarray) -> tuple[str, ...]:
+    """A line about presses without held-out forces (presses, pads): fits without their places failed."""
+    lost = ~np.isfinite(pad_force)
+    if not lost.any():
+        return ()
+    pads = ", ".join(pad.name for pad, some in zip(skin.pads, lost.any(0), strict=True) if some)
+    return (
+        f"{lost.any(1).sum()} of {len(lost)} presses have no held-out force, so that errors of forces are not known: "
+        f"the curves of {pads} could not be fitted without the places of these presses; press these pads at more "
+        "places, or give a curve of fewer parameters (--curve linear)",
     )
 
 

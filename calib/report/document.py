@@ -301,7 +301,7 @@ def _localisation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
     out = []
     for name in sorted(evaluation.estimated, key=[*ESTIMATOR_MEANING, *evaluation.estimated].index):
         mean, error, *rest = (
-            1e3 * s[f"localisation_{name}_{k}"] for k in ("mean", "mean_se", "median", "p95", "inward_bias")
+            1e3 * s.get(f"localisation_{name}_{k}", np.nan) for k in ("mean", "mean_se", "median", "p95", "inward_bias")
         )
         out.append((name, with_error(mean, error, 1), *(number_text(value, 1) for value in rest)))
     return out

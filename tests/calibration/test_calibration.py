@@ -22,6 +22,7 @@ from calib.calibration.evaluation import render_table
 from calib.calibration.force_maps import fused, law_of
 from calib.calibration.localisation.locators import ROWS, CentroidLocator, locate, locator_from_numbers, locator_numbers
 from calib.calibration.localisation.press_images import fit_untouched_sheet
+from calib.calibration.procedure import _not_predicted
 from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play, remembered
 from calib.fitting.fields import Places, geometry_of
@@ -454,10 +455,39 @@ def test_another_skin_is_refused(grid, skin):
         calib.calibrate([session], other)
 
 
+def test_a_skin_of_the_same_scan_and_of_other_pads_is_told_apart(calibration, grid, skin, folder):
+    """A mirrored skin has as many readings and pads: each number is well formed, and belongs elsewhere."""
+    text = skin.toml.replace("[0.0, 0.0, 0.1, 0.1]", "[0.0, 0.0, 0.1, 0.09]")
+    other = replace(je.skin.parse_skin(text, "other"), name="other", toml=text)
+    path = simulate(
+        bench(other, np.array([[0.05, 0.05]]), seed=7),
+        folder / "of_other.h5",
+        fidelity=je.Fidelity.draft(edge_length=0.05),
+    )
+    with calib.open_session(path) as session, calib.open_session(grid) as first:
+        found = calib.evaluate(calibration, session)
+        assert "localisation_half_mean_se" not in found.summary()  # one place tells no standard error
+        assert "0.00)" not in render_table(found, "t").split("total force")[0]
+        assert any("the pads of the skin that the session describes ('other') differ" in note for note in found.notes)
+        with pytest.raises(calib.SessionError, match=r"of_other.h5: another skin than that of .*: its pads differ"):
+            calib.calibrate([first, session])
+        assert not any("differ from those" in note for note in calib.evaluate(calibration, first).notes)
+
+
 def test_a_low_pass_the_stream_cannot_carry_is_refused(grid):
     asked = calib.presses.Processing(corrections=(calib.presses.LowPass(50.0),))
     with calib.open_session(grid) as session, pytest.raises(ValueError, match=r"eit.*10"):
         calib.calibrate([session], recipe=calib.Recipe(processing=asked))
+
+
+def test_presses_without_a_held_out_force_are_said(skin):
+    """Four places a pad and a curve of two parameters: some fits without a place fail, and no error can be told."""
+    force = np.ones((16, 4))
+    assert _not_predicted(skin, force) == ()
+    force[2:5, 1] = np.nan
+    (line,) = _not_predicted(skin, force)
+    assert line.startswith("3 of 16 presses have no held-out force")
+    assert "curves of lower right could not be fitted" in line
 
 
 def test_a_pad_that_was_never_pressed(two):

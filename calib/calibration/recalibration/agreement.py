@@ -1,8 +1,9 @@
 """Whether a session agrees with a calibration that is applied to it, though nobody asked for a recalibration.
 
-Three things are looked at: the presses or contacts against what was calibrated (pressures and places), the levels of
-the pads at rest, and the gains of the pads against the image, or against known force. Gains that the image says have
-moved do not move forces, which is what a recalibration does; they widen the intervals.
+Four things are looked at: the skin that the session describes, the presses or contacts against what was calibrated
+(pressures and places), the levels of the pads at rest, and the gains of the pads against the image, or against known
+force. Gains that the image says have moved do not move forces, which is what a recalibration does; they widen the
+intervals.
 """
 
 from dataclasses import replace
@@ -22,6 +23,7 @@ from .changes import Advice, Recalibration
 from .ordinary_use import MAX_OBSERVATIONS
 from .press_noise import place_spacing
 from .procedure import MIN_SHARE, KnownForces, LoadedPads, OrdinaryUse, estimator_of, judge, use_loads
+from .skins import other_skin
 
 # Change of a level at rest, as a part of the largest calibrated pressure, from which it is worth a line. The level
 # itself is taken off all pressures; a large change means another sensor, supply or air.
@@ -56,14 +58,14 @@ def agreement_of_presses(calibration: Calibration, found: PressMeasurements, ima
     loads = LoadedPads(found.pressure[rows], np.log(integral), place[rows], places, found.rest, time)
     by_image = _judged(calibration, loads, found.session, OrdinaryUse())
     by_force = _judged(calibration, loads._replace(observed=np.log(force)), found.session, KnownForces())
-    return _agreement(calibration, loads, by_image, by_force)
+    return _agreement(calibration, found.session, loads, by_image, by_force)
 
 
 def agreement_of_use(calibration: Calibration, session: Session) -> Agreement:
     """The agreement of the contacts of a session, without known forces."""
     loads = use_loads(calibration, session)
     found = _judged(calibration, loads, session, OrdinaryUse())
-    return _agreement(calibration, loads, found, found)
+    return _agreement(calibration, session, loads, found, found)
 
 
 def _judged(
@@ -77,9 +79,13 @@ def _judged(
 
 
 def _agreement(
-    calibration: Calibration, loads: LoadedPads, by_image: Recalibration | None, told: Recalibration | None
+    calibration: Calibration,
+    session: Session,
+    loads: LoadedPads,
+    by_image: Recalibration | None,
+    told: Recalibration | None,
 ) -> Agreement:
-    notes = [*_outside(calibration, loads), *_moved_rest(calibration, loads.rest)]
+    notes = [*other_skin(calibration, session), *_outside(calibration, loads), *_moved_rest(calibration, loads.rest)]
     if told is not None and told.advice in (Advice.RECALIBRATE, Advice.CALIBRATE):
         notes.append(told.health)
     return Agreement(calibration if by_image is None else widened(calibration, by_image), tuple(notes))

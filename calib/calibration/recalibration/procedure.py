@@ -33,6 +33,7 @@ from .changes import Evidence, Recalibration
 from .image_reference import ImageReference, fit_reference
 from .ordinary_use import distinct, use_contacts
 from .press_noise import PressNoise, press_noise
+from .skins import other_skin
 
 MIN_PRESSES = 3  # of a session that can be used; fewer are refused
 BEYOND = 0.3  # of the calibrated range of pressure, by which the pads may read more than was calibrated
@@ -295,7 +296,7 @@ def assess(
         )
     way = evidence or (KnownForces() if "force" in session.streams else OrdinaryUse())
     loads, notes = way.read(calibration, session, ignore_errors)
-    return judge(calibration, way, loads, session, notes)
+    return judge(calibration, way, loads, session, [*other_skin(calibration, session), *notes])
 
 
 def judge(

@@ -134,5 +134,6 @@ def sensitivity_title(name: str, summary: Mapping[str, float]) -> str:
     label = _SENSITIVITY_TITLE[name]
     if f"cv_{name}_ddof1" not in summary:
         return f"{label}\nCV needs two presses or more"
-    cv, error = summary[f"cv_{name}_ddof1"], summary[f"cv_{name}_se"]
-    return f"{label}\nCV {cv:.3f} ± {error:.3f} (SE), ddof 1"
+    cv, error = summary[f"cv_{name}_ddof1"], summary.get(f"cv_{name}_se")
+    spread = "" if error is None else f" ± {error:.3f} (SE)"  # one place does not tell it
+    return f"{label}\nCV {cv:.3f}{spread}, ddof 1"
