@@ -215,5 +215,7 @@ def _conclusion(report: CheckReport) -> Iterator[str]:
         yield "Nothing wrong was found."
         return
     counts = [counted(errors, "error"), counted(warnings, "warning")]
-    end = "Correct the errors before the calibration." if errors else "It can be calibrated."
+    known = any(stream.name == "force" for stream in report.streams)
+    usable = "It can be calibrated." if known else "It can be used; a calibration needs the force too."
+    end = "Correct the errors before the calibration." if errors else usable
     yield ", ".join(c for c in counts if c) + ". " + end

@@ -383,6 +383,9 @@ def test_low_signal_is_a_warning(parts, look):
     eit = parts.values("eit")
     parts.change("eit", eit + 40 * NOISE * np.random.default_rng(2).normal(size=eit.shape))
     has(look(parts), Severity.WARNING, "median SNR")
+    assert "It can be calibrated." in render(look(parts))
+    del parts.streams["force"]
+    assert "It can be used; a calibration needs the force too." in render(look(parts))
 
 
 # --- skin and protocol ---------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shlex
 
 from ..arguments import prepare_outputs
 from ..terminal import byte_bar, file_size
@@ -26,5 +27,5 @@ def run(args: argparse.Namespace) -> int:
     with byte_bar(2 * file_size(args.journal), "recovering") as progress:
         summary = convert_journal(args.journal, output, recovered=True, progress=progress)
     print(summary.render())
-    print(f"look at it (jaxeit check {output}); {args.journal} may then be deleted")
+    print(f"look at it ({shlex.join(['jaxeit', 'check', output])}); {args.journal} may then be deleted")
     return 0
