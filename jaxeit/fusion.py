@@ -21,10 +21,13 @@ Example:
     print(f"{fmap.force.sum():.1f} N; the image shows where on pads {jnp.flatnonzero(fmap.valid)}")
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
@@ -224,16 +227,14 @@ def contact_shares(
     return ContactShares(part, mine / jnp.where(total > 0, total, 1), lies)
 
 
-@eqx.filter_jit
-@full_precision
 def fuse(
-    image: Float[Array, "... pixels"],
+    image: Float[ArrayLike, "... pixels"],
     masks: PadMasks,
-    pad_forces: Float[Array, "... pads"],
+    pad_forces: Float[ArrayLike, "... pads"] | Sequence[float],
     *,
-    gate: float = 0.6,
+    gate: Float[ArrayLike, ""] = 0.6,
     contacts: ContactShares | None = None,
-    pad_errors: Float[Array, "... pads"] | None = None,
+    pad_errors: Float[ArrayLike, "... pads"] | Sequence[float] | None = None,
 ) -> ForceMap:
     """Distribute each pad's force over its part of the image.
 
@@ -256,12 +257,27 @@ def fuse(
     Raises:
         FusionError: if the shapes do not fit.
     """
+    # numbers of Python, of lists too, would be constants of the program: another value would compile it anew
     image, forces = jnp.asarray(image), jnp.asarray(pad_forces)
     pads, pixels = masks.weights.shape
     if image.shape[-1:] != (pixels,) or forces.shape[-1:] != (pads,):
         raise FusionError(
             f"image {image.shape} and pad_forces {forces.shape} must end in {pixels} pixels and {pads} pads"
         )
+    errors = None if pad_errors is None else jnp.asarray(pad_errors)
+    return _fused(image, masks, forces, jnp.asarray(gate, masks.areas.dtype), contacts, errors)
+
+
+@eqx.filter_jit
+@full_precision
+def _fused(
+    image: Float[Array, "... pixels"],
+    masks: PadMasks,
+    forces: Float[Array, "... pads"],
+    gate: Float[Array, ""],
+    contacts: ContactShares | None,
+    pad_errors: Float[Array, "... pads"] | None,
+) -> ForceMap:
     finite = jnp.isfinite(image)
     mass = jnp.where(finite, image, 0) * masks.areas
     positive = jnp.maximum(mass, 0) @ masks.weights.T

@@ -89,6 +89,16 @@ def test_overlapping_pads_share(skin, pixels):
     assert float(fmap.force.sum()) == pytest.approx(10.0, rel=1e-12)
 
 
+def test_another_force_or_gate_compiles_nothing_anew(pixels, masks, compilations):
+    image = jnp.asarray(np.random.default_rng(5).normal(size=len(pixels.centres)))
+    je.fuse(image, masks, [0.0, 0.0, 11.0, 0.0], gate=0.55)
+    compilations.clear()
+    for force in (12.0, 13.0):
+        found = je.fuse(image, masks, [0.0, 0.0, force, 0.0], gate=0.6 + force / 1e3)
+        np.testing.assert_allclose(np.asarray(found.force).sum(), force)
+    assert not compilations
+
+
 def test_batches_and_gradients(pixels, masks):
     image = jnp.stack([_bump(pixels, (0.05, 0.05)), -_bump(pixels, (0.05, 0.15))])
     forces = jnp.array([[1.0, 2.0, 3.0, 4.0], [4.0, 3.0, 2.0, 1.0]])
