@@ -302,9 +302,17 @@ def as_flags(channels: Any, readings: int) -> Any:
 
 
 def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
-    """Refuse arrays that are not frames of so many readings."""
+    """Refuse arrays that are not frames of so many real readings."""
     if np.shape(dv)[-1:] != (readings,):
         raise InverseError(f"dv has shape {np.shape(dv)}; its last axis must hold {readings} readings")
+    require_real(dv=dv)
+
+
+def require_real(**frames: Any) -> None:
+    """Refuse complex frames: a conversion to float would leave out the imaginary part without an error."""
+    for name, frame in frames.items():
+        if jnp.iscomplexobj(frame):
+            raise InverseError(f"{name} is complex, and a model is real; give {name}.real, or {name}.imag by itself")
 
 
 def require_some(used: Any) -> Any:

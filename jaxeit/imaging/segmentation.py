@@ -29,7 +29,7 @@ from .absolute.images import (
     reading_weights,
 )
 from .level_set import LevelSet, fitted_level, signed_distances
-from .noise import InverseError
+from .noise import InverseError, require_real
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
 """The classes."""
@@ -109,6 +109,7 @@ def segment(
         print(f"{(found.classes == 1).mean():.1%} of the picture is resistive")  # 2: conductive
     """
     require_known("segment", InverseError, model.background)
+    require_real(reference=reference, frame=frame)
     before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
     for values in (before, after):
         require_frame(values, even)

@@ -4,6 +4,7 @@ refuses models that cannot be computed."""
 import pickle
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,10 +25,10 @@ from ..meshing.triangles import CROWDED, Mesh
 from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
 from ..skin.electrodes import touched
-from .fidelity import Fidelity, require_dtype
+from .fidelity import Fidelity, FidelityError, require_dtype
 from .metal_sheet import Coat, lay_coat
 from .mixing import Mixing, padded_rows
-from .scene import Scene
+from .scene import Scene, SceneError
 from .system import System, system_arrays, system_of
 from .unknowns import number_unknowns
 
@@ -125,12 +126,14 @@ def discretise(
         ground: the mesh node held at zero volts; readings do not depend on it.
 
     Raises:
-        FidelityError: float64 asked for while JAX is in 32-bit mode.
+        SceneError: ``scene`` is another object, such as a skin.
+        FidelityError: ``fidelity`` is another object, or float64 is asked for while JAX is in 32-bit mode.
         ProtocolError: an effect on the circuit of a reading, and a protocol of matrices, whose readings have none.
         ElectrodeError, MeshError: the electrodes do not fit the sheet, each other or the mesh.
         BudgetError: the mesh or the fields would be larger than `Budget` allows.
     """
     fidelity = Fidelity.standard() if fidelity is None else fidelity
+    _require_kinds(scene, fidelity)
     require_dtype(fidelity.dtype)
     skin = scene.skin
     if at_terminals := chosen(scene.effects, AbstractTerminalEffect):
@@ -155,6 +158,14 @@ def discretise(
     mixing = skin.protocol.mixing
     mixed = None if mixing is None else Mixing(*map(put, padded_rows(mixing)))
     return Model(**jax.tree.map(put, values), effects=effects, system=system, solver=solver, coat=coat, mixing=mixed)
+
+
+def _require_kinds(scene: Any, fidelity: Any) -> None:
+    """Refuse an object in the place of a scene or of a fidelity, such as a skin or a name."""
+    if not isinstance(scene, Scene):
+        raise SceneError(f"{type(scene).__name__} is not a scene; make one, such as jaxeit.Scene(skin, effects=())")
+    if not isinstance(fidelity, Fidelity):
+        raise FidelityError(f"{type(fidelity).__name__} is not a fidelity; make one, such as jaxeit.Fidelity.draft()")
 
 
 def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:

@@ -21,14 +21,16 @@ class Scene:
     Effects that are not listed are neither computed nor compiled.
 
     Raises:
-        SceneError: if ``effects`` is not a tuple of effects; if two of them are alternatives; if one names an electrode
-            that the skin does not have.
+        SceneError: if ``skin`` is not a `Skin`; if ``effects`` is not a tuple of effects; if two of them are
+            alternatives; if one names an electrode that the skin does not have.
     """
 
     skin: Skin
     effects: tuple[AbstractEffect, ...] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.skin, Skin):
+            raise SceneError(f'{self.skin!r} is not a skin; make one, such as jaxeit.load_skin("testbed")')
         if not isinstance(self.effects, tuple):
             raise SceneError(f"effects must be a tuple, not {type(self.effects).__name__}")
         for effect in self.effects:

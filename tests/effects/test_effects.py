@@ -271,6 +271,15 @@ def test_hidden_values_are_not_examined():
     assert slope(-1.0) == 2.0
 
 
+def test_an_object_in_the_place_of_another_is_named(skin):
+    with pytest.raises(je.model.SceneError, match=r"'testbed' is not a skin; make one, such as jaxeit.load_skin"):
+        je.Scene("testbed")
+    with pytest.raises(je.model.SceneError, match=r"Skin is not a scene; make one, such as jaxeit.Scene\(skin"):
+        je.discretise(skin)
+    with pytest.raises(je.model.FidelityError, match=r"str is not a fidelity; make one, such as jaxeit.Fidelity.draft"):
+        je.discretise(je.Scene(skin), "draft")
+
+
 def test_scenes_refuse_what_is_not_an_effect(skin):
     with pytest.raises(ValueError, match="not an effect"):
         je.Scene(skin, effects=("noise",))

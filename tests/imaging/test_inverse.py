@@ -59,6 +59,20 @@ def test_a_touch_is_found_where_it_is(model, recon):
     assert float(je.metrics.image_sum(image, recon.areas)) > 0
 
 
+def test_complex_frames_are_refused(recon, model):
+    """JAX would leave out their imaginary part with a warning."""
+    frame = np.ones(550) + 1j
+    calls = {
+        "dv": [recon, recon.on_host()],
+        "v0": [lambda v: je.fit_background(model, v)],
+        "frame": [lambda v: je.imaging.fit_reference(model, v), lambda v: je.imaging.segment(model, v.real, v)],
+    }
+    for name, given in calls.items():
+        for call in given:
+            with pytest.raises(je.imaging.InverseError, match=f"{name} is complex, and a model is real"):
+                call(frame)
+
+
 def test_images_are_linear_and_batched(recon):
     dv = jax.random.normal(jax.random.key(0), (3, 2, recon.readings))
     np.testing.assert_allclose(recon(dv)[2, 1], recon(dv[2, 1]), rtol=1e-9, atol=1e-12)

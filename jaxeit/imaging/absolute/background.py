@@ -13,7 +13,7 @@ from ..._compile import verb
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
 from ...model.forward_model import forward
-from ..noise import InverseError
+from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision, GaussianSmooth
 from .images import LogConductivity, Quadratic, gauss_newton
 
@@ -66,6 +66,7 @@ def fit_background(
         truth = je.conductivity(real)
         print(jnp.std(jnp.log(sigma / truth)), "of", jnp.std(jnp.log(truth)), "left")
     """
+    require_real(v0=v0)
     frame = jnp.asarray(v0, model.dtype)
     physics, x = fitted_coat(model, frame, std, length, model_error, columns, basis, tolerance)
     there = jnp.isfinite(frame)

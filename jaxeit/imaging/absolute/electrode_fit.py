@@ -32,7 +32,7 @@ from ...model.forward_model import coefficients, fields, forward, terminal_matri
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian, moved
 from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
 from ...registry import AbstractChoice, limited
-from ..noise import InverseError
+from ..noise import InverseError, require_real
 from ..priors import GaussianSmooth
 from .background import frame_error, require_frame, sheet_level
 from .images import AbstractPosterior, most_probable, reading_weights
@@ -138,6 +138,7 @@ def fit_electrodes(
     require_known("fit_electrodes", InverseError, model.nodes, v0)
     settings = ElectrodeFitSettings() if settings is None else settings
     motion, image = electrode_motion(model), Pixels(settings.columns).on(model)
+    require_real(v0=v0)
     frame, even = jnp.asarray(v0, model.dtype), forward(model)
     require_frame(frame, even)
     level = sheet_level(frame, even) * jnp.average(model.background, weights=model.areas)

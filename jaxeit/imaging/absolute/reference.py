@@ -27,7 +27,7 @@ from ...linalg.lapack import eigh
 from ...model.discretisation import Model
 from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
-from ..noise import InverseError
+from ..noise import InverseError, require_real
 from .background import frame_error, require_explained, require_frame, sheet_level
 from .images import reading_weights
 
@@ -152,6 +152,7 @@ def fit_reference(
         MotionError: if the electrodes cannot be moved on this mesh.
     """
     settings = ReferenceSettings() if settings is None else settings
+    require_real(frame=frame)
     readings, even = jnp.asarray(frame, model.dtype), forward(model)
     require_frame(readings, even)
     level = sheet_level(readings, even) if settings.level else jnp.ones((), model.dtype)
