@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
-from typing import Any, TypedDict, Unpack, overload
+from typing import Any, TypedDict, TypeVar, Unpack, overload
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -23,6 +24,8 @@ from .methods.one_step import one_step_image
 from .noise import InverseError, Whitened, Whitening, whitened_readings
 from .priors import AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
+
+T = TypeVar("T")
 
 _VERSION = metadata.version("jaxeit")
 LARGEST_HYPERPARAMETER = 1e4  # above it the prior leaves nothing of the data
@@ -135,7 +138,8 @@ def prepare(
     problem = replace(problem, hyperparameter=jnp.asarray(chosen, model.dtype))
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
     compress = jnp.asarray(found.compress, model.dtype)
-    recon, followed = _build(problem, linear, compress, found.whitening, noise is not None)
+    asked = replace(problem, prior=_traced(prior, model.dtype))
+    recon, followed = _build(asked, _traced(linear, model.dtype), compress, found.whitening, noise is not None)
     recon = replace(recon, whitening=found.whitening, picture=image.picture)  # inside jit, what is known stays known
     _require_finite(recon)
     settings = {"method": _stated(method), "prior": _stated(prior), "hyperparameter": _stated(chosen)}
@@ -154,6 +158,17 @@ def prepare(
             provenance=about,
         )
     return replace(recon, provenance=about)
+
+
+def _traced(choice: T, dtype: np.dtype) -> T:
+    """One of the package's choices with its numbers as arrays: other numbers then compile nothing anew.
+
+    A choice of a user's own may decide by its numbers in Python, which a traced array does not allow.
+    """
+    if not type(choice).__module__.startswith(f"{__package__}."):
+        return choice
+    found: T = jax.tree.map(lambda leaf: np.asarray(leaf, dtype) if isinstance(leaf, float) else leaf, choice)
+    return found
 
 
 @eqx.filter_jit

@@ -51,6 +51,21 @@ def test_another_process_gives_the_same_image(recon, path):
     assert float(done.stdout) == pytest.approx(float(here), rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (je.imaging.GaussianSmooth(length=0.01), je.imaging.GaussianSmooth(length=0.013, nugget=2e-3)),
+        (je.Noser(floor=1e-3), je.Noser(floor=2e-3)),
+    ],
+)
+def test_another_setting_of_a_prior_compiles_nothing_anew(model, pixels, compilations, one, other):
+    je.prepare(model, one, basis=pixels)
+    before = len(compilations)
+    found = je.prepare(model, other, basis=pixels)
+    assert len(compilations) == before
+    assert found.provenance["prior"] != je.prepare(model, one, basis=pixels).provenance["prior"]
+
+
 def test_another_provenance_compiles_nothing_anew(recon, compilations):
     dv = np.zeros(550)
     recon(dv)
