@@ -35,7 +35,7 @@ class Limits(NamedTuple):
         """The numbers of a value, an array or a scalar, that have no meaning."""
         numbers = np.atleast_1d(np.asarray(value))
         low = numbers > self.least if self.open else numbers >= self.least
-        kind = (np.isfinite(numbers) | (not self.finite)) & ((numbers == np.round(numbers)) | (not self.whole))
+        kind = (np.isfinite(numbers) | (not self.finite)) & ((numbers.dtype.kind in "iu") | (not self.whole))
         found: np.ndarray = numbers[~(low & (numbers <= self.most) & kind)]
         return found
 
@@ -107,7 +107,8 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
         if limits is None or value is None or is_traced(value):
             continue
         if (wrong := limits.outside(value)).size:
-            raise error(f"{type(thing).__name__}: {field.name} is {wrong[0]:g}; give {limits}")
+            shown = repr(wrong[0].item()) if limits.whole else f"{wrong[0]:g}"  # 16.0 is no whole number
+            raise error(f"{type(thing).__name__}: {field.name} is {shown}; give {limits}")
 
 
 class AbstractChoice(eqx.Module):
