@@ -26,6 +26,7 @@ import numpy as np
 import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
+from calib.calibration.localisation.load_windows import FIDELITY as MESH
 from calib.check import check_session
 from calib.check.electrodes import FIDELITY as PLACING
 from calib.check.placement import FIDELITY, WHERE, placement_finding, with_placement
@@ -40,8 +41,6 @@ from .worn_skins import Wear, presses, recorded
 SCENE = ROOT / "data" / "sessions" / "testbed_grid.toml"
 MISPLACED = 1.1e-3  # m
 FIRST_SEED = 21
-# Contacts and loads are placed on this mesh, which moves a load by 0.05 mm, a tenth of the effect of the layer's gain.
-MESH = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
 FILED, FITTED, TRUE = "as the file says", "fitted", "as they sit"
 
 

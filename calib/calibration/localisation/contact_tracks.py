@@ -13,9 +13,9 @@ from jaxtyping import Float, Int
 import jaxeit as je
 from jaxeit.tracking import LearnedLayer, Smoother, TimedTracks, Track, Tracker
 
-from ...check.placement import FIDELITY
 from ..calibration import Calibration
 from ..frame_blocks import FrameBlocks
+from .load_windows import FIDELITY
 from .press_images import fit_untouched_sheet
 from .quiet_frames import ENOUGH, QuietFrames
 

@@ -15,12 +15,13 @@ from jaxtyping import Float
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Loads, Proposal
 
-from ...check.placement import FIDELITY
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
 from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 
+# The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
+FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
 MOST = 3  # loads of a window
 # Chi-square over the number of readings of a fit, and part of the windows beyond it from which it is worth a line. On
 # honest skins of another simulator the median reaches 2; where bolts are 2 mm aside it begins at 25.
