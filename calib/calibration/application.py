@@ -10,7 +10,7 @@ import jaxeit as je
 from ..check.acceptance import accept
 from ..check.placement import placement_note
 from ..presses.streams import finite_mean
-from ..presses.table import Processing, resting_levels
+from ..presses.table import Level, Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from .calibration import Calibration
 from .force_maps import USED, ForceEstimate
@@ -25,8 +25,6 @@ FORMAT = "skin-forcemap"
 TRACKS = "tracks/"  # group of the arrays of contacts that were followed
 LOADS = "loads/"  # group of the arrays of loads in windows
 LEVELS = 64  # times at which the level without contact is averaged
-
-Level = Callable[[np.ndarray], np.ndarray]
 
 
 def apply(

@@ -157,15 +157,20 @@ class Evaluation:
         return out | {f"coverage_{name}": float(inside[part].mean()) for name, part in parts.items() if part.any()}
 
     @cached_property
+    def _places(self) -> np.ndarray:
+        """Number of the place of each press, (presses,)."""
+        return np.asarray(np.unique(np.round(self.position, 6), axis=0, return_inverse=True)[1].ravel())
+
+    @cached_property
     def _draws(self) -> np.ndarray:
         """How often each press is drawn when places are drawn with replacement, (draws, presses)."""
-        return place_draws(np.unique(np.round(self.position, 6), axis=0, return_inverse=True)[1].ravel())
+        return place_draws(self._places)
 
     def _spread(
         self, values: np.ndarray, statistic: Callable[[np.ndarray, np.ndarray], np.ndarray]
     ) -> dict[str, float]:
         """Standard error and 90 % interval of a statistic, by the bootstrap over places; nothing from one place."""
-        if len(np.unique(np.round(self.position, 6), axis=0)) < 2:
+        if not self._places.any():
             return {}
         drawn = statistic(values, self._draws)
         low, high = interval(drawn)
@@ -197,9 +202,10 @@ class Evaluation:
     def _localisation(self, estimate: np.ndarray) -> dict[str, float]:
         error = np.asarray(je.localisation_error(estimate, self.position))
         inward = np.asarray(je.metrics.inward_bias(estimate, self.position, self.centre))
+        spread = self._spread(error, _mean)
         return {
             "mean": float(error.mean()),
-            **{f"mean_{k}": v for k, v in self._spread(error, _mean).items() if k == "se"},
+            **({"mean_se": spread["se"]} if spread else {}),
             "median": float(np.median(error)),
             "p95": float(np.percentile(error, 95)),
             "inward_bias": float(inward.mean()),
@@ -277,6 +283,17 @@ def _cv(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(about * count / np.maximum(count - 1, 1)) / mean)
 
 
+def localisation_errors(summary: Mapping[str, float], estimator: str) -> list[float]:
+    """Mean, its standard error, median, 95th percentile and inward bias of an estimator, m; NaN: not known."""
+    parts = ("mean", "mean_se", "median", "p95", "inward_bias")
+    return [summary.get(f"localisation_{estimator}_{part}", np.nan) for part in parts]
+
+
+def _bracketed(error: float, form: str) -> str:
+    """A standard error as tables show it; blank where one place does not tell it."""
+    return " " * 7 if np.isnan(error) else f"({error:{form}})"
+
+
 def render_table(evaluation: Evaluation, title: str) -> str:
     """The results as a table for a terminal; CV with ddof 1."""
     s = evaluation.summary()
@@ -286,11 +303,8 @@ def render_table(evaluation: Evaluation, title: str) -> str:
     ]
     lines.append("  localisation, mm        mean  (+- SE)  median     p95   inward bias")
     for name in evaluation.estimated:
-        mean, error, median, p95, inward = (
-            1e3 * s.get(f"localisation_{name}_{k}", np.nan) for k in ("mean", "mean_se", "median", "p95", "inward_bias")
-        )
-        spread = " " * 7 if np.isnan(error) else f"({error:5.2f})"  # one place does not tell it
-        lines.append(f"    {name:<16}{mean:12.1f}  {spread} {median:7.1f} {p95:7.1f} {inward:13.1f}")
+        mean, error, median, p95, inward = (1e3 * value for value in localisation_errors(s, name))
+        lines.append(f"    {name:<16}{mean:12.1f}  {_bracketed(error, '5.2f')} {median:7.1f} {p95:7.1f} {inward:13.1f}")
     lines += ["", *_force_lines(evaluation), *_split_lines(evaluation)]
     return "\n".join(lines + [f"  note: {note}" for note in evaluation.notes])
 
@@ -299,8 +313,7 @@ def _force_lines(evaluation: Evaluation) -> list[str]:
     """One row per method: evenness, and errors of the total force."""
     out = ["  total force                       CV    (+- SE)   RMSE, N  % of largest  mean abs., N  worst, N"]
     for label, cv, error, *errors in evaluation.by_method():
-        shown_error = " " * 7 if np.isnan(error) else f"({error:.3f})"
-        spread = " " * 15 if np.isnan(cv) else f"{cv:6.3f}  {shown_error}"
+        spread = " " * 15 if np.isnan(cv) else f"{cv:6.3f}  {_bracketed(error, '.3f')}"
         shown = ["" if np.isnan(e) else f"{e:.2f}" for e in errors]
         numbers = "".join(f"{text:>{width}}" for text, width in zip(shown, (10, 14, 14, 10), strict=True))
         out.append(f"    {label:<28}{spread}{numbers}")

@@ -19,6 +19,7 @@ SMALLEST_SHIFT = 5e-4  # m; smaller shifts cost less than the coat does
 MIN_SOUND = 0.5  # share of the readings that must be sound
 
 WHERE = "/device"
+OTHER_CAUSE = "look for faulty contacts, a common mode of the amplifier, or another skin than the file describes"
 
 
 def check_electrodes(
@@ -42,8 +43,7 @@ def check_electrodes(
             "no places of the electrodes explain the untouched frame: what is left of it is "
             f"{float(fit.misfit):.2g} times the errors of a model"
         )
-        remedy = "look for faulty contacts, a common mode of the amplifier, or another skin than the file describes"
-        findings.append(Finding(Severity.WARNING, WHERE, what, remedy))
+        findings.append(Finding(Severity.WARNING, WHERE, what, OTHER_CAUSE))
         return ()
     rows = _rows(fit)
     findings += _findings(rows)

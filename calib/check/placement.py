@@ -15,7 +15,7 @@ from jaxeit.imaging import InverseError, Misplacement, find_misplacement
 from jaxeit.model import MotionError
 
 from ..session import Session
-from .electrodes import WHERE
+from .electrodes import OTHER_CAUSE, WHERE
 from .report import CheckReport, Finding, Severity
 
 # The mesh of a calibration, whose programs are compiled for its coat already.
@@ -32,7 +32,6 @@ REMEDY = (
     "calibrate with --fit-electrodes, which finds where they sit, or measure their places and correct the skin's file; "
     "`jaxeit check --electrodes` names those that are off"
 )
-OTHER_CAUSE = "look for faulty contacts, a common mode of the amplifier, or another skin than the file describes"
 
 
 def placement_finding(

@@ -256,9 +256,11 @@ def _set_aside(presses: PressTable) -> list[str]:
     return [f"{len(bad)} of {len(presses)} presses set aside ({first})"]
 
 
-def resting_levels(
-    session: Session, skin: je.Skin, processing: Processing
-) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+Level = Callable[[np.ndarray], np.ndarray]
+"""Values of channels without contact as a function of time: (n,) ns -> (n, channels)."""
+
+
+def resting_levels(session: Session, skin: je.Skin, processing: Processing) -> dict[str, Level]:
     """Level without contact of the eit and pressure streams, as functions of time: (n,) ns -> (n, channels).
 
     A level is linear between the means of the rest windows around the presses and constant outside them.
@@ -285,7 +287,7 @@ def _rest_windows(session: Session, stream: Stream, processing: Processing) -> n
     return both[ranges[:, 1] > ranges[:, 0]]
 
 
-def _level(stream: Stream, rests: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def _level(stream: Stream, rests: np.ndarray) -> Level:
     means = np.array([finite_mean(stream.read(int(a), int(b))) for a, b in index_ranges(stream.time, rests)])
     centres = rests.astype(float).mean(1)
 

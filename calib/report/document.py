@@ -10,7 +10,7 @@ import numpy as np
 import jaxeit as je
 
 from ..calibration.calibration import Calibration
-from ..calibration.evaluation import METHODS, THIRDS, Evaluation
+from ..calibration.evaluation import METHODS, THIRDS, Evaluation, localisation_errors
 from ..fitting.selection import Candidate
 from ..session import replacing
 from .figures.parts import require_matplotlib
@@ -300,9 +300,7 @@ def _localisation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
     s = evaluation.summary()
     out = []
     for name in sorted(evaluation.estimated, key=[*ESTIMATOR_MEANING, *evaluation.estimated].index):
-        mean, error, *rest = (
-            1e3 * s.get(f"localisation_{name}_{k}", np.nan) for k in ("mean", "mean_se", "median", "p95", "inward_bias")
-        )
+        mean, error, *rest = (1e3 * value for value in localisation_errors(s, name))
         out.append((name, with_error(mean, error, 1), *(number_text(value, 1) for value in rest)))
     return out
 

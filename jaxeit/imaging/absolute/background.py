@@ -68,35 +68,25 @@ def fit_background(
     """
     require_real(v0=v0)
     frame = jnp.asarray(v0, model.dtype)
-    physics, x = fitted_coat(model, frame, std, length, model_error, columns, basis, tolerance)
+    require_positive(std=std, length=length, model_error=model_error, columns=columns)
+    physics = even_coat(model, frame, Pixels(columns).on(model) if basis is None else basis)
+    penalty = Quadratic(coat_precision(physics.image, length), 1 / jnp.asarray(std) ** 2)
+    x = gauss_newton(physics, penalty, frame, frame_error(frame, model_error), tolerance=tolerance)
     there = jnp.isfinite(frame)
     require_explained("coating", physics.voltages(x), jnp.where(there, frame, 0), there)
     return physics.sigma(x)
 
 
-def fitted_coat(
-    model: Model,
-    v0: Float[Array, "..."],
-    std: Float[ArrayLike, ""] = 0.15,
-    length: Float[ArrayLike, ""] = 0.03,
-    model_error: Float[ArrayLike, ""] = 0.01,
-    columns: int = 20,
-    basis: BasisMap | None = None,
-    tolerance: float = 2e-3,
-) -> tuple[LogConductivity, Float[Array, " basis"]]:
-    """The physics of a coat, and its image that `fit_background` finds, whether or not it explains the frame.
+def even_coat(model: Model, v0: Float[Array, "..."], image: BasisMap) -> LogConductivity:
+    """The physics of a coat about the even sheet nearest to a frame.
 
     Raises:
-        InverseError: if the shape or a value is wrong.
+        InverseError: if the frame has another shape, no reading or the opposite sign.
     """
     even = forward(model, model.background)
     require_frame(v0, even)
-    require_positive(std=std, length=length, model_error=model_error, columns=columns)
     level = sheet_level(v0, even)
-    image = Pixels(columns).on(model) if basis is None else basis
-    physics = LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
-    penalty = Quadratic(coat_precision(image, length), 1 / jnp.asarray(std) ** 2)
-    return physics, gauss_newton(physics, penalty, v0, frame_error(v0, model_error), tolerance=tolerance)
+    return LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
 
 
 def coat_precision(image: BasisMap, length: Float[ArrayLike, ""]) -> AbstractPrecision:

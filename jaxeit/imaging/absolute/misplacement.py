@@ -23,16 +23,18 @@ from jaxtyping import Array, Float
 from scipy.linalg import cholesky, solve_triangular, svd
 
 from ..._compile import require_known, verb
+from ...model.bases import Pixels
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, fields, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
 from ...model.sensitivity import field_jacobian
 from ..noise import InverseError
-from .background import coat_precision, fitted_coat, frame_error
-from .images import LogConductivity
+from .background import coat_precision, even_coat, frame_error
+from .images import LogConductivity, Quadratic, gauss_newton
 
-COAT_LENGTH = 0.03  # m, over which a coat varies
+COAT_LENGTH, COAT_COLUMNS = 0.03, 20  # m, over which a coat varies; pixels of it along x
 USUAL_COAT, COAT_SPREAD = 0.15, 0.7  # of the logarithm of the conductivity, and of the logarithm of that
+COAT_ERROR = 1e-2  # relative error of a reading, by which the coat is found that all is linear about
 MODEL_ERROR = 1e-3  # relative, of which e is a multiple
 LEAST_ERROR = 0.1  # e: derivatives hold no better
 MOST_COAT, MOST_SHIFT = 1.0, 5e-3  # c, and s in m; beyond them, derivatives say nothing of a size
@@ -84,7 +86,9 @@ def find_misplacement(
     """
     require_known("find_misplacement", InverseError, model.nodes, v0, noise)
     frame = jnp.asarray(v0, model.dtype)
-    physics, coat = fitted_coat(model, frame)
+    physics = even_coat(model, frame, Pixels(COAT_COLUMNS).on(model))
+    penalty = Quadratic(coat_precision(physics.image, COAT_LENGTH), 1 / jnp.asarray(USUAL_COAT) ** 2)
+    coat = gauss_newton(physics, penalty, frame, frame_error(frame, COAT_ERROR))
     linear = _linear(physics, electrode_motion(model), coat)
     error = np.asarray(frame_error(frame, MODEL_ERROR), float)
     spread = np.zeros_like(error) if noise is None else np.asarray(noise, float)
