@@ -1,8 +1,8 @@
 """Start-up times of fresh processes: imports, help, the README's first program, and the command of `make demo`.
 
-Times are from the start of a process to its end.  The program runs without a cache of compiled programs, with an empty
-cache, and with the cache that this run filled; the command with an empty and with a full one.  `phases` says what JAX
-spends of the program's time on tracing, on lowering, and on compiling or on reading the cache.
+Times are from the start of a process to its end.  The program runs without a cache, with an empty one, with the cache
+of JAX that this run filled, and with that of `je.cache_programs` beside it; the command with both, empty and full.
+`phases` says what JAX spends of the program's time on tracing, on lowering, and on compiling or on reading the cache.
 """
 
 import json
@@ -42,6 +42,7 @@ spent = collections.Counter()
 monitoring.register_event_duration_secs_listener(lambda name, seconds, **_: spent.update({name: seconds}))
 atexit.register(lambda: print(json.dumps(spent)))
 """
+KEEPING = "import jaxeit\njaxeit.cache_programs({folder!r})\n"
 
 
 def measure(run: Run) -> Iterator[Row]:
@@ -65,13 +66,15 @@ def program() -> str:
 
 
 def programs(repeats: int) -> list[Row]:
-    """The first program without a cache, with an empty one, and with a full one."""
+    """The first program without a cache, with JAX's own, empty and full, and with both, full."""
     code, times = program(), defaultdict(list)
     for _ in range(repeats):
         times["no cache"].append(fresh(code)[0])
         with tempfile.TemporaryDirectory() as folder:
-            for name in ("empty cache", "full cache"):
+            for name in ("empty cache of JAX", "full cache of JAX"):
                 times[name].append(fresh(code, cache=folder)[0])
+            fresh(KEEPING.format(folder=folder) + code, cache=folder)
+            times["both caches full"].append(fresh(KEEPING.format(folder=folder) + code, cache=folder)[0])
     return [{"start": f"the README's program, {name}", **spread(taken)} for name, taken in times.items()]
 
 
@@ -86,18 +89,20 @@ def demos(repeats: int) -> list[Row]:
             words = recipe[1].replace("\\\n", " ").replace("$(OUT)", folder).split()[1:]
             code = "import os, sys; os.environ['XDG_CACHE_HOME'] = "
             code += f"{folder!r}; sys.argv = ['jaxeit', *{words}]; from calib.cli import main; main()"
-            for name in ("empty cache", "full cache"):
+            for name in ("empty caches", "full caches"):
                 times[name].append(fresh(code)[0])
     return [{"start": f"the command of `make demo`, {name}", **spread(taken)} for name, taken in times.items()]
 
 
 def phases(repeats: int) -> list[Row]:
-    """What the first program spends in JAX without a cache and with a full one, s, and on how many programs."""
-    code = LISTENING + program()
+    """What the first program spends in JAX without a cache, with JAX's own and with both, full, s."""
     found: Row = {name: {"phase": name} for name in EVENTS}
     with tempfile.TemporaryDirectory() as folder:
-        fresh(code, cache=folder)
-        for key, cache in (("no_cache_s", ""), ("full_cache_s", folder)):
+        keeping = KEEPING.format(folder=folder)
+        fresh(program(), cache=folder)
+        fresh(keeping + program(), cache=folder)
+        for key, begin, cache in (("no_cache_s", "", ""), ("full_cache_s", "", folder), ("both_s", keeping, folder)):
+            code = LISTENING + begin + program()
             runs = [json.loads(fresh(code, cache=cache)[1].splitlines()[-1]) for _ in range(repeats)]
             for name, event in EVENTS.items():
                 found[name][key] = float(np.median([run[event] for run in runs]))

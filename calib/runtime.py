@@ -4,12 +4,14 @@ import os
 import stat
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import jax
 
 import jaxeit as je
+from jaxeit.program_cache import programs_folder
 
 
 def set_up() -> None:
@@ -22,6 +24,7 @@ def set_up() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        keep_programs(folder)
 
 
 def set_up_live() -> None:
@@ -41,17 +44,27 @@ _SETTINGS = (
     "jax_persistent_cache_min_entry_size_bytes",
 )
 
+_PROGRAMS = "programs"
+
 
 def settings() -> dict[str, Any]:
-    """Those of JAX on which results and the time to compile depend."""
-    return {name: getattr(jax.config, name) for name in _SETTINGS}
+    """Those of JAX on which results and the time to compile depend, and where programs are kept."""
+    return {name: getattr(jax.config, name) for name in _SETTINGS} | {_PROGRAMS: programs_folder()}
 
 
 def take_over(wanted: Mapping[str, Any]) -> None:
     """Make this process, a worker, set up as the one whose `settings` these are."""
-    for name, value in wanted.items():
-        if getattr(jax.config, name) != value:
-            jax.config.update(name, value)
+    for name in _SETTINGS:
+        if getattr(jax.config, name) != wanted[name]:
+            jax.config.update(name, wanted[name])
+    if programs_folder() != wanted[_PROGRAMS]:
+        keep_programs(wanted[_PROGRAMS])
+
+
+def keep_programs(folder: Path | None) -> None:
+    """`je.cache_programs`, where a folder that cannot be made costs time and no result."""
+    with suppress(OSError):
+        je.cache_programs(folder)
 
 
 def cache_folder() -> Path | None:

@@ -71,6 +71,7 @@ from .model import (
     jacobian as jacobian,
     pad_response as pad_response,
 )
+from .program_cache import cache_programs as cache_programs
 from .skin import (
     AreaPatch as AreaPatch,
     BoundaryPatch as BoundaryPatch,

@@ -20,6 +20,8 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 from threadpoolctl import threadpool_limits
 
+from .program_cache import cached_call
+
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
@@ -32,6 +34,7 @@ def verb(function: F) -> F:
     """Compile ``function`` when it is called; inside another compiled function it becomes part of that function.
 
     A decorator, also for functions of your own: as with `equinox.filter_jit`, arrays are traced and the rest is static.
+    No array of the result is weakly typed, because a program that is kept (`cache_programs`) forgets which ones are.
 
     A call outside other compiled functions uses the compiler options that suit its gathers best (`compiler_options`);
     JAX accepts options for whole programs only.
@@ -44,7 +47,7 @@ def verb(function: F) -> F:
 
         print(largest_change(model, 1.1 * model.background))  # V
     """
-    exact = full_precision(function)
+    exact = full_precision(_strongly_typed(function))
     inner = eqx.filter_jit(exact)
 
     @cache
@@ -54,7 +57,10 @@ def verb(function: F) -> F:
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return (inner if _is_transformed(args, kwargs) else outer())(*args, **kwargs)
+        if _is_transformed(args, kwargs):
+            return inner(*args, **kwargs)
+        found = cached_call(call, exact, compiler_options, args, kwargs)
+        return outer()(*args, **kwargs) if found is NotImplemented else found
 
     return call  # type: ignore[return-value]
 
@@ -71,6 +77,21 @@ def full_precision(function: F) -> F:
             return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def _strongly_typed(function: F) -> F:
+    """``function``, whose arrays promote others by their type, as those of NumPy do, whatever they were made of."""
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return jax.tree.map(_strong, function(*args, **kwargs))
+
+    return call  # type: ignore[return-value]
+
+
+def _strong(leaf: Any) -> Any:
+    weak = isinstance(leaf, jax.Array) and jax.typeof(leaf).weak_type
+    return jax.lax.convert_element_type(leaf, leaf.dtype) if weak else leaf
 
 
 def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | None = None) -> Callable[..., T]:

@@ -26,6 +26,7 @@ tests.annotations.install()
 import jax
 import pytest
 
+import calib.runtime
 import jaxeit as je
 
 from .scheduling import RoomScheduling
@@ -34,6 +35,9 @@ pytest_plugins = ["tests.hard_cases"]
 
 # What a shell runs in the background ignores this, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Commands that run in the tests' own process trace their programs, so that annotations are checked.
+calib.runtime.keep_programs = lambda folder: None
 
 # What is imported stays: looking through it for garbage, again and again, is a twentieth of the time of the suite.
 gc.freeze()

@@ -401,7 +401,7 @@ def test_tables_of_the_pages(root):
         },
         "start": {
             "rows": [{"start": "import jaxeit", **spread}],
-            "phases": [{"phase": "tracing", "no_cache_s": 0.5, "full_cache_s": 0.5}],
+            "phases": [{"phase": "tracing", "no_cache_s": 0.5, "full_cache_s": 0.5, "both_s": 0.125}],
         },
     }
     stages = dict.fromkeys(("reading", "model and images", "fitting", "holding out", "all"), 0.125)

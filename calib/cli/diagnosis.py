@@ -118,7 +118,7 @@ def _cache() -> Iterator[Line]:
         reason = str(caught[-1].message) if caught else "no folder for compiled programs"
         yield Line("cache", reason, "make ~/.cache/jaxeit yours alone: chmod 700 ~/.cache/jaxeit", note=True)
     else:
-        size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+        size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
         yield Line("cache", f"{folder}, {size / 1e6:.0f} MB")
 
 

@@ -85,6 +85,7 @@ HOST = {
     "reciprocal_rows": _DESCRIBES,
     "rim_electrodes": _DESCRIBES,
     "refine_contacts": _PREPARES,
+    "cache_programs": _DESCRIBES,
     "limit_blas_threads": _DESCRIBES,
     "reuse_memory": _DESCRIBES,
     "rounding": "what it estimates has no direction",

@@ -1,0 +1,206 @@
+"""Programs that are kept: the same results, traced once, and found only where everything is the same."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit import program_cache
+
+TRACED: list[str] = []
+
+
+class Layer(eqx.Module):
+    """A pytree with a part that is no array."""
+
+    gain: jax.Array
+    name: str = eqx.field(static=True)
+    parts: frozenset[str] = eqx.field(static=True, default=frozenset({"a", "b"}))
+
+
+@je.verb
+def scaled(layer, factor=2):
+    TRACED.append(f"{layer.name} {factor!r}")
+    return replace(layer, gain=layer.gain * factor), {"factor": factor, "ones": jnp.ones(()) * 1.0}
+
+
+def squared(x):
+    TRACED.append("squared")
+    return x**2
+
+
+slope = je.verb(jax.grad(squared))
+"""A verb whose name is that of another function."""
+
+
+def _of(module):
+    """A class whose code nothing would notice a change of."""
+    return type("Mine", (Layer,), {"__module__": module})
+
+
+@pytest.fixture
+def new_process(tmp_path, monkeypatch):
+    """Forget what this process knows, as a new one would; functions of this module are known."""
+    monkeypatch.setattr(program_cache, "_KNOWN", {*program_cache._KNOWN, "tests"})
+
+    def begin():
+        TRACED.clear()
+        je.cache_programs(tmp_path)
+
+    begin()
+    yield begin
+    je.cache_programs(None)
+
+
+def _kept(folder):
+    return sorted(folder.glob("programs-*/*"))
+
+
+def test_a_program_is_traced_once_and_its_result_is_whole(new_process, tmp_path):
+    layer = Layer(jnp.arange(3.0), "coat")
+    expected, told = scaled(layer)
+    assert TRACED == ["coat 2"]
+    new_process()
+    found, said = scaled(layer)
+    assert TRACED == []
+    assert (found.name, found.parts, said["factor"]) == (expected.name, expected.parts, told["factor"])
+    assert found.gain.dtype == expected.gain.dtype
+    np.testing.assert_array_equal(found.gain, [0.0, 2.0, 4.0])
+    assert not any(jax.typeof(result["ones"]).weak_type for result in (told, said))
+    assert len(_kept(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda layer: scaled(replace(layer, gain=jnp.ones(4))),
+        lambda layer: scaled(replace(layer, gain=layer.gain.astype(jnp.float32))),
+        lambda layer: scaled(replace(layer, gain=jnp.ones(3, int))),
+        lambda layer: scaled(replace(layer, name="foam")),
+        lambda layer: scaled(replace(layer, parts=frozenset({"a"}))),
+        lambda layer: scaled(layer, 2.0),
+        lambda layer: scaled(layer, factor=2),
+        lambda layer: scaled(layer, jnp.asarray(2.0)),
+    ],
+    ids=["shape", "precision", "type", "part", "set", "1 is no 1.0", "by name", "array"],
+)
+def test_a_call_that_differs_has_a_program_of_its_own(new_process, call):
+    layer = Layer(jnp.arange(3.0), "coat")
+    scaled(layer)
+    new_process()
+    call(layer)
+    assert len(TRACED) == 1
+
+
+def test_a_setting_of_jax_or_another_source_has_programs_of_its_own(new_process, monkeypatch):
+    layer = Layer(jnp.arange(3.0), "coat")
+    scaled(layer)
+    with jax.numpy_rank_promotion("raise"):
+        scaled(layer)
+    assert len(TRACED) == 2
+    monkeypatch.setattr(program_cache, "_fingerprint", lambda: "another")
+    new_process()
+    scaled(layer)
+    assert len(TRACED) == 1
+
+
+def test_what_is_reported_does_not_matter(new_process):
+    scaled(Layer(jnp.arange(3.0), "coat"))
+    new_process()
+    with jax.log_compiles(False):
+        jax.config.update("jax_traceback_in_locations_limit", 5)
+        try:
+            scaled(Layer(jnp.arange(3.0), "coat"))
+        finally:
+            jax.config.update("jax_traceback_in_locations_limit", 0)
+    assert TRACED == []
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda layer: jax.jit(lambda gain: scaled(replace(layer, gain=gain))[0].gain)(layer.gain),
+        lambda layer: jax.vmap(lambda gain: scaled(replace(layer, gain=gain))[0].gain)(layer.gain),
+        lambda layer: jax.grad(lambda gain: scaled(replace(layer, gain=gain))[0].gain.sum())(layer.gain),
+        lambda layer: scaled(_of("my_module")(layer.gain, "coat")),
+        lambda layer: scaled(_of("__main__")(layer.gain, "coat")),
+        lambda layer: scaled(_of(__name__)(layer.gain, "coat")),
+        lambda layer: slope(layer.gain[1]),
+        lambda layer: je.verb(lambda x: 2 * x)(layer.gain),
+        lambda layer: je.verb(partial(jnp.multiply, 2.0))(layer.gain),
+        lambda layer: je.verb(jax.random.uniform)(jax.random.key(0)),
+    ],
+    ids=["jit", "vmap", "grad", "module", "main", "name", "other verb", "lambda", "partial", "random key"],
+)
+def test_what_is_not_known_for_sure_is_not_kept(new_process, tmp_path, call):
+    call(Layer(jnp.arange(3.0), "coat"))
+    assert _kept(tmp_path) == []
+
+
+def test_an_error_is_that_of_the_verb(new_process, tmp_path):
+    with pytest.raises(TypeError, match="scalar"):
+        scaled(Layer(jnp.arange(3.0), "coat"), "twice")
+    assert _kept(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda text: text[:-9], lambda text: b"", lambda text: text[:99] + b"!" + text[100:]]
+)
+def test_a_damaged_file_is_replaced(new_process, tmp_path, damage):
+    scaled(Layer(jnp.arange(3.0), "coat"))
+    (path,) = _kept(tmp_path)
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    new_process()
+    np.testing.assert_array_equal(scaled(Layer(jnp.arange(3.0), "coat"))[0].gain, [0.0, 2.0, 4.0])
+    assert len(TRACED) == 1
+    new_process()
+    scaled(Layer(jnp.arange(3.0), "coat"))
+    assert TRACED == []
+
+
+def test_a_folder_that_cannot_be_written_costs_time_only(new_process, tmp_path):
+    folder = program_cache._folder
+    folder.rmdir()
+    folder.write_bytes(b"")
+    np.testing.assert_array_equal(scaled(Layer(jnp.arange(3.0), "coat"))[0].gain, [0.0, 2.0, 4.0])
+
+
+def test_programs_that_nothing_uses_any_more_are_removed(new_process, tmp_path):
+    for name, days in (("programs-old", 31), ("programs-recent", 29), ("others", 99)):
+        (tmp_path / name).mkdir()
+        age = (program_cache.time.time() - 86400 * days,) * 2
+        os.utime(tmp_path / name, age)
+    new_process()
+    assert {"programs-recent", "others"} < {path.name for path in tmp_path.iterdir()}
+    assert not (tmp_path / "programs-old").exists()
+
+
+IN_ANOTHER_PROCESS = """
+import jax; jax.config.update("jax_enable_x64", True)
+import jaxeit as je
+je.cache_programs({folder!r})
+model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft())
+print(bytes(memoryview(je.forward(model))).hex())
+"""
+
+
+def test_another_process_finds_a_program(tmp_path):
+    """Sets have another order there, and strings other places in memory."""
+    code = IN_ANOTHER_PROCESS.format(folder=str(tmp_path))
+    said, times = [], []
+    for seed in "12":
+        env = os.environ | {"PYTHONHASHSEED": seed, "JAXTYPING_DISABLE": "1"}
+        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+        said.append(done.stdout)
+        times.append([path.stat().st_mtime_ns for path in _kept(tmp_path)])
+    assert said[0] == said[1] != ""
+    assert times[0] == times[1] != []
