@@ -28,6 +28,7 @@ import pytest
 
 import calib.runtime
 import jaxeit as je
+import tests.mlir_contexts
 
 from .scheduling import RoomScheduling
 
@@ -35,6 +36,8 @@ pytest_plugins = ["tests.hard_cases"]
 
 # What a shell runs in the background ignores this, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+tests.mlir_contexts.install()
 
 # Commands that run in the tests' own process trace their programs, so that annotations are checked.
 calib.runtime.keep_programs = lambda folder: None
