@@ -74,8 +74,8 @@ def commands(bundled, calibrated, tmp_path_factory):
     }
 
 
-QUICK = [(name, fault) for name in ("import", "recover", "apply") for fault in FAULTS]
-LONG = [(name, fault) for name in ("simulate", "calibrate") for fault in ("SIGTERM", "disk full")]
+QUICK = [(name, fault) for name in ("import", "recover") for fault in FAULTS]
+LONG = [(name, fault) for name in ("simulate", "calibrate", "apply") for fault in ("SIGTERM", "disk full")]
 REPORT = [("report", "disk full"), pytest.param("report", "SIGTERM", marks=pytest.mark.slow)]
 
 

@@ -32,7 +32,7 @@ def judged(found, count):
 
 
 def test_some_lies(root):
-    judged(campaign(30, 1, root, 100), 30)
+    judged(campaign(20, 1, root, 100), 20)
 
 
 @pytest.mark.slow

@@ -67,7 +67,12 @@ def _symmetric(name, of):
     return function
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+_ALIKE = ("solve_triangular 0 True", "solve_triangular 1 False", "cholesky, lower")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in _ALIKE else name for name in FUNCTIONS]
+)
 def test_values_and_derivatives_are_those_of_jax(name):
     """Alone, and stacked by two vmaps."""
     ours, theirs = (_derivatives(_symmetric(name, of)) for of in (lapack, jsp))

@@ -44,7 +44,7 @@ def case(request):
 
 def test_a_model_whose_electrodes_stay_is_the_model(case):
     model, motion, shift = case
-    still = moved(model, motion, 0 * shift)
+    still = jax.jit(moved)(model, motion, 0 * shift)
     for before, after in zip(jax.tree.leaves(model), jax.tree.leaves(still), strict=True):
         if jnp.issubdtype(before.dtype, jnp.floating) and before.size:
             np.testing.assert_allclose(after, before, rtol=0, atol=1e-12 * float(jnp.abs(before).max()))
@@ -199,6 +199,6 @@ def test_readings_of_any_currents_move_too():
     )
     motion = electrode_motion(model)
     slopes = shift_jacobian(model, motion)
-    expected = jax.jacfwd(lambda shift: je.forward(moved(model, motion, shift)))(jnp.zeros((8, 2)))
+    expected = jax.jit(jax.jacfwd(lambda shift: je.forward(moved(model, motion, shift))))(jnp.zeros((8, 2)))
     assert slopes.shape == (14, 8, 2)
     np.testing.assert_allclose(slopes, expected, rtol=1e-9, atol=1e-12)
