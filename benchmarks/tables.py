@@ -13,7 +13,7 @@ import jaxeit as je
 
 from .markdown import all_columns, cell, crossed, markdown, plain, replaced
 from .repeat import compared
-from .rows import Row
+from .rows import Row, averaged, grouped
 
 FORMATS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
@@ -184,6 +184,12 @@ def _ktc_phantoms(results: Row) -> list[Row]:
     return [row | {"method": KTC_METHODS[row["method"]]} for row in rows]
 
 
+def _ktc_bound(results: Row) -> Iterator[Row]:
+    """Means over the phantoms of a kind, without some electrodes."""
+    for rows in grouped(results["bound"], "kind", "level").values():
+        yield averaged(rows)
+
+
 KTC_METHODS = {"linear": "linear, Otsu's thresholds", "variation": "`je.imaging.segment`"}
 KTC_KINDS = {"convex": "disc, ellipse or polygon", "two": "two pieces", "three": "three pieces"}
 
@@ -328,6 +334,7 @@ ROWS: dict[str, Callable] = {
     "scans": _scans,
     "ktc": _ktc,
     "ktc_phantoms": _ktc_phantoms,
+    "ktc_bound": _ktc_bound,
     "paper": _paper,
     "ladder_testbed": _ladder(0),
     "ladder_chest": _ladder(1),
