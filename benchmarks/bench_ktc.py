@@ -5,8 +5,8 @@ challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, w
 evaluation frames are not used here; the levels are made by leaving those readings out.
 
 `phantoms` simulates the tank (`ktc_phantoms.py`): settings of methods are chosen on the set `tuning`, and `fresh` was
-never looked at for that. `rows`, with ``--data``, is the last look: the four training frames. `bound` asks what the
-readings tell of the outlines of stars, crosses and crescents.
+never looked at for that. `rows`, with ``--data``, is the last look: the four training frames. `bound` and
+`outlines` ask what the readings tell of stars, crosses and crescents.
 """
 
 from base64 import b64decode, b64encode
@@ -31,6 +31,7 @@ from .clock import seconds
 from .figures import BLUE, ORANGE, panels
 from .harness import Question, Run
 from .ktc_bound import compared
+from .ktc_outlines import outlined
 from .ktc_phantoms import CONDUCTIVE, ELECTRODES, GRID, INSIDE, OBJECTS, RADIUS, RESISTIVE, WATER, Data, simulated
 from .rows import Row, grouped
 
@@ -238,18 +239,32 @@ BOUND_KINDS, BOUND_LEVELS = ("star", "cross", "crescent"), (1, 4, 7)
 def bound(run: Run) -> Iterator[Row]:
     """Fits from the true outline and from that of the image, for phantoms of the set `tuning`."""
     yield {"bound": []}
-    kinds, seeds = run.sizes(BOUND_KINDS, BOUND_KINDS[:1]), run.sizes(SETS["tuning"], SETS["tuning"][:1])
-    all_data = [simulated(seed, tuple(kinds)) for seed in seeds]
+    for row in _each_shape(run, BOUND_KINDS, compared):
+        yield {"bound": [row]}
+
+
+def outlines(run: Run) -> Iterator[Row]:
+    """Outlines of stars and crosses, which are functions of an angle, with errors in common."""
+    yield {"outlines": []}
+    for row in _each_shape(run, BOUND_KINDS[:2], outlined):
+        yield {"outlines": [row]}
+
+
+def _each_shape(run: Run, kinds: tuple[str, ...], question: Callable[..., Row]) -> Iterator[Row]:
+    """The answer for each phantom of the kinds at each level."""
+    seeds, asked = run.sizes(SETS["tuning"], SETS["tuning"][:1]), run.sizes(kinds, kinds[:1])
+    all_data = [simulated(seed, BOUND_KINDS) for seed in seeds]
     model = tank(all_data[0])
     image = je.Pixels(COLUMNS["variation"]).on(model)
     for seed, data in zip(seeds, all_data, strict=True):
         water = homogeneous(model, data.reference, data.channel)
         for level in run.sizes(BOUND_LEVELS, SMOKE_LEVELS[1:]):
-            for place, kind in enumerate(kinds):
+            for kind in asked:
                 row = {"tank": seed, "kind": kind, "level": level}
-                row |= compared(filled(model, water), image, water.missed, with_level(data, level), place)
+                place = BOUND_KINDS.index(kind)
+                row |= question(filled(model, water), image, water.missed, with_level(data, level), place)
                 print(row, flush=True)
-                yield {"bound": [row]}
+                yield row
 
 
 # --- picture
@@ -335,7 +350,7 @@ def challenge(run: Run) -> Iterator[Row]:
 
 
 DATA: Row = {"type": Path, "help": "folder with training/ and groundtruth_training/, for the part rows"}
-PARTS = {"rows": challenge, "phantoms": phantoms, "bound": bound}
+PARTS = {"rows": challenge, "phantoms": phantoms, "bound": bound, "outlines": outlines}
 main = Question("ktc", __doc__, PARTS, {"--data": DATA}, picture=picture, file="ktc-phantoms.png")
 
 if __name__ == "__main__":

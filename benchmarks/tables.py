@@ -184,10 +184,9 @@ def _ktc_phantoms(results: Row) -> list[Row]:
     return [row | {"method": KTC_METHODS[row["method"]]} for row in rows]
 
 
-def _ktc_bound(results: Row) -> Iterator[Row]:
-    """Means over the phantoms of a kind, without some electrodes."""
-    for rows in grouped(results["bound"], "kind", "level").values():
-        yield averaged(rows)
+def _ktc_shapes(part: str) -> Callable[[Row], Iterator[Row]]:
+    """Means over the phantoms of a kind at a level."""
+    return lambda results: map(averaged, grouped(results[part], "kind", "level").values())
 
 
 KTC_METHODS = {"linear": "linear, Otsu's thresholds", "variation": "`je.imaging.segment`"}
@@ -334,7 +333,8 @@ ROWS: dict[str, Callable] = {
     "scans": _scans,
     "ktc": _ktc,
     "ktc_phantoms": _ktc_phantoms,
-    "ktc_bound": _ktc_bound,
+    "ktc_bound": _ktc_shapes("bound"),
+    "ktc_outlines": _ktc_shapes("outlines"),
     "paper": _paper,
     "ladder_testbed": _ladder(0),
     "ladder_chest": _ladder(1),

@@ -12,7 +12,7 @@ from scipy.ndimage import label
 from scipy.stats import multivariate_normal
 
 import jaxeit as je
-from benchmarks import bench_ktc as ktc, ktc_bound, ktc_phantoms, tables
+from benchmarks import bench_ktc as ktc, ktc_bound, ktc_outlines, ktc_phantoms, tables
 from jaxeit.imaging import level_set
 from jaxeit.imaging.absolute import images
 
@@ -160,6 +160,24 @@ def test_errors_in_common_are_columns_of_one_standard_error(uneven):
     np.testing.assert_allclose(found, ktc_phantoms.MOVED_CONTACT * change, atol=1e-3 * np.abs(found).max())
 
 
+@pytest.mark.slow
+def test_outlines_are_found_where_nothing_else_is_wrong(uneven):
+    """Four arms from readings of the same model, started at a disc near their place."""
+    truth = np.concatenate([[0.3, 0.2], [2.0], [np.log(0.3)], np.zeros(16)])
+    truth[4 + 3] = 0.3  # four arms
+    corners = np.asarray(uneven.chart)[np.asarray(uneven.triangles)] / ktc.RADIUS
+    points = jnp.asarray(np.einsum("sc,ecd->esd", ktc_phantoms.CORNER_SHARES, corners))
+    change = je.forward(uneven, ktc_outlines._conductivity(uneven, points, -1.0, truth)) - je.forward(uneven)
+    data = ktc_phantoms.Data(ktc_phantoms.pattern(), 1.0, np.zeros(uneven.readings), *2 * [np.zeros(1)])
+    errors = np.full(uneven.readings, 1e-3 * float(jnp.max(jnp.abs(change))))
+    seen = ktc_bound.Seen(uneven, data, np.asarray(change), errors)
+    line = np.hypot(ktc_phantoms.LINE - 0.25, (ktc_phantoms.LINE - 0.2)[:, None])
+    found = ktc_outlines.fitted_outline(seen, np.where(line < 0.25, ktc.RESISTIVE, ktc.WATER), uneven.background)
+    shape = ktc_outlines._classes(truth, ktc.RESISTIVE)
+    assert np.mean(found.classes != shape) < 0.02 * np.mean(shape > 0)
+    assert found.told.max() < 0.5
+
+
 def test_share_of_triangles_is_that_of_the_piece(uneven):
     piece = ktc_phantoms.Piece(ktc_phantoms.star(np.random.default_rng(5)) + 0.3, ktc.RESISTIVE, 0.1)
     share = ktc_bound.covered(uneven, ktc_phantoms.truth((piece,)))
@@ -288,7 +306,9 @@ def test_smoke_phantoms():
     text = tables.table("ktc-phantoms", data)
     assert text.count("level 1") == text.count("| crescent |") == 1
     assert {(row["kind"], row["level"]) for row in data["bound"]} == {("star", 7)}
-    assert tables.table("ktc-bound", data).count("| star, 7 |") == 1
+    assert [(row["kind"], row["level"]) for row in data["outlines"]] == [("star", 7)]
+    for mark in ("ktc-bound", "ktc-outlines"):
+        assert tables.table(mark, data).count("| star, 7 |") == 1
 
 
 # --- the training frames
