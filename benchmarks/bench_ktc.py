@@ -5,7 +5,8 @@ challenge has seven levels: level k takes the first 2 (k - 1) electrodes away, w
 evaluation frames are not used here; the levels are made by leaving those readings out.
 
 `phantoms` simulates the tank (`ktc_phantoms.py`): settings of methods are chosen on the set `tuning`, and `fresh` was
-never looked at for that. `rows`, with ``--data``, is the last look: the four training frames.
+never looked at for that. `rows`, with ``--data``, is the last look: the four training frames. `bound` and
+`outlines` ask what the readings tell of stars, crosses and crescents.
 """
 
 from base64 import b64decode, b64encode
@@ -29,6 +30,8 @@ import jaxeit as je
 from .clock import seconds
 from .figures import BLUE, ORANGE, panels
 from .harness import Question, Run
+from .ktc_bound import compared
+from .ktc_outlines import outlined
 from .ktc_phantoms import CONDUCTIVE, ELECTRODES, GRID, INSIDE, OBJECTS, RADIUS, RESISTIVE, WATER, Data, simulated
 from .rows import Row, grouped
 
@@ -135,19 +138,27 @@ def linear(model: je.Model, image: je.model.BasisMap, water: Water, data: Data) 
     return [otsu_labels(on_grid(image, recon)) for image in images]
 
 
+def filled(model: je.Model, water: Water) -> je.Model:
+    """The tank with water as the reference tells it."""
+    values = jnp.full_like(model.background, water.sigma), jnp.full_like(model.contact, 1 / water.contact)
+    return eqx.tree_at(lambda m: (m.background, m.contact), model, values)
+
+
 def variation(model: je.Model, image: je.model.BasisMap, water: Water, data: Data, **settings: Any) -> list[np.ndarray]:
     """`je.imaging.segment` with its defaults or ``settings``, and water as the reference tells it."""
-    filled = jnp.full_like(model.background, water.sigma), jnp.full_like(model.contact, 1 / water.contact)
-    model = eqx.tree_at(lambda m: (m.background, m.contact), model, filled)
+    model = filled(model, water)
     settings = {"missed": water.missed} | settings
     found = [je.imaging.segment(model, data.reference, frame, image, **settings) for frame in data.frames]
     return [np.where(INSIDE, one.classes[::-1], WATER) for one in found]
 
 
+COLUMNS = {"linear": 40, "variation": 30}
+
+
 def methods(model: je.Model, water: Water) -> dict[str, Method]:
     """The ways of this benchmark by name, each on its pixels."""
-    columns = {linear: 40, variation: 30}
-    return {way.__name__: partial(way, model, je.Pixels(n).on(model), water) for way, n in columns.items()}
+    ways = {way.__name__: way for way in (linear, variation)}
+    return {name: partial(way, model, je.Pixels(COLUMNS[name]).on(model), water) for name, way in ways.items()}
 
 
 # --- phantoms
@@ -218,6 +229,42 @@ def phantoms(run: Run) -> Iterator[Row]:
 def phantom_totals(rows: list[Row]) -> Row:
     """Of 21 points, by set and method."""
     return {name: totals(mine) for name, mine in grouped(rows, "set").items()}
+
+
+# --- what the readings tell of outlines
+
+BOUND_KINDS, BOUND_LEVELS = ("star", "cross", "crescent"), (1, 4, 7)
+
+
+def bound(run: Run) -> Iterator[Row]:
+    """Fits from the true outline and from that of the image, for phantoms of the set `tuning`."""
+    yield {"bound": []}
+    for row in _each_shape(run, BOUND_KINDS, compared):
+        yield {"bound": [row]}
+
+
+def outlines(run: Run) -> Iterator[Row]:
+    """Outlines of stars and crosses, which are functions of an angle, with errors in common."""
+    yield {"outlines": []}
+    for row in _each_shape(run, BOUND_KINDS[:2], outlined):
+        yield {"outlines": [row]}
+
+
+def _each_shape(run: Run, kinds: tuple[str, ...], question: Callable[..., Row]) -> Iterator[Row]:
+    """The answer for each phantom of the kinds at each level."""
+    seeds, asked = run.sizes(SETS["tuning"], SETS["tuning"][:1]), run.sizes(kinds, kinds[:1])
+    all_data = [simulated(seed, BOUND_KINDS) for seed in seeds]
+    model = tank(all_data[0])
+    image = je.Pixels(COLUMNS["variation"]).on(model)
+    for seed, data in zip(seeds, all_data, strict=True):
+        water = homogeneous(model, data.reference, data.channel)
+        for level in run.sizes(BOUND_LEVELS, SMOKE_LEVELS[1:]):
+            for kind in asked:
+                row = {"tank": seed, "kind": kind, "level": level}
+                place = BOUND_KINDS.index(kind)
+                row |= question(filled(model, water), image, water.missed, with_level(data, level), place)
+                print(row, flush=True)
+                yield row
 
 
 # --- picture
@@ -303,7 +350,7 @@ def challenge(run: Run) -> Iterator[Row]:
 
 
 DATA: Row = {"type": Path, "help": "folder with training/ and groundtruth_training/, for the part rows"}
-PARTS = {"rows": challenge, "phantoms": phantoms}
+PARTS = {"rows": challenge, "phantoms": phantoms, "bound": bound, "outlines": outlines}
 main = Question("ktc", __doc__, PARTS, {"--data": DATA}, picture=picture, file="ktc-phantoms.png")
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import jaxeit as je
 
 from .markdown import all_columns, cell, crossed, markdown, plain, replaced
 from .repeat import compared
-from .rows import Row
+from .rows import Row, averaged, grouped
 
 FORMATS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
@@ -184,6 +184,11 @@ def _ktc_phantoms(results: Row) -> list[Row]:
     return [row | {"method": KTC_METHODS[row["method"]]} for row in rows]
 
 
+def _ktc_shapes(part: str) -> Callable[[Row], Iterator[Row]]:
+    """Means over the phantoms of a kind at a level."""
+    return lambda results: map(averaged, grouped(results[part], "kind", "level").values())
+
+
 KTC_METHODS = {"linear": "linear, Otsu's thresholds", "variation": "`je.imaging.segment`"}
 KTC_KINDS = {"convex": "disc, ellipse or polygon", "two": "two pieces", "three": "three pieces"}
 
@@ -328,6 +333,8 @@ ROWS: dict[str, Callable] = {
     "scans": _scans,
     "ktc": _ktc,
     "ktc_phantoms": _ktc_phantoms,
+    "ktc_bound": _ktc_shapes("bound"),
+    "ktc_outlines": _ktc_shapes("outlines"),
     "paper": _paper,
     "ladder_testbed": _ladder(0),
     "ladder_chest": _ladder(1),

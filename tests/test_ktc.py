@@ -1,6 +1,7 @@
 """The Kuopio Tomography Challenge 2023: what does not need its data, phantoms of our own, and its training frames where
 they are at hand."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.ndimage import label
+from scipy.stats import multivariate_normal
 
 import jaxeit as je
-from benchmarks import bench_ktc as ktc, ktc_phantoms, tables
+from benchmarks import bench_ktc as ktc, ktc_bound, ktc_outlines, ktc_phantoms, tables
 from jaxeit.imaging import level_set
 from jaxeit.imaging.absolute import images
 
@@ -79,6 +81,8 @@ def test_a_tank_in_classes():
         je.imaging.segment(water, reference, frame, floor=0.0)
     with pytest.raises(je.imaging.InverseError, match=r"width is 0\.0"):
         je.imaging.segment(water, reference, frame, je.Pixels(24), borders=je.imaging.LevelSet(widths=(0.5, 0.0)))
+    with pytest.raises(je.imaging.InverseError, match=r"start is no array \(256, 256\)"):
+        je.imaging.segment(water, reference, frame, je.Pixels(24), start=found.classes)
     with pytest.raises(je.imaging.InverseError, match="is no picture"):
         je.imaging.segment(water, reference, frame, je.model.Elements())
 
@@ -111,6 +115,74 @@ def test_gradient_of_a_level_set_is_that_of_its_misfit(disc):
     gradient = jax.grad(lambda z: 0.5 * jnp.sum(posterior.residual(z) ** 2))(at)
     np.testing.assert_allclose(found.grad, gradient, rtol=1e-6, atol=1e-8 * float(jnp.max(jnp.abs(gradient))))
     assert np.linalg.eigvalsh(found.hessian.matrix).min() > 0
+
+
+def test_objective_of_a_fitted_level_is_the_sum_of_its_parts(disc):
+    """Misfit, penalty on edges and prior, each from its own definition, with heights that are known."""
+    readings = disc.voltages(_bump(disc, 0.45, 0.0, 2.0))
+    weight = jnp.full_like(readings, 1e2 / float(jnp.max(jnp.abs(readings))))
+    penalty = je.imaging.IsotropicVariation(weight=2.0)
+    classes = np.zeros((40, 40), int)
+    classes[14:26, 24:34] = ktc.CONDUCTIVE
+    start = level_set.signed_distances(classes, disc.image.picture)
+    settings = je.imaging.LevelSet(height_std=1e-9, weight=1e-2)
+    posterior, count = images.ImagePosterior(disc, penalty, readings, weight), jnp.asarray(float(len(readings)))
+    fit = level_set.fitted_level(posterior, start, count, settings)
+    image = 2 / (1 + np.exp(-np.asarray(fit.level) / settings.widths[-1]))
+    left = np.asarray(weight * (readings - disc.voltages(jnp.asarray(image))))
+    aside = np.asarray(fit.level) - settings.outside
+    smooth = settings.prior.precision(jnp.zeros((0, len(aside))), disc.image.picture).matrix()
+    prior = 0.5 * settings.weight * len(readings) * aside @ np.asarray(smooth) @ aside
+    parts = 0.5 * left @ left, float(penalty.value(disc.image.picture, jnp.asarray(image))), prior
+    assert float(fit.objective) == pytest.approx(sum(parts), rel=1e-6)
+    assert float(fit.misfit) == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-6)
+    assert fit.misfit < 0.5 * np.sqrt(np.mean(np.asarray(weight * (readings - disc.voltages(0 * image))) ** 2))
+
+
+def test_surprise_at_errors_in_common_is_that_of_their_covariance():
+    rng = np.random.default_rng(31)
+    left, errors, columns = rng.normal(size=9), rng.uniform(0.5, 2, 9), rng.normal(size=(9, 4))
+    covariance = np.diag(errors**2) + columns @ columns.T
+    density = multivariate_normal(np.zeros(9), covariance).logpdf(left)
+    plain = multivariate_normal(np.zeros(9), np.diag(errors**2)).logpdf(np.zeros(9))
+    assert ktc_bound.surprise(left, errors, columns) == pytest.approx(plain - density, rel=1e-12)
+
+
+def test_errors_in_common_are_columns_of_one_standard_error(uneven):
+    """Of contacts against differences of the readings; even water has no errors of a change but those of the frame."""
+    sigma = uneven.background * jnp.where(uneven.centroids[:, 0] > 0.05, 0.3, 1.0)
+    data = ktc_phantoms.Data(ktc_phantoms.pattern(), 1.0, *3 * [np.zeros(1)])
+    seen = ktc_bound.Seen(uneven, data, np.zeros(uneven.readings), np.ones(uneven.readings))
+    columns = ktc_bound.common_errors(seen, sigma)
+    touched = replace(uneven, contact=uneven.contact.at[3].multiply(np.exp(1e-4)))
+    change = np.asarray(je.forward(touched, sigma) - je.forward(uneven, sigma)) / 1e-4
+    found = columns[:, -3 * ktc.ELECTRODES :][:, 3]  # behind it: shifts in two directions
+    np.testing.assert_allclose(found, ktc_phantoms.MOVED_CONTACT * change, atol=1e-3 * np.abs(found).max())
+
+
+@pytest.mark.slow
+def test_outlines_are_found_where_nothing_else_is_wrong(uneven):
+    """Four arms from readings of the same model, started at a disc near their place."""
+    truth = np.concatenate([[0.3, 0.2], [2.0], [np.log(0.3)], np.zeros(16)])
+    truth[4 + 3] = 0.3  # four arms
+    corners = np.asarray(uneven.chart)[np.asarray(uneven.triangles)] / ktc.RADIUS
+    points = jnp.asarray(np.einsum("sc,ecd->esd", ktc_phantoms.CORNER_SHARES, corners))
+    change = je.forward(uneven, ktc_outlines._conductivity(uneven, points, -1.0, truth)) - je.forward(uneven)
+    data = ktc_phantoms.Data(ktc_phantoms.pattern(), 1.0, np.zeros(uneven.readings), *2 * [np.zeros(1)])
+    errors = np.full(uneven.readings, 1e-3 * float(jnp.max(jnp.abs(change))))
+    seen = ktc_bound.Seen(uneven, data, np.asarray(change), errors)
+    line = np.hypot(ktc_phantoms.LINE - 0.25, (ktc_phantoms.LINE - 0.2)[:, None])
+    found = ktc_outlines.fitted_outline(seen, np.where(line < 0.25, ktc.RESISTIVE, ktc.WATER), uneven.background)
+    shape = ktc_outlines._classes(truth, ktc.RESISTIVE)
+    assert np.mean(found.classes != shape) < 0.02 * np.mean(shape > 0)
+    assert found.told.max() < 0.5
+
+
+def test_share_of_triangles_is_that_of_the_piece(uneven):
+    piece = ktc_phantoms.Piece(ktc_phantoms.star(np.random.default_rng(5)) + 0.3, ktc.RESISTIVE, 0.1)
+    share = ktc_bound.covered(uneven, ktc_phantoms.truth((piece,)))
+    np.testing.assert_allclose(share, -ktc_phantoms.covered(uneven, piece), atol=0.2)
+    assert np.abs(share + ktc_phantoms.covered(uneven, piece)).mean() < 0.005
 
 
 @pytest.mark.slow
@@ -233,6 +305,10 @@ def test_smoke_phantoms():
     assert all(0 < total["linear"] < 21 and total["variation"] > 10 for total in data["phantoms_of_21"].values())
     text = tables.table("ktc-phantoms", data)
     assert text.count("level 1") == text.count("| crescent |") == 1
+    assert {(row["kind"], row["level"]) for row in data["bound"]} == {("star", 7)}
+    assert [(row["kind"], row["level"]) for row in data["outlines"]] == [("star", 7)]
+    for mark in ("ktc-bound", "ktc-outlines"):
+        assert tables.table(mark, data).count("| star, 7 |") == 1
 
 
 # --- the training frames

@@ -9,6 +9,9 @@ import jaxeit as je
 from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
 
+MOST_ACROSS = 10.0
+"""Extent of a tank, m, beyond which lengths were given in another unit."""
+
 
 class TankError(ValueError):
     """A file that is no recording of a tank, or frames that its model cannot explain.
@@ -68,11 +71,17 @@ def tank_of(
     """The skin of a file that does not describe its tank: electrodes around the rim unless the caller has placed them.
 
     Raises:
-        TankError: if the caller gives no shape, or another number of electrodes.
+        TankError: if the caller gives no shape, one in another unit than metres, or another number of electrodes.
     """
     if domain is None:
         raise TankError(
             f"{name}: the file does not tell the shape of the tank; give domain=, such as je.Disc(0.1), or --radius"
+        )
+    across = domain.perimeter / np.pi
+    if across > MOST_ACROSS:
+        raise TankError(
+            f"{name}: the tank would be {across:.3g} m across, and no tank is more than {MOST_ACROSS:g} m; give "
+            f"metres, such as --radius {5e-4 * across:.3g} for {across / 2:.3g} mm"
         )
     rim = je.skin.rim_electrodes(domain, electrodes) if rim is None else rim
     if len(rim) != electrodes:

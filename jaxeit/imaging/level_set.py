@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.ndimage import distance_transform_edt
 
+from .._compile import verb
 from ..least_squares import quadratic
 from ..least_squares.searches import Quadratic as HalfSquares
 from ..model.bases import Picture
@@ -68,9 +69,19 @@ def signed_distances(classes: Int[np.ndarray, "rows columns"], picture: Picture)
     return Distances(found.max(0), found.argmax(0))
 
 
+class FittedLevel(NamedTuple):
+    """The most probable level of each pixel and the image of pieces that it makes, (basis,); misfit and objective as
+    `Segmentation` has them."""
+
+    level: Float[Array, " basis"]
+    pieces: Float[Array, " basis"]
+    misfit: Float[Array, ""]
+    objective: Float[Array, ""]
+
+
 def fitted_level(
     posterior: ImagePosterior, start: Distances, readings: Float[Array, ""], settings: LevelSet
-) -> Float[Array, " basis"]:
+) -> FittedLevel:
     """The most probable level of each pixel of an image, from distances on any grid over it.
 
     Args:
@@ -92,7 +103,15 @@ def fitted_level(
     for width in settings.widths:
         shaped = _LevelPosterior(posterior, prior, expected, std, jnp.asarray(owner), jnp.asarray(width, dtype))
         z, _ = most_probable(shaped, z, STEPS, TOLERANCE, damped=True)
-    return z[: picture.size]
+    left = _residual(shaped, z)
+    data = jnp.sum(left[: len(posterior.readings)] ** 2)
+    # the penalty and the prior are numbers of which half the square has 1/2 too much
+    return FittedLevel(z[: picture.size], shaped.pieces(z), jnp.sqrt(data / readings), 0.5 * jnp.sum(left**2) - 1)
+
+
+@verb
+def _residual(posterior: AbstractPosterior, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    return posterior.residual(x)
 
 
 def _require_usable(settings: LevelSet) -> None:
@@ -123,10 +142,12 @@ class _LevelPosterior(AbstractPosterior):
     owner: Int[Array, " basis"]
     width: Float[Array, ""]
 
+    def pieces(self, x: Float[Array, " n"]) -> Float[Array, " basis"]:
+        """The image."""
+        return x[-2:][self.owner] * jax.nn.sigmoid(x[:-2] / self.width)
+
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        share = jax.nn.sigmoid(x[:-2] / self.width)
-        prior = self._prior(x)[0]
-        return jnp.append(self.image.residual(x[-2:][self.owner] * share), jnp.sqrt(1 + 2 * prior))
+        return jnp.append(self.image.residual(self.pieces(x)), jnp.sqrt(1 + 2 * self._prior(x)[0]))
 
     def quadratic(self, x: Float[Array, " n"]) -> HalfSquares:
         """That of the image by the chain rule, without the curvature of the sigmoid, plus that of the priors."""

@@ -28,7 +28,7 @@ from .absolute.images import (
     gauss_newton,
     reading_weights,
 )
-from .level_set import LevelSet, fitted_level, signed_distances
+from .level_set import FittedLevel, LevelSet, fitted_level, signed_distances
 from .noise import InverseError, require_real
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
@@ -46,16 +46,24 @@ MORE_FITS, BELIEVED_MISFIT = 3, 1.05
 class Segmentation(eqx.Module):
     """Classes of a frame.
 
-    | meaning                                                                      | shape           |
-    |------------------------------------------------------------------------------|-----------------|
-    | image: logarithm of the conductivity over that of the reference              | (basis,)        |
-    | picture that the image belongs to                                            |                 |
-    | classes: 0 as the reference, 1 resistive, 2 conductive; row 0 at low y       | (rows, columns) |
+    | meaning                                                                              | shape           |
+    |--------------------------------------------------------------------------------------|-----------------|
+    | image: logarithm of the conductivity over that of the reference                      | (basis,)        |
+    | picture that the image belongs to                                                    |                 |
+    | classes: 0 as the reference, 1 resistive, 2 conductive; row 0 at low y               | (rows, columns) |
+    | pieces: image of one height for each class, of fitted borders; NaN: none were fitted | (basis,)        |
+    | errors: standard error of each change that was believed, V                           | (readings,)     |
+    | misfit: root mean square of what the pieces leave of the changes, over the errors    | ()              |
+    | objective: what the fit of borders minimises; the least of several starts is best    | ()              |
     """
 
     image: Float[Array, " basis"]
     picture: Picture
     classes: Int[np.ndarray, "rows columns"]
+    pieces: Float[Array, " basis"]
+    errors: Float[Array, " readings"]
+    misfit: Float[Array, ""]
+    objective: Float[Array, ""]
 
 
 def segment(
@@ -66,6 +74,7 @@ def segment(
     *,
     penalty: AbstractPenalty | None = None,
     borders: LevelSet | None = BORDERS,
+    start: Int[ArrayLike, "rows columns"] | None = None,
     missed: Float[ArrayLike, " readings"] | None = None,
     relative_error: float = 0.03,
     absolute_error: float = 0.003,
@@ -87,6 +96,7 @@ def segment(
         basis: default `Pixels`, 30 along x.
         penalty: default `IsotropicVariation` with a weight of 0.0064 for each reading that is used.
         borders: how borders are fitted to the readings, from those of the regions; None: left as the image shows them.
+        start: classes, (pixels, pixels), from whose borders that fit starts; default: those of the image's regions.
         missed: of the reference by the model, V; default: the difference.
         relative_error: of a change, over itself.
         absolute_error: of a reading that does not change, over the sum of its size and the root mean square of all; it
@@ -123,9 +133,20 @@ def segment(
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
     found, std = _believed_image(physics, penalty, seen, relative_error, absolute_error)
     classes = half_height_classes(on_grid(found, image.picture, (pixels, pixels)), floor, least, weakest)
-    if borders is not None and classes.any():
-        classes = _shaped(physics, penalty, seen, std, classes, borders)
-    return Segmentation(found, image.picture, classes)
+    classes = classes if start is None else _checked_start(start, classes.shape)
+    if borders is None or not classes.any():
+        unfitted = jnp.asarray(jnp.nan, model.dtype)
+        return Segmentation(found, image.picture, classes, found * unfitted, std, unfitted, unfitted)
+    classes, fit = _shaped(physics, penalty, seen, std, classes, borders)
+    return Segmentation(found, image.picture, classes, fit.pieces, std, fit.misfit, fit.objective)
+
+
+def _checked_start(start: Int[ArrayLike, "rows columns"], shape: tuple[int, ...]) -> Int[np.ndarray, "rows columns"]:
+    """Classes of a start; raises InverseError if they are none."""
+    classes = np.asarray(start)
+    if classes.shape != shape or not np.isin(classes, (UNCHANGED, RESISTIVE, CONDUCTIVE)).all():
+        raise InverseError(f"start is no array {shape} of classes 0, 1 and 2; give one, or another number of pixels")
+    return classes
 
 
 def _picture_basis(model: Model, basis: AbstractBasis | BasisMap | None) -> BasisMap:
@@ -184,13 +205,13 @@ def _shaped(
     std: Float[Array, " readings"],
     classes: Int[np.ndarray, "rows columns"],
     borders: LevelSet,
-) -> Int[np.ndarray, "rows columns"]:
-    """Classes whose borders explain the readings, from those of the image."""
+) -> tuple[Int[np.ndarray, "rows columns"], FittedLevel]:
+    """Classes whose borders explain the readings, from those given; and the fit."""
     picture, start = physics.image.picture, signed_distances(classes, physics.image.picture)
     weight, readings = reading_weights(seen.target, std)
     posterior = ImagePosterior(physics, penalty, readings, weight)
-    level = fitted_level(posterior, start, seen.used(physics.model.dtype), borders)
-    return np.where(on_grid(level, picture, classes.shape) > 0, start.owner + 1, UNCHANGED)
+    fit = fitted_level(posterior, start, seen.used(physics.model.dtype), borders)
+    return np.where(on_grid(fit.level, picture, classes.shape) > 0, start.owner + 1, UNCHANGED), fit
 
 
 def on_grid(

@@ -286,6 +286,9 @@ def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypat
     assert " 0 cm^2 resistive (blue), " in capsys.readouterr().out
     assert main(["image", CSV, "-o", "no.png"]) == 2
     assert "--radius" in capsys.readouterr().err
+    assert main(["image", CSV, "--radius", "30", "-o", "no.png"]) == 2
+    assert "60 m across" in (told := capsys.readouterr().err)
+    assert "--radius 0.03 for 30 mm" in told
     assert main(["image", CSV, "--radius", str(RADIUS), "-o", "no.gif"]) == 2
     assert not (tmp_path / "no.gif").exists()
 
