@@ -156,7 +156,7 @@ def _euler_characteristic(square: float) -> float:
 @verb
 def _falls(finder: ContactFinder, y: Float[Array, "n r"]) -> Float[Array, " n"]:
     """Falls of chi-square that one contact makes in frames of noise."""
-    bumps, atoms = finder.bumps(finder.root, finder.whole), finder.atom_table
+    bumps, atoms = finder.bumps(finder.root, finder.whole), finder.atom_table(finder.root, finder.whole)
     none = jnp.zeros((0, 4), y.dtype)
     falls: Array = jax.lax.map(lambda one: one @ one - bumps.fit(one, atoms.one_more(bumps, one, none)).square, y)
     return falls
