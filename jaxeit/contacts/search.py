@@ -279,7 +279,9 @@ class _Search(eqx.Module):
         def again() -> ContactFit:
             begun = bumps.unstarted(y, self.atoms.other(bumps, y))
             second = bumps.finish(y, begun, jnp.minimum(allowed, first.square), jnp.asarray(OUTLOOK))
-            return jax.tree.map(lambda a, b: jnp.where(second.square < first.square, a, b), second, first)
+            better = second.square < first.square
+            chosen: ContactFit = jax.tree.map(lambda a, b: jnp.where(better, a, b), second, first)
+            return chosen
 
         fit: ContactFit = jax.lax.cond(first.converged & (first.square <= allowed), lambda: first, again)
         return fit
@@ -289,7 +291,8 @@ class _Search(eqx.Module):
         its mean, and model error."""
         y = self.y
         noise = len(y) + MAX_DEVIATIONS * np.sqrt(2 * len(y))
-        return noise + self.finder.model_error**2 * (y @ y)
+        allowed: Array = noise + self.finder.model_error**2 * (y @ y)
+        return allowed
 
     def _finished(self, tried: UnfinishedFit, hope: Float[Array, ""], n: int) -> ContactFit:
         """The better of two fits begun, finished, or the first further one that leaves no more than noise and model
