@@ -2,17 +2,23 @@
 
 Single presses of 8 N by a 20 mm tip at places all over the testbed, simulated on another mesh than the one on which
 scans are designed and contacts found; every reading of all scans has the same noise, 60 dB (and once more 50 dB) below
-the rms of the shipped scan's readings; three draws of it. "Bound": the mean error that `place_sensitivity` expects at
+the rms of the shipped scan's readings; three draws of it. "Exact": fits of the frames without noise, with the weights
+of 60 dB: what is left is the error of the fit's model. "Bound": the mean error that `place_sensitivity` expects at
 the sites of the design, over the whole sheet, for contacts of 25 %, a width of 12 mm and a model error of 1.5 %; the
 presses are 15 mm or more from the rim. "Dead": readings of one electrode are left out, of the one that costs most.
+
+`floor` asks where the errors without noise come from: the same presses fitted as bumps on two meshes and as loads
+through the law of pressure, and presses on a contact layer whose gain is uneven by 12 % over 15 mm, unknown to the fit.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,6 +37,8 @@ DRAWS = 3  # of noise
 COLUMNS, UNSEEN = (3, 4, 6, 8, 12), 11  # sites along x of designs, and of those that judge them
 LOAD = 8.0  # N
 MARGIN, PRESSES, SEED = 0.015, 120, 2030
+GAIN, GAIN_LENGTH = 0.12, 0.015  # of the contact layer, and m, in `floor`
+EVERY_OTHER = 2  # of the presses, those that are fitted as loads
 GREEDY, DESIGNED, CAREFUL = "D-optimal among the adjacent", "designed", "designed for a dead electrode"
 
 
@@ -52,11 +60,7 @@ class Bench:
         rng, presses = np.random.default_rng(SEED), 4 if smoke else PRESSES
         low, high = self.skin.domain.bounds
         self.sites = rng.uniform(np.add(low, MARGIN), np.subtract(high, MARGIN), (presses, 2))
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "every.toml"
-            path.write_text(je.skin.with_rows(self.skin, self.every).toml, encoding="utf-8")
-            loads = np.full((presses, 1), LOAD)
-            self.change = pressed((), self.sites[:, None], loads, 0.06 if smoke else 0.026, skin=str(path)).change
+        self.change = self.pressed(())
         self.model = je.discretise(je.Scene(self.skin), je.Fidelity.draft())
         self.noise = 1e-3 * float(jnp.sqrt(jnp.mean(je.forward(self.model) ** 2)))
         settings = je.scan.DesignSettings(noise=self.noise, columns=4 if smoke else 8)
@@ -65,17 +69,26 @@ class Bench:
         self.order = np.asarray(je.scan.choose_readings(signal, len(signal)).rows)
         self.place = {tuple(row): index for index, row in enumerate(self.every.tolist())}
 
-    def seen(self, pattern: np.ndarray) -> np.ndarray:
+    def pressed(self, effects: tuple) -> np.ndarray:
+        """Change of all readings by the presses, (presses, candidates) V, on a skin with these effects."""
+        loads = np.full((len(self.sites), 1), LOAD)
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "every.toml"
+            path.write_text(je.skin.with_rows(self.skin, self.every).toml, encoding="utf-8")
+            edge = 0.06 if self.smoke else 0.026
+            return pressed(effects, self.sites[:, None], loads, edge, skin=str(path)).change
+
+    def seen(self, pattern: np.ndarray, change: np.ndarray) -> np.ndarray:
         """What a scan reads of the presses, less the untouched skin, without noise, (presses, readings) V."""
         pairs = np.sort(pattern.reshape(-1, 2, 2), 2)
         swap = (pairs[:, 0, 0] > pairs[:, 1, 0])[:, None, None]
         rows = np.where(swap, pairs[:, ::-1], pairs).reshape(-1, 4)
         sign = np.where((pattern[:, 0] > pattern[:, 1]) ^ (pattern[:, 2] > pattern[:, 3]), -1, 1)
-        return np.asarray(sign * self.change[:, [self.place[tuple(row)] for row in rows.tolist()]])
+        return np.asarray(sign * change[:, [self.place[tuple(row)] for row in rows.tolist()]])
 
     def row(self, way: str, pattern: np.ndarray, seconds: float | None = None) -> Row:
         """Errors of the contacts fitted to a scan, beside the bound."""
-        model = je.discretise(je.Scene(je.skin.with_rows(self.skin, pattern)), je.Fidelity.draft())
+        model = self.model_of(pattern, je.Fidelity.standard())
         bound = 1e3 * np.asarray(self.sensitivity.errors(pattern))
         out: Row = {"way": way, "readings": len(pattern), "drives": len(np.unique(np.sort(pattern[:, :2], 1), axis=0))}
         out |= {"frames_per_s": 1 / (len(pattern) * self.skin.protocol.reading_time), "design_s": seconds}
@@ -85,26 +98,35 @@ class Bench:
             "dead_mm": None,
             "dead_fit_mm": None,
         }
-        fitted = self.fitted(model, pattern, 1.0)
-        out |= self.errors(fitted, "fit") | self.errors(self.fitted(model, pattern, LOUD), "loud")
+        quiet, change = self.finder(model, 1.0), self.seen(pattern, self.change)
+        out |= self.errors(self.fitted(quiet, change, 0.0), "exact") | self.errors(self.fitted(quiet, change), "fit")
+        out |= self.errors(self.fitted(self.finder(model, LOUD), change, LOUD), "loud")
         if len(pattern) in DEAD or self.smoke:
             dead = [float(jnp.mean(self.sensitivity.errors(pattern, e))) for e in range(len(self.skin.electrodes))]
-            without = self.fitted(model, pattern, 1.0, (pattern != int(np.argmax(dead))).all(1))
+            without = self.fitted(quiet, np.where((pattern != int(np.argmax(dead))).all(1), change, np.nan))
             out |= {"dead_mm": 1e3 * max(dead), "dead_fit_mm": float(np.nanmean(without))}
         return out
 
-    def fitted(self, model: je.Model, pattern: np.ndarray, louder: float, used: np.ndarray | bool = True) -> np.ndarray:
-        """Errors of the places of fitted contacts, mm, NaN where none is found."""
-        noise = louder * self.noise
+    def model_of(self, pattern: np.ndarray, fidelity: je.Fidelity) -> je.Model:
+        """The skin with another scan, for fits."""
+        fidelity = je.Fidelity.draft() if self.smoke else fidelity
+        return je.discretise(je.Scene(je.skin.with_rows(self.skin, pattern)), fidelity)
+
+    def finder(self, model: je.Model, louder: float) -> je.contacts.ContactFinder:
+        """What finds contacts in frames of this noise."""
         settings = je.contacts.ContactSettings(most=2, columns=21 if self.smoke else 41)
-        fit = je.prepare_contacts(model, settings, noise=np.full(len(pattern), noise))
-        change = self.seen(pattern)
+        return je.prepare_contacts(model, settings, noise=np.full(model.readings, louder * self.noise))
+
+    def frames(self, change: np.ndarray, louder: float) -> Iterator[np.ndarray]:
+        """Draws of the frames, (presses, readings) V each."""
         rng = np.random.default_rng(SEED + 1)
-        errors = []
-        for _ in range(DRAWS):
-            frames = np.where(used, change + noise * rng.normal(size=change.shape), np.nan)
-            errors.append(je.localisation_error(je.contacts.strongest(fit(jnp.asarray(frames))), self.sites))
-        return 1e3 * np.concatenate(errors)
+        for _ in range(DRAWS if louder else 1):
+            yield change + louder * self.noise * rng.normal(size=change.shape)
+
+    def fitted(self, fit: je.contacts.ContactFinder, change: np.ndarray, louder: float = 1.0) -> np.ndarray:
+        """Errors of the places of fitted contacts, mm, NaN where none is found."""
+        found = [je.contacts.strongest(fit(jnp.asarray(frames))) for frames in self.frames(change, louder)]
+        return 1e3 * np.concatenate([je.localisation_error(places, self.sites) for places in found])
 
     def errors(self, fitted: np.ndarray, name: str) -> Row:
         figures = {"mm": np.nanmean, "median_mm": np.nanmedian, "p95_mm": lambda e: np.nanquantile(e, 0.95)}
@@ -147,10 +169,65 @@ def without(run: Run) -> Iterator[Row]:
     bench = Bench(run.smoke)
     yield {"without": []}
     for count in run.sizes(DEAD, (40,)):
+        whole = je.scan.design_scan(bench.sensitivity, count).error
         for electrode in (0, 12):
             kept = bench.every[(bench.every != electrode).all(1)]
             found = je.scan.design_scan(bench.sensitivity, count, candidates=kept)
-            yield {"without": [{"electrode": electrode, "readings": count, "bound_mm": 1e3 * found.error}]}
+            row: Row = {"electrode": electrode, "readings": count, "whole_mm": 1e3 * whole}
+            row |= {"bound_mm": 1e3 * found.error, "loss": found.error / whole - 1}
+            yield {"without": [row]}
+
+
+def floor(run: Run) -> Iterator[Row]:
+    """Where the errors of fits without noise come from, and what fits take in processor time."""
+    bench = Bench(run.smoke)
+    uneven = bench.pressed((je.effects.ContactGain(GAIN, GAIN_LENGTH, seed=SEED),))
+    designed = je.scan.design_scan(bench.sensitivity, 40 if run.smoke else 100).pattern
+    yield {"floor": []}
+    for way, pattern in (("adjacent", bench.skin.protocol.pattern), (DESIGNED, designed)):
+        for mesh in ("draft", "standard"):
+            model = bench.model_of(pattern, getattr(je.Fidelity, mesh)())
+            fit = bench.finder(model, 1.0)
+            about = {"way": way, "readings": len(pattern), "mesh": mesh}
+            yield {"floor": [about | {"fit": "bumps"} | _floor(bench, pattern, uneven, partial(_bumps, bench, fit))]}
+        loads = je.contacts.prepare_loads(model, noise=np.full(len(pattern), bench.noise), sigma=model.background)
+        found = _floor(bench, pattern, uneven, partial(_loads, bench, fit, loads))
+        yield {"floor": [about | {"fit": "loads"} | found]}
+
+
+Fitted = tuple[np.ndarray, float]  # errors, mm, and processor time of a frame, ms
+
+
+def _floor(bench: Bench, pattern: np.ndarray, uneven: np.ndarray, fitted: Callable[[np.ndarray], Fitted]) -> Row:
+    """Mean errors of fits without noise, with noise, and with noise on the uneven contact layer."""
+    out: Row = {}
+    for name, change, louder in (("exact", bench.change, 0.0), ("fit", bench.change, 1.0), ("uneven", uneven, 1.0)):
+        errors, out["frame_ms"] = fitted(next(bench.frames(bench.seen(pattern, change), louder)))
+        out[f"{name}_mm"] = float(np.nanmean(errors))
+    return out
+
+
+def _bumps(bench: Bench, fit: je.contacts.ContactFinder, frames: np.ndarray) -> Fitted:
+    fit(jnp.asarray(frames))  # compiles
+    began = process_time()
+    places = np.asarray(je.contacts.strongest(fit(jnp.asarray(frames))))
+    spent = 1e3 * (process_time() - began) / len(frames)
+    return 1e3 * np.asarray(je.localisation_error(jnp.asarray(places), jnp.asarray(bench.sites))), spent
+
+
+def _loads(bench: Bench, fit: je.contacts.ContactFinder, loads: je.contacts.LoadFitter, frames: np.ndarray) -> Fitted:
+    found = fit(jnp.asarray(frames))
+    chosen = range(0, len(frames), EVERY_OTHER)
+
+    def place(k: int) -> np.ndarray:
+        one = loads(frames[k], jax.tree.map(lambda leaf: leaf[k], found)).one
+        return np.asarray(one.position[0])
+
+    place(0)  # compiles
+    began = process_time()
+    places = np.stack([place(k) for k in chosen])
+    spent = 1e3 * (process_time() - began) / len(chosen)
+    return 1e3 * np.linalg.norm(places - bench.sites[::EVERY_OTHER], axis=1), spent
 
 
 def channels(run: Run) -> Iterator[Row]:
@@ -183,7 +260,9 @@ def ladder(run: Run) -> Iterator[Row]:
         yield {"ladder": [row]}
 
 
-main = Question("design", __doc__, {"rows": measure, "without": without, "channels": channels, "ladder": ladder})
+main = Question(
+    "design", __doc__, {"rows": measure, "without": without, "channels": channels, "ladder": ladder, "floor": floor}
+)
 
 if __name__ == "__main__":
     main()

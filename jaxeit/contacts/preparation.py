@@ -40,9 +40,10 @@ def prepare_contacts(
     """Do everything that does not depend on the frame once: make a finder of contacts.
 
     The finder adds contacts one by one and fits each number of contacts by Levenberg-Marquardt from two starts: the
-    bump that explains most of the rest, and the strongest contact split in two. Where both fits of two contacts end
-    badly, it starts a third from the two bumps that explain most together. With the names of `ContactSettings`, it goes
-    on for as long as
+    bump that explains most of the rest, and the strongest contact split in two. Where the fit of one contact ends
+    badly, as it may beside an electrode, it starts once more from the bump that explains most of those unlike the
+    first; where both fits of two contacts do, a third from the two bumps that explain most together. With the names of
+    `ContactSettings`, it goes on for as long as
 
     - chi-square falls by more than noise alone makes it fall in a fraction ``false_alarm`` of blank frames. The largest
       fall over all places and widths follows ``P(fall > z^2) = 1 - exp(-N (z^2 - 1) exp(-z^2 / 2))``, the Euler
@@ -156,7 +157,7 @@ def _euler_characteristic(square: float) -> float:
 @verb
 def _falls(finder: ContactFinder, y: Float[Array, "n r"]) -> Float[Array, " n"]:
     """Falls of chi-square that one contact makes in frames of noise."""
-    bumps, atoms = finder.bumps(finder.root, finder.whole), finder.atom_table
+    bumps, atoms = finder.bumps(finder.root, finder.whole), finder.atom_table(finder.root, finder.whole)
     none = jnp.zeros((0, 4), y.dtype)
     falls: Array = jax.lax.map(lambda one: one @ one - bumps.fit(one, atoms.one_more(bumps, one, none)).square, y)
     return falls

@@ -22,7 +22,7 @@ from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
 from .fit import Bumps, ContactFit, UnfinishedFit, one_row_each
 from .result import ContactResult, Contacts
-from .starts import Atoms, split
+from .starts import Atoms, lengths_of, split
 
 # Least strength of a contact, over that of the strongest. What is weaker is a ripple of the strongest.
 MIN_RELATIVE_STRENGTH = 0.1
@@ -127,17 +127,17 @@ class ContactFinder(eqx.Module):
         """How a frame depends on contacts."""
         return Bumps(self.responses, self.low, self.high, root, whole)
 
-    @property
-    def atom_table(self) -> Atoms:
-        """Bumps from which contacts are started."""
-        return Atoms(self.atoms, self.starts, self.norms, self.alike)
+    def atom_table(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> Atoms:
+        """Bumps from which contacts are started, as a frame shows them."""
+        lengths = lengths_of(self.atoms, self.norms, root, whole)
+        return Atoms(self.atoms, self.starts, self.norms, self.alike, lengths)
 
     def frame(self, dv: Float[Array, " readings"]) -> Contacts:
         """The contacts in one frame."""
         there = jnp.isfinite(dv) & self.whitening.channels
         seen, whole = self.compressed(dv)
         bumps = self.bumps(seen.root, whole)
-        search = _Search(self, bumps, seen.y)
+        search = _Search(self, bumps, self.atom_table(seen.root, whole), seen.y)
         found = jax.lax.stop_gradient(search).contacts()  # derivatives: see `Bumps.sensitive`
         return self._contacts(bumps, seen, found, jnp.any(there))
 
@@ -200,6 +200,7 @@ class _Search(eqx.Module):
 
     finder: ContactFinder
     bumps: Bumps
+    atoms: Atoms
     y: Float[Array, " r"]
 
     def contacts(self) -> Found:
@@ -258,9 +259,9 @@ class _Search(eqx.Module):
 
         def fitted(fit: ContactFit) -> ContactFit:
             theta, y = one_row_each(fit.flat)[: n - 1], self.y
-            one_more = self.finder.atom_table.one_more(self.bumps, y, theta)
+            one_more = self.atoms.one_more(self.bumps, y, theta)
             if n == 1:
-                return _padded(self.bumps.fit(y, one_more), self.finder.most)
+                return _padded(self._single(one_more), self.finder.most)
             starts = jnp.stack([one_more, split(self.bumps, y, theta)])
             tried = jax.vmap(lambda start: self.bumps.try_out(y, start))(starts)
             # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
@@ -269,17 +270,38 @@ class _Search(eqx.Module):
 
         return fitted
 
+    def _single(self, start: Float[Array, "1 4"]) -> ContactFit:
+        """The fit of one contact; where it does not end well, the better of it and of a fit from another start."""
+        y, bumps = self.y, self.bumps
+        first = bumps.fit(y, start)
+        allowed = self._allowed()
+
+        def again() -> ContactFit:
+            begun = bumps.unstarted(y, self.atoms.other(bumps, y))
+            second = bumps.finish(y, begun, jnp.minimum(allowed, first.square), jnp.asarray(OUTLOOK))
+            better = second.square < first.square
+            chosen: ContactFit = jax.tree.map(lambda a, b: jnp.where(better, a, b), second, first)
+            return chosen
+
+        fit: ContactFit = jax.lax.cond(first.converged & (first.square <= allowed), lambda: first, again)
+        return fit
+
+    def _allowed(self) -> Float[Array, ""]:
+        """Chi-square that a fit of all contacts may leave: noise, which seldom leaves four standard deviations above
+        its mean, and model error."""
+        y = self.y
+        noise = len(y) + MAX_DEVIATIONS * np.sqrt(2 * len(y))
+        allowed: Array = noise + self.finder.model_error**2 * (y @ y)
+        return allowed
+
     def _finished(self, tried: UnfinishedFit, hope: Float[Array, ""], n: int) -> ContactFit:
         """The better of two fits begun, finished, or the first further one that leaves no more than noise and model
         error may. Where no fit leaves so little, something else is wrong, and it is not for more contacts to explain.
 
-        Further fits are the other of the two and, for two contacts, the one from the best pair of atoms. Noise leaves a
-        chi-square, which is seldom four of its standard deviations above its mean.
+        Further fits are the other of the two and, for two contacts, the one from the best pair of atoms.
         """
-        y, bumps = self.y, self.bumps
+        y, bumps, allowed = self.y, self.bumps, self._allowed()
         better = jnp.argmin(tried.square)
-        noise = len(y) + MAX_DEVIATIONS * np.sqrt(2 * len(y))
-        allowed = noise + self.finder.model_error**2 * (y @ y)
         most = 2 + (n == 2)
 
         def unfinished(state: Tried) -> Bool[Array, ""]:
@@ -291,9 +313,7 @@ class _Search(eqx.Module):
             k, before = state
             begun = jax.tree.map(lambda leaf: leaf[(better + k) % 2], tried)
             if n == 2:
-                begun = jax.lax.cond(
-                    k < 2, lambda: begun, lambda: bumps.unstarted(y, self.finder.atom_table.pair(bumps, y))
-                )
+                begun = jax.lax.cond(k < 2, lambda: begun, lambda: bumps.unstarted(y, self.atoms.pair(bumps, y)))
             first = k == 0
             fit = bumps.finish(y, begun, jnp.where(first, hope, allowed), jnp.where(first, 0, OUTLOOK))
             taken = first | (fit.square <= allowed)

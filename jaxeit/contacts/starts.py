@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .fit import Bumps
 
@@ -13,6 +13,10 @@ from .fit import Bumps
 MIN_INDEPENDENT_FRACTION = 0.05
 # Number of atoms, those that explain most alone, of which one is assumed to be in the pair that explains most.
 PAIR_CANDIDATES = 64
+# Largest likeness, by the cosine of the angle between responses, of an atom to that from which a bad fit started.
+MAX_LIKENESS = 0.95
+# Least response of an atom in a frame with missing readings, over the largest one. A weaker atom is not seen.
+MIN_SEEN = 1e-3
 # Number of directions along which a contact is split.
 SPLIT_DIRECTIONS = 4
 # Width of each half of a contact that is split, as a fraction of the contact's own.
@@ -22,32 +26,61 @@ HALF_WIDTH = 0.75
 class Atoms(eqx.Module):
     """Unit responses of bumps all over the sheet, from which contacts are started.
 
-    | meaning                                 | shape  |
-    |-----------------------------------------|--------|
-    | atoms: responses, each of length one    | (b, r) |
-    | starts: their x, y and log width        | (b, 3) |
-    | norms: lengths of the responses         | (b,)   |
-    | alike: products of the atoms            | (b, b) |
+    Where readings are missing, a frame shows only part of each response; ``lengths`` makes the parts comparable.
+
+    | meaning                                                              | shape  |
+    |----------------------------------------------------------------------|--------|
+    | atoms: responses, each of length one                                 | (b, r) |
+    | starts: their x, y and log width                                     | (b, 3) |
+    | norms: lengths of the responses                                      | (b,)   |
+    | alike: products of the atoms                                         | (b, b) |
+    | lengths: of the atoms as the frame shows them; infinite: not seen    | (b,)   |
     """
 
     atoms: Float[Array, "b r"]
     starts: Float[Array, "b 3"]
     norms: Float[Array, " b"]
     alike: Float[Array, "b b"]
+    lengths: Float[Array, " b"]
+
+    def gain(self, bumps: Bumps, y: Float[Array, " r"]) -> Float[Array, " b"]:
+        """Root of the square of y that each atom explains alone; negative where its strength would be."""
+        return self.atoms @ bumps.mixed(y) / self.lengths
+
+    def likeness(self, bumps: Bumps, few: Int[Array, "..."]) -> Float[Array, "... b"]:
+        """Products of a few atoms, by number, with all, each of length one as the frame shows it."""
+
+        def mixed() -> Float[Array, "... b"]:
+            seen = self.atoms[few] @ bumps.root.T @ bumps.root
+            return seen @ self.atoms.T / (self.lengths[few][..., None] * self.lengths)
+
+        found: Array = jax.lax.cond(bumps.whole, lambda: self.alike[few], mixed)
+        return found
 
     def one_more(self, bumps: Bumps, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
         """One contact more: the atom that explains most of what is left."""
-        gain = self.atoms @ bumps.mixed(y - bumps.response(theta)[0] if len(theta) else y)
-        best = jnp.argmax(gain)
-        strength = jnp.maximum(gain[best], 0) / self.norms[best]
-        return jnp.concatenate([theta, jnp.append(self.starts[best], strength)[None]])
+        gain = self.gain(bumps, y - bumps.response(theta)[0] if len(theta) else y)
+        return jnp.concatenate([theta, self._contact(gain, jnp.argmax(gain))[None]])
+
+    def other(self, bumps: Bumps, y: Float[Array, " r"]) -> Float[Array, "1 4"]:
+        """Another start of a single contact: the atom that explains most of those unlike the best one.
+
+        Beside an electrode the narrowest contact is a minimum of its own, to which the best atom may lead.
+        """
+        gain = self.gain(bumps, y)
+        unlike = self.likeness(bumps, jnp.argmax(gain)) < MAX_LIKENESS
+        return self._contact(gain, jnp.argmax(jnp.where(unlike, gain, -jnp.inf)))[None]
+
+    def _contact(self, gain: Float[Array, " b"], atom: Int[Array, ""]) -> Float[Array, "4"]:
+        strength = jnp.maximum(gain[atom], 0) / (self.norms[atom] * self.lengths[atom])
+        return jnp.append(self.starts[atom], strength)
 
     def pair(self, bumps: Bumps, y: Float[Array, " r"]) -> Float[Array, "2 4"]:
         """Two contacts: the atoms that explain most together.
 
         Two contacts of one strength may look most like a single one between them, from which neither is found.
         """
-        gain = self.atoms @ bumps.mixed(y)
+        gain = self.gain(bumps, y)
 
         def explained(alike: Float[Array, " b"], one: Float[Array, ""]) -> Float[Array, " b"]:
             """By an atom of gain ``one`` together with each of all, where both have a strength above zero."""
@@ -56,12 +89,27 @@ class Atoms(eqx.Module):
             return jnp.where(fine, one * first + gain * second, 0) / jnp.maximum(rest, MIN_INDEPENDENT_FRACTION)
 
         few = jax.lax.top_k(gain, min(PAIR_CANDIDATES, len(gain)))[1]
-        j = jnp.argmax(jnp.max(jax.vmap(explained)(self.alike[few], gain[few]), 0))
-        pair = jnp.stack([jnp.argmax(explained(self.alike[j], gain[j])), j])
-        alike = self.alike[pair[0], j]
+        j = jnp.argmax(jnp.max(jax.vmap(explained)(self.likeness(bumps, few), gain[few]), 0))
+        like_j = self.likeness(bumps, j)
+        pair = jnp.stack([jnp.argmax(explained(like_j, gain[j])), j])
+        alike = like_j[pair[0]]
         rest = jnp.maximum(1 - alike**2, MIN_INDEPENDENT_FRACTION)
-        strength = (gain[pair] - alike * gain[pair[::-1]]) / rest / self.norms[pair]
+        strength = (gain[pair] - alike * gain[pair[::-1]]) / rest / (self.norms[pair] * self.lengths[pair])
         return jnp.concatenate([self.starts[pair], jnp.maximum(strength, 0)[:, None]], 1)
+
+
+def lengths_of(
+    atoms: Float[Array, "b r"], norms: Float[Array, " b"], root: Float[Array, "r r"], whole: Bool[Array, ""]
+) -> Float[Array, " b"]:
+    """`Atoms.lengths` of a frame; ``root`` and ``whole`` as in `Bumps`."""
+
+    def mixed() -> Float[Array, " b"]:
+        lengths = jnp.sqrt(jnp.sum((atoms @ root.T) ** 2, 1))
+        seen = norms * lengths
+        return jnp.where(seen > MIN_SEEN * jnp.max(seen), lengths, jnp.inf)
+
+    found: Array = jax.lax.cond(whole, lambda: jnp.ones_like(norms), mixed)
+    return found
 
 
 def split(bumps: Bumps, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
