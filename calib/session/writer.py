@@ -78,15 +78,15 @@ class SessionWriter(FileWriter):
     byte.
 
     Raises:
-        SessionError: for data that the format cannot hold, and for a simulated session in the place of a recording.
+        SessionError: for data that the format cannot hold, and where a recording lies at the path, which would be lost;
+            an imported session, which can be made again, only gives way to one that is not simulated.
     """
 
     session = True
 
     def __init__(self, path: str | os.PathLike[str], facts: SessionFacts):
         super().__init__(Path(path))
-        if facts.simulated:
-            require_no_session(self.path, simulated_too=False)
+        require_no_session(self.path, simulated_too=False, imported_too=facts.simulated)
         self._epoch = _utc(self.path, facts.epoch)
         if facts.simulated and (facts.scene is None or facts.seed is None):
             raise self._problem("scene", "a simulated session does not say how", "give scene, seed")

@@ -254,6 +254,20 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["s.h5"]
 
 
+@pytest.mark.parametrize("creator", [None, "a recorder", "a converter import"])
+def test_a_recording_gives_way_to_nothing(tmp_path: Path, creator: str | None) -> None:
+    """It cannot be made again; an import over an import can."""
+    recorded = {"simulated": False, "scene": None, "seed": None}
+    path = make(tmp_path / "s.h5", **recorded)
+    before = file_hash(path)
+    with pytest.raises(SessionError, match=r"s\.h5: file: holds a recording, which would be lost; give another name"):
+        make(path, 100, creator=creator, **(recorded if creator else {}))
+    assert file_hash(path) == before
+    path = make(tmp_path / "i.h5", creator="a converter import", **recorded)
+    make(path, 100, creator="a converter import", **recorded)
+    assert file_hash(path) != before
+
+
 KILLED = """
 import os, signal, sys
 from datetime import datetime, UTC
