@@ -254,18 +254,31 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["s.h5"]
 
 
-@pytest.mark.parametrize("creator", [None, "a recorder", "a converter import"])
-def test_a_recording_gives_way_to_nothing(tmp_path: Path, creator: str | None) -> None:
-    """It cannot be made again; an import over an import can."""
-    recorded = {"simulated": False, "scene": None, "seed": None}
-    path = make(tmp_path / "s.h5", **recorded)
+def recorded(path: Path, rows: int, **changes: object) -> Path:
+    about = {"simulated": False, "scene": None, "seed": None} | changes
+    with SessionWriter(path, SessionFacts(**options(**about))) as writer:
+        writer.add_stream("eit", StreamFacts("voltage", units="V", channels=3, rate_hz=100))
+        writer.append("eit", *samples(rows)[:2])
+    return path
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"simulated": True, "scene": "[scene]", "seed": 3}, {}, {"creator": "a converter import"}],
+    ids=["simulated", "recorded", "imported"],
+)
+def test_a_recording_gives_way_to_nothing(tmp_path: Path, changes: dict[str, object]) -> None:
+    path = recorded(tmp_path / "s.h5", 200)
     before = file_hash(path)
     with pytest.raises(SessionError, match=r"s\.h5: file: holds a recording, which would be lost; give another name"):
-        make(path, 100, creator=creator, **(recorded if creator else {}))
+        recorded(path, 100, **changes)
     assert file_hash(path) == before
-    path = make(tmp_path / "i.h5", creator="a converter import", **recorded)
-    make(path, 100, creator="a converter import", **recorded)
-    assert file_hash(path) != before
+
+
+def test_an_import_can_be_made_again(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "s.h5", 200, creator="a converter import")
+    before = file_hash(path)
+    assert file_hash(recorded(path, 100, creator="a converter import")) != before
 
 
 KILLED = """
