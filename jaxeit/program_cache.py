@@ -140,7 +140,7 @@ def _program(
             spare = path.with_name(f"{name}.{os.getpid()}")
             spare.write_bytes(sha256(text).digest() + text)
             spare.replace(path)
-    return _runnable(text, dict(options()))
+    return _runnable(text, verb.__name__, dict(options()))
 
 
 def _is_plain(leaves: list[Any]) -> bool:
@@ -178,10 +178,16 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         return None
 
 
-def _runnable(text: bytes, options: dict[str, Any]) -> Callable[[list[Any]], Any]:
-    """The function of the arrays of a call that runs a program."""
+def _runnable(text: bytes, name: str, options: dict[str, Any]) -> Callable[[list[Any]], Any]:
+    """The function of the arrays of a call that runs a program, which has the name of its verb in JAX's reports."""
     program, result = pickle.loads(text)
-    run = jax.jit(deserialize(program).call, compiler_options=options)
+    lowered = deserialize(program).call
+
+    def named(*arrays: Any) -> Any:
+        return lowered(*arrays)
+
+    named.__name__ = name
+    run = jax.jit(named, compiler_options=options)
     leaves, form = jax.tree.flatten(result)
 
     def call(arrays: list[Any]) -> Any:
