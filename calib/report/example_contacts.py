@@ -49,7 +49,7 @@ def example_contacts(calibration: Calibration, image: np.ndarray) -> ExampleCont
     shown, locator = calibration.examples, calibration.locator
     assert shown is not None
     if isinstance(locator, ContactLocator):
-        found = locator.single().finder(np.asarray(shown.dv, calibration.recon.dtype))
+        found = locator.single().contacts_of(np.asarray(shown.dv, calibration.recon.dtype))
         present, position = np.asarray(found.present)[:, 0], np.asarray(found.position)[:, 0]
         covariance = np.asarray(found.covariance)[:, 0, :2, :2] + placement_covariance(calibration)
         return ExampleContacts("fitted", np.where(present[:, None], position, np.nan), covariance)

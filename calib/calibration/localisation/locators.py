@@ -5,7 +5,7 @@ neither mesh nor solver.
 """
 
 import abc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_type_hints
 
@@ -63,6 +63,12 @@ class ContactLocator(AbstractLocator):
     def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
         return self.placed(self.finder(dv), recon, masks)
 
+    def contacts_of(self, dv: ArrayLike) -> je.Contacts:
+        """Contacts of any number of difference frames (n, readings) V, by one program."""
+        found: je.Contacts = _by_rows(self.finder, dv)
+        return found
+
+    @je.verb
     def placed(self, found: je.Contacts, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
         """Convert fitted contacts to `Places`; position and width of absent contacts are NaN."""
         position = jnp.where(found.present[..., None], found.position, jnp.nan)
@@ -74,13 +80,6 @@ class ContactLocator(AbstractLocator):
 
 
 ROWS = 64  # frames that are searched for contacts by one call
-
-
-@je.verb
-def _located(
-    locator: AbstractLocator, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks
-) -> Places:
-    return locator(dv, image, recon, masks)
 
 
 class AbstractLocatorChoice(abc.ABC):
@@ -181,12 +180,17 @@ def locate(
             print(calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position)
     """
     frames = np.asarray(dv, recon.dtype)
-    images = np.asarray(recon(jnp.asarray(frames)) if image is None else image)
-    # The search for contacts takes seconds to compile for each length, so all frames go through it by one length.
-    starts = range(0, max(len(frames), 1), ROWS)
-    parts = [_located(locator, _rows(frames, first), _rows(images, first), recon, masks) for first in starts]
-    places: Places = jax.tree.map(lambda *part: jnp.asarray(np.concatenate(part)[: len(frames)]), *parts)
+    images = recon(jnp.asarray(frames)) if image is None else image
+    places: Places = _by_rows(lambda dv, image: locator(dv, image, recon, masks), frames, images)
     return places
+
+
+def _by_rows(function: Callable[..., Any], *arrays: ArrayLike) -> Any:
+    """``function`` of `ROWS` rows at a time: a search for contacts takes seconds to compile for each number of rows."""
+    given = [np.asarray(array) for array in arrays]
+    starts = range(0, max(len(given[0]), 1), ROWS)
+    parts = [function(*(_rows(array, first) for array in given)) for first in starts]
+    return jax.tree.map(lambda *part: jnp.asarray(np.concatenate(part)[: len(given[0])]), *parts)
 
 
 def _rows(values: np.ndarray, first: int) -> Array:
