@@ -13,6 +13,7 @@ import pytest
 from benchmarks import (
     bench_accuracy,
     bench_calibration,
+    bench_contact_law,
     bench_growth,
     bench_loads,
     bench_pipeline,
@@ -324,6 +325,14 @@ def test_smoke_loads():
     frames = sum(row["frames"] for row in data["rows"])
     assert sum(row["count"] for row in data["reliability"]) == 5 * frames  # kinds
     assert {row["case"].split(",")[0] for row in data["coverage"]} == set(bench_loads.SHAPES)
+
+
+@pytest.mark.slow
+def test_smoke_of_the_law_of_contacts():
+    rows = bench_contact_law.main(["--smoke"])["law"]
+    assert {row["skin"] for row in rows} == set(bench_contact_law.SCENES)
+    for row in rows:  # before anything is learned both ways are one
+        assert row["presses"] or (row["gain error"], row["gain covered"]) == (row["law error"], row["law covered"])
 
 
 @pytest.mark.slow

@@ -9,6 +9,8 @@ from jaxeit.tracking import ContactLaw
 from jaxeit.tracking.contact_law import BEYOND, MOST, SCATTER, SHAPE, SPREAD, SURE, USUAL
 from jaxeit.tracking.tracks import Track
 
+from .conftest import load
+
 TRUE = np.array([0.6, -0.6, 1.4])  # a, b and c of a layer like that of the second simulator
 OWN = np.zeros(3)  # of a layer that the model knows
 LEFT = 0.12  # scatter of what the law leaves
@@ -123,3 +125,21 @@ def test_pads_tell_the_contacts_that_lie_on_them(tracker):
     assert known.tolist() == [False, True, True, True]
     assert not tracker.told_by_pads(on, None).any()
     assert tracker.told_by_pads((), errors).shape == (0,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("power", "helps"), [(1.0, False), (1.8, True)])
+def test_frames_of_the_own_law_are_left_alone_and_those_of_another_law_are_mended(tracker, frame_of, power, helps):
+    """Presses on a layer that feels a power of the force, from the full forward map; the model knows the power one."""
+    rng, law, told = np.random.default_rng(501), ContactLaw.unknown(), []
+    for number in range(24):
+        place, force, width = rng.uniform(0.03, 0.17, 2), rng.uniform(4, 25), rng.uniform(0.009, 0.016)
+        frame = frame_of([load(*place, force, width)], (force / 8) ** (power - 1))
+        found = tracker.step(tracker.start(), frame, tracker.settings.persistence).tracks
+        if number < 16 and len(found) == 1:
+            law = law.told(found[0], force)
+        elif number >= 16:
+            told.append([sum(one.force for one in each) / force for each in (found, map(law.applied, found))])
+    before, after = np.median(np.abs(np.log(told)), 0)
+    assert law.is_better is helps
+    assert after < 0.5 * before if helps else after == before
