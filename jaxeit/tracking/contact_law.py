@@ -2,12 +2,14 @@
 
 Readings tell a force through the law by which pressure makes the contact layer conduct. Where the layer follows another
 law, the force that readings alone tell is wrong by a factor that depends on the force and on the width of the load, and
-no gain of a place can mend that. With ``f`` and ``w`` as readings alone tell them,
+no gain of a place can mend that. With the true force F, and with f and w as readings alone tell force and width,
 
-    log force = log f + a + b log(f / f0) + c log(w / w0) + e,
+    log f = log F + a + b log(F / F0) + c log(w / w0) + e,
 
 where a, b and c and the scatter of e are learned: a linear model with conjugate priors (normal and inverse gamma;
-Gelman et al. 2013, Bayesian Data Analysis, ch. 14), whose updates are exact.
+Gelman et al. 2013, Bayesian Data Analysis, ch. 14), whose updates are exact. The force follows by solving for F. The
+regression is that of readings on force, and not the reverse: its numbers then do not depend on which forces happened to
+press, and presses of one force alone do not teach that every force is that one.
 """
 
 import math
@@ -21,12 +23,13 @@ from ..imaging.noise import InverseError
 from .tracks import Track
 
 # Prior standard deviations of a, b and c, and prior scatter of e, which counts as `SHAPE` times two contacts.
-SPREAD, SCATTER, SHAPE = np.array([0.5, 0.5, 1.0]), 0.15, 1.5
+SPREAD, SCATTER, SHAPE = np.array([1.0, 1.0, 2.0]), 0.3, 1.5
 # Contacts, and log of the ratio of probabilities of their forces with and without the law, from which it is believed:
 # 20 to 1.
 FEWEST, SURE = 5, 3.0
-# How far beyond the logs of force and width from which it was learned the law holds, and its largest log factor.
-BEYOND, MOST = 0.5, 3.0
+# How far beyond the logs of force and width from which it was learned the law holds; its largest log factor; and the
+# least slope 1 + b, below which readings hardly tell a force.
+BEYOND, MOST, LEAST_SLOPE = 0.5, 3.0, 0.3
 USUAL = np.log([LoadSettings().force, LoadSettings().width])
 
 
@@ -39,8 +42,9 @@ class ContactLaw(NamedTuple):
     | covariance of these, in units of the variance of e                          | (3, 3) | 1    |
     | shape, rate: of the inverse gamma distribution of the variance of e         | ()     | 1    |
     | plain: that rate if a, b and c were zero                                    | ()     | 1    |
-    | evidence: log ratio of the probabilities of all forces with the law and without | () | 1    |
-    | low, high: least and largest log of force and width learned from            | (2,)   | 1    |
+    | evidence: log ratio of the probabilities of what readings told of all contacts, | () | 1    |
+    |   with the law and without                                                  |        |      |
+    | low, high: least and largest logs of force and width learned from           | (2,)   | 1    |
     | contacts: number of contacts that it was learned from                       |        |      |
 
     Example:
@@ -68,20 +72,30 @@ class ContactLaw(NamedTuple):
 
     @property
     def is_better(self) -> bool:
-        """Whether the forces of contacts so far were more probable with the law than without, each before it was told.
+        """Whether what readings told of contacts so far was more probable with the law than without, each before it was
+        told.
 
         Where the law of the model is right this stays false, and nothing is changed.
         """
         return self.contacts >= FEWEST and self.evidence > SURE
 
+    @property
+    def slope(self) -> float:
+        """Of the log force that readings alone tell in the log of the true force."""
+        return max(1 + float(self.mean[1]), LEAST_SLOPE)
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of e."""
+        return math.sqrt(self.rate / (self.shape - 1))
+
     def render(self) -> str:
         """By which law readings alone tell the force, in one line."""
         if not self.is_better:
             return f"as the model tells it; {self.contacts} contacts do not speak for another law"
-        error = 100 * math.sqrt(self.rate / (self.shape - 1))
         return (
-            f"goes as the power {1 + self.mean[1]:.2f} of the model's force and the power {self.mean[2]:.2f} of the "
-            f"width, learned from {self.contacts} contacts; standard error {error:.0f} %"
+            f"the model's force goes as the power {self.slope:.2f} of the true force and {self.mean[2]:.2f} of the "
+            f"width, learned from {self.contacts} contacts; standard error {100 * self.scatter / self.slope:.0f} %"
         )
 
     def told(self, seen: Track, force: float) -> "ContactLaw":
@@ -96,7 +110,7 @@ class ContactLaw(NamedTuple):
         """
         if not (0 < force < math.inf and 0 < seen.force < math.inf):
             raise InverseError(f"forces {seen.force} and {force} N do not tell a law; give numbers above zero")
-        row, error = np.log([seen.force, seen.width]), math.log(force / seen.force)
+        row, error = np.log([force, seen.width]), math.log(seen.force / force)
         x = _terms(row)
         along = self.covariance @ x
         spread, left = 1 + float(x @ along), error - float(x @ self.mean)
@@ -137,12 +151,15 @@ class ContactLaw(NamedTuple):
         """
         if not self.is_better:
             return track
-        row = np.clip(np.log([track.force, track.width]), self.low - BEYOND, self.high + BEYOND)
-        x = _terms(row)
-        # Student's distribution of 2 shape degrees of freedom, by its variance.
-        variance = self.rate / (self.shape - 1) * (1 + float(x @ self.covariance @ x))
-        factor = math.exp(float(np.clip(x @ self.mean, -MOST, MOST)))
-        return track._replace(force=track.force * factor, log_force_error=math.sqrt(variance))
+        seen, width = np.log([track.force, track.width]) - USUAL
+        low, high = self.low - USUAL - BEYOND, self.high - USUAL + BEYOND
+        width = float(np.clip(width, low[1], high[1]))
+        within = float(np.clip((seen - self.mean[0] - self.mean[2] * width) / self.slope, low[0], high[0]))
+        factor = -(self.mean[0] + (self.slope - 1) * within + self.mean[2] * width)
+        x = np.array([1.0, within, width])
+        error = self.scatter * math.sqrt(1 + float(x @ self.covariance @ x)) / self.slope
+        force = track.force * math.exp(float(np.clip(factor, -MOST, MOST)))
+        return track._replace(force=force, log_force_error=error)
 
     def without_pads(self, tracks: tuple[Track, ...], told: Bool[np.ndarray, " n"]) -> tuple[Track, ...]:
         """Contacts of which some are told by pads (`Tracker.told_by_pads`), with the law for the others."""

@@ -12,14 +12,14 @@ from ..archives.arrays import shaped
 _ABOUT = {
     "mean": (
         (3,),
-        "of a, b and c: log of the force over that by readings, and its slopes in the logs of force and width",
+        "of a, b and c: log of the force by readings over the true one, and its slopes in the logs of force and width",
     ),
     "covariance": ((3, 3), "of these, in units of the variance of what the law leaves"),
     "shape": ((), "of the inverse gamma distribution of that variance"),
     "rate": ((), "of the same"),
     "plain": ((), "rate of the same without the law"),
-    "evidence": ((), "log ratio of the probabilities of all forces with the law and without"),
-    "low": ((2,), "least logs of force, N, and width, m, by readings, that it was learned from"),
+    "evidence": ((), "log ratio of the probabilities of what readings told with the law and without"),
+    "low": ((2,), "least logs of force, N, and width, m, that it was learned from"),
     "high": ((2,), "largest logs of these"),
 }
 _POSITIVE = ("shape", "rate", "plain")
