@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import calib
+from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import ContactTracks
 from calib.calibration.localisation.law_lessons import LawLessons
 from calib.live.follower import LiveFollower
 from calib.session import SessionError, read_archive, write_archive
-from jaxeit.tracking import ContactLaw, Track, Tracker, TrackerSettings, Tracking
+from jaxeit.tracking import ContactLaw, TimedTracks, Track, Tracker, TrackerSettings, Tracking
 
 from ..helpers import stand_in
 
@@ -22,7 +23,7 @@ def track(force, number=1, place=PLACE):
     return Track(number, place, 1e-6 * np.eye(2), WIDTH, force, 0.3, np.zeros(2), np.zeros(2))
 
 
-def known(seed, count=20):
+def known_law(seed, count=20):
     """A law after contacts that readings tell twice too strong."""
     law = ContactLaw.unknown()
     for force in np.random.default_rng(seed).uniform(4, 25, count):
@@ -67,7 +68,7 @@ def followed(forces, *, pads=True, law=None, watch=lambda *_: None, tracker=None
 
 
 def test_a_calibration_keeps_the_law_and_one_without_opens(calibration, tmp_path):
-    law = known(401)
+    law = known_law(401)
     replace(calibration, contact_law=law).save(tmp_path / "c.h5")
     found = calib.load_calibration(tmp_path / "c.h5").contact_law
     for name in ContactLaw._fields:
@@ -90,7 +91,7 @@ def test_a_calibration_keeps_the_law_and_one_without_opens(calibration, tmp_path
 )
 def test_a_damaged_law_is_refused(calibration, tmp_path, name, change, message):
     path, kind = tmp_path / "c.h5", "skin-calibration"
-    replace(calibration, contact_law=known(402)).save(path)
+    replace(calibration, contact_law=known_law(402)).save(path)
     whole = read_archive(path, kind)
     of_the_format = ("format", "format_version", "Conventions", "complete", "seal_sha256")
     attrs = {k: v for k, v in whole.attrs.items() if k not in of_the_format}
@@ -122,7 +123,7 @@ def test_contacts_that_no_pad_tells_teach_nothing():
 
 
 def test_forces_follow_the_law_where_no_pad_tells_them():
-    law = known(403)
+    law = known_law(403)
     without, by_law = (followed([10, 10], pads=False, law=one) for one in (None, law))
     np.testing.assert_allclose(without["force"], 10 / WEAKER)
     np.testing.assert_allclose(by_law["force"], 10, rtol=0.1)
@@ -131,8 +132,33 @@ def test_forces_follow_the_law_where_no_pad_tells_them():
     np.testing.assert_array_equal(told["force"], 10)
 
 
+class Late:
+    """Gives each frame back after the next one, as a smoother of lag one."""
+
+    def __init__(self, tracker):
+        self.frames = []
+
+    def add(self, time, now, seconds):
+        self.frames.append(TimedTracks(time, now.tracks))
+        return [self.frames[-2]] if len(self.frames) > 1 else []
+
+    def end(self):
+        return self.frames[-1:]
+
+
+def test_smoothed_forces_follow_the_law_by_the_pads_of_their_own_frame(monkeypatch):
+    """No pad tells anything in the second of three frames."""
+    monkeypatch.setattr(contact_tracks, "Smoother", Late)
+    tracks, known = ContactTracks(FakeTracker(), law=known_law(405)), np.array([1.0, np.nan, 1.0])[:, None] * np.ones(4)
+    rows = [tracks.add(SECOND // 10 * np.arange(3), np.full((3, 1), 10.0), known, known), tracks.end()]
+    force = np.concatenate([each["force"] for each in rows])
+    np.testing.assert_array_equal(force[[0, 2]], 10)
+    assert force[1] == pytest.approx(10, rel=0.1)
+    assert force[1] != 10
+
+
 def test_live_follows_the_law(calibration):
-    follower = LiveFollower(replace(calibration, contact_law=known(404)), lambda *_: FakeTracker())
+    follower = LiveFollower(replace(calibration, contact_law=known_law(404)), lambda *_: FakeTracker())
     follower._tracker = FakeTracker()
     dark, lit = np.full(4, np.nan), np.ones(4)
     change = np.full(calibration.recon.readings, 10.0)
