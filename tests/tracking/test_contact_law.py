@@ -142,18 +142,13 @@ def test_pads_tell_the_contacts_that_lie_on_them(tracker):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("power", "helps"), [(1.0, False), (1.8, True)])
-def test_frames_of_the_own_law_are_left_alone_and_those_of_another_law_are_mended(tracker, frame_of, power, helps):
-    """Presses on a layer that feels a power of the force, from the full forward map; the model knows the power one."""
-    rng, law, told = np.random.default_rng(501), ContactLaw.unknown(), []
-    for number in range(24):
+def test_frames_of_the_librarys_own_law_are_left_alone(tracker, frame_of):
+    """Presses from the full forward map, each told by its readings alone."""
+    rng, law = np.random.default_rng(501), ContactLaw.unknown()
+    for _ in range(16):
         place, force, width = rng.uniform(0.03, 0.17, 2), rng.uniform(4, 25), rng.uniform(0.009, 0.016)
-        frame = frame_of([load(*place, force, width)], (force / 8) ** (power - 1))
+        frame = frame_of([load(*place, force, width)])
         found = tracker.step(tracker.start(), frame, tracker.settings.persistence).tracks
-        if number < 16 and len(found) == 1:
-            law = law.told(found[0], force)
-        elif number >= 16:
-            told.append([sum(one.force for one in each) / force for each in (found, map(law.applied, found))])
-    before, after = np.median(np.abs(np.log(told)), 0)
-    assert law.is_better is helps
-    assert after < 0.5 * before if helps else after == before
+        law = law.told(found[0], force) if len(found) == 1 else law
+    assert law.contacts > 8
+    assert not law.is_better
