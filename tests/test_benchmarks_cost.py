@@ -13,6 +13,7 @@ import pytest
 from benchmarks import (
     bench_accuracy,
     bench_calibration,
+    bench_contact_law,
     bench_growth,
     bench_loads,
     bench_pipeline,
@@ -324,6 +325,15 @@ def test_smoke_loads():
     frames = sum(row["frames"] for row in data["rows"])
     assert sum(row["count"] for row in data["reliability"]) == 5 * frames  # kinds
     assert {row["case"].split(",")[0] for row in data["coverage"]} == set(bench_loads.SHAPES)
+
+
+@pytest.mark.slow
+def test_smoke_of_the_law_of_contacts():
+    data = bench_contact_law.main(["--smoke"])
+    for scene in bench_contact_law.SCENES:
+        first = data[scene][0]  # before anything is learned both ways are one
+        assert first["presses"] == first["used"] == 0
+        assert (first["gain error"], first["gain covered"]) == (first["law error"], first["law covered"])
 
 
 @pytest.mark.slow

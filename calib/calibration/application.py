@@ -186,7 +186,9 @@ class _Tracks:
         self._writer, self._why = writer, ""
         self._tracks: ContactTracks | None = None
         try:
-            self._tracks = ContactTracks(quiet_tracker(calibration, blocks), layer=calibration.layer)
+            self._tracks = ContactTracks(
+                quiet_tracker(calibration, blocks), layer=calibration.layer, law=calibration.contact_law
+            )
         except NotFollowed as error:
             self._why = f"contacts: none followed: {error}"
             return

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 import jaxeit as je
 from jaxeit.notebook import card
-from jaxeit.tracking import LearnedLayer
+from jaxeit.tracking import ContactLaw, LearnedLayer
 
 from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
@@ -63,6 +63,8 @@ class Calibration:
     | recalibration: how pads have moved since; None: never recalibrated       |
     | layer: gain of the contact layer, by which contacts are followed; None:  |
     |   not learned (`learn_layer`)                                            |
+    | contact_law: by which readings tell a contact's force where no pad does; |
+    |   None: not learned (`learn_layer`)                                      |
     | electrodes: how far they sit from where the skin's file said; None:      |
     |   taken from the file                                                    |
 
@@ -95,6 +97,7 @@ class Calibration:
     rest: np.ndarray | None = None
     recalibration: Recalibration | None = None
     layer: LearnedLayer | None = None
+    contact_law: ContactLaw | None = None
     electrodes: PlacedElectrodes | None = None
 
     @cached_property
@@ -173,6 +176,8 @@ class Calibration:
             rows.append(("recalibrated", "yes"))
         if self.layer is not None:
             rows.append(("gain of the contact layer", f"learned from {self.layer.contacts} contacts"))
+        if self.contact_law is not None:
+            rows.append(("force without pads", self.contact_law.render()))
         rows += [("note", note) for note in self.notes]
         drawing = self.skin.drawing
         drawing.crosses(found.position)

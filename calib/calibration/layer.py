@@ -14,6 +14,7 @@ from .calibration import Calibration
 from .force_maps import USED
 from .frame_blocks import FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import ContactTracks, NotFollowed, probe_presses, quiet_tracker
+from .localisation.law_lessons import LawLessons
 
 # Share of what was learned before that each new session forgets: skins age between sessions, and errors of the model
 # that last for a session are in no covariance.
@@ -28,10 +29,11 @@ def learn_layer(
     ignore_errors: bool = False,
     progress: Progress = iter,
 ) -> Calibration:
-    """The calibration with what the contacts of a session tell of the contact layer's gain.
+    """The calibration with what the contacts of a session tell of the contact layer: its gain, and the contacts' law.
 
-    Contacts are followed through the session as `apply` follows them, with the forces on the pads as data. What was
-    learned before is the start, less `FORGOTTEN` of it. `apply` and `live` then follow contacts with the result.
+    Contacts are followed through the session as `apply` follows them, with the forces on the pads as data. Each is also
+    told by its readings alone: how that force differs from the pads' is the law (`jaxeit.tracking.ContactLaw`). What
+    was learned before is the start, less `FORGOTTEN` of it. `apply` and `live` then follow contacts with the result.
 
     Args:
         processing: how the session is corrected; default: as the sessions of the calibration.
@@ -54,11 +56,13 @@ def learn_layer(
     accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     blocks = FrameBlocks(session, processing, levels)
     before = None if calibration.layer is None else calibration.layer.aged(FORGOTTEN)
+    law = None if calibration.contact_law is None else calibration.contact_law.aged(FORGOTTEN)
     try:
         tracker = quiet_tracker(calibration, blocks)
     except NotFollowed as error:
         raise SessionError(f"{session.name}: {error}; record a second without contact") from None
-    tracks = ContactTracks(tracker, smooth=False, layer=before)
+    lessons = LawLessons(tracker, before, law)
+    tracks = ContactTracks(tracker, smooth=False, layer=before, watch=lessons)
     for block, found in estimated(calibration, progress(blocks)):
         tracks.add(block.time, block.change, found.force, found.standard_error)
     learned = tracks.learned()
@@ -69,7 +73,7 @@ def learn_layer(
             "the presses of the calibration are less probable with what was learned of the contact layer than without"
         )
         raise SessionError(f"{session.name}: {what}; calibrate again, or leave the layer as it is (no --learn-layer)")
-    return replace(calibration, layer=learned)
+    return replace(calibration, layer=learned, contact_law=lessons.law())
 
 
 def _is_better(calibration: Calibration, tracker: Tracker, learned: LearnedLayer, before: LearnedLayer | None) -> bool:

@@ -88,7 +88,10 @@ class LiveFollower:
         before = self._tracker.start(self._layer) if self._now is None else self._now
         self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error), whole=False)
         self._last = host
-        return self._on_sheet(self._now.tracks)
+        tracks, law = self._now.tracks, self._calibration.contact_law
+        if law is not None:
+            tracks = law.without_pads(tracks, self._tracker.told_by_pads(tracks, pad_errors(force, error)))
+        return self._on_sheet(tracks)
 
     def _on_sheet(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:
         """Without those that have left the sheet, which happens while an unexpected frame is looked into."""

@@ -97,7 +97,7 @@ def calibration_pictures(calibration: Calibration, evaluations: Mapping[str, Eva
         gain, about = png(gain_figure(calibration)), about_gain(calibration.field)
         pictures.append(Picture("gain", "Gain by location", gain, *about, gain_panels(calibration)))
     if calibration.layer is not None:
-        maps, about = png(layer_figure(calibration)), about_layer(calibration.layer)
+        maps, about = png(layer_figure(calibration)), about_layer(calibration.layer, calibration.contact_law)
         pictures.append(Picture("layer", "Contact layer", maps, *about, layer_panels(calibration)))
     if calibration.electrodes is not None:
         shifts, about = png(electrodes_figure(calibration)), about_electrodes(calibration)

@@ -35,6 +35,7 @@ Example:
 
 from .belief.layer import GainField, LearnedLayer
 from .compilation import compile_tracker
+from .contact_law import ContactLaw
 from .model_error import fit_model_error, press_evidence
 from .settings import TrackerSettings
 from .smoothing import Smoother, TimedTracks
@@ -42,6 +43,7 @@ from .tracker import Tracker, prepare_tracker
 from .tracks import Track, Tracking
 
 __all__ = [
+    "ContactLaw",
     "GainField",
     "LearnedLayer",
     "Smoother",

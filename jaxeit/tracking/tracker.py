@@ -25,7 +25,7 @@ from .events import Events
 from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
 from .preparation import prepare_filter
 from .settings import TrackerSettings
-from .tracks import Backlog, Look, Seen, Tracking
+from .tracks import Backlog, Look, Seen, Track, Tracking
 
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
 # of the belief changes by much more than it may.
@@ -34,6 +34,8 @@ UNEXPECTED, SURPRISING = 4.0, 25.0
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
 PATIENCE, WORSE = 10, 1.3
+# Share of a load on pads that tell forces, from which the pads tell the force of a contact.
+TOLD = 0.25
 
 
 class Tracker:
@@ -78,6 +80,24 @@ class Tracker:
         """
         before = 0 if layer is None else layer.contacts
         return LearnedLayer.of_belief(self.field, now.belief.gain, now.belief.covariance, before + now.begun)
+
+    def told_by_pads(
+        self, tracks: tuple[Track, ...], pad_errors: Float[ArrayLike, " pads"] | None = None
+    ) -> Bool[np.ndarray, " n"]:
+        """Of which contacts pads tell the force, (n,): at least `TOLD` of the load lies on pads whose force is known.
+
+        Args:
+            pad_errors: as for `step`; not finite for a pad that tells no force.
+        """
+        if pad_errors is None or not tracks:
+            return np.zeros(len(tracks), bool)
+        sheet, known = self.filter.sheet, np.isfinite(np.asarray(pad_errors, float))
+        area, pixels = np.asarray(sheet.pad_area)[:, known].sum(1), np.asarray(sheet.pixels)
+        places, width = np.array([one.position for one in tracks]), np.array([one.width for one in tracks])
+        width = np.maximum(width, np.sqrt(self.area / len(pixels)))  # narrower loads would fall between pixels
+        square = ((places[:, None] - pixels) ** 2).sum(-1)
+        load = np.exp(-0.5 * square / width[:, None] ** 2) / (2 * np.pi * width[:, None] ** 2)
+        return np.asarray(load @ area >= TOLD)
 
     def step(
         self,

@@ -163,7 +163,9 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker
     old, new, out = (str(tmp_path / name) for name in ("old.h5", "new.h5", "out.h5"))
     calibration.save(old)
     assert main(["recalibrate", old, str(session), "-o", new, "--learn-layer"]) == 0
-    assert f"learned from {CONTACTS} contacts" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"learned from {CONTACTS} contacts" in told
+    assert "force without pads: as the model tells it; 0 contacts do not speak for another law" in told
     assert main(["apply", new, str(session), "-o", out, "--track"]) == 0
     assert tracker.started[-1].contacts == CONTACTS
     assert main(["recalibrate", new, str(session), "-o", out, "--learn-layer", "--json"]) == 2

@@ -30,7 +30,7 @@ from calib.report.figures.pads import curves_figure, gain_figure, loops_figure
 from calib.report.figures.parts import ReportError, png
 from calib.report.figures.presses import localisation_figure, sensitivity_figure
 from jaxeit.contacts.loads.settings import LoadSettings
-from jaxeit.tracking import GainField, LearnedLayer
+from jaxeit.tracking import ContactLaw, GainField, LearnedLayer
 
 HOSTILE = "\u65e5 $x^$ <script>alert(1)</script> & 'pad' \"\x00"  # the start is what fits into a figure
 SLOPE = 0.01  # N/Pa
@@ -480,9 +480,10 @@ def test_a_layer_that_was_learned_has_two_maps(located, written, tmp_path):
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
     field = GainField.over(corners, np.random.default_rng(0).uniform(0, 0.2, (99, 2)), LoadSettings(), 0.3)
     layer = LearnedLayer.unknown(field)._replace(mean=np.linspace(-1, 1, len(field.places)), contacts=12)
-    known = replace(located, layer=layer)
+    known = replace(located, layer=layer, contact_law=ContactLaw.unknown()._replace(contacts=12))
     page, *files = write_report(known, tmp_path / "r.html")
     assert "as told by 12 contacts" in page.read_text()
+    assert "as the model tells it; 12 contacts do not speak for another law." in page.read_text()
     assert tmp_path / "r_layer.png" in files
     assert not any("layer" in path.name for path in written)
     gain, spread = layer_maps(layer, known.recon)

@@ -24,6 +24,7 @@ from ...session import Archive
 from ..evaluation import Evaluation
 from ..hysteresis_loops import Loops
 from ..localisation.electrode_places import PlacedElectrodes
+from ..localisation.law_arrays import law_arrays, law_from
 from ..localisation.layer_arrays import layer_arrays, layer_from
 from ..localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
 from ..press_examples import PressExamples
@@ -93,6 +94,8 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         arrays |= cal.recalibration.arrays()
     if cal.layer is not None:
         arrays |= layer_arrays(cal.layer)
+    if cal.contact_law is not None:
+        arrays |= law_arrays(cal.contact_law)
     if cal.electrodes is not None:
         arrays |= cal.electrodes.arrays()
     given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
@@ -253,6 +256,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "rest": shaped(arrays, "pads/rest", (len(skin.pads),), "f") if "pads/rest" in arrays else None,
         "recalibration": Recalibration.restore(attrs, arrays, len(skin.pads)),
         "layer": layer_from(arrays),
+        "contact_law": law_from(arrays),
         "electrodes": PlacedElectrodes.restore(arrays, len(skin.electrodes)),
         "tried": tuple(Candidate(**candidate) for candidate in json.loads(str(attrs.get("tried", "[]")))),
     }
@@ -342,6 +346,7 @@ _COVARIANCES = (
     "location/covariance",
     "recalibration/covariance",
     "layer/covariance",
+    "contact_law/covariance",
     "electrodes/covariance",
 )
 

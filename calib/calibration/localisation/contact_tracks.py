@@ -4,14 +4,15 @@ The untouched sheet and the noise are those of the session's own frames without 
 their standard errors, by the calibration, are data of each frame beside its readings.
 """
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 import jaxeit as je
-from jaxeit.tracking import LearnedLayer, Smoother, TimedTracks, Track, Tracker
+from jaxeit.tracking import ContactLaw, LearnedLayer, Smoother, TimedTracks, Track, Tracker, Tracking
 
 from ..calibration import Calibration
 from ..frame_blocks import FrameBlocks
@@ -85,11 +86,28 @@ def pad_errors(force: Float[np.ndarray, "*n pads"], error: Float[np.ndarray, "*n
 
 
 class ContactTracks:
-    """Follows contacts block by block, and gives back rows of the arrays `ABOUT`, one for each contact of a frame."""
+    """Follows contacts block by block, and gives back rows of the arrays `ABOUT`, one for each contact of a frame.
 
-    def __init__(self, tracker: Tracker, *, smooth: bool = True, layer: LearnedLayer | None = None):
+    Args:
+        smooth: each frame is told by later ones too.
+        layer: gain of the contact layer, as it was learned before.
+        law: by which readings tell the force where no pad does; default: that of the tracker.
+        watch: called after each frame, with what is known then, the change of the frame, and the errors of the pads.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        *,
+        smooth: bool = True,
+        layer: LearnedLayer | None = None,
+        law: ContactLaw | None = None,
+        watch: Callable[[Tracking, np.ndarray, np.ndarray], None] = lambda *_: None,
+    ):
         self._tracker, self._layer, self._now = tracker, layer, tracker.start(layer)
         self._smoother = Smoother(tracker) if smooth else None
+        self._law, self._watch = law, watch
+        self._errors: deque[tuple[int, np.ndarray]] = deque()  # of pads, of frames that are still to be smoothed
         self._last: int | None = None
         self._lives: dict[int, tuple[int, int]] = {}
         self._most = 0
@@ -117,12 +135,26 @@ class ContactTracks:
     def _followed(self, time: int, change: np.ndarray, force: np.ndarray, error: np.ndarray) -> Iterable[TimedTracks]:
         seconds = MIN_SECONDS if self._last is None else max((time - self._last) / 1e9, MIN_SECONDS)
         self._last = time
-        self._now = self._tracker.step(self._now, change, seconds, force, pad_errors(force, error))
+        errors = pad_errors(force, error)
+        self._now = self._tracker.step(self._now, change, seconds, force, errors)
+        self._watch(self._now, change, errors)
+        if self._law is not None:
+            self._errors.append((time, errors))
         if self._smoother is None:
             return [TimedTracks(self._last, self._now.tracks)]
         return list(self._smoother.add(self._last, self._now, seconds))
 
+    def _by_law(self, found: TimedTracks) -> TimedTracks:
+        """With the force by the law of each contact of which no pad tells the force."""
+        if self._law is None:
+            return found
+        time, errors = self._errors.popleft()
+        assert time == found.time
+        told = self._tracker.told_by_pads(found.tracks, errors)
+        return found._replace(tracks=self._law.without_pads(found.tracks, told))
+
     def _rows(self, found: Iterable[TimedTracks]) -> Rows:
+        found = map(self._by_law, found)
         rows = [_row(time, track) for time, tracks in found for track in self._noted(time, tracks)]
         return {name: np.array([row[name] for row in rows]).reshape(-1, *about.shape) for name, about in ABOUT.items()}
 

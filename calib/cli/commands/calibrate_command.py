@@ -85,6 +85,8 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         print(f"  note: {note}")
     if calibration.layer is not None:
         print(f"  {render_layer(calibration.layer, calibration.recon)}")
+    if calibration.contact_law is not None:
+        print(f"  force without pads: {calibration.contact_law.render()}")
     for name, found in tried.items():
         print("\n" + render_table(found, title(name, tests[name].simulated)))
     print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))

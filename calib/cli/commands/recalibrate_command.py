@@ -60,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
     print(found.to_json() if args.json else f"{heading}\n{render(found)}")
     if moved.layer is not None and not args.json:
         print(render_layer(moved.layer, moved.recon))
+    if moved.contact_law is not None and not args.json:
+        print(f"force without pads: {moved.contact_law.render()}")
     return 0
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import jaxeit as je
-from jaxeit.tracking import LearnedLayer
+from jaxeit.tracking import ContactLaw, LearnedLayer
 
 from ...calibration import Calibration
 from ..html_parts import number_text
@@ -54,8 +54,8 @@ def layer_figure(calibration: Calibration) -> "Figure":
     return figure
 
 
-def about_layer(layer: LearnedLayer) -> tuple[str, str]:
-    """Alternative text and caption."""
+def about_layer(layer: LearnedLayer, law: ContactLaw | None) -> tuple[str, str]:
+    """Alternative text and caption; with the law of contacts, if one was learned."""
     alt = "Two maps of the sheet: the gain of the contact layer, and its standard deviation."
     level = number_text(100 * layer.field.deviation, 0)
     caption = (
@@ -63,7 +63,7 @@ def about_layer(layer: LearnedLayer) -> tuple[str, str]:
         "pads knew; 1 is the layer of the model. Contacts are followed with it. Where nobody pressed, the standard "
         f"deviation is that of a layer of which nothing is known, {level} % or more: press there."
     )
-    return alt, caption
+    return alt, caption if law is None else f"{caption} Force where no pad tells it: {law.render()}."
 
 
 def _drawn(calibration: Calibration) -> list[tuple[np.ndarray, tuple[float, float, str]]]:

@@ -1,0 +1,183 @@
+"""The force of a contact from its readings alone, before and after the law of contacts is learned.
+
+Single presses of 4 to 25 N anywhere on a skin. Up to 120 of them teach, with pads that tell their forces to 3 % and
+0.1 N, by the programs of `learn_layer`: contacts are followed, the gain of the contact layer and the law are learned.
+Then other presses rest for half a second, and no pad tells anything. They are followed by the programs of
+`apply --track`, once with the gain alone and once with the law as well. The tracker's model error is that of 24 of the
+presses, as in a calibration; the untouched sheet is fitted to a frame.
+
+second simulator: skins of `tests/oracles/bench`, which shares no code with the library: protrusions one by one,
+Boussinesq's stress, tips of 6 to 30 mm. own scenes: the library's law on another mesh, with an uneven coat and an
+uneven contact layer, Gaussian loads of 8 to 18 mm: nothing is to be learned but the gain.
+
+Force: median and 90th percentile of the relative error of the sum of all contacts. covered: forces within the 90 %
+interval that the standard error states. skins: those on which the law is used.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxeit as je
+from calib.calibration.localisation.contact_tracks import ContactTracks
+from calib.calibration.localisation.law_lessons import LawLessons
+from calib.calibration.localisation.load_windows import FIDELITY
+from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking, fit_model_error, prepare_tracker
+
+from .force_ways import HELD, LIFTED, PAD_ERROR, SECONDS
+from .harness import Question, Run
+from .problems import BLANKS
+from .rows import Row, grouped
+from .worn_skins import FORCES, Wear, presses, recorded, true_map
+
+FIRST_SEED = 7300
+# Presses after which the force is asked, and skins.
+STAGES = {"second simulator": (0, 10, 30, 120), "own scenes": (0, 10, 30)}
+SKINS = {"second simulator": 3, "own scenes": 2}
+PROBES = 24  # presses that tell the model error
+RESTING = 10  # frames of a contact that no pad tells
+WIDTHS = (0.008, 0.018)  # m, of Gaussian loads
+INTERVAL = 1.645  # standard errors in half a 90 % interval
+SNR = 1e-3  # noise of a reading over the root mean square of the readings
+
+
+class Skin(NamedTuple):
+    """Presses on a skin: changes of frames (n, readings) V, forces (n,) and forces on pads (n, pads) N; noise of the
+    readings (readings,) V; and the model's sheet (elements,) S, fitted to an untouched frame."""
+
+    changes: np.ndarray
+    forces: np.ndarray
+    pads: np.ndarray
+    noise: np.ndarray
+    sheet: np.ndarray
+
+
+def second_simulator(model: je.Model, seed: int, count: int) -> Skin:
+    """A skin that shares no code with the library."""
+    rng = np.random.default_rng([seed, 17])
+    given = presses(rng, count)
+    found = recorded(seed, given, Wear())
+    noise = np.full(found.untouched.size, found.noise)
+    blank = found.untouched + noise / np.sqrt(BLANKS) * rng.normal(size=noise.size)
+    image = je.prepare(model, basis=je.Pixels(20), noise=noise)
+    masks, centres = np.asarray(je.pad_masks(je.load_skin("testbed"), image).weights), np.asarray(image.centres)
+    pads = np.array([true_map(press, centres) for press in given]) @ masks.T
+    forces = np.array([press.forces.sum() for press in given])
+    return Skin(found.change, forces, pads, noise, np.asarray(je.fit_background(model, blank)))
+
+
+def own_scene(model: je.Model, seed: int, count: int) -> Skin:
+    """A skin whose contacts follow the law that the tracker takes for granted."""
+    rng, skin = np.random.default_rng([seed, 23]), je.load_skin("testbed")
+    effects = (
+        je.effects.LoadSpreading(),
+        je.effects.CoatingNonUniformity(seed=seed),
+        je.effects.ContactGain(seed=seed),
+        je.effects.ContactPiezoresistance(),
+    )
+    true = je.discretise(je.Scene(skin, effects), je.Fidelity.standard())
+    v0 = np.asarray(je.forward(true, je.conductivity(true)))
+    places, forces = rng.uniform(0.02, 0.18, (count, 2)), rng.uniform(*FORCES, count)
+    spread = [je.model.load_spread(true, *one) for one in zip(places, rng.uniform(*WIDTHS, count), strict=True)]
+    volts = [je.forward(true, je.conductivity(true, f * one)) for f, one in zip(forces, spread, strict=True)]
+    pixels = je.Pixels(20).on(true)
+    on_pixels = np.array([pixels.restrict(f * one * true.areas) for f, one in zip(forces, spread, strict=True)])
+    pads = on_pixels @ np.asarray(je.pad_masks(skin, pixels).weights).T
+    noise = np.full(v0.size, SNR * np.sqrt(np.mean(v0**2)))
+    blank = v0 + noise / np.sqrt(BLANKS) * rng.normal(size=noise.size)
+    return Skin(np.array(volts) - v0, forces, pads, noise, np.asarray(je.fit_background(model, jnp.asarray(blank))))
+
+
+SCENES: dict[str, Callable[[je.Model, int, int], Skin]] = {
+    "second simulator": second_simulator,
+    "own scenes": own_scene,
+}
+
+
+class Session:
+    """A skin in use: presses that teach, and others that are told by their readings alone."""
+
+    def __init__(self, model: je.Model, skin: Skin, seed: int, probes: int):
+        self.skin, self.rng = skin, np.random.default_rng([seed, 29])
+        tracker = prepare_tracker(model, je.load_skin("testbed"), noise=skin.noise, sigma=jnp.asarray(skin.sheet))
+        forces, errors = self.told(skin.pads[:probes])
+        self.tracker: Tracker = fit_model_error(tracker, self.noisy(skin.changes[:probes]), forces, errors)
+
+    def noisy(self, changes: np.ndarray) -> np.ndarray:
+        """Frames with their noise."""
+        return np.asarray(changes + self.skin.noise * self.rng.normal(size=changes.shape))
+
+    def told(self, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What pads tell, N, and their errors."""
+        forces = exact + np.hypot(PAD_ERROR[0] * exact, PAD_ERROR[1]) * self.rng.normal(size=exact.shape)
+        return forces, np.hypot(PAD_ERROR[0] * np.maximum(forces, 0), PAD_ERROR[1])
+
+    def taught(self, stages: tuple[int, ...]) -> Iterator[tuple[int, LearnedLayer, ContactLaw]]:
+        """Gain and law after some presses, which follow one another in one session."""
+        lessons = LawLessons(self.tracker, None, None)
+        tracks, level = ContactTracks(self.tracker, smooth=False, watch=lessons), np.repeat([1.0, 0.0], [HELD, LIFTED])
+        for number in range(max(stages) + 1):
+            if number in stages:
+                yield number, tracks.learned(), lessons.law()
+            time = round(1e9 * SECONDS) * (len(level) * number + np.arange(len(level)))
+            change = self.noisy(level[:, None] * self.skin.changes[number])
+            tracks.add(time, change, *self.told(level[:, None] * self.skin.pads[number]))
+
+    def alone(self, number: int, layer: LearnedLayer) -> tuple[Track, ...]:
+        """The contacts of a press that no pad tells."""
+        seen: list[Tracking] = []
+        tracks = ContactTracks(
+            self.tracker, smooth=False, layer=layer, watch=lambda now, change, errors: seen.append(now)
+        )
+        silent = np.full((RESTING, self.skin.pads.shape[1]), np.nan)
+        change = self.noisy(np.tile(self.skin.changes[number], (RESTING, 1)))
+        tracks.add(round(1e9 * SECONDS) * np.arange(RESTING), change, silent, silent)
+        return seen[-1].tracks
+
+
+def judged(tracks: tuple[Track, ...], true: float) -> Row:
+    """What is right of the sum of the contacts' forces; without any, all of it is missed."""
+    force = sum(one.force for one in tracks)
+    if not force:
+        return {"error": 1.0, "covered": False}
+    error = np.linalg.norm([one.force * one.log_force_error for one in tracks]) / force
+    return {"error": abs(force / true - 1), "covered": bool(abs(np.log(force / true)) < INTERVAL * error)}
+
+
+def one_scene(run: Run, scene: str) -> Iterator[Row]:
+    """Errors of force on skins of one kind."""
+    (stages, given), rows = run.sizes((STAGES[scene], 15), ((0, 2), 2)), []
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    for seed in range(FIRST_SEED, FIRST_SEED + (1 if run.smoke else SKINS[scene])):
+        skin = SCENES[scene](model, seed, max(stages) + 1 + given)
+        session = Session(model, skin, seed, min(PROBES, max(stages)))
+        for number, layer, law in session.taught(stages):
+            for press in range(max(stages) + 1, len(skin.forces)):
+                tracks = session.alone(press, layer)
+                for way, each in (("gain", tracks), ("law", tuple(map(law.applied, tracks)))):
+                    about = {"way": way, "presses": number, "seed": seed, "used": law.is_better}
+                    rows.append(about | judged(each, skin.forces[press]))
+        print(f"{scene}, skin {seed}: {law.mean.round(2)}, evidence {law.evidence:.1f}", flush=True)
+    yield {scene: [{"skin": scene} | summary(n, mine) for n, mine in grouped(rows, "presses").items()]}
+
+
+def summary(presses: int, rows: list[Row]) -> Row:
+    """Both ways after so many presses."""
+    found: Row = {"presses": presses, "frames": len(rows) // 2, "skins": len({row["seed"] for row in rows})}
+    for way, mine in grouped(rows, "way").items():
+        error = np.array([row["error"] for row in mine])
+        found |= {
+            f"{way} error": round(float(np.median(error)), 4),
+            f"{way} error 90": round(float(np.quantile(error, 0.9)), 4),
+            f"{way} covered": round(float(np.mean([row["covered"] for row in mine])), 4),
+        }
+    return found | {"used": len({row["seed"] for row in rows if row["used"]})}
+
+
+main = Question("contact_law", __doc__, {scene.split()[0]: partial(one_scene, scene=scene) for scene in SCENES})
+
+if __name__ == "__main__":
+    main()
