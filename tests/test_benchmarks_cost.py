@@ -324,7 +324,9 @@ def test_smoke_loads():
         assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data[part])
     frames = sum(row["frames"] for row in data["rows"])
     assert sum(row["count"] for row in data["reliability"]) == 5 * frames  # kinds
-    assert {row["case"].split(",")[0] for row in data["coverage"]} == set(bench_loads.SHAPES)
+    for part in ("coverage", "ellipses"):
+        assert {row["case"].split(",")[0] for row in data[part]} == set(bench_loads.SHAPES)
+    assert all(row["outside"] >= row["beyond"] >= 0 for row in data["ellipses_cases"])
 
 
 @pytest.mark.slow

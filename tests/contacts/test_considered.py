@@ -9,16 +9,16 @@ from benchmarks.bench_loads import INSIDE, TIP_SPREAD, shaped
 from benchmarks.problems import pressed, uneven
 from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import prepare_loads
-from jaxeit.contacts.loads.considered import Known, inverse_of, mean_square_error
-from jaxeit.contacts.loads.pressure import MOST, Form, shape_directions, spot, tilt_directions
+from jaxeit.contacts.loads.considered import Known, inverse_of, mean_errors
+from jaxeit.contacts.loads.pressure import MOST, Form, even_moments, shape_directions, spot, tilt_directions
 from jaxeit.contacts.loads.sheet import Unknowns
 from tests.compiled import compiled
 
-READINGS, FREE, SHAPES, TILTS = 12, 3, 2, 2
-FACTORS = np.array([1.0, 2.0, 4.0, 8.0])
+READINGS, FREE, SHAPES, TILTS = 12, 3, 6, 2
+FACTORS = np.array([0.0, 1.0, 2.0, 4.0, 8.0])
 
 
-def test_mean_square_errors_are_those_of_simulated_fits():
+def test_mean_errors_are_those_of_simulated_fits():
     """Frames of a linear problem whose shapes are drawn anew, fitted as if all factors were one."""
     rng = np.random.default_rng(4100)
     loads, shapes, tilts = (rng.normal(size=(READINGS, n)) for n in (FREE, SHAPES, TILTS))
@@ -27,18 +27,22 @@ def test_mean_square_errors_are_those_of_simulated_fits():
     believed = np.linalg.inv(white.T @ white + np.eye(FREE))
     free, elongation = np.array([True, False, True, True]), np.zeros((READINGS, 2))
     every = np.insert(loads, 1, 7.0, axis=1)  # of a parameter that is not fitted
-    stated, seen = [], []
+    odd = np.array([0, 0, 1, 1, 0, 0, 1, 1])  # of one load, and the moments of next order
+    stated, seen, left = [], [], []
     for _ in range(3000):
-        true, factor = rng.normal(size=FREE), rng.choice(FACTORS)
-        bent = np.concatenate([shapes, tilts], 1) @ rng.normal(size=SHAPES + TILTS)
-        y = loads @ true + factor * bent + rng.normal(size=READINGS)
+        true, factors = rng.normal(size=FREE), rng.choice(FACTORS, 2)[odd]
+        bent = np.concatenate([shapes, tilts], 1) @ (factors * rng.normal(size=SHAPES + TILTS))
+        y = loads @ true + bent + rng.normal(size=READINGS)
         found = believed @ white.T @ np.linalg.solve(root, y)
         end = Unknowns(loads @ found, shapes, shapes, tilts, every, elongation)
-        stated.append(mean_square_error(Known(y, end, root, found, np.eye(FREE)), free, FACTORS))
-        seen.append(np.outer(found - true, found - true))
+        mean, square = mean_errors(Known(y, end, root, found, np.eye(FREE)), free, FACTORS)
+        stated.append(square)
+        seen.append(np.outer(true - found, true - found))
+        left.append(np.outer(true - found - mean, true - found - mean))
     error, scale = np.mean(seen, 0), 1 / np.sqrt(np.diag(np.mean(seen, 0)))
     np.testing.assert_allclose(scale[:, None] * np.mean(stated, 0) * scale, scale[:, None] * error * scale, atol=0.1)
     assert (np.diag(error) > 2 * np.diag(believed)).all()
+    assert np.trace(np.mean(left, 0)) < 0.9 * np.trace(error)
 
 
 def test_without_larger_shapes_a_fit_at_rest_keeps_its_covariance():
@@ -49,8 +53,9 @@ def test_without_larger_shapes_a_fit_at_rest_keeps_its_covariance():
     believed = np.linalg.inv(white.T @ white + np.eye(FREE))
     found = believed @ white.T @ np.linalg.solve(root, y)
     end = Unknowns(loads @ found, shapes, shapes, np.zeros((READINGS, 0)), loads, np.zeros((READINGS, 2)))
-    stated = mean_square_error(Known(y, end, root, found, np.eye(FREE)), np.ones(FREE, bool), FACTORS[:1])
+    mean, stated = mean_errors(Known(y, end, root, found, np.eye(FREE)), np.ones(FREE, bool), np.ones(1))
     np.testing.assert_allclose(stated, believed, atol=1e-12)
+    np.testing.assert_allclose(mean, 0, atol=1e-12)
 
 
 def test_an_inverse_leaves_out_what_nothing_tells():
@@ -78,6 +83,17 @@ def test_moments_of_next_order_change_nothing_that_the_others_change():
     weight = area / 7.0 / np.asarray(compiled(spot, one, points))
     products = np.einsum("xyd,xye,xy->de", tilts[..., :2], every, weight)
     np.testing.assert_allclose(products, np.eye(2, 8), atol=1e-6)
+
+
+def test_even_moments_are_equal_at_opposite_places():
+    points = jnp.asarray(np.random.default_rng(4102).uniform(-0.02, 0.02, (9, 2)))
+    row = jnp.array([0.0, 0.0, np.log(0.01), 2.0, 0.0, 0.0])
+    forms = jnp.array([Form.ROUND] + [Form.ABSENT] * (MOST - 1))
+    found = np.asarray(compiled(shape_directions, jnp.stack([row] * MOST), forms, jnp.concatenate([points, -points])))
+    one, other = found[:9, :6], found[9:, :6]
+    np.testing.assert_allclose(
+        other, np.where(even_moments(found.shape[1])[:6], 1, -1) * one, atol=1e-9 * np.abs(one).max()
+    )
 
 
 @pytest.mark.slow

@@ -233,7 +233,7 @@ def test_what_cannot_be_fitted_is_refused(ready):
         fitter(np.where(np.arange(550) == 3, np.nan, frames[0]), contacts)
     for bad in (
         {"width": 0.0},
-        {"shapes": (0.5,)},
+        {"shapes": (-0.5,)},
         {"gain": -1.0},
         {"coat": -1.0},
         {"prior": (1.0, 0.0, 0.0)},

@@ -1,11 +1,13 @@
-"""Mean square errors of fitted loads, where shapes may differ from a Gaussian by more than the fits marginalise.
+"""Errors of fitted loads, where shapes may differ from a Gaussian by more than the fits marginalise, or by less.
 
 A fit takes the moments of a shape for 0.1, since larger ones would explain two loads as one of another shape. A ring
 has moments of up to -2/3 and a flat tip that tilts has moments of higher order; at a high signal-to-noise ratio the fit
-explains both by place and force. With S the slopes of the readings in all moments, n their standard deviation over that
-which the fit takes, and R the covariance of all other errors at the loads found, what the fit leaves of the frame is
+explains both by place and force. A Gaussian has none. Even moments, which a flat tip or a ring has, move no load; odd
+ones do, which a tilted tip has: each of the two has a scale of its own. With S the slopes of the readings in all
+moments, n their standard deviations over those which the fit takes, and R the covariance of all other errors at the
+loads found, what the fit leaves of the frame is
 
-    J d + e,    e ~ N(0, R + n^2 S S'),    d: the true loads less the found ones, with what is known of loads before.
+    J d + e,    e ~ N(0, R + S n^2 S'),    d: the true loads less the found ones, with what is known of loads before.
 
 For each n, d has a mean m and a covariance C, and the frame has an evidence. The mean over all n of C + m m', weighed
 by evidence, is the mean square of what the found loads err by: the covariance of the posterior about the found loads
@@ -20,6 +22,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_triangular
 
+from .pressure import even_moments
 from .sheet import Unknowns
 
 
@@ -41,50 +44,71 @@ class Known(NamedTuple):
     slopes: Float[np.ndarray, "s m"]
 
 
-def mean_square_error(known: Known, free: np.ndarray, shapes: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m m"]:
-    """Mean square error (m, m) of the parameters that are free, of all; shapes: factors n, equally probable before."""
+def mean_errors(
+    known: Known, free: np.ndarray, shapes: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
+    """Mean (m,) and mean square (m, m) of the true parameters less the found ones, of those that are free.
+
+    Args:
+        known: what is known at the loads found.
+        free: which of all parameters are fitted.
+        shapes: factors n; each pair of one for even and one for odd moments is equally probable before the frame.
+    """
     end, left = known.end, known.y - np.asarray(known.end.value)
     every = np.concatenate([np.asarray(end.loads)[:, free], left[:, None], end.shapes, end.tilts], 1)
-    white = solve_triangular(known.root, every, lower=True)
-    products = white.T @ white
-    # The root holds the moments that the fit marginalises once already.
-    counts = end.shapes.shape[1], end.tilts.shape[1]
-    more = [np.repeat([np.sqrt(n**2 - 1), n], counts) for n in shapes]
-    found = [_about(products, one, known.surprise, known.slopes) for one in more]
-    weight = np.exp([evidence for evidence, _ in found] - np.max([evidence for evidence, _ in found]))
-    mean: np.ndarray = np.average([square for _, square in found], axis=0, weights=weight)
-    return mean
+    white = solve_triangular(known.root, every.astype(float), lower=True)
+    products, count = white.T @ white, np.count_nonzero(free) + 1
+    variances = _variances(shapes, end.shapes.shape[1], end.tilts.shape[1])
+    # Loads that are absent have no moments.
+    there = np.diag(products)[count:] > 0
+    kept = np.append(np.ones(count, bool), there)
+    found = _about(products[np.ix_(kept, kept)], variances[:, there], known.surprise, known.slopes)
+    evidence, covariance, away = found
+    weight = np.exp(evidence - evidence.max())
+    weight /= weight.sum()
+    square = covariance + away[:, :, None] * away[:, None]
+    return weight @ away, np.einsum("g,gij->ij", weight, square)
+
+
+def _variances(shapes: Float[np.ndarray, " k"], count: int, more: int) -> Float[np.ndarray, "g q"]:
+    """Variances of moments, of all pairs of factors, over those that the root of the errors holds already."""
+    even, odd = (factor.reshape(-1, 1) ** 2 for factor in np.meshgrid(shapes, shapes))
+    return np.concatenate([np.where(even_moments(count), even, odd) - 1, np.repeat(odd, more, 1)], 1)
 
 
 def _about(
     products: Float[np.ndarray, "p p"],
-    more: Float[np.ndarray, " q"],
+    variances: Float[np.ndarray, "g q"],
     surprise: Float[np.ndarray, " s"],
     slopes: Float[np.ndarray, "s m"],
-) -> tuple[float, Float[np.ndarray, "m m"]]:
-    """Log evidence of moments of standard deviations `more`, up to a constant, and the mean square error with them.
+) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, "g m m"], Float[np.ndarray, "g m"]]:
+    """Log evidence of moments of further variances, up to a constant; covariance and mean of the errors with them.
 
     Products are those of the whitened slopes in m parameters, what is left, and the slopes in q moments. The inverse of
-    the covariance with these moments is by Woodbury's identity, so that all matrices are small.
+    the covariance with these moments is by Woodbury's identity, so that all matrices are small. A variance is negative
+    where moments are smaller than those of the fit, but not below -1, so that the covariance is that of errors.
     """
-    count = len(products) - len(more)
-    across = more[:, None] * products[count:, :count]
-    inner = np.eye(len(more)) + more[:, None] * products[count:, count:] * more
-    rest = products[:count, :count] - across.T @ np.linalg.solve(inner, across)
-    towards = rest[:-1, -1] - slopes.T @ surprise
-    covariance, volume = inverse_of(rest[:-1, :-1] + slopes.T @ slopes)
-    away = covariance @ towards
-    evidence = -0.5 * (rest[-1, -1] - towards @ away + np.linalg.slogdet(inner)[1] + volume)
-    return float(evidence), covariance + np.outer(away, away)
+    count = len(products) - variances.shape[1]
+    across, own = products[:count, count:], products[count:, count:]
+    inner = np.eye(len(own)) + own * variances[:, None]
+    explained = np.linalg.solve(inner, np.broadcast_to(across.T, (len(variances), *across.T.shape)))
+    rest = products[:count, :count] - (across * variances[:, None]) @ explained
+    towards = rest[:, :-1, -1] - slopes.T @ surprise
+    covariance, volume = inverse_of(rest[:, :-1, :-1] + slopes.T @ slopes)
+    away = (covariance @ towards[:, :, None])[..., 0]
+    square = rest[:, -1, -1] - np.sum(towards * away, 1)
+    return -0.5 * (square + np.linalg.slogdet(inner)[1] + volume), covariance, away
 
 
-def inverse_of(normal: Float[np.ndarray, "m m"]) -> tuple[Float[np.ndarray, "m m"], float]:
-    """Inverse of a normal matrix, whose parameters differ in unit, and the logarithm of its determinant.
+def inverse_of(normal: Float[np.ndarray, "*n m m"]) -> tuple[Float[np.ndarray, "*n m m"], Float[np.ndarray, "*n"]]:
+    """Inverses of normal matrices, whose parameters differ in unit, and the logarithms of their determinants.
 
     A direction that nothing tells has no part in the inverse.
     """
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
-    value, vector = np.linalg.eigh(scale[:, None] * normal * scale)
-    told = value > len(value) * np.finfo(float).eps * value.max()
-    vector = scale[:, None] * vector[:, told]
-    return vector / value[told] @ vector.T, float(np.sum(np.log(value[told])) - 2 * np.sum(np.log(scale)))
+    diagonal = np.diagonal(normal, axis1=-2, axis2=-1)
+    scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
+    value, vector = np.linalg.eigh(scale[..., None] * normal * scale[..., None, :])
+    told = value > value.shape[-1] * np.finfo(float).eps * value.max(-1, keepdims=True)
+    value, vector = np.where(told, value, 1), scale[..., None] * np.where(told[..., None, :], vector, 0)
+    volume = np.sum(np.log(value), -1) - 2 * np.sum(np.log(scale), -1)
+    return vector / value[..., None, :] @ np.swapaxes(vector, -1, -2), np.asarray(volume)

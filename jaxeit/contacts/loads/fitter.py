@@ -9,8 +9,8 @@ bends it and splits it; the coat of the sheet; and the shape of a load. All of i
 the slopes of the r whitened readings y in these unknowns, each of standard deviation one, and e the part of the signal
 by which all else errs, errors have the covariance (1 + e^2 |y|^2 / r) I + N N'. Kinds are compared by their evidence in
 Laplace's approximation (MacKay 1992, Neural Comput. 4), so that probabilities and covariances hold the model's error as
-well as the noise. The covariance that is handed out also holds that shapes may be larger, and that slopes are those of
-the fit's end (`considered`).
+well as the noise. The covariance that is handed out also holds that shapes may be larger or smaller, as the frame
+tells, and that slopes are those of the fit's end (`considered`); a single load moves by half of its mean error.
 
 The host decides what is fitted next; JAX runs two compiled programs, which serve all kinds (`pressure`).
 """

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import erf
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 MOST, SIZE = 3, 6  # loads, and parameters of each
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
@@ -76,6 +76,12 @@ def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 
     """
     by_load = _rows_of_round(_bent, loads, forms, points)
     return jnp.concatenate([by_load[..., :2].sum(0), *by_load[..., 2:]], -1)
+
+
+def even_moments(count: int) -> Bool[np.ndarray, " d"]:
+    """Which of so many moments of `shape_directions` are equal at opposite places, so that they move no load."""
+    of_load = np.array([False, False, True, True])
+    return np.append([True, True], np.tile(of_load, max(count - 2, 0) // 4))[:count]
 
 
 def tilt_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "... d"]:

@@ -28,8 +28,9 @@ class LoadSettings:
     | coat_length: over which it changes                                           | 0.03         | m    |
     | shape: standard deviation of each moment by which a round load differs from a | 0.1          | 1    |
     |   Gaussian (`pressure.shape_directions`)                                     |              |      |
-    | shapes: how many times `shape` these moments may be, each as probable as the | 1, 2, 4, 8   | 1    |
-    |   others, for covariances (`considered`); a ring has moments of up to -2/3   |              |      |
+    | shapes: how many times `shape` the even moments may be, and the odd ones,    | 0, 1, 2, 4,  | 1    |
+    |   each as probable as the others, for covariances and the place of a single  | 8            |      |
+    |   load (`considered`); a ring has even moments of up to -2/3                 |              |      |
     | model_error: part of the signal by which all else errs                       | 0.005        | 1    |
     | width, width_spread: median of a load's width, standard deviation of its log | 0.012, 0.4   | m, 1 |
     | force, force_spread: median of a force, standard deviation of its log        | 8, 1.2       | N, 1 |
@@ -51,7 +52,7 @@ class LoadSettings:
     coat: float | None = None
     coat_length: float = 0.03
     shape: float = 0.1
-    shapes: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
+    shapes: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0, 8.0)
     model_error: float = 0.005
     width: float = 0.012
     width_spread: float = 0.4
@@ -71,8 +72,8 @@ class LoadSettings:
         for name in ("gain", "coat", "shape", "model_error"):
             if getattr(self, name) is not None and not 0 <= getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give 0 or more")
-        if not (len(self.shapes) and min(self.shapes) >= 1 and max(self.shapes) < np.inf):
-            raise InverseError(f"shapes is {self.shapes}; give numbers of at least 1")
+        if not (len(self.shapes) and min(self.shapes) >= 0 and max(self.shapes) < np.inf):
+            raise InverseError(f"shapes is {self.shapes}; give numbers of at least 0")
         if len(self.prior) != 5 or min(self.prior) < 0 or not np.isclose(sum(self.prior), 1):
             raise InverseError(f"prior is {self.prior}; give five probabilities whose sum is 1")
 
