@@ -181,7 +181,7 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
 def _runnable(text: bytes, name: str, options: dict[str, Any]) -> Callable[[list[Any]], Any]:
     """The function of the arrays of a call that runs a program, which has the name of its verb in JAX's reports."""
     program, result = pickle.loads(text)
-    lowered = deserialize(program).call
+    lowered: Callable[..., Any] = deserialize(program).call
 
     def named(*arrays: Any) -> Any:
         return lowered(*arrays)
