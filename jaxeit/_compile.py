@@ -34,7 +34,6 @@ def verb(function: F) -> F:
     """Compile ``function`` when it is called; inside another compiled function it becomes part of that function.
 
     A decorator, also for functions of your own: as with `equinox.filter_jit`, arrays are traced and the rest is static.
-    No array of the result is weakly typed, because a program that is kept (`cache_programs`) forgets which ones are.
 
     A call outside other compiled functions uses the compiler options that suit its gathers best (`compiler_options`);
     JAX accepts options for whole programs only.
@@ -47,7 +46,7 @@ def verb(function: F) -> F:
 
         print(largest_change(model, 1.1 * model.background))  # V
     """
-    exact = full_precision(_strongly_typed(function))
+    exact = full_precision(function)
     inner = eqx.filter_jit(exact)
 
     @cache
@@ -79,8 +78,12 @@ def full_precision(function: F) -> F:
     return call  # type: ignore[return-value]
 
 
-def _strongly_typed(function: F) -> F:
-    """``function``, whose arrays promote others by their type, as those of NumPy do, whatever they were made of."""
+def strongly_typed(function: F) -> F:
+    """``function``, whose arrays promote others by their type, whatever they were made of.
+
+    A program that is kept (`cache_programs`) forgets which of its results are weakly typed, so that those of a verb
+    with such results are not kept.
+    """
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -49,8 +49,8 @@ def cache_programs(folder: str | os.PathLike[str] | None) -> None:
     and the settings of JAX. Use both caches together, as the commands do with ``~/.cache/jaxeit``.
 
     A call is traced as ever where a verb or an argument is of a module of your own, since a change of its code would
-    not be noticed, inside transformations of JAX, and where JAX has other devices than one CPU. Take a folder that
-    only you can write, because the programs in it are run.
+    not be noticed; where a result is weakly typed; inside transformations of JAX; and where JAX has other devices than
+    one CPU. Take a folder that only you can write, because the programs in it are run.
 
     Args:
         folder: made where it does not exist.
@@ -169,12 +169,15 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         args, kwargs = jax.tree.unflatten(structure, [next(given) if eqx.is_array(leaf) else leaf for leaf in leaves])
         found, form = jax.tree.flatten(function(*args, **kwargs))
         forms.append(jax.tree.unflatten(form, [_ARRAY if eqx.is_array(leaf) else leaf for leaf in found]))
-        return [leaf for leaf in found if eqx.is_array(leaf)]
+        results = [leaf for leaf in found if eqx.is_array(leaf)]
+        if any(jax.typeof(leaf).weak_type for leaf in results):
+            raise TypeError("a program that is kept forgets which results are weakly typed")
+        return results
 
     try:
         program = export(jax.jit(flat))(*(leaf for leaf in leaves if eqx.is_array(leaf)))
         return pickle.dumps((program.serialize(), forms[-1]))
-    except Exception:  # the verb refuses its arguments, calls back into Python, or returns what pickle cannot write
+    except Exception:  # the verb refuses its arguments, or returns or calls what cannot be written
         return None
 
 

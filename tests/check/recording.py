@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,8 @@ class Recording:
         return cls(facts, streams, session.presses)
 
     def write(self, path):
-        """Write the session file."""
+        """Write the session file, in the place of an earlier one."""
+        Path(path).unlink(missing_ok=True)
         with SessionWriter(path, self.facts) as writer:
             for name, samples in self.streams.items():
                 writer.add_stream(name, samples.facts)

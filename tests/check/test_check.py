@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -58,6 +59,7 @@ class Parts:
         about |= {"pattern": self.pattern, "current": self.skin.protocol.current, "epoch": EPOCH}
         if self.pattern is None:
             about["current"] = None
+        Path(path).unlink(missing_ok=True)  # the writer replaces no recording
         with SessionWriter(path, SessionFacts(**about | self.header)) as writer:
             for name, (variable, units, rate, time, values) in self.streams.items():
                 writer.add_stream(name, StreamFacts(variable, units=units, channels=values.shape[1], rate_hz=rate))
