@@ -1,6 +1,7 @@
 """Programs that are kept: the same results, traced once, and found only where everything is the same."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -209,3 +210,16 @@ def test_another_process_finds_a_program(tmp_path):
         times.append([path.stat().st_mtime_ns for path in _kept(tmp_path)])
     assert said[0] == said[1] != ""
     assert times[0] == times[1] != []
+
+
+def test_the_lines_of_the_page_keep_programs(root, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = jax.config.jax_compilation_cache_dir
+    lines = re.search(r"```python\n(.*?)```", (root / "docs" / "costs.md").read_text(encoding="utf-8"), re.DOTALL)
+    try:
+        exec(lines[1], {})
+        je.metrics.localisation_error(jnp.zeros((1, 2)), jnp.ones((1, 2)))
+        assert len(_kept(tmp_path / "programs")) == 1
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+        je.cache_programs(None)
