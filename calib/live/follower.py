@@ -86,11 +86,12 @@ class LiveFollower:
         assert self._tracker is not None
         seconds = FIRST_SECONDS if self._last is None else max((host - self._last) / 1e9, MIN_SECONDS)
         before = self._tracker.start(self._layer) if self._now is None else self._now
-        self._now = self._tracker.step(before, change, seconds, force, pad_errors(force, error), whole=False)
+        errors = pad_errors(force, error)
+        self._now = self._tracker.step(before, change, seconds, force, errors, whole=False)
         self._last = host
         tracks, law = self._now.tracks, self._calibration.contact_law
-        if law is not None:
-            tracks = law.without_pads(tracks, self._tracker.told_by_pads(tracks, pad_errors(force, error)))
+        if law is not None and law.is_better:
+            tracks = law.without_pads(tracks, self._tracker.told_by_pads(tracks, errors))
         return self._on_sheet(tracks)
 
     def _on_sheet(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:

@@ -10,10 +10,11 @@ from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import ContactTracks
 from calib.calibration.localisation.law_lessons import LawLessons
 from calib.live.follower import LiveFollower
-from calib.session import SessionError, read_archive, write_archive
+from calib.session import SessionError
 from jaxeit.tracking import ContactLaw, TimedTracks, Track, Tracker, TrackerSettings, Tracking
 
 from ..helpers import stand_in
+from .damage import damage
 
 PLACE, WIDTH, SECOND = np.array([0.05, 0.05]), 0.012, 10**9
 WEAKER = 0.5  # true force over that of readings alone
@@ -90,16 +91,9 @@ def test_a_calibration_keeps_the_law_and_one_without_opens(calibration, tmp_path
     ],
 )
 def test_a_damaged_law_is_refused(calibration, tmp_path, name, change, message):
-    path, kind = tmp_path / "c.h5", "skin-calibration"
+    path = tmp_path / "c.h5"
     replace(calibration, contact_law=known_law(402)).save(path)
-    whole = read_archive(path, kind)
-    of_the_format = ("format", "format_version", "Conventions", "complete", "seal_sha256")
-    attrs = {k: v for k, v in whole.attrs.items() if k not in of_the_format}
-    arrays = {k: (v, whole.units[k], whole.long_names[k]) for k, v in whole.arrays.items()}
-    value, *about = arrays[f"contact_law/{name}"]
-    arrays[f"contact_law/{name}"] = (change(value), *about)
-    path.unlink()
-    write_archive(path, kind, attrs, arrays)
+    damage(path, f"contact_law/{name}", change)
     with pytest.raises(SessionError, match=message):
         calib.load_calibration(path)
 
