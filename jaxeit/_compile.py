@@ -20,7 +20,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 from threadpoolctl import threadpool_limits
 
-from .program_cache import cached_call
+from .program_cache import changes_of_folder, keep
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -49,17 +49,16 @@ def verb(function: F) -> F:
     exact = full_precision(function)
     inner = eqx.filter_jit(exact)
 
-    @cache
-    def outer() -> Any:
+    @lru_cache(maxsize=1)
+    def outer(_changes: int) -> Any:
         jit: Any = eqx.filter_jit  # its type leaves out what it hands on to jax.jit
-        return jit(exact, compiler_options=compiler_options())
+        return jit(keep(exact, call), compiler_options=compiler_options())
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         if _is_transformed(args, kwargs):
             return inner(*args, **kwargs)
-        found = cached_call(call, exact, compiler_options, args, kwargs)
-        return outer()(*args, **kwargs) if found is NotImplemented else found
+        return outer(changes_of_folder())(*args, **kwargs)
 
     return call  # type: ignore[return-value]
 
@@ -76,25 +75,6 @@ def full_precision(function: F) -> F:
             return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
-
-
-def strongly_typed(function: F) -> F:
-    """``function``, whose arrays promote others by their type, whatever they were made of.
-
-    A program that is kept (`cache_programs`) forgets which of its results are weakly typed, so that those of a verb
-    with such results are not kept.
-    """
-
-    @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        return jax.tree.map(_strong, function(*args, **kwargs))
-
-    return call  # type: ignore[return-value]
-
-
-def _strong(leaf: Any) -> Any:
-    weak = isinstance(leaf, jax.Array) and jax.typeof(leaf).weak_type
-    return jax.lax.convert_element_type(leaf, leaf.dtype) if weak else leaf
 
 
 def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | None = None) -> Callable[..., T]:
@@ -118,24 +98,30 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     flags = tuple(sorted((compiler_options() if options is None else options).items()))
     kept, form = jax.tree.flatten(static)
     typed = tuple((type(leaf), leaf) for leaf in kept)  # 1 is no 1.0
-    program = _bound(function, structure, layout, typed, form, flags)
+    program = _bound(function, structure, layout, typed, form, flags, changes_of_folder())
     return lambda *rest: program(packs, rest)
 
 
 @lru_cache(maxsize=256)
 def _bound(
-    function: Callable[..., T], structure: Any, layout: "_Layout", typed: tuple[Any, ...], form: Any, flags: Any
+    function: Callable[..., T],
+    structure: Any,
+    layout: "_Layout",
+    typed: tuple[Any, ...],
+    form: Any,
+    flags: Any,
+    _changes: int,
 ) -> Callable[..., T]:
     """The program of `bind`, which models that differ in their numbers only share."""
+    kept = keep(full_precision(function), function)
 
     @partial(jax.jit, compiler_options=dict(flags))
-    @full_precision
     def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
         leaves, static = (
             jax.tree.unflatten(structure, layout.unpack(packs)),
             jax.tree.unflatten(form, [leaf for _, leaf in typed]),
         )
-        return function(*eqx.combine(leaves, static), *rest)
+        return kept(*eqx.combine(leaves, static), *rest)
 
     found: Callable[..., T] = program
     return found

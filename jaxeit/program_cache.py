@@ -5,9 +5,11 @@ import pickle
 import platform
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from enum import Enum
+from functools import wraps
 from hashlib import sha256
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -35,9 +37,7 @@ UNUSED_DAYS = 30
 """Programs of other versions are removed when no process has used them for so many days."""
 
 _folder: Path | None = None
-
-# The programs that this process knows, by what a call is; None: one that cannot be kept.
-_programs: dict[Any, Callable[[list[Any]], Any] | None] = {}
+_changes = 0  # of the folder
 
 
 def cache_programs(folder: str | os.PathLike[str] | None) -> None:
@@ -49,8 +49,8 @@ def cache_programs(folder: str | os.PathLike[str] | None) -> None:
     and the settings of JAX. Use both caches together, as the commands do with ``~/.cache/jaxeit``.
 
     A call is traced as ever where a verb or an argument is of a module of your own, since a change of its code would
-    not be noticed; where a result is weakly typed; inside transformations of JAX; and where JAX has other devices than
-    one CPU. Take a folder that only you can write, because the programs in it are run.
+    not be noticed, inside transformations of JAX, and where JAX has other devices than one CPU. Take a folder that
+    only you can write, because the programs in it are run.
 
     Args:
         folder: made where it does not exist.
@@ -62,8 +62,8 @@ def cache_programs(folder: str | os.PathLike[str] | None) -> None:
         je.cache_programs("programs")
         print(je.forward(model))  # traced once, and not again in the next process
     """
-    global _folder
-    _programs.clear()
+    global _folder, _changes
+    _changes += 1
     _folder = None
     if folder is not None:
         _remove_unused(Path(folder))
@@ -78,36 +78,28 @@ def programs_folder() -> Path | None:
     return None if _folder is None else _folder.parent
 
 
-def cached_call(
-    verb: Callable[..., Any],
-    function: Callable[..., Any],
-    options: Callable[[], Mapping[str, Any]],
-    args: tuple[Any, ...],
-    kwargs: Mapping[str, Any],
-) -> Any:
-    """What a verb returns, by a program that is kept; NotImplemented where none can be kept.
+def changes_of_folder() -> int:
+    """How often a folder was set. What was traced before a change is traced anew after it."""
+    return _changes
+
+
+def keep(function: Callable[..., Any], known: Callable[..., Any]) -> Callable[..., Any]:
+    """``function``, which finds its program in the folder when JAX traces it, and is traced itself if there is none.
 
     Args:
-        verb: the public function.
-        function: what it computes, as it is traced.
-        options: give those of XLA.
-        args, kwargs: of the call, without arrays that a transformation hides.
+        function: what is computed.
+        known: the function that users call, by whose name a program is found.
     """
-    if _folder is None:
-        return NotImplemented
-    leaves, structure = jax.tree.flatten((args, kwargs))
-    key = (verb, structure, tuple(map(_kind, leaves)), tuple(jax.config.values.values()))
-    if key not in _programs:
-        _programs[key] = _program(verb, function, options, leaves, structure)
-    program = _programs[key]
-    return NotImplemented if program is None else program([leaf for leaf in leaves if eqx.is_array(leaf)])
 
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        program = None if _folder is None else _program(_folder, function, known, leaves, structure)
+        return (
+            function(*args, **kwargs) if program is None else program([leaf for leaf in leaves if eqx.is_array(leaf)])
+        )
 
-def _kind(leaf: Any) -> Any:
-    """What a program depends on of a leaf of the arguments."""
-    if eqx.is_array(leaf):
-        return (_ARRAY, leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False))
-    return (type(leaf).__name__, leaf)  # 1 is no 1.0
+    return call
 
 
 class _Array(Enum):
@@ -120,17 +112,13 @@ _ARRAY = _Array.ARRAY
 
 
 def _program(
-    verb: Callable[..., Any],
-    function: Callable[..., Any],
-    options: Callable[[], Mapping[str, Any]],
-    leaves: list[Any],
-    structure: Any,
+    folder: Path, function: Callable[..., Any], known: Callable[..., Any], leaves: list[Any], structure: Any
 ) -> Callable[[list[Any]], Any] | None:
     """The program of a call: from the folder, or traced and written there; None where it cannot be kept."""
-    name = _name(verb, leaves, structure) if _folder is not None and _is_plain(leaves) else None
-    if _folder is None or name is None:
+    name = _name(known, leaves, structure) if _is_plain(leaves) else None
+    if name is None:
         return None
-    path = _folder / name
+    path = folder / name
     text = _read(path)
     if text is None:
         text = _traced(function, leaves, structure)
@@ -140,7 +128,7 @@ def _program(
             spare = path.with_name(f"{name}.{os.getpid()}")
             spare.write_bytes(sha256(text).digest() + text)
             spare.replace(path)
-    return _runnable(text, verb.__name__, dict(options()))
+    return _runnable(text)
 
 
 def _is_plain(leaves: list[Any]) -> bool:
@@ -169,48 +157,55 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         args, kwargs = jax.tree.unflatten(structure, [next(given) if eqx.is_array(leaf) else leaf for leaf in leaves])
         found, form = jax.tree.flatten(function(*args, **kwargs))
         forms.append(jax.tree.unflatten(form, [_ARRAY if eqx.is_array(leaf) else leaf for leaf in found]))
-        results = [leaf for leaf in found if eqx.is_array(leaf)]
-        if any(jax.typeof(leaf).weak_type for leaf in results):
-            raise TypeError("a program that is kept forgets which results are weakly typed")
-        return results
+        return [leaf for leaf in found if eqx.is_array(leaf)]
 
+    shapes = [
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, weak_type=jax.typeof(leaf).weak_type)
+        for leaf in leaves
+        if eqx.is_array(leaf)
+    ]
     try:
-        program = export(jax.jit(flat))(*(leaf for leaf in leaves if eqx.is_array(leaf)))
-        return pickle.dumps((program.serialize(), forms[-1]))
+        program = export(jax.jit(flat))(*shapes)
+        weak = [result.weak_type for result in program.out_avals]
+        return pickle.dumps((program.serialize(), weak, forms[-1]))
     except Exception:  # the verb refuses its arguments, or returns or calls what cannot be written
         return None
 
 
-def _runnable(text: bytes, name: str, options: dict[str, Any]) -> Callable[[list[Any]], Any]:
-    """The function of the arrays of a call that runs a program, which has the name of its verb in JAX's reports."""
-    program, result = pickle.loads(text)
-    lowered: Callable[..., Any] = deserialize(program).call
-
-    def named(*arrays: Any) -> Any:
-        return lowered(*arrays)
-
-    named.__name__ = name
-    run = jax.jit(named, compiler_options=options)
+def _runnable(text: bytes) -> Callable[[list[Any]], Any]:
+    """The function of the arrays of a call that runs a program."""
+    written, weak, result = pickle.loads(text)
+    program = deserialize(written)
+    # Programs are written without it. What users compute from a result has the same precision with a cache as without.
+    types = tuple(one.update(weak_type=is_weak) for one, is_weak in zip(program.out_avals, weak, strict=True))
+    lowered = replace(program, out_avals=types).call
     leaves, form = jax.tree.flatten(result)
 
     def call(arrays: list[Any]) -> Any:
-        found = iter(run(*arrays))
+        found = iter(lowered(*arrays))
         return jax.tree.unflatten(form, [next(found) if leaf is _ARRAY else leaf for leaf in leaves])
 
     return call
 
 
-def _name(verb: Callable[..., Any], leaves: list[Any], structure: Any) -> str | None:
+def _name(known: Callable[..., Any], leaves: list[Any], structure: Any) -> str | None:
     """The file of a program: a hash of what it depends on beside `_fingerprint`; None where code is not known."""
     settings = {name: str(value) for name, value in jax.config.values.items() if not _is_reporting(name)}
     arguments = jax.tree.unflatten(structure, [_kind(leaf) for leaf in leaves])
     text = BytesIO()
     try:
-        _require_known(verb)
-        _Description(text).dump((verb.__module__, verb.__qualname__, arguments, settings))
+        _require_known(known)
+        _Description(text).dump((known.__module__, known.__qualname__, arguments, settings))
     except Exception:  # of many kinds, for what pickle cannot write
         return None
     return sha256(text.getvalue()).hexdigest()
+
+
+def _kind(leaf: Any) -> Any:
+    """What a program depends on of a leaf of the arguments."""
+    if eqx.is_array(leaf):
+        return (_ARRAY, leaf.shape, leaf.dtype, jax.typeof(leaf).weak_type)
+    return (type(leaf).__name__, leaf)  # 1 is no 1.0
 
 
 def _is_reporting(setting: str) -> bool:

@@ -34,8 +34,9 @@ def scaled(layer, factor=2):
 
 
 @je.verb
-def weakly_typed(x):
-    return x, jnp.asarray(1.0)
+def with_weak_types(x):
+    TRACED.append("with weak types")
+    return x, jnp.asarray(1.0), jnp.full(3, 2.0)
 
 
 def squared(x):
@@ -81,6 +82,33 @@ def test_a_program_is_traced_once_and_its_result_is_whole(new_process, tmp_path)
     assert found.gain.dtype == expected.gain.dtype
     np.testing.assert_array_equal(found.gain, [0.0, 2.0, 4.0])
     assert len(_kept(tmp_path)) == 1
+
+
+def test_programs_of_bind_are_kept_and_those_of_the_verb(new_process, tmp_path):
+    layer = Layer(jnp.arange(3.0), "coat")
+    expected, _ = je.bind(scaled, layer)(jnp.asarray(2.0))
+    new_process()
+    np.testing.assert_array_equal(je.bind(scaled, layer)(jnp.asarray(2.0))[0].gain, expected.gain)
+    np.testing.assert_array_equal(scaled(layer, jnp.asarray(2.0))[0].gain, expected.gain)
+    assert TRACED == []
+    assert len(_kept(tmp_path)) == 1
+    assert je.bind(lambda layer, factor: factor * layer.gain, layer)(jnp.asarray(2.0)).shape == (3,)
+    assert len(_kept(tmp_path)) == 1
+
+
+def test_results_are_weakly_typed_as_without_a_cache(new_process):
+    narrow = jnp.zeros(3, jnp.float32)
+    expected = with_weak_types(narrow)
+    new_process()
+    found = with_weak_types(narrow)
+    assert TRACED == []
+    for one, other in zip(found, expected, strict=True):
+        assert (one.weak_type, one.dtype, (one[..., None] + narrow).dtype) == (
+            other.weak_type,
+            other.dtype,
+            (other[..., None] + narrow).dtype,
+        )
+    assert [one.weak_type for one in found] == [False, True, True]
 
 
 @pytest.mark.parametrize(
@@ -138,13 +166,12 @@ def test_what_is_reported_does_not_matter(new_process):
         lambda layer: scaled(_of("my_module")(layer.gain, "coat")),
         lambda layer: scaled(_of("__main__")(layer.gain, "coat")),
         lambda layer: scaled(_of(__name__)(layer.gain, "coat")),
-        lambda layer: weakly_typed(layer.gain),
         lambda layer: slope(layer.gain[1]),
         lambda layer: je.verb(lambda x: 2 * x)(layer.gain),
         lambda layer: je.verb(partial(jnp.multiply, 2.0))(layer.gain),
         lambda layer: je.verb(jax.random.uniform)(jax.random.key(0)),
     ],
-    ids=["jit", "vmap", "grad", "module", "main", "name", "weak type", "other verb", "lambda", "partial", "random key"],
+    ids=["jit", "vmap", "grad", "module", "main", "name", "other verb", "lambda", "partial", "random key"],
 )
 def test_what_is_not_known_for_sure_is_not_kept(new_process, tmp_path, call):
     call(Layer(jnp.arange(3.0), "coat"))

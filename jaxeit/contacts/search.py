@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import sequential_on_cpu, strongly_typed, verb
+from .._compile import sequential_on_cpu, verb
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
@@ -332,7 +332,6 @@ _single_frame = sequential_on_cpu(lambda finder, frame: finder.frame(frame))
 
 
 @verb
-@strongly_typed
 def _find(finder: ContactFinder, frames: Float[Array, "... readings"]) -> Contacts:
     if frames.ndim == 1:
         one: Contacts = _single_frame(finder, frames)

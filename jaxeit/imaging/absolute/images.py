@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ..._compile import full_precision, strongly_typed, verb
+from ..._compile import full_precision, verb
 from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
 from ...least_squares.searches import Quadratic as HalfSquares
 from ...model.bases import BasisMap, Picture
@@ -189,7 +189,6 @@ class ImagePosterior(AbstractPosterior):
 
 
 @verb
-@strongly_typed
 def most_probable(
     posterior: AbstractPosterior, start: Float[Array, " n"], steps: int, tolerance: float, *, damped: bool = False
 ) -> tuple[Float[Array, " n"], LeastSquaresState]:
