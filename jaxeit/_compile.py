@@ -121,10 +121,11 @@ def _bound(
             jax.tree.unflatten(structure, layout.unpack(packs)),
             jax.tree.unflatten(form, [leaf for _, leaf in typed]),
         )
-        return kept(*eqx.combine(leaves, static), *rest)
+        found: T = kept(*eqx.combine(leaves, static), *rest)
+        return found
 
-    found: Callable[..., T] = program
-    return found
+    compiled: Callable[..., T] = program
+    return compiled
 
 
 class _Layout(NamedTuple):

@@ -178,7 +178,7 @@ def _runnable(text: bytes) -> Callable[[list[Any]], Any]:
     program = deserialize(written)
     # Programs are written without it. What users compute from a result has the same precision with a cache as without.
     types = tuple(one.update(weak_type=is_weak) for one, is_weak in zip(program.out_avals, weak, strict=True))
-    lowered = replace(program, out_avals=types).call
+    lowered: Callable[..., Any] = replace(program, out_avals=types).call
     leaves, form = jax.tree.flatten(result)
 
     def call(arrays: list[Any]) -> Any:
