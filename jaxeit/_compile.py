@@ -20,7 +20,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 from threadpoolctl import threadpool_limits
 
-from .program_cache import changes_of_folder, keep
+from .program_cache import changes_of_folder, keep, programs_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -96,10 +96,13 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     flat, structure = jax.tree.flatten(leaves)
     packs, layout = _pack_by_type(flat)
     flags = tuple(sorted((compiler_options() if options is None else options).items()))
-    kept, form = jax.tree.flatten(static)
-    typed = tuple((type(leaf), leaf) for leaf in kept)  # 1 is no 1.0
-    program = _bound(function, structure, layout, typed, form, flags, changes_of_folder())
-    return lambda *rest: program(packs, rest)
+    others, form = jax.tree.flatten(static)
+    typed = tuple((type(leaf), leaf) for leaf in others)  # 1 is no 1.0
+    program = _bound(function, structure, layout, typed, form, flags, None)
+    if programs_folder() is None:
+        return lambda *rest: program(packs, rest)
+    kept = _bound(function, structure, layout, typed, form, flags, changes_of_folder())
+    return lambda *rest: (program if _is_transformed(rest) else kept)(packs, rest)
 
 
 @lru_cache(maxsize=256)
@@ -110,10 +113,15 @@ def _bound(
     typed: tuple[Any, ...],
     form: Any,
     flags: Any,
-    _changes: int,
+    changes: int | None,
 ) -> Callable[..., T]:
-    """The program of `bind`, which models that differ in their numbers only share."""
-    kept = keep(full_precision(function), function)
+    """The program of `bind`, which models that differ in their numbers only share.
+
+    Args:
+        changes: those of the folder where the program is kept. None: it is not kept, so that it can be transformed.
+    """
+    exact = full_precision(function)
+    run = exact if changes is None else keep(exact, function)
 
     @partial(jax.jit, compiler_options=dict(flags))
     def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
@@ -121,7 +129,7 @@ def _bound(
             jax.tree.unflatten(structure, layout.unpack(packs)),
             jax.tree.unflatten(form, [leaf for _, leaf in typed]),
         )
-        found: T = kept(*eqx.combine(leaves, static), *rest)
+        found: T = run(*eqx.combine(leaves, static), *rest)
         return found
 
     compiled: Callable[..., T] = program

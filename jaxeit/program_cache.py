@@ -46,7 +46,8 @@ def cache_programs(folder: str | os.PathLike[str] | None) -> None:
     JAX's own cache (``jax_compilation_cache_dir``) keeps what XLA has compiled. To find a program there, JAX traces and
     lowers the verb, which takes half of the time of most commands. Here the lowered program is found by the verb, the
     shapes and types of arrays, all other arguments, the source of this package, the versions of the packages below it
-    and the settings of JAX. Use both caches together, as the commands do with ``~/.cache/jaxeit``.
+    and the settings of JAX. Programs of `bind` made after this call are kept likewise. Use both caches together, as the
+    commands do with ``~/.cache/jaxeit``.
 
     A call is traced as ever where a verb or an argument is of a module of your own, since a change of its code would
     not be noticed, inside transformations of JAX, and where JAX has other devices than one CPU. Take a folder that
@@ -93,11 +94,11 @@ def keep(function: Callable[..., Any], known: Callable[..., Any]) -> Callable[..
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        if _folder is None:
+            return function(*args, **kwargs)
         leaves, structure = jax.tree.flatten((args, kwargs))
-        program = None if _folder is None else _program(_folder, function, known, leaves, structure)
-        return (
-            function(*args, **kwargs) if program is None else program([leaf for leaf in leaves if eqx.is_array(leaf)])
-        )
+        program = _program(_folder, function, known, leaves, structure)
+        return function(*args, **kwargs) if program is None else program(leaves)
 
     return call
 
@@ -135,7 +136,7 @@ def _is_plain(leaves: list[Any]) -> bool:
     """Whether JAX would run these arguments as a compiled program on the only CPU there is."""
     settings = jax.config.values
     special = settings["jax_disable_jit"] or settings["jax_debug_nans"] or settings["jax_debug_infs"]
-    keys = any(not isinstance(leaf.dtype, np.dtype) for leaf in leaves if eqx.is_array(leaf))  # random ones
+    keys = any(not isinstance(leaf.dtype, np.dtype) for leaf in filter(eqx.is_array, leaves))  # random ones
     return not special and not keys and [device.platform for device in jax.devices()] == ["cpu"]
 
 
@@ -157,12 +158,11 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         args, kwargs = jax.tree.unflatten(structure, [next(given) if eqx.is_array(leaf) else leaf for leaf in leaves])
         found, form = jax.tree.flatten(function(*args, **kwargs))
         forms.append(jax.tree.unflatten(form, [_ARRAY if eqx.is_array(leaf) else leaf for leaf in found]))
-        return [leaf for leaf in found if eqx.is_array(leaf)]
+        return list(filter(eqx.is_array, found))
 
     shapes = [
         jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, weak_type=jax.typeof(leaf).weak_type)
-        for leaf in leaves
-        if eqx.is_array(leaf)
+        for leaf in filter(eqx.is_array, leaves)
     ]
     try:
         program = export(jax.jit(flat))(*shapes)
@@ -173,17 +173,17 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
 
 
 def _runnable(text: bytes) -> Callable[[list[Any]], Any]:
-    """The function of the arrays of a call that runs a program."""
+    """The function of the leaves of a call that runs a program."""
     written, weak, result = pickle.loads(text)
     program = deserialize(written)
-    # Programs are written without it. What users compute from a result has the same precision with a cache as without.
+    # A program is written without weak types. With a cache, results promote other arrays as they do without one.
     types = tuple(one.update(weak_type=is_weak) for one, is_weak in zip(program.out_avals, weak, strict=True))
     lowered: Callable[..., Any] = replace(program, out_avals=types).call
-    leaves, form = jax.tree.flatten(result)
+    parts, form = jax.tree.flatten(result)
 
-    def call(arrays: list[Any]) -> Any:
-        found = iter(lowered(*arrays))
-        return jax.tree.unflatten(form, [next(found) if leaf is _ARRAY else leaf for leaf in leaves])
+    def call(leaves: list[Any]) -> Any:
+        found = iter(lowered(*filter(eqx.is_array, leaves)))
+        return jax.tree.unflatten(form, [next(found) if part is _ARRAY else part for part in parts])
 
     return call
 

@@ -163,6 +163,8 @@ def test_what_is_reported_does_not_matter(new_process):
         lambda layer: jax.jit(lambda gain: scaled(replace(layer, gain=gain))[0].gain)(layer.gain),
         lambda layer: jax.vmap(lambda gain: scaled(replace(layer, gain=gain))[0].gain)(layer.gain),
         lambda layer: jax.grad(lambda gain: scaled(replace(layer, gain=gain))[0].gain.sum())(layer.gain),
+        lambda layer: jax.vmap(je.bind(squared))(layer.gain),
+        lambda layer: jax.jit(jax.grad(je.bind(squared, options={})))(layer.gain[1]),
         lambda layer: scaled(_of("my_module")(layer.gain, "coat")),
         lambda layer: scaled(_of("__main__")(layer.gain, "coat")),
         lambda layer: scaled(_of(__name__)(layer.gain, "coat")),
@@ -171,7 +173,20 @@ def test_what_is_reported_does_not_matter(new_process):
         lambda layer: je.verb(partial(jnp.multiply, 2.0))(layer.gain),
         lambda layer: je.verb(jax.random.uniform)(jax.random.key(0)),
     ],
-    ids=["jit", "vmap", "grad", "module", "main", "name", "other verb", "lambda", "partial", "random key"],
+    ids=[
+        "jit",
+        "vmap",
+        "grad",
+        "vmap of bind",
+        "grad of bind",
+        "module",
+        "main",
+        "name",
+        "other verb",
+        "lambda",
+        "partial",
+        "random key",
+    ],
 )
 def test_what_is_not_known_for_sure_is_not_kept(new_process, tmp_path, call):
     call(Layer(jnp.arange(3.0), "coat"))
