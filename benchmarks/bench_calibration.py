@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import calib
 import jaxeit as je
-from calib.fitting.fields import Geometry, Places, geometry_of
+from calib.fitting import Geometry, Places, geometry_of
 from calib.fitting.held_out import folds_by_place
 from calib.fitting.pads import LocatedPresses, PadModel, fit_pads
 from calib.fitting.results import FitResult

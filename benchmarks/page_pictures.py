@@ -16,7 +16,7 @@ import numpy as np
 
 import calib
 from calib.calibration import Calibration
-from calib.live.engine import Engine, ReceivedFrame
+from calib.live import Engine, ReceivedFrame
 from calib.live.loop import LiveControl
 from calib.live.page import Page
 from calib.report.document import write_report

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxeit as je
-from jaxeit.imaging.priors import Diagonal
+from jaxeit.imaging import Diagonal
 
 jax.config.update("jax_enable_x64", True)  # jaxeit never changes the settings of JAX for you
 

@@ -41,11 +41,15 @@ NONE = "–"  # an error that is not measured
 
 @dataclass(frozen=True)
 class Chapter:
-    """A question that cases answer whose names begin so, without the columns of errors if they have none."""
+    """A question that cases answer whose names begin so, without the columns of errors if they have none.
+
+    ``end`` stands below the table.
+    """
 
     text: str
     beginnings: tuple[str, ...]
     errors: bool = False
+    end: str = ""
 
 
 CHAPTERS = (
@@ -69,14 +73,23 @@ values unless the case says otherwise.
 ## Is wrong data noticed?
 
 Spoilt files are refused. Recordings whose numbers are well formed but cannot be true are refused, or named by
-`jaxeit check`, whose message the rows quote. No generated lie that changed a result went through in silence.
+`jaxeit check`. No generated lie that changed a result went through in silence.
 
 No recording tells whether all changes of EIT have the right sign, whether a common gain of EIT, force or pressure is
 wrong by less than a factor of 3, the tare of a load cell, an offset of 2 kPa that all pads share, or a grid that is
 numbered from the opposite corner.
 
 """,
-        ("a campaign", "hostile files", "lie:", "lies:", "spoilt input:", "unsound meshes"),
+        ("a campaign", "hostile files", "lies:", "spoilt input:", "unsound meshes"),
+    ),
+    Chapter(
+        """
+<details markdown="1">
+<summary>Each way in which a recording is untrue, and the message of <code>jaxeit check</code></summary>
+
+""",
+        ("lie:",),
+        end="\n</details>\n",
     ),
     Chapter(
         """
@@ -191,7 +204,9 @@ def document(rows: dict[str, Cells]) -> str:
         found = (chapter for chapter in CHAPTERS if case.startswith(chapter.beginnings))
         chapters[next(found, CHAPTERS[0])].append(cells)
     return INTRODUCTION + "".join(
-        chapter.text + _markdown(chapters[chapter], chapter.errors) for chapter in CHAPTERS if chapters[chapter]
+        chapter.text + _markdown(chapters[chapter], chapter.errors) + chapter.end
+        for chapter in CHAPTERS
+        if chapters[chapter]
     )
 
 

@@ -122,6 +122,19 @@ def test_names_in_programs_exist(site):
                 assert reduce(getattr, path[1:], import_module(path[0])) is not None, (room, name, path)
 
 
+def test_programs_import_from_rooms_that_have_a_page(site):
+    """So does a reader who goes on from a program."""
+    pages = [path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]]
+    texts = [program for page in pages for program in re.findall(r"```python.*?```", page, re.DOTALL)]
+    texts += [path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")]
+    texts += [program for room in CONTENTS for _, program in site.programs_of(room)]
+    imported = {
+        name for text in texts for name in re.findall(r"^ *(?:from|import) ((?:calib|jaxeit)[\w.]*)", text, re.M)
+    }
+    assert imported > {"calib", "jaxeit"}
+    assert imported <= {*CONTENTS, "calib.simulators.mujoco"}  # which needs MuJoCo
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("room", ["jaxeit", *(room for room in CONTENTS if room in SLOW and room not in FIRST)])
 def test_slow_programs_of_a_room(site, calibrated, room):

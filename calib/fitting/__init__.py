@@ -52,6 +52,7 @@ from .fields import (
     RadialBasis,
     TensorSpline,
     fit_field,
+    geometry_of,
     single_places,
 )
 from .logs import fit_log
@@ -98,5 +99,6 @@ __all__ = [
     "fit_curves",
     "fit_field",
     "fit_log",
+    "geometry_of",
     "single_places",
 ]

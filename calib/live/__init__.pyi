@@ -1,7 +1,7 @@
 """Names of `calib.live` and their modules, from which `__init__.py` imports them on first use."""
 
 from . import bridges as bridges
-from .engine import Engine as Engine
+from .engine import Engine as Engine, ReceivedFrame as ReceivedFrame
 from .loop import LiveControl as LiveControl, LiveError as LiveError, LiveSettings as LiveSettings, run_live as run_live
 from .presentation import Presentation as Presentation, present as present
 from .results import (

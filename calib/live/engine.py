@@ -226,8 +226,7 @@ class Engine:
 
         import numpy as np
 
-        from calib.live import Engine
-        from calib.live.engine import ReceivedFrame
+        from calib.live import Engine, ReceivedFrame
 
         engine = Engine(mine, rest=0.0)  # frame by frame, without devices
         for k in range(3):

@@ -8,8 +8,7 @@ uses the same wire format.
 Example:
     import numpy as np
 
-    from calib.record import SimulatedDevice, StopRequest, plan_recording, record_session
-    from calib.record.device import frame_packets
+    from calib.record import SimulatedDevice, StopRequest, frame_packets, plan_recording, record_session
 
     times = range(0, 1_000_000_000, 10_000_000)  # ns: 1 s at 100 Hz
     pads = (np.full(4, 100.0 * k, "f4") for k in range(100))  # Pa

@@ -1,6 +1,6 @@
 """Names of `calib.record` and their modules, from which `__init__.py` imports them on first use."""
 
-from .device import SimulatedDevice as SimulatedDevice
+from .device import SimulatedDevice as SimulatedDevice, frame_packets as frame_packets
 from .journal.conversion import convert_journal as convert_journal
 from .journal.file import JournalError as JournalError
 from .plan import PlanError as PlanError, RecordingPlan as RecordingPlan, StreamPlan as StreamPlan

@@ -121,7 +121,6 @@ def fit_field(
         import jax.numpy as jnp
 
         import jaxeit as je
-        from calib.fitting.fields import geometry_of
 
         skin = je.load_skin("testbed")
         lines = np.linspace(0.01, 0.19, 8)
@@ -133,7 +132,7 @@ def fit_field(
         reach = jnp.array([[0.01, 0.01], [0.19, 0.19]])  # m
         for field in (fitting.Constant(), calib.PadEdge(), fitting.Bilinear()):
             found = fitting.fit_field(
-                field, geometry_of(skin), presses, dip, jnp.asarray(share), jnp.ones(64), reach
+                field, fitting.geometry_of(skin), presses, dip, jnp.asarray(share), jnp.ones(64), reach
             )
             print(f"{fitting.FIELDS.text(field)}: scatter {found.noise:.3f} of {found.spread:.3f}")
     """

@@ -40,10 +40,19 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from ..errors import SessionError, printable
-from .arrays import AbstractArrayImporter
+from .arrays import AbstractArrayImporter, ArrayShape
 from .base import About, AbstractImporter, add_common_arguments, parse_epoch
 from .columns import FileSpec, StreamSpec
-from .formats import CsvImporter, Hdf5Importer, MatImporter, McapImporter, NpzImporter, ParquetImporter, import_csv
+from .formats import (
+    CsvFile,
+    CsvImporter,
+    Hdf5Importer,
+    MatImporter,
+    McapImporter,
+    NpzImporter,
+    ParquetImporter,
+    import_csv,
+)
 from .reports import FileReport, ImportReport, StreamReport
 from .table_importer import AbstractTableImporter
 from .table_session import import_tables
@@ -58,6 +67,8 @@ __all__ = [
     "AbstractImporter",
     "AbstractTableFile",
     "AbstractTableImporter",
+    "ArrayShape",
+    "CsvFile",
     "CsvImporter",
     "FileReport",
     "FileSpec",

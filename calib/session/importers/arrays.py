@@ -55,8 +55,7 @@ class AbstractArrayImporter(AbstractTableImporter):
     Example:
         import numpy as np
 
-        from calib.session.importers import AbstractArrayImporter
-        from calib.session.importers.arrays import ArrayShape
+        from calib.session.importers import AbstractArrayImporter, ArrayShape
 
 
         class RawImporter(AbstractArrayImporter):  # jaxeit import my_module:RawImporter FILE ...

@@ -82,12 +82,10 @@ def import_tables(
     `SessionError` for what cannot be read or understood and for a recording at ``output``, and then writes nothing.
 
     Example:
-        from calib.session.importers.formats.csv_tables import CsvFile
-
         streams = (importers.StreamSpec("force", ("load",), "N"),)
         table = importers.FileSpec(Path("bench.csv"), time="time", time_unit="s", streams=streams)
         about = importers.About(title="a bench of ours", license="CC0-1.0")
-        report = importers.import_tables(CsvFile, [table], "by_hand.h5", about)  # or a file of your own
+        report = importers.import_tables(importers.CsvFile, [table], "by_hand.h5", about)  # or a file of your own
     """
     require_no_session(Path(output), simulated_too=False, imported_too=False)
     _check_specs(files)
