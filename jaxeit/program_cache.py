@@ -11,6 +11,7 @@ from dataclasses import replace
 from enum import Enum
 from functools import wraps
 from hashlib import sha256
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from io import BytesIO
@@ -167,9 +168,23 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
     try:
         program = export(jax.jit(flat))(*shapes)
         weak = [result.weak_type for result in program.out_avals]
-        return pickle.dumps((program.serialize(), weak, forms[-1]))
+        text = BytesIO()
+        _Pickler(text).dump((program.serialize(), weak, forms[-1]))
+        structures = [jax.tree.structure(one) for one in (forms[-1], pickle.loads(text.getvalue())[-1])]
+        return text.getvalue() if structures[0] in structures[1:] else None
     except Exception:  # the verb refuses its arguments, or returns or calls what cannot be written
         return None
+
+
+class _Pickler(pickle.Pickler):
+    """Writes the tags of lineax as their names, because JAX compares them by identity."""
+
+    def reducer_override(self, value: Any) -> Any:
+        return (_tag, (repr(value),)) if type(value).__module__ == "lineax._tags" else NotImplemented
+
+
+def _tag(name: str) -> Any:
+    return getattr(import_module("lineax"), name)
 
 
 def _runnable(text: bytes) -> Callable[[list[Any]], Any]:

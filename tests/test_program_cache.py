@@ -10,6 +10,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -27,6 +28,20 @@ class Layer(eqx.Module):
     parts: frozenset[str] = eqx.field(static=True, default=frozenset({"a", "b"}))
 
 
+class Mark:
+    """A value that equals itself only."""
+
+
+MARK = Mark()
+
+
+class Marked(eqx.Module):
+    """A pytree of which only results of one process fit together."""
+
+    value: jax.Array
+    mark: Mark = eqx.field(static=True)
+
+
 @je.verb
 def scaled(layer, factor=2):
     TRACED.append(f"{layer.name} {factor!r}")
@@ -37,6 +52,18 @@ def scaled(layer, factor=2):
 def with_weak_types(x):
     TRACED.append("with weak types")
     return x, jnp.asarray(1.0), jnp.full(3, 2.0)
+
+
+@je.verb
+def operator(x):
+    TRACED.append("operator")
+    return lx.MatrixLinearOperator(jnp.diag(x), lx.positive_semidefinite_tag)
+
+
+@je.verb
+def marked(x):
+    TRACED.append("marked")
+    return Marked(x, MARK)
 
 
 def squared(x):
@@ -109,6 +136,18 @@ def test_results_are_weakly_typed_as_without_a_cache(new_process):
             (other[..., None] + narrow).dtype,
         )
     assert [one.weak_type for one in found] == [False, True, True]
+
+
+def test_results_fit_together_with_results_that_were_traced(new_process, tmp_path):
+    x = jnp.arange(1.0, 4.0)
+    expected = operator(x)
+    new_process()
+    found = operator(x)
+    assert TRACED == []
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    assert lx.is_positive_semidefinite(found)
+    assert jax.tree.structure(marked(x)) == jax.tree.structure(marked(2 * x))
+    assert len(_kept(tmp_path)) == 1  # a result that cannot be restored is not kept
 
 
 @pytest.mark.parametrize(
