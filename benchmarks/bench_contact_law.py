@@ -10,12 +10,15 @@ second simulator: skins of `tests/oracles/bench`, which shares no code with the 
 Boussinesq's stress, tips of 6 to 30 mm. own scenes: the library's law on another mesh, with an uneven coat and an
 uneven contact layer, Gaussian loads of 8 to 18 mm: nothing is to be learned but the gain.
 
+pads: none tells anything, or the one that bears most of the press is dead, and the others tell their forces.
+
 Force: median and 90th percentile of the relative error of the sum of all contacts. covered: forces within the 90 %
 interval that the standard error states. skins: those on which the law is used.
 """
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -40,6 +43,7 @@ SKINS = {"second simulator": 3, "own scenes": 2}
 PROBES = 24  # presses that tell the model error
 RESTING = 10  # frames of a contact that no pad tells
 WIDTHS = (0.008, 0.018)  # m, of Gaussian loads
+NONE, DEAD = "none", "one is dead"  # which pads tell forces
 INTERVAL = 1.645  # standard errors in half a 90 % interval
 SNR = 1e-3  # noise of a reading over the root mean square of the readings
 
@@ -126,16 +130,20 @@ class Session:
             change = self.noisy(level[:, None] * self.skin.changes[number])
             tracks.add(time, change, *self.told(level[:, None] * self.skin.pads[number]))
 
-    def alone(self, number: int, layer: LearnedLayer) -> tuple[Track, ...]:
-        """The contacts of a press that no pad tells."""
+    def alone(
+        self, number: int, layer: LearnedLayer, law: ContactLaw, pads: str
+    ) -> tuple[tuple[Track, ...], tuple[Track, ...]]:
+        """The contacts of a press that some pads do not tell, without the law and with it."""
         seen: list[Tracking] = []
         tracks = ContactTracks(
             self.tracker, smooth=False, layer=layer, watch=lambda now, change, errors: seen.append(now)
         )
-        silent = np.full((RESTING, self.skin.pads.shape[1]), np.nan)
-        change = self.noisy(np.tile(self.skin.changes[number], (RESTING, 1)))
-        tracks.add(round(1e9 * SECONDS) * np.arange(RESTING), change, silent, silent)
-        return seen[-1].tracks
+        exact, change = (np.tile(a[number], (RESTING, 1)) for a in (self.skin.pads, self.skin.changes))
+        silent = np.ones(exact.shape[1], bool) if pads == NONE else np.arange(exact.shape[1]) == np.argmax(exact[0])
+        forces, errors = (np.where(silent, np.nan, a) for a in self.told(exact))
+        tracks.add(round(1e9 * SECONDS) * np.arange(RESTING), self.noisy(change), forces, errors)
+        found = seen[-1].tracks
+        return found, law.without_pads(found, self.tracker.told_by_pads(found, errors[-1]))
 
 
 def judged(tracks: tuple[Track, ...], true: float) -> Row:
@@ -155,13 +163,18 @@ def one_scene(run: Run, scene: str) -> Iterator[Row]:
         skin = SCENES[scene](model, seed, max(stages) + 1 + given)
         session = Session(model, skin, seed, min(PROBES, max(stages)))
         for number, layer, law in session.taught(stages):
-            for press in range(max(stages) + 1, len(skin.forces)):
-                tracks = session.alone(press, layer)
-                for way, each in (("gain", tracks), ("law", tuple(map(law.applied, tracks)))):
-                    about = {"way": way, "presses": number, "seed": seed, "used": law.is_better}
-                    rows.append(about | judged(each, skin.forces[press]))
+            about = {"presses": number, "seed": seed, "used": law.is_better}
+            for press, pads in product(range(max(stages) + 1, len(skin.forces)), (NONE, DEAD)):
+                for way, each in zip(("gain", "law"), session.alone(press, layer, law, pads), strict=True):
+                    rows.append(about | {"way": way, "pads": pads} | judged(each, skin.forces[press]))
         print(f"{scene}, skin {seed}: {law.mean.round(2)}, evidence {law.evidence:.1f}", flush=True)
-    yield {scene: [{"skin": scene} | summary(n, mine) for n, mine in grouped(rows, "presses").items()]}
+    yield {
+        scene: [
+            {"skin": scene, "pads": pads} | summary(number, mine)
+            for pads, of_pads in grouped(rows, "pads").items()
+            for number, mine in grouped(of_pads, "presses").items()
+        ]
+    }
 
 
 def summary(presses: int, rows: list[Row]) -> Row:

@@ -115,7 +115,7 @@ class Bench:
             frame = level * self.changes[number] + self.noise * self.rng.normal(size=self.noise.size)
             (forces,) = self.told(level * exact[None])
             now = self.tracker.step(now, frame, SECONDS, forces, self._pad_errors(forces))
-        return self.tracker.learned(now, layer)
+        return self.tracker.learned(now)
 
     def _pad_errors(self, forces: np.ndarray) -> np.ndarray:
         return np.hypot(PAD_ERROR[0] * np.maximum(np.nan_to_num(forces), 0), PAD_ERROR[1])

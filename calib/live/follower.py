@@ -68,7 +68,7 @@ class LiveFollower:
         """The gain of the contact layer, as the calibration knows it and contacts have told it since; None: unknown."""
         if self._tracker is None or self._now is None:
             return self._layer
-        return self._tracker.learned(self._now, self._layer)
+        return self._tracker.learned(self._now)
 
     def restart(self) -> None:
         """Forget the contacts, as after a new measurement of the rest levels, but not what they told of the layer."""

@@ -19,7 +19,7 @@ from ..model.discretisation import Model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
 from .belief.filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
-from .belief.layer import GainField, LearnedLayer
+from .belief.layer import PRESS_VARIANCES, GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
 from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
@@ -30,8 +30,10 @@ from .tracks import Backlog, Look, Seen, Track, Tracking
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
 # of the belief changes by much more than it may.
 UNEXPECTED, SURPRISING = 4.0, 25.0
-# Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
+# Prior standard deviations beyond which no mode of the gain is believed, of the layer and under a press: what contacts
+# told of the gain was wrong then.
 MOST_GAIN = 4.0
+MOST_UNDER_PRESS = MOST_GAIN * float(np.sqrt(1 + PRESS_VARIANCES.max()))
 # A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
 PATIENCE, WORSE = 10, 1.3
 # Share of a load on pads that tell forces, from which the pads tell the force of a contact.
@@ -69,17 +71,27 @@ class Tracker:
         """
         layer = LearnedLayer.unknown(self.field) if layer is None else layer
         self.field.require_same(layer.field)
+        return Tracking(self._untouched(layer), layer=layer)
+
+    def _untouched(self, layer: LearnedLayer) -> Belief:
+        """The belief without contacts; its gain is that under the next press."""
         put = partial(jnp.asarray, dtype=self.filter.places.dtype)
-        return Tracking(Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(layer.covariance)))
+        return Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(layer.under_press))
 
-    def learned(self, now: Tracking, layer: LearnedLayer | None = None) -> LearnedLayer:
-        """What contacts have told of the gain of the contact layer up to now, to `start` with another time.
+    def learned(self, now: Tracking) -> LearnedLayer:
+        """What contacts have told of the gain of the contact layer up to now, to `start` with another time."""
+        before = LearnedLayer.unknown(self.field) if now.layer is None else now.layer
+        if now.begun == now.taught:
+            return before
+        found = before.told(now.belief.gain, now.belief.covariance, now.begun - now.taught)
+        return found if (np.abs(found.mean) <= MOST_GAIN).all() else found.restarted()
 
-        Args:
-            layer: with which these contacts were started.
-        """
-        before = 0 if layer is None else layer.contacts
-        return LearnedLayer.of_belief(self.field, now.belief.gain, now.belief.covariance, before + now.begun)
+    def _taught(self, now: Tracking) -> Tracking:
+        """With what contacts have taught, once all of them have lifted: the next press has an effect of its own."""
+        if now.numbers or now.backlog is not None or now.begun == now.taught:
+            return now
+        layer = self.learned(now)
+        return replace(now, belief=self._untouched(layer), layer=layer, taught=now.begun)
 
     def told_by_pads(
         self, tracks: tuple[Track, ...], pad_errors: Float[ArrayLike, " pads"] | None = None
@@ -125,7 +137,7 @@ class Tracker:
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         seen = Seen(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
-        return self._with_considered(bounded(self._stepped(now, seen, whole)), seen.pads)
+        return self._with_considered(self._taught(bounded(self._stepped(now, seen, whole))), seen.pads)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
@@ -152,7 +164,7 @@ class Tracker:
         if backlog is None:
             return now
         last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.seen
-        return self._with_considered(bounded(self._looked(now, backlog)), last.pads)
+        return self._with_considered(self._taught(bounded(self._looked(now, backlog))), last.pads)
 
     def _with_considered(self, now: Tracking, pads: Pads) -> Tracking:
         """With what unknown shapes and an unknown coat make the contacts err by."""
@@ -221,15 +233,17 @@ class Tracker:
 
 
 def bounded(now: Tracking) -> Tracking:
-    """Without what was learned of the gain, if a mode is beyond `MOST_GAIN`; the contacts stay."""
+    """Without what this press told of the gain, if a mode is beyond `MOST_UNDER_PRESS`; the contacts stay."""
     gain = np.asarray(now.belief.gain)
-    if (np.abs(gain) <= MOST_GAIN).all():
+    if (np.abs(gain) <= MOST_UNDER_PRESS).all():
         return now
     covariance = np.array(now.belief.covariance)
     own = now.belief.contacts.size
     covariance[own:] = covariance[:, own:] = 0
-    covariance[own:, own:] = np.eye(len(gain))
-    return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(0 * gain), jnp.asarray(covariance)))
+    mean, covariance[own:, own:] = (
+        (0 * gain, np.eye(len(gain))) if now.layer is None else (now.layer.mean, now.layer.under_press)
+    )
+    return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(mean), jnp.asarray(covariance)))
 
 
 def prepare_tracker(

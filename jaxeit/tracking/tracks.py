@@ -8,6 +8,7 @@ import numpy as np
 
 from .belief.consider import ConsiderErrors
 from .belief.filter import SIZE, Attempt, Belief, Pads
+from .belief.layer import LearnedLayer
 from .events import Hypothesis
 
 
@@ -46,6 +47,8 @@ class Tracking:
     | edges: which of them are edges                                        |
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
+    | layer: what was known of the gain before the contacts of now; None: before any contact |
+    | taught: number of contacts that it holds of those that have begun     |
     | misfit: chi-square of the last frame that was looked into, and frames since then |
     | considered: what unknown shapes and an unknown coat make the contacts err by |
     | backlog: frames that are not explained yet; the belief is that without events since then |
@@ -60,6 +63,8 @@ class Tracking:
     since: int = 0
     considered: ConsiderErrors = field(default_factory=ConsiderErrors)
     backlog: "Backlog | None" = None
+    layer: LearnedLayer | None = None
+    taught: int = 0
 
     @property
     def tracks(self) -> tuple[Track, ...]:

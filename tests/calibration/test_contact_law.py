@@ -52,7 +52,7 @@ class FakeTracker(Tracker):
         tracks = (track(force if told else force / WEAKER, begun),)
         return stand_in(Tracking, tracks=tracks, begun=begun, backlog=None)
 
-    def learned(self, now, layer=None):
+    def learned(self, now):
         return ("layer after", now.begun)
 
     def told_by_pads(self, tracks, pad_errors=None):

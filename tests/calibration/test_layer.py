@@ -48,14 +48,14 @@ class FakeTracker(Tracker):
 
     def start(self, layer=None):
         self.started.append(layer)
-        return stand_in(Tracking, tracks=(), begun=0, backlog=None)
+        return stand_in(Tracking, tracks=(), begun=0, backlog=None, layer=layer)
 
     def step(self, now, change, seconds, force, error, whole=True):
         self.steps += 1
-        return stand_in(Tracking, tracks=(), begun=CONTACTS, backlog=None)
+        return stand_in(Tracking, tracks=(), begun=CONTACTS, backlog=None, layer=now.layer)
 
-    def learned(self, now, layer=None):
-        return self.tells._replace(contacts=now.begun + (0 if layer is None else layer.contacts))
+    def learned(self, now):
+        return self.tells._replace(contacts=now.begun + (0 if now.layer is None else now.layer.contacts))
 
 
 def better_with_contacts(tracker, dv, forces, errors, layer):
@@ -80,9 +80,10 @@ def session(later, tmp_path_factory):
 
 
 def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
+    layer = layer._replace(evidence=np.linspace(-7.0, -1.0, len(layer.evidence)))
     replace(calibration, layer=layer).save(tmp_path / "c.h5")
     found = calib.load_calibration(tmp_path / "c.h5").layer
-    for name in ("mean", "covariance", "contacts"):
+    for name in ("mean", "covariance", "contacts", "evidence"):
         np.testing.assert_array_equal(getattr(found, name), getattr(layer, name))
     points = np.random.default_rng(1).uniform(0, 0.2, (20, 2))
     np.testing.assert_array_equal(found.at(points), layer.at(points))
@@ -96,6 +97,8 @@ def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
         ("covariance", lambda a: a - 2 * np.eye(len(a)), "is no covariance"),
         ("mean", lambda a: np.where(np.arange(len(a)) == 3, np.nan, a), "layer/mean holds a number that is not finite"),
         ("places", lambda a: a[1:], "layer/places is float64 of shape"),
+        ("evidence", lambda a: a * np.nan, "layer/evidence holds a number that is not finite"),
+        ("evidence", lambda a: a[1:], "layer/evidence is float64 of shape"),
         ("length", lambda a: 0 * a, "layer/length holds a number that is not finite, or zero or less"),
         ("contacts", lambda a: a - 100, "layer/contacts is -93; nothing is learned from less than none"),
     ],

@@ -365,10 +365,11 @@ class FakeTracker(Tracker):
         self.untouched, self.noise, self.steps, self.looks = untouched, noise, [], []
 
     def start(self, layer=None):
+        self.layer = layer
         return stand_in(Tracking, tracks=(), begun=0)
 
-    def learned(self, now, layer=None):
-        return layer
+    def learned(self, now):
+        return self.layer
 
     def look(self, now):
         self.looks.append(now.backlog)

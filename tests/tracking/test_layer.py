@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import GainField, LearnedLayer
-from jaxeit.tracking.tracker import MOST_GAIN, bounded
+from jaxeit.tracking.belief.layer import OUTLIER, PRESS_VARIANCES
+from jaxeit.tracking.tracker import MOST_UNDER_PRESS, bounded
 
 from .conftest import SECONDS, load
 
@@ -23,7 +25,7 @@ def test_a_gain_beyond_all_belief_is_forgotten_and_the_contacts_stay(tracker, fr
     for _ in range(3):
         now = tracker.step(now, frame_of([load(0.08, 0.08, 10.0)]), SECONDS)
     assert bounded(now) is now
-    wrong = replace(now, belief=now.belief._replace(gain=now.belief.gain.at[5].set(-MOST_GAIN - 1)))
+    wrong = replace(now, belief=now.belief._replace(gain=now.belief.gain.at[5].set(-MOST_UNDER_PRESS - 1)))
     found = bounded(wrong).belief
     np.testing.assert_array_equal(found.contacts, now.belief.contacts)
     np.testing.assert_array_equal(found.covariance[:8, :8], now.belief.covariance[:8, :8])
@@ -88,7 +90,7 @@ def test_what_was_learned_tells_the_force_without_pads(tracker, frame_of, layer)
 
 def test_learning_goes_on_where_it_ended(tracker, layer):
     now = tracker.start(layer)
-    again = tracker.learned(now, layer)
+    again = tracker.learned(now)
     np.testing.assert_allclose(again.mean, layer.mean, rtol=1e-6)
     np.testing.assert_allclose(again.covariance, layer.covariance, atol=1e-7)
     assert again.contacts == layer.contacts
@@ -110,3 +112,64 @@ def test_a_layer_of_another_sheet_is_refused(tracker, layer):
     for field in (moved, replace(layer.field, deviation=0.2)):
         with pytest.raises(InverseError, match="learned on another sheet or under other settings"):
             tracker.start(layer._replace(field=field))
+
+
+SMALL = GainField(np.concatenate([np.full((1, 2), np.inf), np.zeros((7, 2))]), 0.015, 0.3, 0.12, 1.0)
+NOISE = 0.05  # of what a press tells of the gain under it
+
+
+def after_presses(rng, count, variance):
+    """A layer after presses of which each tells three directions of the gain under it; its true gain, told so far."""
+    layer, true = LearnedLayer.unknown(SMALL), rng.normal(size=8)
+    for _ in range(count):
+        under, rows = true + np.sqrt(variance) * rng.normal(size=8), rng.normal(size=(3, 8))
+        seen = rows @ under + NOISE * rng.normal(size=3)
+        before = layer.under_press
+        gain = before @ rows.T @ np.linalg.inv(rows @ before @ rows.T + NOISE**2 * np.eye(3))
+        layer = layer.told(layer.mean + gain @ (seen - rows @ layer.mean), before - gain @ rows @ before, 1)
+    return layer, true
+
+
+def test_without_an_effect_of_the_press_the_layer_is_the_belief_of_the_press():
+    """Directions of which a press takes away less than a hundredth of the variance are left out."""
+    gain, covariance = np.array([0.1, *np.zeros(7)]), np.diag([0.2, *np.ones(7)])
+    layer = LearnedLayer.unknown(SMALL).told(gain, covariance, 2)
+    assert (layer.press_variance, layer.contacts) == (0.0, 2)
+    np.testing.assert_allclose(layer.mean, gain, atol=1e-12)
+    np.testing.assert_allclose(layer.covariance, covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("variance", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("seed", range(701, 704))
+def test_how_far_presses_differ_is_learned_and_the_layer_states_its_error(seed, variance):
+    """Normalised squares of the errors: within bounds that 1 of 10,000 layers of eight modes would break."""
+    layer, true = after_presses(np.random.default_rng(seed), 60, variance)
+    near = np.argsort(np.abs(PRESS_VARIANCES - variance))[:2]
+    assert layer.press_variance in PRESS_VARIANCES[near]
+    error = layer.mean - true
+    assert chi2.ppf(5e-5, 8) < error @ np.linalg.solve(layer.covariance, error) < chi2.ppf(1 - 5e-5, 8)
+    assert error @ error < true @ true
+
+
+def test_no_single_press_rules_a_variance_out():
+    layer, _ = after_presses(np.random.default_rng(704), 10, 0.0)
+    wild = layer.told(layer.mean + 100, 0.5 * layer.under_press, 1)
+    assert (wild.evidence - layer.evidence).min() >= np.log(OUTLIER)
+    assert np.ptp(wild.evidence - layer.evidence) > 1
+
+
+@pytest.mark.slow
+def test_after_a_press_the_next_one_has_an_effect_of_its_own(tracker, frame_of):
+    """What is known of the gain under the next press is the layer and the effect; and no press, no lesson."""
+    start = LearnedLayer.unknown(tracker.field)._replace(evidence=np.linspace(-30, 0, len(PRESS_VARIANCES)))
+    now = tracker.start(start)
+    for force in (0.0, 10.0, 10.0, 10.0, 0.0, 0.0):
+        now = tracker.step(
+            now, frame_of([load(0.05, 0.06, max(force, 1e-6))]), SECONDS, FORCES * force / 10 + 1e-9, np.full(4, 0.2)
+        )
+    known = tracker.learned(now)
+    assert not now.numbers
+    assert now.taught == now.begun == known.contacts == 1
+    np.testing.assert_allclose(now.belief.covariance, known.under_press)
+    assert np.trace(known.covariance) < np.trace(start.covariance)
+    assert tracker.learned(tracker.start(start)) is start

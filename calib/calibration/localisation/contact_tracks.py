@@ -104,7 +104,7 @@ class ContactTracks:
         law: ContactLaw | None = None,
         watch: Callable[[Tracking, np.ndarray, np.ndarray], None] = lambda *_: None,
     ):
-        self._tracker, self._layer, self._now = tracker, layer, tracker.start(layer)
+        self._tracker, self._now = tracker, tracker.start(layer)
         self._smoother = Smoother(tracker) if smooth else None
         self._law, self._watch = law, watch
         self._errors: deque[tuple[int, np.ndarray]] = deque()  # of pads, of frames that are still to be smoothed
@@ -126,7 +126,7 @@ class ContactTracks:
 
     def learned(self) -> LearnedLayer:
         """What all contacts so far have told of the gain of the contact layer."""
-        return self._tracker.learned(self._now, self._layer)
+        return self._tracker.learned(self._now)
 
     def end(self) -> Rows:
         """The rows that are left."""

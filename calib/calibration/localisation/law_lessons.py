@@ -60,7 +60,7 @@ class LawLessons:
         best, self._strongest = self._strongest, None
         if best is None:
             return
-        layer = self._layer if self._quiet is None else self._tracker.learned(self._quiet, self._layer)
+        layer = self._layer if self._quiet is None else self._tracker.learned(self._quiet)
         # A frame by itself: an error of the model counts once.
         alone = self._tracker.step(self._tracker.start(layer), best.change, self._tracker.settings.persistence).tracks
         if len(alone) == 1 and np.linalg.norm(alone[0].position - best.place) < NEAR:

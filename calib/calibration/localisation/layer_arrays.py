@@ -24,6 +24,7 @@ def layer_arrays(layer: LearnedLayer) -> dict[str, tuple[Any, str, str]]:
         "layer/places": (layer.field.places[1:], "m", "of the bumps that the log gain of the contact layer is made of"),
         "layer/mean": (layer.mean, "1", "of level and bumps, in their standard deviations before any contact"),
         "layer/covariance": (layer.covariance, "1", "of these"),
+        "layer/evidence": (layer.evidence, "1", "log probability of all presses for each variance of a press's effect"),
         "layer/contacts": (layer.contacts, "1", "number of contacts that they were learned from"),
     }
 
@@ -43,4 +44,10 @@ def layer_from(arrays: Mapping[str, np.ndarray]) -> LearnedLayer | None:
     contacts = int(shaped(arrays, "layer/contacts", (), "iu"))
     if contacts < 0:
         raise ValueError(f"layer/contacts is {contacts}; nothing is learned from less than none")
-    return LearnedLayer(field, found["mean"], found["covariance"], contacts)
+    learned = LearnedLayer(field, found["mean"], found["covariance"], contacts)
+    if "layer/evidence" not in arrays:  # of an early version
+        return learned
+    evidence = shaped(arrays, "layer/evidence", learned.evidence.shape, "f")
+    if not np.isfinite(evidence).all():
+        raise ValueError("layer/evidence holds a number that is not finite")
+    return learned._replace(evidence=evidence)

@@ -1,10 +1,18 @@
-"""The gain of the contact layer over the sheet: what is known of it beforehand, and what contacts have told of it."""
+"""The gain of the contact layer over the sheet: what is known of it beforehand, and what contacts have told of it.
+
+The model of a contact errs: tips are not Gaussian, and the layer of a skin may follow another law. During a press such
+an error is the same in all frames, and looks like another gain there; the next press brings another error. So the gain
+under a press is that of the layer plus an effect of the press, a random effect (Laird and Ware 1982, Biometrics 38,
+963): drawn anew for each press from the distribution of the gain before any contact, with the variance times a number
+that is the same for all presses. That number is learned from how far presses differ from what was known before them.
+"""
 
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ...contacts.loads.preparation import field_bumps, field_nodes, field_norm
 from ...contacts.loads.settings import LoadSettings
@@ -12,6 +20,14 @@ from ...imaging.noise import InverseError
 
 # Difference within which numbers of two fields count as equal, relative to the length of the field.
 SAME = 1e-5
+# Variances of the effect of a press that are considered, in those of the gain before any contact.
+PRESS_VARIANCES = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+# Least share of the variance of a direction of the gain that a press takes away, for the direction to count.
+LEAST_TOLD = 0.01
+# Least share that it leaves: rounding.
+TINY = 1e-9
+# Probability of a press that is like none of these: it says no more than this against any of them.
+OUTLIER = 1e-3
 
 
 class GainField(eqx.Module):
@@ -73,6 +89,8 @@ class LearnedLayer(NamedTuple):
     | mean of the modes, in units of their prior standard deviations   | (g,)   | 1    |
     | covariance of the modes                                          | (g, g) | 1    |
     | contacts: number of contacts that it was learned from            |        |      |
+    | evidence: log of the probability of all presses, for each of     | (v,)   | 1    |
+    |   `PRESS_VARIANCES`, up to a constant                            |        |      |
 
     Example:
         layer = tracker.learned(now)  # the gain of the contact layer, as contacts tell it
@@ -84,6 +102,7 @@ class LearnedLayer(NamedTuple):
     mean: Float[np.ndarray, " g"]
     covariance: Float[np.ndarray, "g g"]
     contacts: int = 0
+    evidence: Float[np.ndarray, " v"] = np.zeros(len(PRESS_VARIANCES))
 
     @classmethod
     def unknown(cls, field: GainField) -> "LearnedLayer":
@@ -91,17 +110,50 @@ class LearnedLayer(NamedTuple):
         size = len(field.places)
         return cls(field, np.zeros(size), np.eye(size))
 
-    @classmethod
-    def of_belief(
-        cls,
-        field: GainField,
-        gain: Float[Array | np.ndarray, " g"],
-        covariance: Float[Array | np.ndarray, "n n"],
-        contacts: int,
+    @property
+    def press_variance(self) -> float:
+        """The mean of `PRESS_VARIANCES` by their probabilities: none where the model of contacts is right.
+
+        The first presses, before there is another to compare with, are not believed as if they had no effect.
+        """
+        return _mean_variance(self.evidence)
+
+    @property
+    def under_press(self) -> Float[np.ndarray, "g g"]:
+        """Covariance of the gain under the next press, whose effect is not known; its mean is that of the layer."""
+        return self.covariance + self.press_variance * np.eye(len(self.mean))
+
+    def told(
+        self, gain: Float[Array | np.ndarray, " g"], covariance: Float[Array | np.ndarray, "n n"], contacts: int
     ) -> "LearnedLayer":
-        """The gain of a belief of contacts and gain, whose covariance (n, n) ends with that of the gain (g, g)."""
-        mean, own = np.asarray(gain, float), np.asarray(covariance, float)[-len(gain) :, -len(gain) :]
-        return cls(field, mean, 0.5 * (own + own.T), contacts)
+        """The gain of the layer after a press that began with `mean` and `under_press`.
+
+        What the press told of the gain under it is a measurement y = H (g + e) + noise, along directions H of which it
+        took variance away. With the gain g ~ N(m, P), the effect e ~ N(0, v) and v the mean variance after
+        this press, g follows by conditioning.
+
+        Args:
+            gain: under the press, as it was told.
+            covariance: (n, n), which ends with that of this gain (g, g).
+            contacts: number of contacts of the press.
+        """
+        own = np.asarray(covariance, float)[-len(gain) :, -len(gain) :]
+        root = np.linalg.cholesky(self.under_press)
+        white = solve_triangular(root, solve_triangular(root, 0.5 * (own + own.T), lower=True).T, lower=True)
+        left, directions = np.linalg.eigh(0.5 * (white + white.T))
+        kept = left < 1 - LEAST_TOLD
+        left, along = np.maximum(left[kept], TINY), solve_triangular(root.T, directions[:, kept])
+        seen, noise = along.T @ (np.asarray(gain, float) - self.mean) / (1 - left), left / (1 - left)
+        towards, effect = self.covariance @ along, along.T @ along
+        known = along.T @ towards + np.diag(noise)
+        evidence = self.evidence + _bounded([_log_normal(seen, known + v * effect) for v in PRESS_VARIANCES])
+        whole = cho_factor(known + _mean_variance(evidence) * effect)
+        return self._replace(
+            mean=self.mean + towards @ cho_solve(whole, seen),
+            covariance=self.covariance - towards @ cho_solve(whole, towards.T),
+            contacts=self.contacts + contacts,
+            evidence=evidence,
+        )
 
     def at(self, points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Mean and standard deviation of the log gain at points (n, 2) m."""
@@ -118,4 +170,28 @@ class LearnedLayer(NamedTuple):
             raise InverseError(f"the share that is forgotten is {share}; give 0 to 1")
         kept = 1 - share
         unit = np.eye(len(self.mean))
-        return self._replace(mean=kept * self.mean, covariance=unit + kept**2 * (self.covariance - unit))
+        return self._replace(
+            mean=kept * self.mean, covariance=unit + kept**2 * (self.covariance - unit), evidence=kept * self.evidence
+        )
+
+    def restarted(self) -> "LearnedLayer":
+        """Without the gain, where it cannot be believed; how far presses differ stays known."""
+        return LearnedLayer.unknown(self.field)._replace(contacts=self.contacts, evidence=self.evidence)
+
+
+def _mean_variance(evidence: Float[np.ndarray, " v"]) -> float:
+    """Mean of `PRESS_VARIANCES`, of which each is as probable as the others before any press."""
+    weight = np.exp(evidence - evidence.max())
+    return float(weight @ PRESS_VARIANCES / weight.sum())
+
+
+def _log_normal(seen: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"]) -> float:
+    """Log density of a normal distribution about zero, up to a constant."""
+    root = np.linalg.cholesky(covariance)
+    return float(-0.5 * np.sum(np.linalg.solve(root, seen) ** 2) - np.sum(np.log(np.diag(root))))
+
+
+def _bounded(evidence: list[float]) -> Float[np.ndarray, " v"]:
+    """Logs of probabilities of a press, over that of the most probable variance, which one press cannot rule out."""
+    found = np.array(evidence)
+    return np.asarray(np.logaddexp(found - found.max(), np.log(OUTLIER)))
