@@ -133,7 +133,8 @@ def after_presses(rng, count, variance):
 def test_without_an_effect_of_the_press_the_layer_is_the_belief_of_the_press():
     """Directions of which a press takes away less than a hundredth of the variance are left out."""
     gain, covariance = np.array([0.1, *np.zeros(7)]), np.diag([0.2, *np.ones(7)])
-    layer = LearnedLayer.unknown(SMALL).told(gain, covariance, 2)
+    sure = np.where(PRESS_VARIANCES > 0, -50.0, 0.0)
+    layer = LearnedLayer.unknown(SMALL)._replace(evidence=sure).told(gain, covariance, 2)
     assert (layer.press_variance, layer.contacts) == (0.0, 2)
     np.testing.assert_allclose(layer.mean, gain, atol=1e-12)
     np.testing.assert_allclose(layer.covariance, covariance, atol=1e-12)

@@ -112,11 +112,8 @@ class LearnedLayer(NamedTuple):
 
     @property
     def press_variance(self) -> float:
-        """The mean of `PRESS_VARIANCES` by their probabilities: none where the model of contacts is right.
-
-        The first presses, before there is another to compare with, are not believed as if they had no effect.
-        """
-        return _mean_variance(self.evidence)
+        """The most probable of `PRESS_VARIANCES`: none where the model of contacts is right, and before any press."""
+        return float(PRESS_VARIANCES[np.argmax(self.evidence)])
 
     @property
     def under_press(self) -> Float[np.ndarray, "g g"]:
@@ -129,8 +126,9 @@ class LearnedLayer(NamedTuple):
         """The gain of the layer after a press that began with `mean` and `under_press`.
 
         What the press told of the gain under it is a measurement y = H (g + e) + noise, along directions H of which it
-        took variance away. With the gain g ~ N(m, P), the effect e ~ N(0, v) and v the mean variance after
-        this press, g follows by conditioning.
+        took variance away. With the gain g ~ N(m, P), the effect e ~ N(0, v) and v the mean variance
+        after this press, g follows by conditioning. The mean, since the first presses cannot tell whether they have an
+        effect, and would else be believed for good as if they had none.
 
         Args:
             gain: under the press, as it was told.
@@ -148,9 +146,10 @@ class LearnedLayer(NamedTuple):
         known = along.T @ towards + np.diag(noise)
         evidence = self.evidence + _bounded([_log_normal(seen, known + v * effect) for v in PRESS_VARIANCES])
         whole = cho_factor(known + _mean_variance(evidence) * effect)
+        left_over = self.covariance - towards @ cho_solve(whole, towards.T)
         return self._replace(
             mean=self.mean + towards @ cho_solve(whole, seen),
-            covariance=self.covariance - towards @ cho_solve(whole, towards.T),
+            covariance=0.5 * (left_over + left_over.T),
             contacts=self.contacts + contacts,
             evidence=evidence,
         )
@@ -180,7 +179,7 @@ class LearnedLayer(NamedTuple):
 
 
 def _mean_variance(evidence: Float[np.ndarray, " v"]) -> float:
-    """Mean of `PRESS_VARIANCES`, of which each is as probable as the others before any press."""
+    """Mean of `PRESS_VARIANCES`, by their probabilities; before any press these are the same."""
     weight = np.exp(evidence - evidence.max())
     return float(weight @ PRESS_VARIANCES / weight.sum())
 
