@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.tracking.belief.filter import PIECE, SIZE, STEPS, Pads
+from jaxeit.tracking.belief.filter import PIECE, STEPS, Pads
 from jaxeit.tracking.belief.programs import Programs
 from jaxeit.tracking.looks import KEPT, PATIENCE, meanwhile
 from jaxeit.tracking.tracks import Seen

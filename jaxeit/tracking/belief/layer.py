@@ -179,7 +179,7 @@ class LearnedLayer(NamedTuple):
 
 
 def _mean_variance(evidence: Float[np.ndarray, " v"]) -> float:
-    """Mean of `PRESS_VARIANCES`, by their probabilities; before any press these are the same."""
+    """Mean of `PRESS_VARIANCES` by their probabilities, which are the same before any press."""
     weight = np.exp(evidence - evidence.max())
     return float(weight @ PRESS_VARIANCES / weight.sum())
 
