@@ -10,7 +10,7 @@ second simulator: skins of `tests/oracles/bench`, which shares no code with the 
 Boussinesq's stress, tips of 6 to 30 mm. own scenes: the library's law on another mesh, with an uneven coat and an
 uneven contact layer, Gaussian loads of 8 to 18 mm: nothing is to be learned but the gain.
 
-pads: those that tell no force: all, or the one that bears most of the press, as if it leaked.
+pads: none tells a force, or the one that bears most of the press is dead and the others tell theirs.
 
 Force: median and 90th percentile of the relative error of the sum of all contacts. covered: forces within the 90 %
 interval that the standard error states. skins: those on which the law is used.
@@ -43,7 +43,7 @@ SKINS = {"second simulator": 3, "own scenes": 2}
 PROBES = 24  # presses that tell the model error
 RESTING = 10  # frames of a contact that no pad tells
 WIDTHS = (0.008, 0.018)  # m, of Gaussian loads
-NONE, DEAD = "all", "the one pressed"  # pads that tell no force
+NONE, DEAD = "none", "one is dead"  # pads that tell forces
 INTERVAL = 1.645  # standard errors in half a 90 % interval
 SNR = 1e-3  # noise of a reading over the root mean square of the readings
 

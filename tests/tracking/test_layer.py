@@ -133,14 +133,13 @@ def after_presses(rng, count, variance):
 def test_without_an_effect_of_the_press_the_layer_is_the_belief_of_the_press():
     """Directions of which a press takes away less than a hundredth of the variance are left out."""
     gain, covariance = np.array([0.1, *np.zeros(7)]), np.diag([0.2, *np.ones(7)])
-    sure = np.where(PRESS_VARIANCES > 0, -50.0, 0.0)
-    layer = LearnedLayer.unknown(SMALL)._replace(evidence=sure).told(gain, covariance, 2)
+    layer = LearnedLayer.unknown(SMALL).told(gain, covariance, 2)
     assert (layer.press_variance, layer.contacts) == (0.0, 2)
     np.testing.assert_allclose(layer.mean, gain, atol=1e-12)
     np.testing.assert_allclose(layer.covariance, covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("variance", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("variance", [0.0, 3.0])
 @pytest.mark.parametrize("seed", range(701, 704))
 def test_how_far_presses_differ_is_learned_and_the_layer_states_its_error(seed, variance):
     """Normalised squares of the errors: within bounds that 1 of 10,000 layers of eight modes would break."""

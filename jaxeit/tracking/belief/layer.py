@@ -126,9 +126,9 @@ class LearnedLayer(NamedTuple):
         """The gain of the layer after a press that began with `mean` and `under_press`.
 
         What the press told of the gain under it is a measurement y = H (g + e) + noise, along directions H of which it
-        took variance away. With the gain g ~ N(m, P), the effect e ~ N(0, v) and v the mean variance
-        after this press, g follows by conditioning. The mean, since the first presses cannot tell whether they have an
-        effect, and would else be believed for good as if they had none.
+        took variance away. With the gain g ~ N(m, P), the effect e ~ N(0, v) and v the most probable variance
+        after this press, g follows by conditioning. A press that was believed under a smaller variance than later ones
+        show stays so believed: where effects are small beside the gain, the stated covariance is too small.
 
         Args:
             gain: under the press, as it was told.
@@ -145,7 +145,7 @@ class LearnedLayer(NamedTuple):
         towards, effect = self.covariance @ along, along.T @ along
         known = along.T @ towards + np.diag(noise)
         evidence = self.evidence + _bounded([_log_normal(seen, known + v * effect) for v in PRESS_VARIANCES])
-        whole = cho_factor(known + _mean_variance(evidence) * effect)
+        whole = cho_factor(known + PRESS_VARIANCES[np.argmax(evidence)] * effect)
         left_over = self.covariance - towards @ cho_solve(whole, towards.T)
         return self._replace(
             mean=self.mean + towards @ cho_solve(whole, seen),
@@ -176,12 +176,6 @@ class LearnedLayer(NamedTuple):
     def restarted(self) -> "LearnedLayer":
         """Without the gain, where it cannot be believed; how far presses differ stays known."""
         return LearnedLayer.unknown(self.field)._replace(contacts=self.contacts, evidence=self.evidence)
-
-
-def _mean_variance(evidence: Float[np.ndarray, " v"]) -> float:
-    """Mean of `PRESS_VARIANCES` by their probabilities, which are the same before any press."""
-    weight = np.exp(evidence - evidence.max())
-    return float(weight @ PRESS_VARIANCES / weight.sum())
 
 
 def _log_normal(seen: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"]) -> float:
