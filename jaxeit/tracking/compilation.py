@@ -29,7 +29,8 @@ def compile_tracker(tracker: Tracker) -> None:
     most, pads = tracker.settings.most, tracker.filter.sheet.pad_area.shape[1]
     tracker.step(start, 0 * frame, SECONDS)  # without forces on pads
     for count in range(most + 1):
-        now = Tracking(belief, tuple(range(1, count + 1)), (False,) * count, (0,) * count, count, taught=count)
+        numbers = tuple(range(1, count + 1))
+        now = Tracking(belief, start.layer, numbers, (False,) * count, (0,) * count, count, taught=count)
         tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
         tracker.programs.predicted(belief, SECONDS)
         if count:

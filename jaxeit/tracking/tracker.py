@@ -19,7 +19,7 @@ from ..model.discretisation import Model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
 from .belief.filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
-from .belief.layer import PRESS_VARIANCES, GainField, LearnedLayer
+from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
 from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
@@ -30,10 +30,8 @@ from .tracks import Backlog, Look, Seen, Track, Tracking
 # A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
 # of the belief changes by much more than it may.
 UNEXPECTED, SURPRISING = 4.0, 25.0
-# Prior standard deviations beyond which no mode of the gain is believed, of the layer and under a press: what contacts
-# told of the gain was wrong then.
+# Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
 MOST_GAIN = 4.0
-MOST_UNDER_PRESS = MOST_GAIN * float(np.sqrt(1 + PRESS_VARIANCES.max()))
 # A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
 PATIENCE, WORSE = 10, 1.3
 # Share of a load on pads that tell forces, from which the pads tell the force of a contact.
@@ -71,7 +69,7 @@ class Tracker:
         """
         layer = LearnedLayer.unknown(self.field) if layer is None else layer
         self.field.require_same(layer.field)
-        return Tracking(self._untouched(layer), layer=layer)
+        return Tracking(self._untouched(layer), layer)
 
     def _untouched(self, layer: LearnedLayer) -> Belief:
         """The belief without contacts; its gain is that under the next press."""
@@ -80,10 +78,9 @@ class Tracker:
 
     def learned(self, now: Tracking) -> LearnedLayer:
         """What contacts have told of the gain of the contact layer up to now, to `start` with another time."""
-        before = LearnedLayer.unknown(self.field) if now.layer is None else now.layer
         if now.begun == now.taught:
-            return before
-        found = before.told(now.belief.gain, now.belief.covariance, now.begun - now.taught)
+            return now.layer
+        found = now.layer.told(now.belief.gain, now.belief.covariance, now.begun - now.taught)
         return found if (np.abs(found.mean) <= MOST_GAIN).all() else found.restarted()
 
     def _taught(self, now: Tracking) -> Tracking:
@@ -233,17 +230,15 @@ class Tracker:
 
 
 def bounded(now: Tracking) -> Tracking:
-    """Without what this press told of the gain, if a mode is beyond `MOST_UNDER_PRESS`; the contacts stay."""
-    gain = np.asarray(now.belief.gain)
-    if (np.abs(gain) <= MOST_UNDER_PRESS).all():
+    """Without what this press told of the gain, if a mode is beyond `MOST_GAIN`; the contacts stay."""
+    gain, layer = np.asarray(now.belief.gain), now.layer
+    if (np.abs(gain) <= MOST_GAIN * np.sqrt(1 + layer.press_variance)).all():
         return now
     covariance = np.array(now.belief.covariance)
     own = now.belief.contacts.size
     covariance[own:] = covariance[:, own:] = 0
-    mean, covariance[own:, own:] = (
-        (0 * gain, np.eye(len(gain))) if now.layer is None else (now.layer.mean, now.layer.under_press)
-    )
-    return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(mean), jnp.asarray(covariance)))
+    covariance[own:, own:] = layer.under_press
+    return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(layer.mean), jnp.asarray(covariance)))
 
 
 def prepare_tracker(

@@ -43,18 +43,19 @@ class Tracking:
     | meaning                                                               |
     |-----------------------------------------------------------------------|
     | belief: of contacts and gain                                          |
+    | layer: what was known of the gain before the contacts of now          |
     | numbers: of the contacts                                              |
     | edges: which of them are edges                                        |
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
-    | layer: what was known of the gain before the contacts of now; None: before any contact |
-    | taught: number of contacts that it holds of those that have begun     |
+    | taught: number of contacts that the layer holds of those that have begun |
     | misfit: chi-square of the last frame that was looked into, and frames since then |
     | considered: what unknown shapes and an unknown coat make the contacts err by |
     | backlog: frames that are not explained yet; the belief is that without events since then |
     """
 
     belief: Belief
+    layer: LearnedLayer
     numbers: tuple[int, ...] = ()
     edges: tuple[bool, ...] = ()
     faint: tuple[int, ...] = ()
@@ -63,7 +64,6 @@ class Tracking:
     since: int = 0
     considered: ConsiderErrors = field(default_factory=ConsiderErrors)
     backlog: "Backlog | None" = None
-    layer: LearnedLayer | None = None
     taught: int = 0
 
     @property

@@ -7,11 +7,13 @@ OF_THE_FORMAT = ("format", "format_version", "Conventions", "complete", "seal_sh
 
 
 def damage(path, name, change):
-    """Write the calibration at ``path`` anew, with ``change(value)`` in the place of the array ``name``."""
+    """Write the calibration at ``path`` anew, with ``change(value)`` in the place of the array ``name``; without it if that
+    is None."""
     whole = read_archive(path, KIND)
     attrs = {k: v for k, v in whole.attrs.items() if k not in OF_THE_FORMAT}
     arrays = {k: (v, whole.units[k], whole.long_names[k]) for k, v in whole.arrays.items()}
-    value, *about = arrays[name]
-    arrays[name] = (change(value), *about)
+    value, *about = arrays.pop(name)
+    if (changed := change(value)) is not None:
+        arrays[name] = (changed, *about)
     path.unlink()
     write_archive(path, KIND, attrs, arrays)

@@ -37,7 +37,7 @@ def layer():
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
     field = GainField.over(corners, rng.uniform(0, 0.2, (50, 2)), LoadSettings(gain_length=0.05), level=0.3)
     half = np.eye(len(field.places)) - 0.2
-    return LearnedLayer(field, rng.normal(size=len(half)), half @ half.T / len(half), 7)
+    return LearnedLayer.normal(field, rng.normal(size=len(half)), half @ half.T / len(half), 7)
 
 
 class FakeTracker(Tracker):
@@ -80,10 +80,10 @@ def session(later, tmp_path_factory):
 
 
 def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
-    layer = layer._replace(evidence=np.linspace(-7.0, -1.0, len(layer.evidence)))
+    layer = layer._replace(means=layer.means + layer.evidence[:, None])  # one for each variance
     replace(calibration, layer=layer).save(tmp_path / "c.h5")
     found = calib.load_calibration(tmp_path / "c.h5").layer
-    for name in ("mean", "covariance", "contacts", "evidence"):
+    for name in ("means", "covariances", "contacts", "evidence"):
         np.testing.assert_array_equal(getattr(found, name), getattr(layer, name))
     points = np.random.default_rng(1).uniform(0, 0.2, (20, 2))
     np.testing.assert_array_equal(found.at(points), layer.at(points))
@@ -91,11 +91,27 @@ def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
     assert calib.load_calibration(tmp_path / "none.h5").layer is None
 
 
+def test_a_layer_of_an_early_version_is_read(calibration, layer, tmp_path):
+    """It holds one normal distribution, and nothing of how far presses differ from it."""
+    path = tmp_path / "c.h5"
+    replace(calibration, layer=layer).save(path)
+    for name, change in (("mean", lambda a: a[0]), ("covariance", lambda a: a[0]), ("evidence", lambda a: None)):
+        damage(path, f"layer/{name}", change)
+    found = calib.load_calibration(path).layer
+    for name in ("means", "covariances", "contacts", "evidence"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(layer, name))
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("covariance", lambda a: a - 2 * np.eye(len(a)), "is no covariance"),
-        ("mean", lambda a: np.where(np.arange(len(a)) == 3, np.nan, a), "layer/mean holds a number that is not finite"),
+        ("covariance", lambda a: a - 2 * np.eye(a.shape[-1]), "is no covariance"),
+        ("covariance", lambda a: a[0], "layer/covariance is float64 of shape"),
+        (
+            "mean",
+            lambda a: np.where(np.arange(a.shape[1]) == 3, np.nan, a),
+            "layer/mean holds a number that is not finite",
+        ),
         ("places", lambda a: a[1:], "layer/places is float64 of shape"),
         ("evidence", lambda a: a * np.nan, "layer/evidence holds a number that is not finite"),
         ("evidence", lambda a: a[1:], "layer/evidence is float64 of shape"),
@@ -205,7 +221,8 @@ def test_live_goes_on_with_the_layer_and_writes_it(calibration, tracker, layer, 
 
 
 def test_a_line_tells_how_much_is_known(calibration, layer):
-    line = render_layer(layer._replace(covariance=0.25 * np.eye(len(layer.mean))), calibration.recon)
+    known = LearnedLayer.normal(layer.field, layer.mean, 0.25 * np.eye(len(layer.mean)), 7)
+    line = render_layer(known, calibration.recon)
     assert "learned from 7 contacts; its uncertainty is 50 % of that before any contact" in line
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxeit.tracking import GainField, LearnedLayer
+from jaxeit.tracking.belief.layer import PRESS_VARIANCES
 
 from ..archives.arrays import shaped
 
@@ -20,21 +21,24 @@ _NUMBERS = {
 def layer_arrays(layer: LearnedLayer) -> dict[str, tuple[Any, str, str]]:
     """The arrays of what was learned of the contact layer; the first mode is the level and has no place."""
     numbers = {f"layer/{name}": (getattr(layer.field, name), *about) for name, about in _NUMBERS.items()}
+    each = "for each variance of a press's effect"
     return numbers | {
         "layer/places": (layer.field.places[1:], "m", "of the bumps that the log gain of the contact layer is made of"),
-        "layer/mean": (layer.mean, "1", "of level and bumps, in their standard deviations before any contact"),
-        "layer/covariance": (layer.covariance, "1", "of these"),
-        "layer/evidence": (layer.evidence, "1", "log probability of all presses for each variance of a press's effect"),
+        "layer/mean": (layer.means, "1", f"of level and bumps, in their standard deviations before contact, {each}"),
+        "layer/covariance": (layer.covariances, "1", "of these"),
+        "layer/evidence": (layer.evidence, "1", f"log probability of all presses, {each}"),
         "layer/contacts": (layer.contacts, "1", "number of contacts that they were learned from"),
     }
 
 
 def layer_from(arrays: Mapping[str, np.ndarray]) -> LearnedLayer | None:
-    """What was learned of the contact layer, if anything was."""
+    """What was learned of the contact layer, if anything was; an early version knew no effects of presses."""
     if "layer/mean" not in arrays:
         return None
-    size = len(arrays["layer/mean"])
-    shapes = {"mean": (size,), "covariance": (size, size), "places": (size - 1, 2)} | dict.fromkeys(_NUMBERS, ())
+    early, modes = "layer/evidence" not in arrays, np.shape(arrays["layer/mean"])[-1:]
+    each = () if early else PRESS_VARIANCES.shape
+    shapes = {"mean": each + modes, "covariance": each + 2 * modes, "places": (sum(modes) - 1, 2)}
+    shapes |= dict.fromkeys(_NUMBERS, ()) | ({} if early else {"evidence": each})
     found = {name: shaped(arrays, f"layer/{name}", shape, "f") for name, shape in shapes.items()}
     for name, array in found.items():
         if not np.isfinite(array).all() or (name in _NUMBERS and array <= 0):
@@ -44,10 +48,6 @@ def layer_from(arrays: Mapping[str, np.ndarray]) -> LearnedLayer | None:
     contacts = int(shaped(arrays, "layer/contacts", (), "iu"))
     if contacts < 0:
         raise ValueError(f"layer/contacts is {contacts}; nothing is learned from less than none")
-    learned = LearnedLayer(field, found["mean"], found["covariance"], contacts)
-    if "layer/evidence" not in arrays:  # of an early version
-        return learned
-    evidence = shaped(arrays, "layer/evidence", learned.evidence.shape, "f")
-    if not np.isfinite(evidence).all():
-        raise ValueError("layer/evidence holds a number that is not finite")
-    return learned._replace(evidence=evidence)
+    if early:
+        return LearnedLayer.normal(field, found["mean"], found["covariance"], contacts)
+    return LearnedLayer(field, found["mean"], found["covariance"], found["evidence"], contacts)

@@ -4,7 +4,9 @@ The model of a contact errs: tips are not Gaussian, and the layer of a skin may 
 an error is the same in all frames, and looks like another gain there; the next press brings another error. So the gain
 under a press is that of the layer plus an effect of the press, a random effect (Laird and Ware 1982, Biometrics 38,
 963): drawn anew for each press from the distribution of the gain before any contact, with the variance times a number
-that is the same for all presses. That number is learned from how far presses differ from what was known before them.
+that is the same for all presses. How large this number is, presses tell by how far they differ from what was known
+before them: a bank of Kalman filters, one for each of some variances, is weighted by the probabilities that they gave
+to the presses (Magill 1965, IEEE Trans. Automatic Control 10, 434).
 """
 
 from typing import NamedTuple
@@ -12,7 +14,8 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import eigh
+from scipy.special import softmax
 
 from ...contacts.loads.preparation import field_bumps, field_nodes, field_norm
 from ...contacts.loads.settings import LoadSettings
@@ -20,8 +23,10 @@ from ...imaging.noise import InverseError
 
 # Difference within which numbers of two fields count as equal, relative to the length of the field.
 SAME = 1e-5
-# Variances of the effect of a press that are considered, in those of the gain before any contact.
-PRESS_VARIANCES = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+# Variances of the effect of a press that are considered, in those of the gain before any contact; and that below which
+# they are about as probable as none before any press. Larger ones are the less probable the larger they are.
+PRESS_VARIANCES = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+USUAL_VARIANCE = 0.03
 # Least share of the variance of a direction of the gain that a press takes away, for the direction to count.
 LEAST_TOLD = 0.01
 # Least share that it leaves: rounding.
@@ -81,16 +86,16 @@ class GainField(eqx.Module):
 
 
 class LearnedLayer(NamedTuple):
-    """Gain of the contact layer as learned from contacts: a normal distribution of its modes.
+    """Gain of the contact layer as learned from contacts: a normal distribution of its modes for each press variance.
 
-    | meaning                                                          | shape  | unit |
-    |------------------------------------------------------------------|--------|------|
-    | field: before the first contact                                  |        |      |
-    | mean of the modes, in units of their prior standard deviations   | (g,)   | 1    |
-    | covariance of the modes                                          | (g, g) | 1    |
-    | contacts: number of contacts that it was learned from            |        |      |
-    | evidence: log of the probability of all presses, for each of     | (v,)   | 1    |
-    |   `PRESS_VARIANCES`, up to a constant                            |        |      |
+    | meaning                                                          | shape     | unit |
+    |------------------------------------------------------------------|-----------|------|
+    | field: before the first contact                                  |           |      |
+    | means of the modes, in units of their prior standard deviations  | (v, g)    | 1    |
+    | covariances of the modes                                         | (v, g, g) | 1    |
+    | evidence: log of the probability of each of `PRESS_VARIANCES`,   | (v,)      | 1    |
+    |   up to a constant                                               |           |      |
+    | contacts: number of contacts that it was learned from            |           |      |
 
     Example:
         layer = tracker.learned(now)  # the gain of the contact layer, as contacts tell it
@@ -99,26 +104,51 @@ class LearnedLayer(NamedTuple):
     """
 
     field: GainField
-    mean: Float[np.ndarray, " g"]
-    covariance: Float[np.ndarray, "g g"]
+    means: Float[np.ndarray, "v g"]
+    covariances: Float[np.ndarray, "v g g"]
+    evidence: Float[np.ndarray, " v"]
     contacts: int = 0
-    evidence: Float[np.ndarray, " v"] = np.zeros(len(PRESS_VARIANCES))
+
+    @classmethod
+    def normal(
+        cls, field: GainField, mean: Float[np.ndarray, " g"], covariance: Float[np.ndarray, "g g"], contacts: int = 0
+    ) -> "LearnedLayer":
+        """A normal distribution, of which nothing is known how far presses differ from it."""
+        count = len(PRESS_VARIANCES)
+        evidence = -np.log1p(PRESS_VARIANCES / USUAL_VARIANCE)
+        return cls(field, np.tile(mean, (count, 1)), np.tile(covariance, (count, 1, 1)), evidence, contacts)
 
     @classmethod
     def unknown(cls, field: GainField) -> "LearnedLayer":
         """Nothing is learned."""
         size = len(field.places)
-        return cls(field, np.zeros(size), np.eye(size))
+        return cls.normal(field, np.zeros(size), np.eye(size))
+
+    @property
+    def probabilities(self) -> Float[np.ndarray, " v"]:
+        """Of `PRESS_VARIANCES`."""
+        return np.asarray(softmax(self.evidence))
 
     @property
     def press_variance(self) -> float:
-        """The most probable of `PRESS_VARIANCES`: none where the model of contacts is right, and before any press."""
-        return float(PRESS_VARIANCES[np.argmax(self.evidence)])
+        """Mean variance of the effect of a press, in those of the gain before any contact."""
+        return float(self.probabilities @ PRESS_VARIANCES)
+
+    @property
+    def mean(self) -> Float[np.ndarray, " g"]:
+        """Mean of the modes, in units of their prior standard deviations."""
+        return self.probabilities @ self.means
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "g g"]:
+        """Covariance of the modes: that which the variances have on average, and that of their means."""
+        probabilities, apart = self.probabilities, self.means - self.mean
+        return np.tensordot(probabilities, self.covariances, 1) + (apart.T * probabilities) @ apart
 
     @property
     def under_press(self) -> Float[np.ndarray, "g g"]:
         """Covariance of the gain under the next press, whose effect is not known; its mean is that of the layer."""
-        return self.covariance + self.press_variance * np.eye(len(self.mean))
+        return self.covariance + self.press_variance * np.eye(len(self.field.places))
 
     def told(
         self, gain: Float[Array | np.ndarray, " g"], covariance: Float[Array | np.ndarray, "n n"], contacts: int
@@ -126,9 +156,8 @@ class LearnedLayer(NamedTuple):
         """The gain of the layer after a press that began with `mean` and `under_press`.
 
         What the press told of the gain under it is a measurement y = H (g + e) + noise, along directions H of which it
-        took variance away. With the gain g ~ N(m, P), the effect e ~ N(0, v) and v the most probable variance
-        after this press, g follows by conditioning. A press that was believed under a smaller variance than later ones
-        show stays so believed: where effects are small beside the gain, the stated covariance is too small.
+        took variance away. With the gain g ~ N(m, P) and the effect e ~ N(0, v), g and the probability of v follow by
+        conditioning, for each of `PRESS_VARIANCES`.
 
         Args:
             gain: under the press, as it was told.
@@ -136,22 +165,22 @@ class LearnedLayer(NamedTuple):
             contacts: number of contacts of the press.
         """
         own = np.asarray(covariance, float)[-len(gain) :, -len(gain) :]
-        root = np.linalg.cholesky(self.under_press)
-        white = solve_triangular(root, solve_triangular(root, 0.5 * (own + own.T), lower=True).T, lower=True)
-        left, directions = np.linalg.eigh(0.5 * (white + white.T))
-        kept = left < 1 - LEAST_TOLD
-        left, along = np.maximum(left[kept], TINY), solve_triangular(root.T, directions[:, kept])
-        seen, noise = along.T @ (np.asarray(gain, float) - self.mean) / (1 - left), left / (1 - left)
-        towards, effect = self.covariance @ along, along.T @ along
-        known = along.T @ towards + np.diag(noise)
-        evidence = self.evidence + _bounded([_log_normal(seen, known + v * effect) for v in PRESS_VARIANCES])
-        whole = cho_factor(known + PRESS_VARIANCES[np.argmax(evidence)] * effect)
-        left_over = self.covariance - towards @ cho_solve(whole, towards.T)
+        # x' U x = 1 and x' C x = share of the variance that is left, with the covariances U before and C after
+        left, along = eigh(0.5 * (own + own.T), self.under_press, subset_by_value=(-np.inf, 1 - LEAST_TOLD))
+        left, mean = np.maximum(left, TINY), self.mean
+        seen = along.T @ mean + along.T @ (np.asarray(gain, float) - mean) / (1 - left)
+        towards = self.covariances @ along
+        effects = PRESS_VARIANCES[:, None, None] * (along.T @ along)
+        root = np.linalg.cholesky(along.T @ towards + effects + np.diag(left / (1 - left)))
+        surprise = np.linalg.solve(root, (seen - self.means @ along)[..., None])
+        share = np.linalg.solve(root, towards.mT)
+        spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+        covariances = self.covariances - share.mT @ share
         return self._replace(
-            mean=self.mean + towards @ cho_solve(whole, seen),
-            covariance=0.5 * (left_over + left_over.T),
+            means=self.means + (share.mT @ surprise)[..., 0],
+            covariances=0.5 * (covariances + covariances.mT),
+            evidence=self.evidence + _bounded(-0.5 * (surprise**2).sum((1, 2)) - spread),
             contacts=self.contacts + contacts,
-            evidence=evidence,
         )
 
     def at(self, points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -167,10 +196,11 @@ class LearnedLayer(NamedTuple):
         """
         if not 0 <= share <= 1:
             raise InverseError(f"the share that is forgotten is {share}; give 0 to 1")
-        kept = 1 - share
-        unit = np.eye(len(self.mean))
+        kept, prior = 1 - share, LearnedLayer.unknown(self.field)
         return self._replace(
-            mean=kept * self.mean, covariance=unit + kept**2 * (self.covariance - unit), evidence=kept * self.evidence
+            means=kept * self.means,
+            covariances=prior.covariances + kept**2 * (self.covariances - prior.covariances),
+            evidence=prior.evidence + kept * (self.evidence - prior.evidence),
         )
 
     def restarted(self) -> "LearnedLayer":
@@ -178,13 +208,6 @@ class LearnedLayer(NamedTuple):
         return LearnedLayer.unknown(self.field)._replace(contacts=self.contacts, evidence=self.evidence)
 
 
-def _log_normal(seen: Float[np.ndarray, " k"], covariance: Float[np.ndarray, "k k"]) -> float:
-    """Log density of a normal distribution about zero, up to a constant."""
-    root = np.linalg.cholesky(covariance)
-    return float(-0.5 * np.sum(np.linalg.solve(root, seen) ** 2) - np.sum(np.log(np.diag(root))))
-
-
-def _bounded(evidence: list[float]) -> Float[np.ndarray, " v"]:
+def _bounded(evidence: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
     """Logs of probabilities of a press, over that of the most probable variance, which one press cannot rule out."""
-    found = np.array(evidence)
-    return np.asarray(np.logaddexp(found - found.max(), np.log(OUTLIER)))
+    return np.asarray(np.logaddexp(evidence - evidence.max(), np.log(OUTLIER)))
