@@ -7,8 +7,10 @@ OF_THE_FORMAT = ("format", "format_version", "Conventions", "complete", "seal_sh
 
 
 def damage(path, name, change):
-    """Write the calibration at ``path`` anew, with ``change(value)`` in the place of the array ``name``; without it if that
-    is None."""
+    """Write the calibration at ``path`` anew, with ``change(value)`` in the place of the array ``name``.
+
+    Without this array if that is None.
+    """
     whole = read_archive(path, KIND)
     attrs = {k: v for k, v in whole.attrs.items() if k not in OF_THE_FORMAT}
     arrays = {k: (v, whole.units[k], whole.long_names[k]) for k, v in whole.arrays.items()}
