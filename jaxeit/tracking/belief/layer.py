@@ -25,10 +25,10 @@ from ...imaging.noise import InverseError
 SAME = 1e-5
 # Variances of the effect of a press that are considered, in those of the gain before any contact; and that below which
 # they are about as probable as none before any press. Larger ones are the less probable the larger they are.
-PRESS_VARIANCES = np.array([0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+PRESS_VARIANCES = np.array([0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 USUAL_VARIANCE = 0.03
 # Least share of the variance of a direction of the gain that a press takes away, for the direction to count.
-LEAST_TOLD = 0.01
+LEAST_TOLD = 1e-4
 # Least share that it leaves: rounding.
 TINY = 1e-9
 # Probability of a press that is like none of these: it says no more than this against any of them.
@@ -137,13 +137,13 @@ class LearnedLayer(NamedTuple):
     @property
     def mean(self) -> Float[np.ndarray, " g"]:
         """Mean of the modes, in units of their prior standard deviations."""
-        return self.probabilities @ self.means
+        return np.asarray(self.probabilities @ self.means)
 
     @property
     def covariance(self) -> Float[np.ndarray, "g g"]:
         """Covariance of the modes: that which the variances have on average, and that of their means."""
         probabilities, apart = self.probabilities, self.means - self.mean
-        return np.tensordot(probabilities, self.covariances, 1) + (apart.T * probabilities) @ apart
+        return np.asarray(np.tensordot(probabilities, self.covariances, 1) + (apart.T * probabilities) @ apart)
 
     @property
     def under_press(self) -> Float[np.ndarray, "g g"]:
