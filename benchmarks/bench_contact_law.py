@@ -38,7 +38,7 @@ from .worn_skins import FORCES, Wear, presses, recorded, true_map
 
 FIRST_SEED = 7300
 # Presses after which the force is asked, and skins.
-STAGES = {"second simulator": (0, 10, 30, 120), "own scenes": (0, 10, 30)}
+STAGES = {"second simulator": (0, 10, 30, 120), "own scenes": (0, 10, 30, 120)}
 SKINS = {"second simulator": 3, "own scenes": 2}
 PROBES = 24  # presses that tell the model error
 RESTING = 10  # frames of a contact that no pad tells

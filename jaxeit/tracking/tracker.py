@@ -18,7 +18,7 @@ from ..imaging.noise import InverseError
 from ..model.discretisation import Model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
-from .belief.filter import SEEN, SIZE, Belief, ContactFilter, Pads, Update
+from .belief.filter import SEEN, SIZE, TOLD, Belief, ContactFilter, Pads, Update
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
@@ -34,8 +34,6 @@ UNEXPECTED, SURPRISING = 4.0, 25.0
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
 PATIENCE, WORSE = 10, 1.3
-# Share of a load on pads that tell forces, from which the pads tell the force of a contact.
-TOLD = 0.25
 
 
 class Tracker:

@@ -87,6 +87,20 @@ def test_what_was_learned_tells_the_force_without_pads(tracker, frame_of, layer)
     assert abs(errors[1]) < 0.5 * abs(errors[0])
 
 
+def test_the_tail_of_a_load_on_other_pads_tells_no_force(tracker, frame_of):
+    """The pad under the contact is dead; the one beside it feels more than of the load that is believed."""
+    now, without = tracker.start(), tracker.start()
+    for force in (0.0, 10.0, 10.0, 10.0):
+        frame = frame_of([load(0.05, 0.06, max(force, 1e-6))])
+        felt = np.array([np.nan, 0.3 * force, 0.1 * force, 0.0])
+        now = tracker.step(now, frame, SECONDS, felt, np.full(4, 0.1))
+        without = tracker.step(without, frame, SECONDS)
+    (track,), (alone,) = now.tracks, without.tracks
+    assert not tracker.told_by_pads(now.tracks, np.array([np.inf, 0.1, 0.1, 0.1])).any()
+    assert track.force == pytest.approx(alone.force, rel=1e-6)
+    assert track.position == pytest.approx(alone.position, abs=1e-8)
+
+
 def test_learning_goes_on_where_it_ended(tracker, layer):
     now = tracker.start(layer)
     again = tracker.learned(now)

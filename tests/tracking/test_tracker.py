@@ -66,7 +66,7 @@ def test_covariances_stay_symmetric_and_definite(followed):
 
 
 def test_the_gain_is_learned_where_contacts_were_and_stays_unknown_elsewhere(tracker, followed):
-    variance = np.diag(np.asarray(followed[0][-1].belief.covariance))[1:]
+    variance = np.diag(tracker.learned(followed[0][-1]).covariance)[1:]
     distance = np.linalg.norm(np.asarray(tracker.filter.places)[1:] - [0.065, 0.09], axis=1)
     assert variance[distance.argmin()] < 0.95
     assert variance[distance.argmax()] == pytest.approx(1, abs=1e-3)

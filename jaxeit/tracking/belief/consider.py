@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from ..._compile import verb
 from ...linalg import lapack
-from .filter import ROUND, SEEN, Belief, ContactFilter, Pads, active_numbers
+from .filter import ROUND, SEEN, Belief, ContactFilter, Pads, active_numbers, telling_pads
 
 # Frames n, each with an error of the model of its own, after which contacts are told by the frames and not by P.
 FRAMES = 10
@@ -43,6 +43,7 @@ def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> F
     contacts, count = belief.contacts[:, :SEEN], len(belief.contacts)
     active = active_numbers(tracker, belief.contacts)
     near = tracker.sheet.near(contacts)
+    pads = telling_pads(tracker, belief.contacts, near, pads)
     modes = active[contacts.size :] - belief.contacts.size
     shown = tracker.sheet.shown(contacts, belief.gain, modes, near, shapes=True)
     square = (shown.readings @ shown.readings) / len(shown.readings)

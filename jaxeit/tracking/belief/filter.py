@@ -32,6 +32,10 @@ SIZE, SEEN = 8, 6
 PLACE = 0.012
 # Half an edge that is none: what keeps its covariance definite, m.
 ROUND = 1e-4
+# Share of a load on pads that tell forces, from which the pads tell the force of a contact.
+TOLD = 0.25
+# Load on a pad that counts as none, N.
+NO_LOAD = 1e-6
 # Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
 # of an ordinary frame, whose next step would lower it by 0.001 then, and of one that begins far from its end.
 FALL, CAREFUL_FALL = 10.0, 1.0
@@ -242,7 +246,22 @@ def _problem(
     active = active_numbers(tracker, belief.contacts)
     factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
     near = tracker.sheet.near(belief.contacts[:, :SEEN])
+    pads = telling_pads(tracker, belief.contacts, near, pads)
     return _Problem(tracker, frame, whole, pads, belief, active, factor, scale, alone, near)
+
+
+def telling_pads(tracker: ContactFilter, contacts: Float[Array, "K 8"], near: Near, pads: Pads) -> Pads:
+    """Pads without those that mostly bear contacts with less than `TOLD` of their load on pads that tell forces.
+
+    Such a pad bears the tail of a load, and how much lies there depends on the shape of the load, which is not known:
+    as where the pad under a contact is dead, and those beside it tell forces. The whole force would err tenfold. While
+    there is such a contact, pads without any load count as bearing it.
+    """
+    loads = tracker.sheet.on_pads(contacts[:, :SEEN], near)
+    told = jnp.sum(jnp.where(jnp.isfinite(pads.error), loads, 0), 1) >= TOLD * jnp.exp(contacts[:, 3])
+    of_told = jnp.sum(jnp.where(told[:, None], loads, 0), 0)
+    of_others = jnp.sum(jnp.where(told[:, None], 0, loads + NO_LOAD), 0)
+    return pads._replace(error=jnp.where(of_told >= of_others, pads.error, jnp.inf))
 
 
 def _scales(

@@ -143,7 +143,8 @@ class LearnedLayer(NamedTuple):
     def covariance(self) -> Float[np.ndarray, "g g"]:
         """Covariance of the modes: that which the variances have on average, and that of their means."""
         probabilities, apart = self.probabilities, self.means - self.mean
-        return np.asarray(np.tensordot(probabilities, self.covariances, 1) + (apart.T * probabilities) @ apart)
+        found = np.tensordot(probabilities, self.covariances, 1) + (apart.T * probabilities) @ apart
+        return np.asarray(0.5 * (found + found.T))
 
     @property
     def under_press(self) -> Float[np.ndarray, "g g"]:
@@ -175,10 +176,9 @@ class LearnedLayer(NamedTuple):
         surprise = np.linalg.solve(root, (seen - self.means @ along)[..., None])
         share = np.linalg.solve(root, towards.mT)
         spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
-        covariances = self.covariances - share.mT @ share
         return self._replace(
             means=self.means + (share.mT @ surprise)[..., 0],
-            covariances=0.5 * (covariances + covariances.mT),
+            covariances=self.covariances - share.mT @ share,
             evidence=self.evidence + _bounded(-0.5 * (surprise**2).sum((1, 2)) - spread),
             contacts=self.contacts + contacts,
         )

@@ -155,6 +155,12 @@ class LoadedSheet(eqx.Module):
         """What is near contacts."""
         return self.neighbours.near(contacts.astype(self.points.dtype), len(self.sigma), len(self.pixels))
 
+    def on_pads(self, contacts: Float[Array, "K 6"], near: Near) -> Float[Array, "K pads"]:
+        """Force of each contact on each pad, N."""
+        places, area = self.pixels[near.pixels], jnp.where(near.own_pixels[:, None], self.pad_area[near.pixels], 0)
+        pressures = jax.vmap(load_pressure, (0, None))(contacts.astype(self.points.dtype), places)
+        return (pressures @ area).astype(contacts.dtype)
+
     def shown(
         self,
         contacts: Float[Array, "K 6"],
