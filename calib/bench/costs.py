@@ -70,7 +70,7 @@ def _session_costs(made: SimulatedStreams) -> Iterator[PartCost]:
     response = jnp.ones((len(made.bench.scene.skin.pads), model.background.size), model.dtype)
     for effect in fx.chosen(model.effects, fx.AbstractPadEffect):
         yield _part_cost(effect, 1, effect, response, response)
-    when = jnp.zeros(len(model.pattern))
+    when = jnp.zeros(model.readings)
     for effect in fx.chosen(model.effects, fx.AbstractScanEffect):
         yield _part_cost(effect, 1, effect, when, when)
 

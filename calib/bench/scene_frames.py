@@ -85,7 +85,6 @@ class SceneFrames:
 
     def __init__(self, bench: Bench, fidelity: je.Fidelity, basis: je.Pixels, scenes: RandomScenes):
         self.bench, self._scenes = bench, scenes
-        bench.scene.skin.protocol.rows("a bench")
         self._model = je.discretise(bench.scene, fidelity)
         self._motion = je.model.electrode_motion(self._model) if scenes.misplaced else None
         self._diameter = jnp.asarray(bench.tip_diameter, self._model.dtype)
@@ -253,7 +252,7 @@ class _Recording:
     ):
         self._effects = fx.chosen(model.effects, fx.AbstractReadoutEffect, kind)
         self._key = jax.random.fold_in(key, SHARD_FRAMES + 1 + (kind is fx.StreamKind.EIT))  # beyond those of frames
-        pattern = jnp.asarray(bench.scene.skin.protocol.pattern, jnp.int32)
+        pattern = jnp.asarray(bench.scene.skin.protocol.pairs, jnp.int32)
         self._pattern = pattern if kind is fx.StreamKind.EIT else pattern[:0]
         self._interval, self._blocks = jnp.asarray(1 / bench.eit_rate), 0
         self._state = fx.history_start(self._effects, jnp.asarray(resting))

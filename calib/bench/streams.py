@@ -99,7 +99,7 @@ class AbstractSimulatedStream(ABC):
         times = self.times(number)
         key = jax.random.fold_in(jax.random.fold_in(self._key, purpose), number)
         warmth, air = jnp.asarray(temperature_rise(self.bench, times)), jnp.asarray(barometer_rise(self.bench, times))
-        pattern = jnp.asarray(self.bench.scene.skin.protocol.pattern, jnp.int32)
+        pattern = jnp.asarray(self.bench.scene.skin.protocol.pairs, jnp.int32)
         pattern = pattern if self.kind is fx.StreamKind.EIT else pattern[:0]
         return fx.Line(key, jnp.asarray(1 / self.rate), warmth, air, pattern)
 
@@ -352,7 +352,6 @@ class SimulatedStreams:
 
 def simulated_streams(bench: Bench, fidelity: je.Fidelity) -> SimulatedStreams:
     """Discretise the scene, apply the effects of the stage to its motion, and set up the streams."""
-    bench.scene.skin.protocol.rows("a bench")
     model = je.discretise(bench.scene, fidelity)
     laid = fx.laid(model.effects, model.centroids)
     model = eqx.tree_at(lambda m: m.effects, model, laid, is_leaf=lambda x: x is model.effects)

@@ -7,6 +7,7 @@ import numpy as np
 import jaxeit as je
 from jaxeit.imaging import ElectrodeFit, fit_electrodes
 
+from ..session.mixing import same_scan
 from .eit.reading_order import OrderCheck
 from .report import ChannelTable, ElectrodeRow, Finding, Severity, listed
 
@@ -56,7 +57,9 @@ def _obstacle(skin: je.Skin | None, table: ChannelTable | None, order: OrderChec
         return "there are no EIT voltages with a pattern"
     if skin is None:
         return "the session describes no skin (--skin FILE)"
-    if not np.array_equal(skin.protocol.pattern, table.pattern) or (order is not None and order.claimed):
+    if not same_scan(table.pattern, table.mixing, skin.protocol.pattern, skin.protocol.mixing) or (
+        order is not None and order.claimed
+    ):
         return "the order of the readings is not that of the skin"
     sound = np.isfinite(table.mean) & ~table.bad
     if sound.mean() < MIN_SOUND:

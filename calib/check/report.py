@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..presses.onsets import OnsetDelay
 from .eit.reading_order import OrderCheck
@@ -88,7 +89,8 @@ class ChannelTable:
 
     | field                  | meaning                                                                | unit |
     |------------------------|------------------------------------------------------------------------|------|
-    | pattern                | drive+, drive-, sense+, sense- (readings, 4)                           |      |
+    | pattern                | drive+, drive-, sense+, sense- (rows, 4)                               |      |
+    | mixing                 | readings as sums of rows, (readings, rows); None: each row is one      |      |
     | mean, noise            | over `frames` frames without contact                                   | V    |
     | snr                    | 20 log10(abs(mean) / noise)                                            | dB   |
     | partner                | row of the reciprocal reading, -1 without one                          |      |
@@ -109,6 +111,7 @@ class ChannelTable:
     dead: np.ndarray
     saturated: np.ndarray
     noisy: np.ndarray
+    mixing: sp.csr_array | None = None
 
     def __len__(self) -> int:
         return len(self.mean)

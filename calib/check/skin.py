@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 import jaxeit as je
 
 from ..session import Session
+from ..session.mixing import same_scan
 from .report import Finding, Severity, listed
 
 RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrodes are looked at
@@ -114,7 +115,6 @@ def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:
 
 def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:
     where, pattern, own = "/device/eit_protocol", session.pattern, skin.protocol
-    rows = own.rows("a session")
     if pattern is None:
         if "eit" in session.streams:
             remedy = "write the pattern of the scan: no reading has a meaning without it"
@@ -123,12 +123,20 @@ def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:
     if pattern.max() >= len(skin.electrodes):
         what = f"the pattern names electrode {pattern.max()}; the skin has 0 to {len(skin.electrodes) - 1}"
         yield Finding(Severity.ERROR, where, what, "electrodes are counted from 0")
-    elif pattern.shape != rows.shape or (pattern != rows).any():
+    elif not same_scan(pattern, session.mixing, own.pattern, own.mixing):
         remedy = "calibrate with the skin that was recorded (--skin FILE), or correct its protocol"
-        yield Finding(Severity.ERROR, where, _pattern_difference(pattern, rows), remedy)
+        yield Finding(Severity.ERROR, where, _scan_difference(session, own), remedy)
     if session.current is not None and not np.isclose(session.current, own.current, rtol=0.01):
         what = f"the drive current is {session.current:g} A, but {own.current:g} A in the skin's file"
         yield Finding(Severity.WARNING, where, what, "correct the wrong one of the two")
+
+
+def _scan_difference(session: Session, own: je.Protocol) -> str:
+    if session.mixing is None and own.mixing is None:
+        return _pattern_difference(np.asarray(session.pattern), own.pattern)
+    if session.readings != own.readings:
+        return f"the scan has {session.readings} readings, the skin's protocol {own.readings}"
+    return "the currents or the voltages of the scan are not those of the skin's protocol"
 
 
 def _pattern_difference(pattern: np.ndarray, own: np.ndarray) -> str:

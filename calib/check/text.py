@@ -182,13 +182,19 @@ def _reciprocity(table: ChannelTable) -> str:
 CHANNEL_COLUMNS = ("  reading", "drive", "sense", "mean mV", "SNR dB", "reciprocity", "missing", "")
 
 
+def _terminals(table: ChannelTable, i: int) -> tuple[str, str]:
+    """Drive and sense of a reading: the pair of electrodes, or how many pairs the reading is a sum of."""
+    rows = table.pattern[[i] if table.mixing is None else table.mixing[[i]].indices]
+    pairs = (np.unique(part, axis=0) for part in (rows[:, :2], rows[:, 2:]))
+    drive, sense = (f"{p[0, 0]}-{p[0, 1]}" if len(p) == 1 else f"{len(p)} pairs" for p in pairs)
+    return drive, sense
+
+
 def _channel(table: ChannelTable, i: int) -> tuple[str, ...]:
-    drive, sense = table.pattern[i, :2], table.pattern[i, 2:]
     names = ("dead", "saturated", "noisy")
     return (
         f"  {i}",
-        f"{drive[0]}-{drive[1]}",
-        f"{sense[0]}-{sense[1]}",
+        *_terminals(table, i),
         _number(1e3 * table.mean[i], ".4f"),
         _number(table.snr[i], ".1f"),
         _percent(table.reciprocity[i]),

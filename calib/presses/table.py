@@ -8,6 +8,7 @@ import numpy as np
 import jaxeit as je
 
 from ..session import PressTable, Session, SessionError, Stream
+from ..session.mixing import same_scan
 from ..session.units import SECOND
 from .corrections import AbstractBaseline, AbstractCorrection, LowPass, TwoSided, WindowMeans, sample_rate
 from .detection import find_presses
@@ -156,8 +157,7 @@ def require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) ->
     pattern = session.pattern
     if pattern is None:
         raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
-    own = skin.protocol.rows("calibration of a skin")
-    if pattern.shape != own.shape or (pattern != own).any():
+    if not same_scan(pattern, session.mixing, skin.protocol.pattern, skin.protocol.mixing):
         raise _error(
             session,
             "/device/eit_protocol/pattern",

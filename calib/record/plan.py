@@ -9,12 +9,15 @@ from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..session.hdf5.guard import MAX_ATTRIBUTE_BYTES
+from ..session.mixing import mixing_of_terms
 from .journal.file import JournalError
 from .wire.messages import Layout
 
 PLAN_FORMAT = "jaxeit-journal"
+MAX_TERMS = 25_000  # of the readings of a scan, about 40 bytes each: a record of a journal holds a megabyte
 
 
 class PlanError(ValueError):
@@ -118,8 +121,9 @@ class StreamPlan:
 class RecordingPlan:
     """Plan of a recording: facts for the session file, its time axis, and its streams.
 
-    ``pattern`` (readings, 4), ``current`` (A), ``frequency`` (Hz) and ``offset`` (readings,) s describe the EIT
-    protocol, or are None. ``epoch`` is an ISO time with zone, at which the monotonic clock showed ``host_epoch`` ns.
+    ``pattern`` (rows, 4), ``mixing`` (reading, row and share of each term; None: each row is one reading), ``current``
+    (A), ``frequency`` (Hz) and ``offset`` (readings,) s describe the EIT protocol, or are None. ``epoch`` is an ISO
+    time with zone, at which the monotonic clock showed ``host_epoch`` ns.
     """
 
     streams: tuple[StreamPlan, ...]
@@ -130,6 +134,7 @@ class RecordingPlan:
     skin_name: str = ""
     skin_toml: str = ""
     pattern: tuple[tuple[int, ...], ...] | None = None
+    mixing: tuple[tuple[int | float, ...], ...] | None = None
     current: float | None = None
     frequency: float | None = None
     offset: tuple[float, ...] | None = None
@@ -147,9 +152,29 @@ class RecordingPlan:
             raise PlanError(f"epoch {self.epoch}: has no time zone")
         self._check_storable()
         eit = [s.channels for s in self.streams if s.name == "eit"]
-        if eit and (self.pattern is None or len(self.pattern) != eit[0]):
-            rows = "no pattern" if self.pattern is None else f"a pattern of {len(self.pattern)} rows"
+        if eit and self._readings() != eit[0]:
+            rows = "no pattern" if self.pattern is None else f"a pattern of {self._readings()} readings"
             raise PlanError(f"eit: {eit[0]} readings beside {rows}; give the skin whose protocol is measured")
+
+    def _readings(self) -> int | None:
+        """Number of readings of the EIT protocol; None without one."""
+        mixing = None if self.pattern is None else self.mixing_matrix()
+        return None if self.pattern is None else len(self.pattern) if mixing is None else mixing.shape[0]
+
+    def mixing_matrix(self) -> sp.csr_array | None:
+        """``mixing`` as a matrix (readings, rows); raises `PlanError` for terms that are none."""
+        if self.mixing is None:
+            return None
+        if len(self.mixing) > MAX_TERMS:
+            raise PlanError(
+                f"a scan of {len(self.mixing):,} terms is too long for a journal, which holds {MAX_TERMS:,}; give the "
+                "skin a scan of pairs, or one through fewer electrodes"
+            )
+        try:
+            reading, row, share = np.array(self.mixing, float).reshape(-1, 3).T
+            return mixing_of_terms(reading.astype(int), row.astype(int), share, len(self.pattern or ()))
+        except ValueError as error:
+            raise PlanError(f"mixing: {error}; give reading, row and share of each term") from None
 
     def _check_storable(self) -> None:
         """Raise `PlanError` for facts that the session file, made only after the recording, could not store."""
@@ -178,7 +203,8 @@ def plan_from_json(text: bytes) -> RecordingPlan:
         if table.pop("format") != PLAN_FORMAT or table.pop("version") != 1:
             raise JournalError("journal: of another format or version; use the jaxeit that wrote it")
         table["streams"] = tuple(_typed(StreamPlan, stream) for stream in table["streams"])
-        for name in ("pattern", "offset"):
+        table.setdefault("mixing", None)  # of plans before version 1.1 of the session file
+        for name in ("pattern", "mixing", "offset"):
             table[name] = table[name] and tuple(tuple(v) if isinstance(v, list) else v for v in table[name])
         plan: RecordingPlan = _typed(RecordingPlan, {f.name: table[f.name] for f in fields(RecordingPlan)})
         return plan

@@ -43,12 +43,22 @@ def plan_recording(
         title=title,
         skin_name=skin.name if skin is not None else "",
         skin_toml=skin.toml if skin is not None else "",
-        pattern=None if eit is None else tuple(tuple(map(int, row)) for row in eit.rows("a session")),
+        pattern=None if eit is None else tuple(tuple(map(int, row)) for row in eit.pattern),
+        mixing=None if eit is None else _terms(eit),
         current=None if eit is None else float(eit.current),
         frequency=None if eit is None else float(eit.frequency),
         offset=None if eit is None else tuple(map(float, eit.reading_offsets)),
     )
     return plan, sources
+
+
+def _terms(protocol: "je.Protocol") -> tuple[tuple[int | float, ...], ...] | None:
+    """Reading, row of the pattern and share of each term, where readings are sums of rows."""
+    if protocol.mixing is None:
+        return None
+    found = protocol.mixing.tocoo()
+    reading, row = found.coords
+    return tuple(zip(reading.tolist(), row.tolist(), found.data.tolist(), strict=True))
 
 
 def _channels(name: str, url: str, skin: "je.Skin | None") -> int:

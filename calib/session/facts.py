@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from datetime import datetime
 
+import scipy.sparse as sp
 from numpy.typing import ArrayLike, DTypeLike
 
 
@@ -17,9 +18,10 @@ class SessionFacts:
     | skin_name         | name of the skin that was recorded                                         |      |
     | skin_toml         | its description                                                            |      |
     | pattern           | zero-based electrodes drive+, drive-, sense+, sense- of each reading, (M, 4) |    |
+    | mixing            | readings as sums of rows of the pattern, (readings, M); None: each row is one |   |
     | current           | amplitude of the stimulation                                               | A    |
     | frequency         | of the stimulation                                                         | Hz   |
-    | offset            | when each reading is taken after the frame's time, (M,)                    | s    |
+    | offset            | when each reading is taken after the frame's time, (readings,)             | s    |
     | simulated         | whether it was simulated; `scene` and `seed` must then say how             |      |
     | scene, seed       | TOML text of the simulated scene, and seed of its noise                    |      |
     | creator           | name and version of the program that made it; default: this one            |      |
@@ -34,6 +36,7 @@ class SessionFacts:
     skin_name: str = ""
     skin_toml: str = ""
     pattern: ArrayLike | None = None
+    mixing: sp.csr_array | None = None
     current: float | None = None
     frequency: float | None = None
     offset: ArrayLike | None = None

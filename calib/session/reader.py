@@ -9,12 +9,14 @@ from types import MappingProxyType
 
 import h5py
 import numpy as np
+import scipy.sparse as sp
 
 from .errors import SessionError, printable, problem
 from .hdf5.chunks import GuardedArray
 from .hdf5.guard import Node, open_guarded, root_node
 from .hdf5.members import SCHEMA, column, declared_unit, required, small_array
 from .hdf5.storage import file_hash
+from .mixing import mixing_of_terms
 from .stream import Stream
 from .tables import CLOCK_ATTRIBUTES, FORMAT, PRESS_COLUMNS, ClockTable, Events, PressTable
 from .units import Unit
@@ -91,6 +93,7 @@ class Session:
         self.skin_name, self.skin_toml = device.text("skin"), device.text("skin_toml")
         protocol = device.group("eit_protocol")
         self.pattern: np.ndarray | None = None
+        self.mixing: sp.csr_array | None = None
         self.offset: np.ndarray | None = None
         self.current: float | None = None
         self.frequency: float | None = None
@@ -99,6 +102,7 @@ class Session:
 
     def _read_protocol(self, protocol: Node) -> None:
         self.pattern = _pattern(required(protocol, "pattern", protocol.dataset("pattern")))
+        self.mixing = _mixing(protocol, len(self.pattern))
         for name in ("current", "frequency"):
             if protocol.attribute(name) is not None:
                 setattr(self, name, float(protocol.number(name)))
@@ -107,7 +111,7 @@ class Session:
             raise protocol.error(what, "write an amplitude above zero, and a frequency of zero or more")
         offset = protocol.dataset("offset")
         if offset is not None:
-            self.offset = small_array(offset, (len(self.pattern),), "f").astype(float)
+            self.offset = small_array(offset, (self.readings,), "f").astype(float)
 
     def _read_streams(self) -> "dict[str, Stream]":
         group = required(self._root, "streams", self._root.group("streams"))
@@ -116,11 +120,16 @@ class Session:
         streams = {name: Stream(name, node) for name, node in nodes.items() if node is not None}
         if not streams:
             raise group.error("holds no stream", "record at least one")
-        rows = None if self.pattern is None else len(self.pattern)
-        if "eit" in streams and rows is not None and streams["eit"].channels != rows:
-            what = f"has {streams['eit'].channels} channels, the pattern has {rows} rows"
+        if "eit" in streams and self.readings is not None and streams["eit"].channels != self.readings:
+            what = f"has {streams['eit'].channels} channels, the pattern has {self.readings} "
+            what += "rows" if self.mixing is None else "readings"
             raise problem(self.path, "/streams/eit", what, "give the pattern that was recorded")
         return streams
+
+    @property
+    def readings(self) -> int | None:
+        """Number of readings of a frame; None without a pattern."""
+        return None if self.pattern is None else len(self.pattern) if self.mixing is None else self.mixing.shape[0]
 
     def stream(self, name: str) -> "Stream":
         """The stream `name`. If it is missing, the `SessionError` lists the streams of the file."""
@@ -261,6 +270,21 @@ def _pattern(node: Node) -> np.ndarray:
         what = f"row {row} is no measurement" if len(pattern) else "has no rows"
         raise node.error(what, "give drive+, drive-, sense+, sense- as zero-based electrodes")
     return pattern
+
+
+def _mixing(protocol: Node, rows: int) -> sp.csr_array | None:
+    """Readings as sums of rows of the pattern, (readings, rows); None where each row is one reading."""
+    node = protocol.dataset("term_reading")
+    if node is None:
+        return None
+    reading = small_array(node, (None,), "iu").astype(np.int64)
+    parts = {name: required(protocol, name, protocol.dataset(name)) for name in ("term_row", "term_share")}
+    row = small_array(parts["term_row"], (len(reading),), "iu").astype(np.int64)
+    share = small_array(parts["term_share"], (len(reading),), "f")
+    try:
+        return mixing_of_terms(reading, row, share, rows)
+    except ValueError as error:
+        raise protocol.error(f"the terms of its readings: {error}", SCHEMA) from None
 
 
 def _clock(node: Node) -> ClockTable:

@@ -12,6 +12,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from calib.session.errors import SessionError, printable, problem
@@ -28,9 +29,11 @@ from calib.session.hdf5.storage import (
     require_no_session,
     text_array,
 )
+from calib.session.mixing import checked_mixing
 from calib.session.tables import (
     CLOCK_ATTRIBUTES,
     FORMAT,
+    MIXED_VERSION,
     PRESS_COLUMNS,
     STREAM_EXTRAS,
     VERSION,
@@ -91,7 +94,7 @@ class SessionWriter(FileWriter):
         if facts.simulated and (facts.scene is None or facts.seed is None):
             raise self._problem("scene", "a simulated session does not say how", "give scene, seed")
         self._facts = facts
-        self._protocol = _protocol(self.path, facts.pattern, facts.current, facts.frequency, facts.offset)
+        self._protocol = _protocol(self.path, facts)
         self._streams: dict[str, _Stream] = {}
         self._presses: PressTable | None = None
         self._truth: dict[str, tuple[np.ndarray, str]] = {}
@@ -102,7 +105,7 @@ class SessionWriter(FileWriter):
         facts = self._facts
         out: dict[str, AttributeValue] = {
             "format": FORMAT,
-            "format_version": VERSION,
+            "format_version": VERSION if facts.mixing is None else MIXED_VERSION,
             "Conventions": "CF-1.11",
             "NX_class": "NXroot",
             "session_id": facts.session_id or str(uuid.uuid4()),
@@ -148,14 +151,18 @@ class SessionWriter(FileWriter):
         numbers = {k: v for k, v in self._protocol.items() if isinstance(v, float)}
         group = make_group(device, "eit_protocol", {"NX_class": "NXcollection", **numbers})
         pattern = self._protocol["pattern"]
-        rows = make_index(group, "measurement", len(pattern))
+        mixing = self._protocol.get("mixing")
+        rows = make_index(group, "measurement" if mixing is None else "row", len(pattern))
+        readings = rows if mixing is None else make_index(group, "measurement", mixing.shape[0])
         terminals = make_index(group, "terminal", 4)
         meaning = "electrodes (zero-based): drive+, drive-, sense+, sense-"
         attrs = {"units": "1", "long_name": meaning}
         attach(make_array(group, "pattern", pattern, attrs), rows, terminals)
         if "offset" in self._protocol:
             attrs = {"units": "s", "long_name": "when in the scan each reading is taken"}
-            attach(make_array(group, "offset", self._protocol["offset"], attrs), rows)
+            attach(make_array(group, "offset", self._protocol["offset"], attrs), readings)
+        if mixing is not None:
+            _write_mixing(group, mixing)
 
     def _time_attrs(self, meaning: str) -> dict[str, str]:
         units = f"nanoseconds since {self._epoch}"
@@ -431,31 +438,45 @@ def _utc(path: Path, epoch: datetime) -> str:
     return epoch.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
-def _protocol(
-    path: Path,
-    pattern: ArrayLike | None,
-    current: float | None,
-    frequency: float | None,
-    offset: ArrayLike | None,
-) -> dict[str, Any]:
+def _write_mixing(group: h5py.Group, mixing: sp.csr_array) -> None:
+    """The terms of which readings are sums: reading, row of the pattern, and share of that row."""
+    term = make_index(group, "term", mixing.nnz)
+    reading = np.repeat(np.arange(mixing.shape[0]), np.diff(mixing.indptr))
+    columns = {
+        "term_reading": (reading.astype("i4"), "reading that the term belongs to"),
+        "term_row": (mixing.indices.astype("i4"), "row of the pattern"),
+        "term_share": (mixing.data.astype("f8"), "share of that row in the reading"),
+    }
+    for name, (values, meaning) in columns.items():
+        attach(make_array(group, name, values, {"units": "1", "long_name": meaning}), term)
+
+
+def _protocol(path: Path, facts: SessionFacts) -> dict[str, Any]:
     """The protocol's arrays and numbers, checked; empty without a pattern."""
-    if pattern is None:
-        if current is not None or frequency is not None or offset is not None:
+    if facts.pattern is None:
+        if any(value is not None for value in (facts.current, facts.frequency, facts.offset, facts.mixing)):
             raise problem(path, "eit_protocol", "has no pattern", "give pattern as well")
         return {}
-    array = np.asarray(pattern)
+    array = np.asarray(facts.pattern)
     if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iu" or not len(array):
         raise problem(path, "pattern", f"has shape {array.shape}", "give (M, 4) integers")
     if array.min() < 0 or array.max() > np.iinfo("i2").max:
         raise problem(path, "pattern", "names impossible electrodes", "count electrodes from 0")
     found: dict[str, Any] = {"pattern": array.astype("i2")}
-    for name, value, least in (("current", current, np.nextafter(0, 1)), ("frequency", frequency, 0.0)):
+    for name, value, least in (("current", facts.current, np.nextafter(0, 1)), ("frequency", facts.frequency, 0.0)):
         if value is not None:
             found[name] = float(value)
             if not least <= found[name] < np.inf:
                 raise problem(path, name, f"is {value}", "give a current above zero, a frequency of zero or more")
-    if offset is not None:
-        found["offset"] = np.asarray(offset, np.float64)
-        if found["offset"].shape != (len(array),) or not np.isfinite(found["offset"]).all():
-            raise problem(path, "offset", "does not fit the pattern", "give one time per row")
+    readings = len(array)
+    if facts.mixing is not None:
+        try:
+            found["mixing"] = checked_mixing(facts.mixing, len(array))
+        except ValueError as error:
+            raise problem(path, "mixing", str(error), "give that of jaxeit.Protocol") from None
+        readings = found["mixing"].shape[0]
+    if facts.offset is not None:
+        found["offset"] = np.asarray(facts.offset, np.float64)
+        if found["offset"].shape != (readings,) or not np.isfinite(found["offset"]).all():
+            raise problem(path, "offset", "does not fit the pattern", "give one time per reading")
     return found

@@ -124,7 +124,6 @@ def prepare_skin(
             )
     if not fx.chosen(scene.effects, fx.AbstractLoadEffect):
         raise SimulatorError("no effect spreads the load, and contacts are points; add jaxeit.effects.LoadSpreading")
-    scene.skin.protocol.rows("a skin on a simulated robot")
     model = je.discretise(scene, fidelity)
     laid = fx.laid(model.effects, model.centroids)
     model = eqx.tree_at(lambda m: m.effects, model, laid, is_leaf=lambda x: x is model.effects)
@@ -187,7 +186,7 @@ def _step(
 
     def continued(family: type, values: Array, before: Any, purpose: int, stream: Any = None) -> tuple[Array, Any]:
         mine = fx.chosen(effects, family, stream)
-        pattern = model.pattern if stream is fx.StreamKind.EIT else model.pattern[:0]
+        pattern = model.pattern if stream is fx.StreamKind.EIT and model.mixing is None else model.pattern[:0]
         key = jax.random.fold_in(jax.random.fold_in(state.key, purpose), state.number)
         still = jnp.zeros(1, model.dtype)
         series, after = fx.history(mine, values[None], before, fx.Line(key, skin.interval, still, still, pattern))

@@ -111,7 +111,7 @@ class Line(NamedTuple):
     | interval between samples                                      | ()            | s    |
     | temperature of the air above that at the start                | (time,)       | K    |
     | barometer: air pressure above that at the start               | (time,)       | Pa   |
-    | pattern of the EIT stream; no rows elsewhere                  | (channels, 4) |      |
+    | pattern of the EIT stream; no rows elsewhere, nor of a protocol of matrices | (channels, 4) | |
     """
 
     key: Key[Array, ""]
@@ -156,7 +156,8 @@ class EffectError(ValueError):
 class AbstractEffect(eqx.Module):
     """One departure from the ideal sensor.
 
-    ``rank`` orders effects within their family.  A scene lists at most one effect of each ``alternative``.
+    ``rank`` orders effects within their family.  A scene lists at most one effect of each ``alternative``.  An effect
+    ``of_pairs`` acts on the pair that drives and the pair that senses, which readings of a protocol of matrices lack.
 
     Raises:
         EffectError: for a parameter below its least value, such as a negative standard deviation.
@@ -165,6 +166,7 @@ class AbstractEffect(eqx.Module):
     stage: ClassVar[str]
     rank: ClassVar[int] = 0
     alternative: ClassVar[str] = ""
+    of_pairs: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
         require_limits(self, EffectError)
@@ -247,6 +249,7 @@ class AbstractTerminalEffect(AbstractEffect):
     """Electrical: changes of the terminal voltages by source and amplifier."""
 
     stage: ClassVar[str] = "electrical"
+    of_pairs: ClassVar[bool] = True
 
     @abstractmethod
     def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:

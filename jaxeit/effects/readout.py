@@ -50,6 +50,7 @@ class IntermittentElectrode(AbstractReadoutEffect):
     """
 
     rank: ClassVar[int] = -3  # a fault of the skin acts before the electronics
+    of_pairs: ClassVar[bool] = True
     stream: ClassVar[StreamKind] = StreamKind.EIT  # type: ignore[misc]
 
     electrode: Int[Array, ""] = parameter(0)

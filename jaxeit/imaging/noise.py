@@ -190,6 +190,14 @@ def lines_of(pairs: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return lines, signs
 
 
+def lines_of_shares(pairs: np.ndarray, shares: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each pair sum the readings it occurs in, and its share there; padded with share 0."""
+    place = np.repeat(np.arange(len(pairs)), pairs.shape[1]), pairs.ravel()
+    found = sp.csr_array((shares.ravel(), place), (len(pairs), count)).T.tocsr()
+    found.eliminate_zeros()
+    return padded_rows(found)
+
+
 def matrix_of(pairs: np.ndarray, count: int) -> sp.csr_array:
     """P for a unit current, (readings, k)."""
     rows = np.repeat(np.arange(len(pairs)), 4)

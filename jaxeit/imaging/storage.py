@@ -18,7 +18,7 @@ from ..files import DAMAGE, read_arrays, write_arrays
 from ..linalg import is_covariance
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem
-from .noise import Whitening, lines_of
+from .noise import Whitening, lines_of, lines_of_shares
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
 from .settings import Imaging
 
@@ -27,7 +27,7 @@ FORMAT = "jaxeit reconstructor 1"
 # Name: dimensions, unit, meaning.
 _SHARED = {
     "predict": ("k k", "ohm2", "pair sums of the one-step image, from weighted ones of the readings"),
-    "pairs": ("readings 4", "1", "the four pair sums of each reading"),
+    "pairs": ("readings n", "1", "the pair sums of each reading: four, or as many as shares has"),
     "current": ("", "A", "amplitude of the stimulation"),
     "weight": ("readings *", "1/V2", "inverse of the noise: variances, or a covariance matrix"),
     "channels": ("readings", "1", "readings that are used"),
@@ -48,8 +48,12 @@ ITERATIVE_NUMBERS = {
     "hyperparameter": ("", "1", "weight of the prior"),
     **_SHARED,
 }
-NUMBERS = LINEAR_NUMBERS | ITERATIVE_NUMBERS
-"""Shape, unit and meaning of each array of a stored reconstructor, by its name."""
+SHARES = {"shares": ("readings n", "1", "share of each pair sum in each reading; absent: 1, -1, -1, 1")}
+NUMBERS = LINEAR_NUMBERS | ITERATIVE_NUMBERS | SHARES
+"""Shape, unit and meaning of each array of a stored reconstructor, by its name.
+
+Readings of a protocol of matrices, and those of amplifiers with a `CommonMode`, have ``shares``.
+"""
 
 _KINDS = {"pairs": "iu", "edges": "iu", "channels": "b"}
 _WORDS = {"f": "floating point", "iu": "integers", "b": "boolean"}
@@ -69,9 +73,6 @@ class StorageError(ValueError):
 def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.ndarray]:
     """The arrays of a reconstructor under the names of `NUMBERS`; of an iterative one, all but its method and prior.
 
-    Raises:
-        StorageError: for a protocol of matrices (`Protocol.from_matrices`), or amplifiers with a `CommonMode`.
-
     Example:
         # for a file format of your own; NUMBERS has shapes, units and meanings
         numbers = je.imaging.to_numbers(recon)
@@ -80,21 +81,17 @@ def to_numbers(recon: Reconstructor | IterativeReconstructor) -> dict[str, np.nd
         again = je.imaging.from_numbers(numbers, recon.shape, recon.extent, recon.provenance)
     """
     require_known("to_numbers", StorageError, recon)
-    if recon.whitening.shares is not None:
-        raise StorageError(
-            "a reconstructor for a protocol of matrices (Protocol.from_matrices), or for amplifiers with a CommonMode, "
-            "has no form in a file; make it with prepare where it is used"
-        )
     parts = (recon, recon.whitening, recon.picture)
+    shares = () if recon.whitening.shares is None else tuple(SHARES)
     if isinstance(recon, Reconstructor):
-        return {name: _part(parts, name) for name in LINEAR_NUMBERS}
+        return {name: _part(parts, name) for name in (*LINEAR_NUMBERS, *shares)}
     problem = recon.problem
     own = {
         "jacobian": np.asarray(problem.jacobian),
         "count": np.asarray(problem.readings),
         "hyperparameter": np.asarray(problem.hyperparameter),
     }
-    return {name: own[name] if name in own else _part(parts, name) for name in ITERATIVE_NUMBERS}
+    return {name: own[name] if name in own else _part(parts, name) for name in (*ITERATIVE_NUMBERS, *shares)}
 
 
 def _part(parts: tuple[Any, ...], name: str) -> np.ndarray:
@@ -136,11 +133,13 @@ def from_numbers(
         StorageError: if an array is missing, they do not fit each other, or the method is needed and not iterative.
     """
     iterative = "jacobian" in numbers
-    names = ITERATIVE_NUMBERS if iterative else LINEAR_NUMBERS
+    names = [*(ITERATIVE_NUMBERS if iterative else LINEAR_NUMBERS), *(SHARES.keys() & numbers.keys())]
     missing = [name for name in names if name not in numbers]
     if missing:
         raise StorageError(f"{missing[0]}: missing")
     sizes = _sizes({name: numbers[name] for name in names})
+    if "shares" not in numbers and sizes["n"] != 4:
+        raise StorageError(f"pairs: names {sizes['n']} pair sums for each reading; without shares, give four")
     if len(extent) != 4 or not np.isfinite(extent).all() or math.prod(shape) != sizes["basis"]:
         raise StorageError(
             f"a picture of shape {shape} and extent {extent} does not hold {sizes['basis']} coefficients"
@@ -192,7 +191,8 @@ def _iterative(
 
 
 def _whitening(numbers: Mapping[str, np.ndarray], k: int, dtype: np.dtype) -> Whitening:
-    lines, sign = lines_of(np.asarray(numbers["pairs"]), k)
+    pairs, shares = np.asarray(numbers["pairs"]), numbers.get("shares")
+    lines, sign = lines_of(pairs, k) if shares is None else lines_of_shares(pairs, np.asarray(shares), k)
     return Whitening(
         pairs=jnp.asarray(numbers["pairs"], jnp.int32),
         lines=jnp.asarray(lines, jnp.int32),
@@ -200,6 +200,7 @@ def _whitening(numbers: Mapping[str, np.ndarray], k: int, dtype: np.dtype) -> Wh
         current=jnp.asarray(numbers["current"]),
         weight=jnp.asarray(numbers["weight"]),
         channels=jnp.asarray(numbers["channels"], bool),
+        shares=None if shares is None else jnp.asarray(shares),
     )
 
 

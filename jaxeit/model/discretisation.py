@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._compile import is_traced
 from ..budget import require
-from ..effects import AbstractCoatEffect, AbstractEffect, AbstractTerminalEffect, chosen
+from ..effects import AbstractCoatEffect, AbstractEffect, chosen
 from ..geometry.shapes import Domain
 from ..linalg import AbstractLinearSolver, default_solver
 from ..linalg.base import on_device
@@ -136,8 +136,9 @@ def discretise(
     _require_kinds(scene, fidelity)
     require_dtype(fidelity.dtype)
     skin = scene.skin
-    if at_terminals := chosen(scene.effects, AbstractTerminalEffect):
-        skin.protocol.rows(f"the effect {type(at_terminals[0]).__name__}")
+    for effect in scene.effects:
+        if effect.of_pairs:
+            skin.protocol.rows(f"the effect {type(effect).__name__}")
     sheet, metal = _spaces(scene, fidelity, None if mesh is None else mesh.check(min_angle))
     values = _model_arrays(skin, sheet.mesh)
     electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)

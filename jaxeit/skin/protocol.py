@@ -140,6 +140,11 @@ class Protocol:
         return self.pattern
 
     @property
+    def pairs(self) -> Int[np.ndarray, "some 4"]:
+        """The pattern, where each row is one reading; no rows for a protocol of matrices, whose readings have none."""
+        return self.pattern if self.mixing is None else self.pattern[:0]
+
+    @property
     def slots(self) -> Int[np.ndarray, " readings"]:
         """Number of the slot in which each reading is taken.
 

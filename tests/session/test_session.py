@@ -403,7 +403,7 @@ def test_the_writer_refuses(case: str, tmp_path: Path) -> None:
         ({"scene": None}, "does not say how"),
         ({"pattern": np.zeros((3, 3), int)}, "(M, 4)"),
         ({"pattern": -PATTERN}, "from 0"),
-        ({"offset": [0.0]}, "one time per row"),
+        ({"offset": [0.0]}, "one time per reading"),
         ({"pattern": None}, "give pattern"),
     ],
 )

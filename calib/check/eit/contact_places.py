@@ -7,6 +7,7 @@ wrong by 4 mm (median) at 40 mm between electrodes.
 """
 
 import numpy as np
+import scipy.sparse as sp
 
 import jaxeit as je
 
@@ -14,13 +15,16 @@ POINTS = 40  # of the grid of places along the longer side of the sheet
 BLUR = 0.1  # distances between neighbouring electrodes, over which the field of an electrode is finite
 
 
-def locate_contacts(change: np.ndarray, pattern: np.ndarray, skin: je.Skin) -> tuple[np.ndarray, np.ndarray]:
+def locate_contacts(
+    change: np.ndarray, pattern: np.ndarray, skin: je.Skin, mixing: sp.csr_array | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The place that explains each change best, and its correlation with the change, from -1 to 1.
 
     Args:
         change: of the readings (presses, readings) V; readings that are not finite in all presses are left out.
-        pattern: drive+, drive-, sense+, sense- (readings, 4).
+        pattern: drive+, drive-, sense+, sense- (rows, 4).
         skin: its electrodes and its sheet.
+        mixing: readings as sums of rows of the pattern (readings, rows); default: each row is one.
 
     Returns:
         Places (presses, 2) m and correlations (presses,), which are zero where nothing changes. They are negative
@@ -29,8 +33,9 @@ def locate_contacts(change: np.ndarray, pattern: np.ndarray, skin: je.Skin) -> t
     places = _grid(skin)
     known = np.isfinite(change).all(0)
     fields = _fields(skin, places)
-    source, sink, plus, minus = pattern[known].T
-    products = np.einsum("rpx,rpx->rp", fields[source] - fields[sink], fields[plus] - fields[minus])
+    source, sink, plus, minus = pattern.T
+    rows = np.einsum("rpx,rpx->rp", fields[source] - fields[sink], fields[plus] - fields[minus])
+    products = (rows if mixing is None else mixing @ rows)[known]
     alike = _unit(change[:, known]) @ _unit(products.T).T
     best = np.abs(alike).argmax(1)
     return places[best], alike[np.arange(len(best)), best]

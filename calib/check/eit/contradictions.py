@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..report import ChannelTable, Finding, Severity, listed
-from .grouping import common_part
+from .grouping import common_part, readings_of_electrodes
 from .model import SkinModel
 
 WHERE = "/streams/eit"
@@ -82,7 +82,7 @@ def _away_from_model(table: ChannelTable, model: SkinModel | None) -> np.ndarray
     """How far each reading is from the model, as a logarithm; a wrong sign counts for a factor of a thousand."""
     if model is None:
         return np.zeros(len(table))
-    expected = model.predict(table.pattern)
+    expected = model.predict(table)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = table.mean / expected
         ratio = ratio / np.nanmedian(ratio)
@@ -106,8 +106,8 @@ def _exchanged(wrong: np.ndarray, table: ChannelTable) -> list[tuple[int, int]]:
 
 def offset_finding(table: ChannelTable, good: np.ndarray, model: SkinModel) -> Finding | None:
     """A voltage that all readings have in addition to what the skin gives."""
-    scale, offset = model.scale_and_offset(table.mean, good, table.pattern)
-    left = table.mean[good] - scale * model.predict(table.pattern)[good]
+    scale, offset = model.scale_and_offset(table.mean, good, table)
+    left = table.mean[good] - scale * model.predict(table)[good]
     size = float(np.sqrt(np.mean((table.mean[good] - offset) ** 2)))
     if not (abs(offset) > MIN_OFFSET * size and abs(np.median(left)) > MIN_OFFSET * size):
         return None
@@ -121,13 +121,12 @@ def offset_finding(table: ChannelTable, good: np.ndarray, model: SkinModel) -> F
 
 def lost_electrode_findings(table: ChannelTable, model: SkinModel) -> Iterator[Finding]:
     """Electrodes whose readings hold noise instead of the voltage that the model has."""
-    expected = np.abs(model.predict(table.pattern))
+    expected = np.abs(model.predict(table))
     large = (expected > MIN_MODEL * np.sqrt(np.mean(expected**2))) & np.isfinite(table.mean) & ~table.dead
     ratio = np.abs(table.mean) / np.where(large, expected, 1)
     usual = float(np.median(ratio[large])) if large.any() else 0.0
     weak = large & (ratio < LOST * usual)
-    for electrode in range(len(model.transfer)):
-        uses = (table.pattern == electrode).any(1)
+    for electrode, uses in enumerate(readings_of_electrodes(table.pattern, table.mixing)):
         if (uses & large).sum() > 2 and (weak | ~large)[uses].all():
             what = (
                 f"the {uses.sum()} readings of electrode {electrode} hold less than {100 * LOST:.0f} % of the voltage "

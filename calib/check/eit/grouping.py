@@ -1,23 +1,36 @@
 """What a set of readings has in common: electrodes, or a pair of electrodes that drives or senses."""
 
 import numpy as np
+import scipy.sparse as sp
 
 MIN_SHARE = 0.8  # of the readings of an electrode, that are in the set
 
 
-def common_electrodes(flag: np.ndarray, pattern: np.ndarray, among: np.ndarray | None = None) -> list[int]:
+def readings_of_electrodes(pattern: np.ndarray, mixing: sp.csr_array | None = None) -> np.ndarray:
+    """Which readings each electrode takes part in, (electrodes, readings).
+
+    Where readings are sums of rows, those that sense with the electrode: all of them are driven through nearly all
+    electrodes, which tells none from another.
+    """
+    electrodes = np.arange(pattern.max() + 1)
+    if mixing is None:
+        return np.asarray((pattern == electrodes[:, None, None]).any(2))
+    senses = (pattern[:, 2:] == electrodes[:, None, None]).any(2)
+    return np.asarray((abs(mixing) @ senses.T.astype(float)).T > 0)
+
+
+def common_electrodes(flag: np.ndarray, uses: np.ndarray, among: np.ndarray | None = None) -> list[int]:
     """One or two electrodes that occur in all flagged readings and in few others; found greedily.
 
     Args:
         flag: (readings,).
-        pattern: drive+, drive-, sense+, sense- (readings, 4).
+        uses: from `readings_of_electrodes`.
         among: the readings that may be flagged (readings,); default: all.
     """
     left = flag.copy()
     found: list[int] = []
+    uses = uses if among is None else uses & among
     while left.sum() >= 3 and len(found) < 2:
-        uses = np.array([(pattern == e).any(1) for e in range(pattern.max() + 1)])
-        uses = uses if among is None else uses & among
         share = (uses & flag).sum(1) / np.maximum(uses.sum(1), 1)
         hits = np.where(share > MIN_SHARE, (uses & left).sum(1), 0)
         if not hits.any():

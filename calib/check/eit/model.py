@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..report import ChannelTable
 from .reading_order import OrderCheck, check_order, predict_readings
 
 
@@ -16,7 +17,7 @@ class SkinModel:
     | transfer  | from `transfer_matrix`                               | (electrodes, electrodes) | ohm  |
     | current   | drive current                                        |                          | A    |
     | positions | of the electrodes, to try the numberings of a grid   | (electrodes, 2)          | m    |
-    | usual     | the skin's own pattern                               | (readings, 4)            |      |
+    | usual     | the skin's own pattern, if each row is one reading   | (readings, 4)            |      |
     """
 
     transfer: np.ndarray
@@ -24,32 +25,33 @@ class SkinModel:
     positions: np.ndarray
     usual: np.ndarray
 
-    def predict(self, pattern: np.ndarray) -> np.ndarray:
+    def predict(self, table: ChannelTable) -> np.ndarray:
         """Readings (readings,) of the uniform sheet, V."""
-        return self.current * predict_readings(self.transfer, pattern)
+        return self.current * predict_readings(self.transfer, table.pattern, table.mixing)
 
-    def check(self, voltage: np.ndarray, good: np.ndarray, pattern: np.ndarray) -> OrderCheck:
+    def check(self, voltage: np.ndarray, good: np.ndarray, table: ChannelTable) -> OrderCheck:
         """Compare a frame with the sheet under many orders of its readings: `check_order`."""
         return check_order(
             voltage,
             good,
-            pattern,
+            table.pattern,
             self.transfer,
+            mixing=table.mixing,
             current=self.current,
             positions=self.positions,
             usual=self.usual,
         )
 
-    def misfit(self, voltage: np.ndarray, good: np.ndarray, pattern: np.ndarray) -> tuple[float, float]:
+    def misfit(self, voltage: np.ndarray, good: np.ndarray, table: ChannelTable) -> tuple[float, float]:
         """How far a frame is from the sheet: one minus the cosine between them, and the logarithm of their ratio."""
-        v, model = voltage[good], self.predict(pattern)[good]
+        v, model = voltage[good], self.predict(table)[good]
         sizes = (float(np.linalg.norm(x)) for x in (v, model))
         of_v, of_model = (max(size, np.finfo(float).tiny) for size in sizes)
         return 1 - float(v @ model) / (of_v * of_model), abs(float(np.log(of_v / of_model)))
 
-    def scale_and_offset(self, voltage: np.ndarray, good: np.ndarray, pattern: np.ndarray) -> tuple[float, float]:
+    def scale_and_offset(self, voltage: np.ndarray, good: np.ndarray, table: ChannelTable) -> tuple[float, float]:
         """Amplitude over that of the sheet, and what all readings have in addition (V), by least squares."""
-        v, model = voltage[good], self.predict(pattern)[good]
+        v, model = voltage[good], self.predict(table)[good]
         away = model - model.mean()
         power = float(away @ away)
         scale = float(away @ v) / power if power > 0 else float("nan")

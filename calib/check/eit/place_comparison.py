@@ -78,11 +78,11 @@ def _located(
     full = windows.ramp[:, 1]
     around = np.stack([full - quarter, full + quarter + SECOND // 20], 1)
     sound = ~channels.bad & ~(channels.reciprocity > MIN_CONTRADICTION)
-    change = press_means(eit, replace(windows, hold=around)).change.mean[:, sound]
+    change = np.where(sound, press_means(eit, replace(windows, hold=around)).change.mean, np.nan)
     known = np.flatnonzero(np.isfinite(change).any(1))
     if not len(known) or not np.isfinite(change[known]).all(0).any():
         return np.empty(0, int), np.empty((0, 2)), np.empty(0)
-    contacts, alike = locate_contacts(change[known], channels.pattern[sound], skin)
+    contacts, alike = locate_contacts(change[known], channels.pattern, skin, channels.mixing)
     good = np.abs(alike) > MIN_ALIKE
     return known[good], contacts[good], alike[good]
 

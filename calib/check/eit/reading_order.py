@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 
 import jaxeit as je
 
@@ -47,20 +48,28 @@ def transfer_matrix(skin: je.Skin) -> np.ndarray:
     return matrix
 
 
-def predict_readings(transfer: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """Readings per ampere (readings,) in ohm for a ``pattern`` (readings, 4): drive+, drive-, sense+, sense-."""
+def predict_readings(transfer: np.ndarray, pattern: np.ndarray, mixing: sp.csr_array | None = None) -> np.ndarray:
+    """Readings per ampere (readings,) in ohm for a ``pattern`` (rows, 4): drive+, drive-, sense+, sense-.
+
+    With ``mixing``, (readings, rows), readings are sums of rows.
+    """
     source, sink, plus, minus = pattern.T
     z = transfer
-    return np.asarray(z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink])
+    rows = z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink]
+    return np.asarray(rows if mixing is None else mixing @ rows)
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A mistake that the recorder may have made, and the ``pattern`` (readings, 4) that its readings then follow."""
+    """A mistake that the recorder may have made, and what its readings then follow.
+
+    ``pattern`` (rows, 4), and the ``order`` (readings,) of what is read by it; None: as it is.
+    """
 
     what: str
     remedy: str
     pattern: np.ndarray
+    order: np.ndarray | None = None
     magnitude: bool = False
 
 
@@ -101,19 +110,26 @@ def check_order(
     current: float = 1.0,
     positions: np.ndarray | None = None,
     usual: np.ndarray | None = None,
+    mixing: sp.csr_array | None = None,
 ) -> OrderCheck:
     """Compare mean readings of the untouched skin with a uniform sheet under many orders.
 
     Args:
         voltage: mean readings (readings,) V.
         good: which readings to trust (readings,).
-        pattern: as recorded (readings, 4).
+        pattern: as recorded (rows, 4).
         transfer: from `transfer_matrix`.
         current: drive current, A.
         positions: positions of the electrodes (electrodes, 2) m, to try the numberings of a grid.
         usual: the skin's own pattern, to try if the recorded pattern differs from it.
+        mixing: readings as sums of rows of the pattern (readings, rows); default: each row is one.
     """
-    v, model = voltage[good], current * predict_readings(transfer, pattern[good])
+
+    def predicted(hypothesis: Hypothesis) -> np.ndarray:
+        found = current * predict_readings(transfer, hypothesis.pattern, mixing)
+        return np.asarray(found if hypothesis.order is None else found[hypothesis.order])[good]
+
+    v, model = voltage[good], current * predict_readings(transfer, pattern, mixing)[good]
     power = model @ model
     as_is = OrderCheck(
         readings=len(v),
@@ -124,10 +140,8 @@ def check_order(
     if as_is.as_is >= SUFFICIENT_CORRELATION:
         return as_is
     scored = [
-        _ScoredHypothesis(
-            h.what, h.remedy, _signed_correlation(v, current * predict_readings(transfer, h.pattern[good]), h)
-        )
-        for h in _hypotheses(pattern, len(transfer), positions, usual)
+        _ScoredHypothesis(h.what, h.remedy, _signed_correlation(v, predicted(h), h))
+        for h in _hypotheses(pattern, len(voltage), len(transfer), positions, usual)
     ]
     return _best_explanation(as_is, scored)
 
@@ -175,7 +189,7 @@ def _signed_correlation(v: np.ndarray, model: np.ndarray, hypothesis: Hypothesis
 
 
 def _hypotheses(
-    pattern: np.ndarray, electrodes: int, positions: np.ndarray | None, usual: np.ndarray | None
+    pattern: np.ndarray, readings: int, electrodes: int, positions: np.ndarray | None, usual: np.ndarray | None
 ) -> Iterator[Hypothesis]:
     """All hypotheses, from the simplest to the most unusual; the first is the recorded order itself."""
     yield Hypothesis(
@@ -189,32 +203,35 @@ def _hypotheses(
         pattern,
         magnitude=True,
     )
-    yield from _reading_orders(pattern, usual)
+    yield from _reading_orders(pattern, readings, usual)
     yield from _renumbered(pattern, electrodes)
     yield from _grid_numberings(pattern, positions)
-    yield from _shifted_frames(pattern)
+    yield from _shifted_frames(pattern, readings)
     yield from _swapped(pattern, electrodes)
 
 
 REORDER_REMEDY = "write the rows of the pattern in the order in which the readings come"
 
 
-def _reading_orders(pattern: np.ndarray, usual: np.ndarray | None) -> Iterator[Hypothesis]:
-    drive, sense = _rank(pattern[:, :2]), _rank(pattern[:, 2:])
+def _reading_orders(pattern: np.ndarray, readings: int, usual: np.ndarray | None) -> Iterator[Hypothesis]:
     if usual is not None and usual.shape == pattern.shape and (usual != pattern).any():
         yield Hypothesis(
             "the readings are in the order of the skin's protocol, not of the recorded pattern",
             "write the skin's own pattern into the session",
             usual,
         )
+    backwards = np.arange(readings)[::-1]
+    yield Hypothesis("the readings of a frame come in reversed order", REORDER_REMEDY, pattern, backwards)
+    if readings != len(pattern):
+        return
+    drive, sense = _rank(pattern[:, :2]), _rank(pattern[:, 2:])
     orders = {
-        "the readings of a frame come in reversed order": np.arange(len(pattern))[::-1],
         "within each drive the readings start at sense electrode 0": np.lexsort((pattern[:, 2], drive)),
         "the readings come sense pair by sense pair, not drive by drive": np.lexsort((drive, sense)),
         "the readings come sense electrode by sense electrode": np.lexsort((drive, pattern[:, 2])),
     }
     for what, order in orders.items():
-        yield Hypothesis(what, REORDER_REMEDY, pattern[order])
+        yield Hypothesis(what, REORDER_REMEDY, pattern, order)
 
 
 def _rank(pairs: np.ndarray) -> np.ndarray:
@@ -257,10 +274,10 @@ def _grid_numberings(pattern: np.ndarray, positions: np.ndarray | None) -> Itera
                 yield Hypothesis(f"electrodes are numbered {name} in a snake, {start}", remedy, snake.ravel()[pattern])
 
 
-def _shifted_frames(pattern: np.ndarray) -> Iterator[Hypothesis]:
-    for start in range(1, min(len(pattern), MAX_SHIFTS)):
+def _shifted_frames(pattern: np.ndarray, readings: int) -> Iterator[Hypothesis]:
+    for start in range(1, min(readings, MAX_SHIFTS)):
         what = f"each frame starts at reading {start} of the pattern"
-        yield Hypothesis(what, "synchronise the recorder with the scan", np.roll(pattern, -start, 0))
+        yield Hypothesis(what, "synchronise the recorder with the scan", pattern, np.roll(np.arange(readings), -start))
 
 
 def _swapped(pattern: np.ndarray, electrodes: int) -> Iterator[Hypothesis]:

@@ -14,7 +14,7 @@ from ..evidence import PressEvidence
 from ..report import ChannelTable, Finding, Severity, listed
 from ..streams.statistics import StreamStatistics
 from .contradictions import check_reciprocity, lost_electrode_findings, offset_finding
-from .grouping import common_electrodes
+from .grouping import common_electrodes, readings_of_electrodes
 from .model import SkinModel
 from .order_findings import MIN_CORRELATION, amplitude_findings, order_findings
 from .reading_order import OrderCheck, transfer_matrix
@@ -47,7 +47,7 @@ def check_eit(
     if stats is None or pattern is None or stats.row.variable != "voltage":
         return None, None
     findings += _frame_rate_findings(session, stats, skin)
-    table = _channel_table(stats, pattern, presses)
+    table = _channel_table(stats, session, presses)
     findings += _channel_findings(stats, table)
     model = None
     if skin is not None and pattern.max() < len(skin.electrodes):
@@ -74,7 +74,7 @@ def _model(session: Session, skin: je.Skin, transfer: np.ndarray | None, finding
         findings.append(Finding(Severity.ERROR, "/device", what, "correct the skin's TOML file"))
         return None
     current = skin.protocol.current if session.current is None else session.current
-    return SkinModel(transfer, current, skin.electrode_positions, skin.protocol.pattern)
+    return SkinModel(transfer, current, skin.electrode_positions, skin.protocol.pairs)
 
 
 def _sound(table: ChannelTable) -> np.ndarray:
@@ -87,7 +87,7 @@ def _check_order(table: ChannelTable, good: np.ndarray, model: SkinModel, findin
         what = f"only {good.sum()} readings are sound: order and signs were not checked"
         findings.append(Finding(Severity.WARNING, "/streams/eit", what, "correct the readings above first"))
         return None
-    return model.check(table.mean, good, table.pattern)
+    return model.check(table.mean, good, table)
 
 
 def _model_findings(table: ChannelTable, good: np.ndarray, order: OrderCheck, model: SkinModel) -> Iterator[Finding]:
@@ -135,7 +135,8 @@ def _rest_frames(time: np.ndarray, presses: PressColumns | None) -> slice:
     return slice(start, start + min(int(sizes.max()), MAX_REST_FRAMES))
 
 
-def _channel_table(stats: StreamStatistics, pattern: np.ndarray, presses: PressColumns | None) -> ChannelTable:
+def _channel_table(stats: StreamStatistics, session: Session, presses: PressColumns | None) -> ChannelTable:
+    pattern, mixing = np.asarray(session.pattern), session.mixing
     rest = _rest_frames(stats.time, presses)
     values = stats.stream.read(rest.start, rest.stop)
     mean = finite_mean(values)
@@ -143,7 +144,8 @@ def _channel_table(stats: StreamStatistics, pattern: np.ndarray, presses: PressC
     noise = np.sqrt(finite_mean(np.diff(values, axis=0) ** 2) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = 20 * np.log10(np.abs(mean) / noise)
-    partner, saturated = je.skin.reciprocal_rows(pattern), _saturated(stats)
+    partner = je.skin.reciprocal_rows(pattern) if mixing is None else np.full(len(mean), -1)
+    saturated = _saturated(stats)
     typical = np.median(noise[np.isfinite(noise)]) if np.isfinite(noise).any() else np.inf
     return ChannelTable(
         frames=len(values),
@@ -156,6 +158,7 @@ def _channel_table(stats: StreamStatistics, pattern: np.ndarray, presses: PressC
         missing=stats.missing,
         dead=stats.dead & ~saturated,
         saturated=saturated,
+        mixing=mixing,
         noisy=(noise > NOISE_RATIO * typical) & (snr < MIN_SNR) & ~stats.dead,
     )
 
@@ -218,7 +221,7 @@ def _channel_list_finding(
     if not len(rows):
         return
     text = f"{len(rows)} of {len(table)} readings {what}: {listed(rows)}"
-    common = common_electrodes(flag, table.pattern)
+    common = common_electrodes(flag, readings_of_electrodes(table.pattern, table.mixing))
     if common:
         text += f"; all of them use electrode {' or '.join(map(str, common))}"
         remedy = f"check electrode {' and '.join(map(str, common))}: its terminal, wire and switch"

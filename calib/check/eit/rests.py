@@ -14,7 +14,7 @@ from ..evidence import PressEvidence
 from ..parts import MIN_ROWS, time_text
 from ..report import ChannelTable, Finding, Severity, listed
 from ..streams.statistics import StreamStatistics
-from .grouping import common_electrodes
+from .grouping import common_electrodes, readings_of_electrodes
 from .model import SkinModel
 
 WHERE = "/streams/eit"
@@ -137,7 +137,7 @@ def _first_is_wrong(change: RestChange, known: np.ndarray, table: ChannelTable, 
         if moved.mean() > 0.5:
             return False
         return _rms(change.before[known][moved]) < LOST * _rms(change.after[known][moved])
-    before, after = (model.misfit(frame, known, table.pattern) for frame in (change.before, change.after))
+    before, after = (model.misfit(frame, known, table) for frame in (change.before, change.after))
     shape, amplitude = (a - b for a, b in zip(before, after, strict=True))
     return bool(shape > 0 if abs(shape) > TIE else amplitude > TIE)
 
@@ -162,7 +162,7 @@ def _explanation(
     local = _local_explanation(wrong, right, known, table)
     if local is not None:
         return local
-    order = None if model is None else model.check(wrong, known & ~table.dead, table.pattern)
+    order = None if model is None else model.check(wrong, known & ~table.dead, table)
     if order is not None and order.claimed:
         return order.what, f"{order.remedy}, or use the other part only", Severity.ERROR
     if alike > MAX_UNNAMED:
@@ -178,7 +178,7 @@ def _local_explanation(
     floor = 0.1 * _rms(right[known])
     moved = known & (np.abs(wrong - right) > MIN_LOCAL * np.fmax(np.fmax(np.abs(wrong), np.abs(right)), floor))
     large = known & (np.abs(right) > floor)
-    electrodes = common_electrodes(moved & large, table.pattern, large)
+    electrodes = common_electrodes(moved & large, readings_of_electrodes(table.pattern, table.mixing), large)
     if not electrodes:
         return None
     left = _rms(wrong[moved]) / max(_rms(right[moved]), np.finfo(float).tiny)

@@ -74,6 +74,11 @@ def numbers_of(calibration: Calibration, *, without_location: bool = False) -> N
             "noise: the covariance between readings needs tables of readings squared, which are not exported; "
             "calibrate with --noise equal or --noise measured"
         )
+    if recon.whitening.shares is not None:
+        raise ExportError(
+            "protocol: readings of many electrodes, as of a trigonometric scan, and of amplifiers with a CommonMode "
+            'are not exported; calibrate a skin with a scan of pairs, such as pattern = "adjacent"'
+        )
     pairs, weight = np.asarray(recon.whitening.pairs), np.asarray(recon.whitening.weight, float)
     if max(len(weight), recon.predict.shape[0], len(calibration.masks.areas)) > np.iinfo(np.uint16).max:
         raise ExportError("more than 65,535 readings, pairs of electrodes or pixels; calibrate with fewer --pixels")

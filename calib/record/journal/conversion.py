@@ -225,6 +225,7 @@ def _session_facts(plan: RecordingPlan, complete: bool, recovered: bool) -> Sess
         skin_name=plan.skin_name,
         skin_toml=plan.skin_toml,
         pattern=plan.pattern,
+        mixing=plan.mixing_matrix(),
         current=plan.current,
         frequency=plan.frequency,
         offset=plan.offset,

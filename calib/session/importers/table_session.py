@@ -228,7 +228,8 @@ def _described(files: Sequence[FileSpec], skin: "je.Skin | None") -> dict[str, A
         raise SessionError("--skin: no stream is called eit; name the readings' columns, as --stream eit=1-550:V")
     protocol = skin.protocol
     scan = {
-        "pattern": protocol.rows("a session"),
+        "pattern": protocol.pattern,
+        "mixing": protocol.mixing,
         "current": float(protocol.current),
         "frequency": float(protocol.frequency),
     }
