@@ -1,6 +1,7 @@
 """A scan through all electrodes at once, by the command line: simulated, checked, calibrated, applied, evaluated."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 import calib
 import jaxeit as je
 from calib.cli import main
+from calib.record import PlanError, SimulatedDevice, StopRequest, frame_packets, plan_recording, record_session
+from calib.record.plan import plan_from_json
 from calib.session import SessionError, read_archive
 
 RING = 0.06 + 0.047 * np.stack([np.cos(a := 2 * np.pi * np.arange(12) / 12), np.sin(a)], 1)
@@ -108,6 +111,41 @@ def test_a_session_holds_the_scan(sessions):
         assert session.mixing is None
 
 
+def test_a_device_is_recorded(sessions, tmp_path):
+    skin = je.load_skin(sessions / "trigonometric.toml")
+    times = range(0, 200_000_000, 10_000_000)  # ns
+    frames = 1e-3 * np.random.default_rng(0).standard_normal((20, 132)).astype("f4")  # V
+    with SimulatedDevice([frame_packets(1, times, frames)], wait_for=1) as device:
+        plan, sources = plan_recording({"eit": device.urls[0]}, skin=skin, title="all electrodes")
+        record_session(plan, sources, tmp_path / "recorded.h5", seconds=0.4, stop_request=StopRequest())
+    with calib.open_session(tmp_path / "recorded.h5") as session:
+        np.testing.assert_array_equal(session.mixing.toarray(), skin.protocol.mixing.toarray())
+        found = session.stream("eit").read()
+        np.testing.assert_allclose(found, frames[: len(found)], rtol=1e-6)
+        assert len(found) > 10
+
+
+def test_plans_of_journals_keep_the_scan_and_old_ones_open(sessions):
+    skin = je.load_skin(sessions / "trigonometric.toml")
+    plan, _ = plan_recording({"eit": "tcp://127.0.0.1:1"}, skin=skin, title="all electrodes")
+    again = plan_from_json(plan.to_json())
+    assert again == plan
+    np.testing.assert_array_equal(again.mixing_matrix().toarray(), skin.protocol.mixing.toarray())
+    pairs = je.load_skin(sessions / "adjacent.toml")
+    old = json.loads(plan_recording({"eit": "tcp://127.0.0.1:1"}, skin=pairs, title="pairs")[0].to_json())
+    del old["mixing"]
+    assert plan_from_json(json.dumps(old).encode()).mixing is None
+    with pytest.raises(PlanError, match="mixing: names no reading from 0 on, or no row of the 132"):
+        replace(plan, mixing=((0, 132, 1.0),))
+
+
+def test_a_scan_too_long_for_a_journal_is_refused(sessions):
+    skin = je.load_skin(sessions / "trigonometric.toml")
+    plan, _ = plan_recording({"eit": "tcp://127.0.0.1:1"}, skin=skin, title="all electrodes")
+    with pytest.raises(PlanError, match="25,001 terms is too long for a journal"):
+        replace(plan, mixing=((0, 0, 1.0),) * 25_001)
+
+
 def test_forces_are_as_with_the_adjacent_scan(sessions, capsys):
     """The pads tell the force with either scan; that of the image alone is as good, and so is the place."""
     found = {}
@@ -123,6 +161,9 @@ def test_forces_are_as_with_the_adjacent_scan(sessions, capsys):
         assert main(["apply", calibration, session, "-o", str(sessions / f"map-{scan}.h5")]) == 0
         capsys.readouterr()
         assert np.isfinite(read_archive(sessions / f"map-{scan}.h5", "skin-forcemap").arrays["force"]).all()
+    assert main(["export", "c", str(sessions / "cal-trigonometric.h5"), "-o", str(sessions / "skin.h")]) == 2
+    assert "readings of many electrodes" in capsys.readouterr().err
+    assert not (sessions / "skin.h").exists()
     through_all, pairs = (found[scan] for scan in SCANS)
     assert through_all["force_rmse"] == pytest.approx(pairs["force_rmse"], rel=0.05)
     assert through_all["force_eit_rmse"] < 1.2 * pairs["force_eit_rmse"]

@@ -126,8 +126,9 @@ def check_order(
     """
 
     def predicted(hypothesis: Hypothesis) -> np.ndarray:
-        found = current * predict_readings(transfer, hypothesis.pattern, mixing)
-        return np.asarray(found if hypothesis.order is None else found[hypothesis.order])[good]
+        found: np.ndarray = current * predict_readings(transfer, hypothesis.pattern, mixing)
+        kept: np.ndarray = (found if hypothesis.order is None else found[hypothesis.order])[good]
+        return kept
 
     v, model = voltage[good], current * predict_readings(transfer, pattern, mixing)[good]
     power = model @ model
