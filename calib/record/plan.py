@@ -153,7 +153,8 @@ class RecordingPlan:
         self._check_storable()
         eit = [s.channels for s in self.streams if s.name == "eit"]
         if eit and self._readings() != eit[0]:
-            rows = "no pattern" if self.pattern is None else f"a pattern of {self._readings()} readings"
+            kind = "rows" if self.mixing is None else "readings"
+            rows = "no pattern" if self.pattern is None else f"a pattern of {self._readings()} {kind}"
             raise PlanError(f"eit: {eit[0]} readings beside {rows}; give the skin whose protocol is measured")
 
     def _readings(self) -> int | None:

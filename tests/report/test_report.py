@@ -479,7 +479,8 @@ def test_a_layer_that_was_learned_has_two_maps(located, written, tmp_path):
     """They are the field's own mean and deviation, and nothing is drawn off the sheet."""
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
     field = GainField.over(corners, np.random.default_rng(0).uniform(0, 0.2, (99, 2)), LoadSettings(), 0.3)
-    layer = LearnedLayer.unknown(field)._replace(mean=np.linspace(-1, 1, len(field.places)), contacts=12)
+    count = len(field.places)
+    layer = LearnedLayer.normal(field, np.linspace(-1, 1, count), np.eye(count), contacts=12)
     known = replace(located, layer=layer, contact_law=ContactLaw.unknown()._replace(contacts=12))
     page, *files = write_report(known, tmp_path / "r.html")
     assert "as told by 12 contacts" in page.read_text()
