@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, is_traced
 from ..model.bases import AbstractBasis, BasisMap, Pixels
-from ..model.discretisation import Model
+from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
 from .absolute.background import sheet_of
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
@@ -119,8 +119,10 @@ def prepare(
             ``untouched`` and ``sigma`` are given, or no coating explains the untouched frame; if prior, method or
             basis is an object of another kind, such as a method in the place of the prior; or if jit, grad or vmap
             hides the protocol or the channels.
+        SceneError: if ``model`` is no model, such as a skin.
         HyperparameterError: if the hyperparameter is to be chosen by values that jit, grad or vmap hides.
     """
+    require_model(model)
     method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()
     require_choices(prior, method, basis, hyperparameter)
     image = basis if isinstance(basis, BasisMap) else basis.on(model)

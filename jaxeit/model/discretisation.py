@@ -161,6 +161,13 @@ def discretise(
     return Model(**jax.tree.map(put, values), effects=effects, system=system, solver=solver, coat=coat, mixing=mixed)
 
 
+def require_model(model: Any) -> None:
+    """Refuse an object in the place of a model, such as a skin or a scene; raises `SceneError`."""
+    if not isinstance(model, Model):
+        kind = type(model).__name__
+        raise SceneError(f"{kind} is not a model; make one, such as jaxeit.discretise(scene, jaxeit.Fidelity.draft())")
+
+
 def _require_kinds(scene: Any, fidelity: Any) -> None:
     """Refuse an object in the place of a scene or of a fidelity, such as a skin or a name."""
     if not isinstance(scene, Scene):

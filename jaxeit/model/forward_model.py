@@ -36,7 +36,7 @@ from ..effects import (
 )
 from ..linalg import AbstractPlan, inverse_columns
 from ..linalg.small_matrices import summed
-from .discretisation import Model
+from .discretisation import Model, require_model
 from .metal_sheet import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
 from .system import System
 
@@ -98,8 +98,10 @@ def forward(
 
     Raises:
         ValueError: if ``sigma`` has another shape or precision than the model, or has a coat and the model none.
+        SceneError: if ``model`` is no model, such as a skin.
         DerivativeError: if JAX differentiates with respect to the mesh of the model or arrays made of it.
     """
+    require_model(model)
     sigma = conductivity(model) if sigma is None else sigma  # one program, with or without a conductivity given
     return _forward(model, sigma if isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
 

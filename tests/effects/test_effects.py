@@ -278,6 +278,9 @@ def test_an_object_in_the_place_of_another_is_named(skin):
         je.discretise(skin)
     with pytest.raises(je.model.FidelityError, match=r"str is not a fidelity; make one, such as jaxeit.Fidelity.draft"):
         je.discretise(je.Scene(skin), "draft")
+    for wrong in (je.forward, je.prepare, lambda scene: je.imaging.fit_reference(scene, [])):
+        with pytest.raises(je.model.SceneError, match=r"Scene is not a model; make one, such as jaxeit.discretise\("):
+            wrong(je.Scene(skin))
 
 
 def test_scenes_refuse_what_is_not_an_effect(skin):

@@ -24,7 +24,7 @@ from ..._compile import full_precision
 from ...effects import CommonMode, chosen
 from ...least_squares import ImplicitStep, LevenbergMarquardt
 from ...linalg.lapack import eigh
-from ...model.discretisation import Model
+from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
 from ..noise import InverseError, require_real
@@ -149,8 +149,10 @@ def fit_reference(
 
     Raises:
         InverseError: if a shape or a value is wrong, or no even content explains the frame.
+        SceneError: if ``model`` is no model, such as a tank.
         MotionError: if the electrodes cannot be moved on this mesh.
     """
+    require_model(model)
     settings = ReferenceSettings() if settings is None else settings
     require_real(frame=frame)
     readings, even = jnp.asarray(frame, model.dtype), forward(model)
