@@ -132,6 +132,13 @@ def test_descriptions_come_back(session: Session) -> None:
     assert set(session.streams) == {"eit", "force"}
 
 
+def test_a_stream_of_a_closed_session_says_so(good: Path) -> None:
+    with open_session(good) as opened:
+        eit = opened.streams["eit"]
+    with pytest.raises(SessionError, match="is read after its file was closed; read it before, inside the `with`"):
+        eit.read()
+
+
 def test_samples_come_back_with_holes_and_flags(session: Session) -> None:
     time, voltage, force = samples(200)
     eit, stage = session.streams["eit"], session.streams["force"]

@@ -112,6 +112,8 @@ class GuardedArray:
 
         `SessionError` if they are more bytes than the budget allows at once.
         """
+        if not self.node.id.valid:
+            raise self.node.error("is read after its file was closed", "read it before, inside the `with` of the file")
         rows = len(range(*slice(start, stop).indices(self.shape[0]))) if self.shape else 1
         self.node.require("array_bytes", rows * self.row_bytes)
         with translated(self.node.path, self.node.where):
