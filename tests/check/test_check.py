@@ -536,6 +536,11 @@ def test_a_pad_too_few(parts, look):
     has(look(parts), Severity.ERROR, "has 3 columns, the skin 'testbed' has 4 pads")
 
 
+def test_pressures_by_another_name_are_missing(parts, look):
+    parts.streams["presure"] = parts.streams.pop("pressure")
+    only(look(parts), Severity.ERROR, "missing; the skin 'testbed' has 4 pads, the file has: eit, force, presure")
+
+
 @pytest.mark.parametrize(("value", "words"), [(np.nan, "no finite sample"), (101.0, "always reads 101 Pa")])
 def test_a_dead_pad_is_named(value, words, parts, look):
     parts.values("pressure")[:, 1] = value

@@ -29,6 +29,10 @@ def check_pads(
     searched for channels that carry no information.
     """
     stats = statistics.get("pressure")
+    if stats is None and skin is not None and skin.pads and {"eit", "force"} <= statistics.keys():
+        what = f"missing; the skin {skin.name!r} has {len(skin.pads)} pads, the file has: {listed(sorted(statistics))}"
+        remedy = "record the pads, or import their stream by the name pressure"
+        findings.append(Finding(Severity.ERROR, "/streams/pressure", what, remedy))
     if stats is None or stats.row.variable not in ("pressure", "counts"):
         return ()
     is_array = skin is None and stats.row.channels >= MIN_ARRAY_CHANNELS
