@@ -37,6 +37,8 @@ def load_tank(
     if not path.exists():
         raise TankError(f"{path}: does not exist; check the name and the folder")
     if skin is not None:
+        if not isinstance(skin, je.Skin):
+            raise TankError(f'{type(skin).__name__} is not a skin; make one, such as jaxeit.load_skin("tank.toml")')
         return described_tank(path, skin)
     if path.is_dir():
         return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
@@ -149,7 +151,8 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
         {"pattern", "amplitude"} <= set(arrays) or {"current", "measurement"} <= set(arrays)
     ):
         raise TankError(
-            f"{path.name}: holds {sorted(arrays)}; frames, and pattern and amplitude or current and measurement"
+            f"{path.name}: holds {sorted(arrays)}; save frames with pattern and amplitude, or with current and "
+            "measurement; frames alone need a skin's TOML, as --skin TANK.toml"
         )
     if "pattern" in arrays:
         protocol = je.Protocol(arrays["pattern"], float(arrays["amplitude"]))

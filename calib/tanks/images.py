@@ -125,6 +125,10 @@ def _scaled(
     used = np.isfinite(before) & np.isfinite(after)
     if used.sum() < 3:
         raise TankError(f"{tank.skin.name}: the frames share {int(used.sum())} finite readings; more are needed")
+    if not np.ptp(before[used]):
+        raise TankError(
+            f"{tank.skin.name}: all readings of frame {first} are the same number; give a recorded frame as reference"
+        )
     correlation = float(np.corrcoef(np.asarray(je.forward(model))[used], before[used])[0, 1])
     if not correlation > LEAST_CORRELATION:
         raise TankError(

@@ -45,10 +45,15 @@ class Tank:
 
     def __post_init__(self) -> None:
         readings = self.skin.protocol.readings
-        if self.frames.ndim != 2 or self.frames.shape != (len(self.names), readings):
+        if self.frames.ndim != 2 or self.frames.shape[1] != readings:
+            turned = self.frames.ndim == 2 and len(self.frames) == readings
             raise TankError(
-                f"{self.skin.name}: frames have shape {self.frames.shape}; the protocol has {readings} readings and "
-                f"there are {len(self.names)} names"
+                f"{self.skin.name}: frames have shape {self.frames.shape}; the protocol has {readings} readings: "
+                + ("transpose them, so that each row is a frame" if turned else f"give (frames, {readings})")
+            )
+        if len(self.frames) != len(self.names):
+            raise TankError(
+                f"{self.skin.name}: {len(self.frames)} frames have {len(self.names)} names; give one to each"
             )
 
     def model(self, fidelity: je.Fidelity | None = None, min_angle: float = 1.0) -> je.Model:

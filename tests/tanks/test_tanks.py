@@ -114,6 +114,17 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
         TankError, match=r"correlation of frame 0 .* is -.*check the order and the polarity.*the other sign"
     ):
         difference_image(reversed_polarity)
+    with pytest.raises(TankError, match="all readings of frame 0 are the same number; give a recorded frame"):
+        difference_image(calib.tanks.Tank(csv.skin, 0 * csv.frames, csv.names))
+    with pytest.raises(TankError, match="transpose them, so that each row is a frame"):
+        calib.tanks.Tank(csv.skin, csv.frames.T, csv.names)
+    with pytest.raises(TankError, match="2 frames have 1 names; give one to each"):
+        calib.tanks.Tank(csv.skin, csv.frames, csv.names[:1])
+    np.savez(tmp_path / "alone.npz", frames=bench.frames)
+    with pytest.raises(TankError, match=r"holds \['frames'\]; save frames with .*, as --skin TANK.toml"):
+        load_tank(tmp_path / "alone.npz", je.Disc(RADIUS))
+    with pytest.raises(TankError, match="str is not a skin; make one, such as"):
+        load_tank(tmp_path / "alone.npz", skin="tank.toml")
     for frame in (0, -2, 7):
         with pytest.raises(TankError, match=f"frame {frame} less frame 0, of 2 frames; give two different ones"):
             difference_image(csv, frame)
