@@ -164,7 +164,9 @@ class TomlTable:
         """
         if not self.has(key):
             if default is ...:
-                raise self.error(key, f"missing; give {meaning}")
+                near = difflib.get_close_matches(key, self._values.keys() - self._asked, 1, cutoff=0.75)
+                hint = f"; is {SHORT_REPR.repr(near[0])} a misspelling of it?" if near else ""
+                raise self.error(key, f"missing; give {meaning}{hint}")
             return default
         value = self._values[key]
         if not kind(value):

@@ -222,7 +222,8 @@ def _sites(table: je.toml.TomlTable, domain: je.geometry.Domain) -> np.ndarray:
     margin = table.number("margin", "least distance of the tip's centre from the rim, m")
     (x0, y0), (x1, y1) = domain.bounds
     if 2 * margin > min(x1 - x0, y1 - y0):
-        raise table.error("margin", f"is {margin:g} m, which leaves no place on a sheet of {x1 - x0:g} x {y1 - y0:g} m")
+        what = f"is {margin:g} m, which leaves no place on a sheet of {x1 - x0:g} x {y1 - y0:g} m"
+        raise table.error("margin", f"{what}; give less than half of its shorter side, in m")
     x = np.linspace(x0 + margin, x1 - margin, columns)
     y = np.linspace(y0 + margin, y1 - margin, rows)
     places = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)

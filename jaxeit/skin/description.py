@@ -277,7 +277,9 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
     if (beyond > _PAD_REACH * (high - low)).any():
         raise table.error(key, f"reaches {beyond.max():.3g} m beyond the sheet; give its corners in m")
     if (size := np.ptp(outline, 0).min()) < _MIN_PAD_WIDTH * (high - low).min():
-        raise table.error(key, f"is {size:.3g} m wide, too little for a pad of this sheet; give its corners in m")
+        sides = " x ".join(f"{side:g}" for side in high - low)
+        what = f"is {size:.3g} m wide, too little for a pad of this sheet of {sides} m"
+        raise table.error(key, f"{what}; give all lengths in m")
     table.done()
     return Pad(name, np.asarray(outline, float))
 

@@ -21,8 +21,10 @@ def read_positions_inside(table: TomlTable, domain: Domain) -> list[tuple[float,
     if outside.any():
         number = int(np.argmax(outside))
         problem = f"electrode {number} at {positions[number]} m lies outside the sheet"
-        hint = "" if table.has("positions") else "; list positions = [[x, y], ...] where the sheet is no rectangle"
-        raise table.error("positions", problem + hint)
+        if table.has("positions"):
+            raise table.error("positions", problem)
+        hint = "give pitch and origin in m, or list positions = [[x, y], ...] where the sheet is no rectangle"
+        raise table.error("grid", f"{problem}; {hint}")
     return positions
 
 

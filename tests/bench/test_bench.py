@@ -370,6 +370,9 @@ def test_a_grid_of_presses_keeps_what_an_l_shaped_sheet_holds(tmp_path):
     assert len(x) > 20
     assert (np.maximum(x - 0.168, y - 0.108) <= 1e-9).all()
     assert (np.minimum(x - 0.078, y - 0.048) <= 1e-9).all()  # at least the margin from the sides that turn inwards
+    (tmp_path / "scene.toml").write_text(scene.replace("MARGIN", "12"))
+    with pytest.raises(je.toml.TomlError, match=r"is 12 m, .*; give less than half of its shorter side, in m"):
+        load_bench(str(tmp_path / "scene.toml"))
     (tmp_path / "scene.toml").write_text(scene.replace("MARGIN", "0.059"))
     with pytest.raises(je.toml.TomlError, match=r"margin: is 0.059 m, and no place of the 9 x 6 grid is so far inside"):
         load_bench(str(tmp_path / "scene.toml"))

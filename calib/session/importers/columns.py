@@ -184,5 +184,6 @@ def _range_of_names(path: Path, text: str, header: Sequence[str]) -> list[int] |
 def _all_there(path: Path, text: str, names: Sequence[str], indices: Sequence[int | None]) -> list[int]:
     for name, index in zip(names, indices, strict=True):
         if index is None:
-            raise problem(path, f"columns {text!r}", f"no column is called {printable(name)}", "name each column")
+            remedy = "end the range before it, or name each column"
+            raise problem(path, f"columns {text!r}", f"no column is called {printable(name)}", remedy)
     return [index for index in indices if index is not None]
