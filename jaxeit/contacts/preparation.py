@@ -14,7 +14,7 @@ from .._compile import full_precision, require_known, verb
 from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError, Whitened, whitened_readings
 from ..model.bases import Elements
-from ..model.discretisation import Model
+from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
 from .bump_responses import Nodes, mean_conductivity, nodes_of, reached, responses_of, tabulate
 from .fit import bounds_of
@@ -67,7 +67,9 @@ def prepare_contacts(
     Raises:
         InverseError: if the noise is out of range, no channel is left, both ``untouched`` and ``sigma`` are given, or
             no coating explains the untouched frame.
+        SceneError: if ``model`` is no model, such as a skin.
     """
+    require_model(model)
     require_known("prepare_contacts", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or ContactSettings()
     sigma = sheet_of(model, untouched, sigma, channels)

@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from .._compile import require_known
 from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
-from ..model.discretisation import Model
+from ..model.discretisation import Model, require_model
 from ..model.forward_model import forward
 from .absolute.background import require_frame, require_positive
 from .absolute.images import (
@@ -107,6 +107,7 @@ def segment(
         pixels: of the classes along each axis.
 
     Raises:
+        SceneError: if ``model`` is no model, such as a tank.
         InverseError: if a shape or a value is wrong.
 
     Example:
@@ -118,6 +119,7 @@ def segment(
         )
         print(f"{(found.classes == 1).mean():.1%} of the picture is resistive")  # 2: conductive
     """
+    require_model(model)
     require_known("segment", InverseError, model.background)
     require_real(reference=reference, frame=frame)
     before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)

@@ -23,7 +23,7 @@ from ..geometry.shapes import cross
 from ..linalg.base import on_device
 from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.triangles import Mesh
-from .discretisation import Model
+from .discretisation import Model, require_model
 from .forward_model import Coefficients, Fields, coefficients, fields, series_resistance, terminal_matrix, voltages
 from .system import Entries, stiffness_places
 
@@ -70,8 +70,10 @@ def electrode_motion(model: Model) -> Motion:
     Electrodes inside the sheet move in both directions. Electrodes on the rim move along it, and not around corners.
 
     Raises:
+        SceneError: if ``model`` is no model, such as a skin.
         MotionError: for a metal coat, or for electrodes so near to each other or to a corner that none can move.
     """
+    require_model(model)
     require_known("electrode_motion", MotionError, model.nodes)
     if model.coat is not None:
         raise MotionError(

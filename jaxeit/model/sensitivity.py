@@ -19,7 +19,7 @@ from .._compile import verb
 from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
 from .bases import AbstractBasis, BasisMap, Elements
-from .discretisation import Model
+from .discretisation import Model, require_model
 from .forward_model import (
     CoatedSheet,
     Coefficients,
@@ -50,8 +50,10 @@ def jacobian(
             `BasisMap` made outside with ``basis.on(model)``.
 
     Raises:
+        SceneError: if ``model`` is no model, such as a skin.
         ValueError: if ``sigma`` does not fit the model, or is that of two sheets.
     """
+    require_model(model)
     if isinstance(sigma, CoatedSheet):
         raise ValueError("sigma is that of a sheet and its coat; the Jacobian is for one sheet: give sigma.sigma")
     basis = Elements() if basis is None else basis

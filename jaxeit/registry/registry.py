@@ -111,10 +111,17 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             return self._checked(_loaded(installed[name], self.kind), name)
         if ":" in name:
             return self._checked(self._by_path(name, allow_import), name)
+        raise RegistryError(f"no {self.kind} {name!r}; {self._hint(name)}")
+
+    def _hint(self, name: str) -> str:
+        """What may be meant by an unknown name."""
         near = difflib.get_close_matches(name, self.names, 1)
-        every = ", ".join(f'"{known}"' for known in self.names)
-        hint = f"did you mean {near[0]!r}?" if near else f"give one of {every}"
-        raise RegistryError(f"no {self.kind} {name!r}; {hint}")
+        if near:
+            return f"did you mean {near[0]!r}?"
+        module, dot, own = name.rpartition(".")
+        if dot:
+            return f"write a class of your own as {module + ':' + own!r}"
+        return "give one of " + ", ".join(f'"{known}"' for known in self.names)
 
     def name_of(self, thing: T | type[T]) -> str:
         """The name of a class or of an object's class; its import path if it is neither shipped nor installed."""

@@ -271,7 +271,8 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
             raise table.error(key, "the second corner must lie right of and above the first")
         outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     else:
-        outline = Polygon(table.array(key, 2, "corners [[x, y], ...] in m")).corner_points
+        corners = "rectangle = [x0, y0, x1, y1] in m, or polygon = [[x, y], ...]"
+        outline = Polygon(table.array(key, 2, corners)).corner_points
     low, high = np.asarray(domain.bounds)
     beyond = np.maximum(low - np.min(outline, 0), np.max(outline, 0) - high)
     if (beyond > _PAD_REACH * (high - low)).any():

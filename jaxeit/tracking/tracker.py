@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from .._compile import require_known
 from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError
-from ..model.discretisation import Model
+from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
 from .belief.filter import SEEN, SIZE, TOLD, Belief, ContactFilter, Pads, Update
@@ -260,6 +260,7 @@ def prepare_tracker(
     Raises:
         InverseError: as for `prepare_contacts`.
     """
+    require_model(model)
     require_known("prepare_tracker", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or TrackerSettings()
     sheet = sheet_of(model, untouched, sigma, channels)

@@ -278,7 +278,17 @@ def test_an_object_in_the_place_of_another_is_named(skin):
         je.discretise(skin)
     with pytest.raises(je.model.FidelityError, match=r"str is not a fidelity; make one, such as jaxeit.Fidelity.draft"):
         je.discretise(je.Scene(skin), "draft")
-    for wrong in (je.forward, je.prepare, lambda scene: je.imaging.fit_reference(scene, [])):
+    for wrong in (
+        je.forward,
+        je.jacobian,
+        je.prepare,
+        je.model.electrode_motion,
+        lambda scene: je.imaging.fit_reference(scene, []),
+        lambda scene: je.imaging.segment(scene, [], []),
+        lambda scene: je.prepare_contacts(scene, noise=1.0),
+        lambda scene: je.contacts.prepare_loads(scene, noise=1.0),
+        lambda scene: je.tracking.prepare_tracker(scene, skin, noise=1.0),
+    ):
         with pytest.raises(je.model.SceneError, match=r"Scene is not a model; make one, such as jaxeit.discretise\("):
             wrong(je.Scene(skin))
 

@@ -70,6 +70,11 @@ def test_settings_are_given_in_a_word(registry, text, again):
     [
         (PRIORS, "nosr", "^no prior 'nosr'; did you mean 'noser'[?]$"),
         (PRIORS, "zzz", '^no prior .zzz.; give one of "noser", "tikhonov", '),
+        (
+            EFFECTS,
+            "my_effects.Wetness",
+            "^no effect 'my_effects.Wetness'; write a class of your own as 'my_effects:Wetness'$",
+        ),
         (METHODS, "greit:widht=1", "method 'greit:widht=1': widht: unknown key; did you mean 'width'"),
         (METHODS, "greit:width=wide", "width: is 'wide'; give a number such as 0.012 .width: standard deviation of a"),
         (METHODS, "sparse-bayes:steps=1.5", "steps: is 1.5; give a whole number from 0 such as 15"),

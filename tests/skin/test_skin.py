@@ -49,6 +49,11 @@ def test_a_copied_and_edited_file(tmp_path):
         ('pattern = "adjacent"', "pattern = 3", "pattern: is 3; give"),
         ('pattern = "adjacent"', "rows = [[0, 0, 2, 3]]", "uses one electrode twice"),
         ("pitch = 0.04", "pitch = 0.06", "grid: electrode 4 at .* lies outside the sheet; give pitch and origin in m"),
+        (
+            "rectangle = [0.0, 0.0, 0.1, 0.1]",
+            "rect = [0, 0, 1, 1]",
+            r"polygon: missing; give rectangle = \[x0, y0, x1, y1\] in m",
+        ),
         ("sheet_resistance", "sheet_resistence", "missing; give ohm .*; is 'sheet_resistence' a misspelling of it?"),
         (
             "size = [0.2, 0.2]",

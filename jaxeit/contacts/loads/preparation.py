@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..._compile import full_precision, require_known, verb
 from ...imaging.absolute.background import sheet_of
 from ...imaging.noise import InverseError, whitened_readings
-from ...model.discretisation import Model
+from ...model.discretisation import Model, require_model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ..bump_responses import mean_conductivity, points_of
 from .fitter import LoadFitter
@@ -44,6 +44,7 @@ def prepare_loads(
     Raises:
         InverseError: as for `prepare_contacts`.
     """
+    require_model(model)
     require_known("prepare_loads", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or LoadSettings()
     sigma = sheet_of(model, untouched, sigma, channels)
