@@ -274,13 +274,13 @@ def _pattern(node: Node) -> np.ndarray:
 
 def _mixing(protocol: Node, rows: int) -> sp.csr_array | None:
     """Readings as sums of rows of the pattern, (readings, rows); None where each row is one reading."""
-    node = protocol.dataset("term_reading")
-    if node is None:
+    parts = {name: protocol.dataset(name) for name in ("term_reading", "term_row", "term_share")}
+    if all(node is None for node in parts.values()):
         return None
-    reading = small_array(node, (None,), "iu").astype(np.int64)
-    parts = {name: required(protocol, name, protocol.dataset(name)) for name in ("term_row", "term_share")}
-    row = small_array(parts["term_row"], (len(reading),), "iu").astype(np.int64)
-    share = small_array(parts["term_share"], (len(reading),), "f")
+    nodes = {name: required(protocol, name, node) for name, node in parts.items()}
+    reading = small_array(nodes["term_reading"], (None,), "iu").astype(np.int64)
+    row = small_array(nodes["term_row"], (len(reading),), "iu").astype(np.int64)
+    share = small_array(nodes["term_share"], (len(reading),), "f")
     try:
         return mixing_of_terms(reading, row, share, rows)
     except ValueError as error:
