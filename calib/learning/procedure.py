@@ -71,9 +71,11 @@ def train_proposal(
 
     Raises:
         BenchError: nothing can be simulated so, or the folder holds something else.
+        ProtocolError: for a protocol of matrices (`Protocol.from_matrices`).
     """
     if frames < MIN_SHARDS * SHARD_FRAMES:
         raise BenchError(f"{frames} frames are too few to hold skins out; give {MIN_SHARDS * SHARD_FRAMES:,} or more")
+    skin.protocol.rows("a proposal")
     fidelity, parts = fidelity or je.Fidelity.draft(dtype="float32"), Path(f"{path}.parts")
     skins, made = -(-frames // SHARD_FRAMES), itertools.count(1)
     write_training_frames(
@@ -130,7 +132,7 @@ def _tested(
 ) -> dict[str, dict[str, Any]]:
     """Figures on skins that gave nothing to the proposal: as they are; without pads; also without an electrode."""
     dv, forces, targets = frames["frames"], calibrated_forces(frames), targets_of(frames)
-    lacking = without_an_electrode(dv, skin.protocol.rows("a proposal"), rng)
+    lacking = without_an_electrode(dv, skin.protocol.pattern, rng)
     cases = {"held_out": (dv, forces), "without_pads": (dv, None), "without_pads_and_an_electrode": (lacking, None)}
     skins = {"skins": len(frames.shards)}
     return {name: skins | figures_of(proposal(*given), targets) for name, given in cases.items()}
@@ -155,7 +157,7 @@ def _examples(
     units: tuple[np.ndarray, np.ndarray],
     rng: np.random.Generator,
 ) -> Examples:
-    pattern = skin.protocol.rows("a proposal")
+    pattern = skin.protocol.pattern
     damaged = inputs_of(frames, compression, lambda dv: without_an_electrode(dv, pattern, rng))
     pads = pad_inputs(calibrated_forces(frames))
     loads = np.where(np.repeat(targets.known, SIZES, 1), (targets.loads - units[0]) / units[1], 0)

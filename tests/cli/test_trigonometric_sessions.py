@@ -177,3 +177,21 @@ def test_damaged_terms_are_refused(sessions, tmp_path):
         file["device/eit_protocol/term_row"][0] = 999
     with pytest.raises(SessionError, match="no row of the 132 of the pattern"):
         calib.open_session(damaged)
+
+
+@pytest.mark.parametrize("lost", ["term_reading", "term_row", "term_share"])
+def test_terms_are_not_read_in_part(sessions, tmp_path, lost):
+    """The scan has as many rows as readings: without its terms, it would pass for one of pairs."""
+    damaged = tmp_path / "damaged.h5"
+    damaged.write_bytes((sessions / "trigonometric.h5").read_bytes())
+    with h5py.File(damaged, "r+") as file:
+        del file[f"device/eit_protocol/{lost}"]
+    with pytest.raises(SessionError, match=f"{lost}: missing"):
+        calib.open_session(damaged)
+
+
+def test_no_proposal_is_trained(sessions, tmp_path, capsys):
+    """It would learn to lack an electrode, through which nearly all readings of this scan are driven."""
+    assert main(["train", str(sessions / "trigonometric.toml"), "-o", str(tmp_path / "proposal.npz")]) == 2
+    assert "a proposal needs one pair that drives" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
