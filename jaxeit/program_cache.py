@@ -170,8 +170,8 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         weak = [result.weak_type for result in program.out_avals]
         text = BytesIO()
         _Pickler(text).dump((program.serialize(), weak, forms[-1]))
-        structures = [jax.tree.structure(one) for one in (forms[-1], pickle.loads(text.getvalue())[-1])]
-        return text.getvalue() if structures[0] in structures[1:] else None
+        written: Any = jax.tree.structure(pickle.loads(text.getvalue())[-1])
+        return text.getvalue() if written == jax.tree.structure(forms[-1]) else None
     except Exception:  # the verb refuses its arguments, or returns or calls what cannot be written
         return None
 

@@ -57,9 +57,7 @@ def _obstacle(skin: je.Skin | None, table: ChannelTable | None, order: OrderChec
         return "there are no EIT voltages with a pattern"
     if skin is None:
         return "the session describes no skin (--skin FILE)"
-    if not same_scan(table.pattern, table.mixing, skin.protocol.pattern, skin.protocol.mixing) or (
-        order is not None and order.claimed
-    ):
+    if not same_scan(table, skin.protocol) or (order is not None and order.claimed):
         return "the order of the readings is not that of the skin"
     sound = np.isfinite(table.mean) & ~table.bad
     if sound.mean() < MIN_SOUND:

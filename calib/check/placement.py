@@ -83,7 +83,7 @@ def with_placement(report: CheckReport, session: Session, skin: je.Skin | None =
     if channels is None or not report.ok or not (skin or session.skin_toml.strip()):
         return report
     skin = skin or je.skin.parse_skin(session.skin_toml, f"{session.name}: skin_toml")
-    if not same_scan(channels.pattern, channels.mixing, skin.protocol.pattern, skin.protocol.mixing):
+    if not same_scan(channels, skin.protocol):
         return report
     found = placement_finding(skin, channels.mean, ~channels.bad)
     return report if found is None else replace(report, findings=(*report.findings, found))

@@ -123,7 +123,7 @@ def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:
     if pattern.max() >= len(skin.electrodes):
         what = f"the pattern names electrode {pattern.max()}; the skin has 0 to {len(skin.electrodes) - 1}"
         yield Finding(Severity.ERROR, where, what, "electrodes are counted from 0")
-    elif not same_scan(pattern, session.mixing, own.pattern, own.mixing):
+    elif not same_scan(session, own):
         remedy = "calibrate with the skin that was recorded (--skin FILE), or correct its protocol"
         yield Finding(Severity.ERROR, where, _scan_difference(session, own), remedy)
     if session.current is not None and not np.isclose(session.current, own.current, rtol=0.01):

@@ -154,10 +154,9 @@ def require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) ->
     for name, stream in streams.items():
         if not len(stream):
             raise _error(session, f"/streams/{name}", "holds no sample", "record again")
-    pattern = session.pattern
-    if pattern is None:
+    if session.pattern is None:
         raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
-    if not same_scan(pattern, session.mixing, skin.protocol.pattern, skin.protocol.mixing):
+    if not same_scan(session, skin.protocol):
         raise _error(
             session,
             "/device/eit_protocol/pattern",

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..session.hdf5.guard import MAX_ATTRIBUTE_BYTES
-from ..session.mixing import mixing_of_terms
+from ..session.mixing import count_readings, mixing_of_terms
 from .journal.file import JournalError
 from .wire.messages import Layout
 
@@ -159,8 +159,7 @@ class RecordingPlan:
 
     def _readings(self) -> int | None:
         """Number of readings of the EIT protocol; None without one."""
-        mixing = None if self.pattern is None else self.mixing_matrix()
-        return None if self.pattern is None else len(self.pattern) if mixing is None else mixing.shape[0]
+        return None if self.pattern is None else count_readings(self.pattern, self.mixing_matrix())
 
     def mixing_matrix(self) -> sp.csr_array | None:
         """``mixing`` as a matrix (readings, rows); raises `PlanError` for terms that are none."""

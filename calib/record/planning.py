@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
+from ..session.mixing import terms_of_mixing
 from .plan import PlanError, RecordingPlan
 from .sources import Source, source_from_url
 
@@ -56,9 +57,7 @@ def _terms(protocol: "je.Protocol") -> tuple[tuple[int | float, ...], ...] | Non
     """Reading, row of the pattern and share of each term, where readings are sums of rows."""
     if protocol.mixing is None:
         return None
-    found = protocol.mixing.tocoo()
-    reading, row = found.coords
-    return tuple(zip(reading.tolist(), row.tolist(), found.data.tolist(), strict=True))
+    return tuple(zip(*(part.tolist() for part in terms_of_mixing(protocol.mixing)), strict=True))
 
 
 def _channels(name: str, url: str, skin: "je.Skin | None") -> int:

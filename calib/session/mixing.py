@@ -1,7 +1,28 @@
 """Scans whose readings are sums of rows of the pattern, such as the trigonometric one."""
 
+from collections.abc import Sized
+from typing import Protocol, runtime_checkable
+
 import numpy as np
 import scipy.sparse as sp
+
+
+@runtime_checkable
+class Scan(Protocol):
+    """What a session, a table of its channels and the protocol of a skin have in common."""
+
+    @property
+    def pattern(self) -> np.ndarray | None:
+        """Zero-based electrodes drive+, drive-, sense+, sense- of each row, (rows, 4)."""
+
+    @property
+    def mixing(self) -> sp.csr_array | None:
+        """Readings as sums of rows, (readings, rows); None: each row is one."""
+
+
+def count_readings(pattern: Sized, mixing: sp.csr_array | None) -> int:
+    """Number of readings of a frame."""
+    return len(pattern) if mixing is None else int(mixing.shape[0])
 
 
 def checked_mixing(mixing: sp.csr_array, rows: int) -> sp.csr_array:
@@ -35,12 +56,17 @@ def mixing_of_terms(reading: np.ndarray, row: np.ndarray, share: np.ndarray, row
     return checked_mixing(sp.csr_array((share.astype(float), (reading, row)), (int(reading.max()) + 1, rows)), rows)
 
 
-def same_scan(
-    pattern: np.ndarray, mixing: sp.csr_array | None, other: np.ndarray, other_mixing: sp.csr_array | None
-) -> bool:
+def terms_of_mixing(mixing: sp.csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reading, row of the pattern and share of each term (terms,): the reverse of `mixing_of_terms`."""
+    found = mixing.tocoo()
+    return (*found.coords, found.data)
+
+
+def same_scan(one: Scan, other: Scan) -> bool:
     """Whether two scans have the same readings in the same order."""
-    if pattern.shape != other.shape or (pattern != other).any() or (mixing is None) != (other_mixing is None):
+    if one.pattern is None or other.pattern is None or not np.array_equal(one.pattern, other.pattern):
         return False
-    if mixing is None or other_mixing is None:
-        return True
-    return mixing.shape == other_mixing.shape and bool(abs(mixing - other_mixing).max() <= 1e-9 * abs(mixing).max())
+    mine, others = one.mixing, other.mixing
+    if mine is None or others is None:
+        return mine is others
+    return mine.shape == others.shape and bool(abs(mine - others).max() <= 1e-9 * abs(mine).max())

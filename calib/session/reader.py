@@ -16,7 +16,7 @@ from .hdf5.chunks import GuardedArray
 from .hdf5.guard import Node, open_guarded, root_node
 from .hdf5.members import SCHEMA, column, declared_unit, required, small_array
 from .hdf5.storage import file_hash
-from .mixing import mixing_of_terms
+from .mixing import count_readings, mixing_of_terms
 from .stream import Stream
 from .tables import CLOCK_ATTRIBUTES, FORMAT, PRESS_COLUMNS, ClockTable, Events, PressTable
 from .units import Unit
@@ -129,7 +129,7 @@ class Session:
     @property
     def readings(self) -> int | None:
         """Number of readings of a frame; None without a pattern."""
-        return None if self.pattern is None else len(self.pattern) if self.mixing is None else self.mixing.shape[0]
+        return None if self.pattern is None else count_readings(self.pattern, self.mixing)
 
     def stream(self, name: str) -> "Stream":
         """The stream `name`. If it is missing, the `SessionError` lists the streams of the file."""

@@ -29,7 +29,7 @@ from calib.session.hdf5.storage import (
     require_no_session,
     text_array,
 )
-from calib.session.mixing import checked_mixing
+from calib.session.mixing import checked_mixing, count_readings, terms_of_mixing
 from calib.session.tables import (
     CLOCK_ATTRIBUTES,
     FORMAT,
@@ -441,11 +441,11 @@ def _utc(path: Path, epoch: datetime) -> str:
 def _write_mixing(group: h5py.Group, mixing: sp.csr_array) -> None:
     """The terms of which readings are sums: reading, row of the pattern, and share of that row."""
     term = make_index(group, "term", mixing.nnz)
-    reading = np.repeat(np.arange(mixing.shape[0]), np.diff(mixing.indptr))
+    reading, row, share = terms_of_mixing(mixing)
     columns = {
         "term_reading": (reading.astype("i4"), "reading that the term belongs to"),
-        "term_row": (mixing.indices.astype("i4"), "row of the pattern"),
-        "term_share": (mixing.data.astype("f8"), "share of that row in the reading"),
+        "term_row": (row.astype("i4"), "row of the pattern"),
+        "term_share": (share.astype("f8"), "share of that row in the reading"),
     }
     for name, (values, meaning) in columns.items():
         attach(make_array(group, name, values, {"units": "1", "long_name": meaning}), term)
@@ -468,15 +468,16 @@ def _protocol(path: Path, facts: SessionFacts) -> dict[str, Any]:
             found[name] = float(value)
             if not least <= found[name] < np.inf:
                 raise problem(path, name, f"is {value}", "give a current above zero, a frequency of zero or more")
-    readings = len(array)
     if facts.mixing is not None:
         try:
             found["mixing"] = checked_mixing(facts.mixing, len(array))
         except ValueError as error:
             raise problem(path, "mixing", str(error), "give that of jaxeit.Protocol") from None
-        readings = found["mixing"].shape[0]
     if facts.offset is not None:
         found["offset"] = np.asarray(facts.offset, np.float64)
-        if found["offset"].shape != (readings,) or not np.isfinite(found["offset"]).all():
+        if (
+            found["offset"].shape != (count_readings(array, found.get("mixing")),)
+            or not np.isfinite(found["offset"]).all()
+        ):
             raise problem(path, "offset", "does not fit the pattern", "give one time per reading")
     return found

@@ -126,7 +126,7 @@ def lost_electrode_findings(table: ChannelTable, model: SkinModel) -> Iterator[F
     ratio = np.abs(table.mean) / np.where(large, expected, 1)
     usual = float(np.median(ratio[large])) if large.any() else 0.0
     weak = large & (ratio < LOST * usual)
-    for electrode, uses in enumerate(readings_of_electrodes(table.pattern, table.mixing)):
+    for electrode, uses in enumerate(readings_of_electrodes(table)):
         if (uses & large).sum() > 2 and (weak | ~large)[uses].all():
             what = (
                 f"the {uses.sum()} readings of electrode {electrode} hold less than {100 * LOST:.0f} % of the voltage "

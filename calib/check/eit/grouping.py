@@ -1,22 +1,23 @@
 """What a set of readings has in common: electrodes, or a pair of electrodes that drives or senses."""
 
 import numpy as np
-import scipy.sparse as sp
+
+from ..report import ChannelTable
 
 MIN_SHARE = 0.8  # of the readings of an electrode, that are in the set
 
 
-def readings_of_electrodes(pattern: np.ndarray, mixing: sp.csr_array | None = None) -> np.ndarray:
+def readings_of_electrodes(table: ChannelTable) -> np.ndarray:
     """Which readings each electrode takes part in, (electrodes, readings).
 
     Where readings are sums of rows, those that sense with the electrode: all of them are driven through nearly all
     electrodes, which tells none from another.
     """
-    electrodes = np.arange(pattern.max() + 1)
-    if mixing is None:
-        return np.asarray((pattern == electrodes[:, None, None]).any(2))
-    senses = (pattern[:, 2:] == electrodes[:, None, None]).any(2)
-    return np.asarray((abs(mixing) @ senses.T.astype(float)).T > 0)
+    electrodes = np.arange(table.pattern.max() + 1)
+    if table.mixing is None:
+        return np.asarray((table.pattern == electrodes[:, None, None]).any(2))
+    senses = (table.pattern[:, 2:] == electrodes[:, None, None]).any(2)
+    return np.asarray((abs(table.mixing) @ senses.T.astype(float)).T > 0)
 
 
 def common_electrodes(flag: np.ndarray, uses: np.ndarray, among: np.ndarray | None = None) -> list[int]:

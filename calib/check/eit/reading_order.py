@@ -14,6 +14,8 @@ import scipy.sparse as sp
 
 import jaxeit as je
 
+from ...session.mixing import count_readings
+
 # A uniform sheet reaches 0.99 on healthy sessions; two swapped electrodes leave 0.93 at most.
 SUFFICIENT_CORRELATION = 0.95
 MIN_BEST_CORRELATION = 0.7  # of the other order, to be reported
@@ -142,7 +144,7 @@ def check_order(
         return as_is
     scored = [
         _ScoredHypothesis(h.what, h.remedy, _signed_correlation(v, predicted(h), h))
-        for h in _hypotheses(pattern, len(voltage), len(transfer), positions, usual)
+        for h in _hypotheses(pattern, mixing, len(transfer), positions, usual)
     ]
     return _best_explanation(as_is, scored)
 
@@ -190,7 +192,11 @@ def _signed_correlation(v: np.ndarray, model: np.ndarray, hypothesis: Hypothesis
 
 
 def _hypotheses(
-    pattern: np.ndarray, readings: int, electrodes: int, positions: np.ndarray | None, usual: np.ndarray | None
+    pattern: np.ndarray,
+    mixing: sp.csr_array | None,
+    electrodes: int,
+    positions: np.ndarray | None,
+    usual: np.ndarray | None,
 ) -> Iterator[Hypothesis]:
     """All hypotheses, from the simplest to the most unusual; the first is the recorded order itself."""
     yield Hypothesis(
@@ -204,26 +210,26 @@ def _hypotheses(
         pattern,
         magnitude=True,
     )
-    yield from _reading_orders(pattern, readings, usual)
+    yield from _reading_orders(pattern, mixing, usual)
     yield from _renumbered(pattern, electrodes)
     yield from _grid_numberings(pattern, positions)
-    yield from _shifted_frames(pattern, readings)
+    yield from _shifted_frames(pattern, count_readings(pattern, mixing))
     yield from _swapped(pattern, electrodes)
 
 
 REORDER_REMEDY = "write the rows of the pattern in the order in which the readings come"
 
 
-def _reading_orders(pattern: np.ndarray, readings: int, usual: np.ndarray | None) -> Iterator[Hypothesis]:
+def _reading_orders(pattern: np.ndarray, mixing: sp.csr_array | None, usual: np.ndarray | None) -> Iterator[Hypothesis]:
     if usual is not None and usual.shape == pattern.shape and (usual != pattern).any():
         yield Hypothesis(
             "the readings are in the order of the skin's protocol, not of the recorded pattern",
             "write the skin's own pattern into the session",
             usual,
         )
-    backwards = np.arange(readings)[::-1]
+    backwards = np.arange(count_readings(pattern, mixing))[::-1]
     yield Hypothesis("the readings of a frame come in reversed order", REORDER_REMEDY, pattern, backwards)
-    if readings != len(pattern):
+    if mixing is not None:  # a reading has no pair of its own to be ordered by
         return
     drive, sense = _rank(pattern[:, :2]), _rank(pattern[:, 2:])
     orders = {

@@ -221,7 +221,7 @@ def _channel_list_finding(
     if not len(rows):
         return
     text = f"{len(rows)} of {len(table)} readings {what}: {listed(rows)}"
-    common = common_electrodes(flag, readings_of_electrodes(table.pattern, table.mixing))
+    common = common_electrodes(flag, readings_of_electrodes(table))
     if common:
         text += f"; all of them use electrode {' or '.join(map(str, common))}"
         remedy = f"check electrode {' and '.join(map(str, common))}: its terminal, wire and switch"

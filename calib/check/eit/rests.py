@@ -178,7 +178,7 @@ def _local_explanation(
     floor = 0.1 * _rms(right[known])
     moved = known & (np.abs(wrong - right) > MIN_LOCAL * np.fmax(np.fmax(np.abs(wrong), np.abs(right)), floor))
     large = known & (np.abs(right) > floor)
-    electrodes = common_electrodes(moved & large, readings_of_electrodes(table.pattern, table.mixing), large)
+    electrodes = common_electrodes(moved & large, readings_of_electrodes(table), large)
     if not electrodes:
         return None
     left = _rms(wrong[moved]) / max(_rms(right[moved]), np.finfo(float).tiny)

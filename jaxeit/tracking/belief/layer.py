@@ -173,8 +173,8 @@ class LearnedLayer(NamedTuple):
         towards = self.covariances @ along
         effects = PRESS_VARIANCES[:, None, None] * (along.T @ along)
         root = np.linalg.cholesky(along.T @ towards + effects + np.diag(left / (1 - left)))
-        surprise = np.linalg.solve(root, (seen - self.means @ along)[..., None])
-        share = np.linalg.solve(root, towards.mT)
+        right = np.concatenate([towards.mT, (seen - self.means @ along)[..., None]], -1)
+        share, surprise = np.split(np.linalg.solve(root, right), [-1], -1)
         spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
         return self._replace(
             means=self.means + (share.mT @ surprise)[..., 0],
