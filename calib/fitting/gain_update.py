@@ -3,7 +3,8 @@
 With residuals r (n,) of observed over expected logarithms, their slopes A (n, pads) in the log gains g, their
 covariance R and a prior N(m, P), the posterior has the precision P^-1 + A' W A with W = R^-1. Directions U that the
 data cannot tell from something unknown, such as a gain common to all pads and the image, are projected out:
-W = R^-1 - R^-1 U (U' R^-1 U)^+ U' R^-1. Along them the posterior is the prior.
+W = R^-1 - R^-1 U (U' R^-1 U)^+ U' R^-1. Along them the posterior is the prior. No inverse is formed: rows are
+divided by the Cholesky factor of R, and the posterior is found by a QR decomposition of them under those of the prior.
 
 An outlier has an independent error besides that of R: variance R_ii (1 / w - 1), with the weights w = 1 for residuals
 within `USUAL` deviations and of Cauchy's distribution beyond, iterated. Multiplying the rows of R instead would take
@@ -16,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import cholesky, solve_triangular
 
 from ..presses.streams import MAD_TO_SIGMA
 
@@ -59,6 +61,7 @@ class GainUpdate(NamedTuple):
     | covariance | of the log gains                                                          | (pads, pads) |
     | determined | whether the data determine the gain (relative to the others, with nuisance) | (pads,)    |
     | misfit     | median deviation of the residuals over the stated one; 1 is as stated     | ()           |
+    | scatter    | median deviation of the residuals                                         | ()           |
     | weight     | of each observation, small for outliers                                   | (n,)         |
     """
 
@@ -66,6 +69,7 @@ class GainUpdate(NamedTuple):
     covariance: Float[np.ndarray, "pads pads"]
     determined: Bool[np.ndarray, " pads"]
     misfit: float
+    scatter: float
     weight: Float[np.ndarray, " n"]
 
 
@@ -86,25 +90,26 @@ def update_gains(
     """
     gain, n = prior.mean, len(covariance)
     free = np.zeros((n, 0)) if nuisance is None else nuisance
-    inverse = np.linalg.inv(prior.covariance)
-    sigma, weight, misfit = np.sqrt(np.diag(covariance)), np.ones(n), 1.0
-    information = np.zeros_like(inverse)
+    known = solve_triangular(cholesky(prior.covariance, lower=True), np.eye(len(gain)), lower=True)
+    sigma, weight, misfit, scatter = np.sqrt(np.diag(covariance)), np.ones(n), 1.0, 0.0
+    rows = np.zeros((0, len(gain)))
     for _ in range(STEPS if n else 0):
-        residual, slope = residuals(gain)
-        precision = _precision(covariance, weight, free)
-        information = slope.T @ precision @ slope
-        step = np.linalg.solve(inverse + information, slope.T @ precision @ residual + inverse @ (prior.mean - gain))
+        rows, residual = _whitened(covariance, weight, free, *residuals(gain))
+        orthogonal, triangle = np.linalg.qr(np.concatenate([known, rows]))
+        step = solve_triangular(triangle, orthogonal.T @ np.concatenate([known @ (prior.mean - gain), residual]))
         gain = gain + step
-        fitted = free.shape[1] + np.trace(np.linalg.solve(inverse + information, information))
+        fitted = free.shape[1] + np.sum(orthogonal[len(gain) :] ** 2)
         # Residuals of a fit are smaller than the errors, as n - fitted to n.
-        left = _without(free, covariance, weight, residuals(gain)[0]) / sigma * np.sqrt(n / max(n - fitted, 1.0))
-        misfit = float(MAD_TO_SIGMA * np.median(np.abs(left)))
-        weight = np.minimum(1.0, (1 + USUAL**2) / (1 + (left / max(misfit, 1.0)) ** 2))
+        left = _without(free, covariance, weight, residuals(gain)[0]) * np.sqrt(n / max(n - fitted, 1.0))
+        scatter, misfit = (float(MAD_TO_SIGMA * np.median(np.abs(size))) for size in (left, left / sigma))
+        weight = np.minimum(1.0, (1 + USUAL**2) / (1 + (left / sigma / max(misfit, 1.0)) ** 2))
         if np.abs(step).max() < TOLERANCE:
             break
     scale = misfit if misfit > _largest_usual(n) else 1.0
-    posterior = np.linalg.inv(inverse + information / scale**2)
-    return GainUpdate(gain, posterior, _determined(prior, posterior, nuisance is not None), misfit, weight)
+    root = solve_triangular(np.linalg.qr(np.concatenate([known, rows / scale]), mode="r"), np.eye(len(gain)))
+    posterior = root @ root.T
+    determined = _determined(prior, posterior, nuisance is not None)
+    return GainUpdate(gain, posterior, determined, misfit, scatter, weight)
 
 
 def _largest_usual(n: int) -> float:
@@ -112,17 +117,23 @@ def _largest_usual(n: int) -> float:
     return float(1 + 2.4 / np.sqrt(max(n, 1)))
 
 
-def _precision(covariance: np.ndarray, weight: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Inverse covariance of weighted observations, with the directions `free` projected out."""
-    whole = np.linalg.inv(covariance + np.diag(np.diag(covariance) * (1 / weight - 1)))
-    held = whole @ free
-    return np.asarray(whole - held @ np.linalg.pinv(free.T @ held, hermitian=True) @ held.T)
+def _whitened(
+    covariance: np.ndarray, weight: np.ndarray, free: np.ndarray, residual: np.ndarray, slope: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes and residuals of weighted observations in their errors, with the directions `free` projected out."""
+    root = cholesky(covariance + np.diag(np.diag(covariance) * (1 / weight - 1)), lower=True)
+    white = solve_triangular(root, np.column_stack([slope, residual, free]), lower=True)
+    kept, held = np.split(white, [slope.shape[1] + 1], axis=1)
+    kept = kept - held @ np.linalg.lstsq(held, kept, rcond=None)[0] if held.shape[1] else kept
+    return kept[:, :-1], kept[:, -1]
 
 
 def _without(free: np.ndarray, covariance: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Residuals minus what the directions `free` explain of them, by weighted least squares."""
-    held = free * (weight / np.diag(covariance))[:, None]
-    return np.asarray(residual - free @ (np.linalg.pinv(free.T @ held, hermitian=True) @ (held.T @ residual)))
+    if not free.shape[1]:
+        return residual
+    root = np.sqrt(weight / np.diag(covariance))
+    return np.asarray(residual - free @ np.linalg.lstsq(free * root[:, None], residual * root, rcond=None)[0])
 
 
 def relative(covariance: Float[np.ndarray, "pads pads"]) -> Float[np.ndarray, "pads pads"]:

@@ -6,6 +6,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import scipy.sparse as sp
 
+TERMS = ("term_reading", "term_row", "term_share")  # datasets of a session file: what `terms_of_mixing` gives
+
 
 @runtime_checkable
 class Scan(Protocol):

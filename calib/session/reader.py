@@ -16,7 +16,7 @@ from .hdf5.chunks import GuardedArray
 from .hdf5.guard import Node, open_guarded, root_node
 from .hdf5.members import SCHEMA, column, declared_unit, required, small_array
 from .hdf5.storage import file_hash
-from .mixing import count_readings, mixing_of_terms
+from .mixing import TERMS, count_readings, mixing_of_terms
 from .stream import Stream
 from .tables import CLOCK_ATTRIBUTES, FORMAT, PRESS_COLUMNS, ClockTable, Events, PressTable
 from .units import Unit
@@ -101,8 +101,10 @@ class Session:
             self._read_protocol(protocol)
 
     def _read_protocol(self, protocol: Node) -> None:
-        self.pattern = _pattern(required(protocol, "pattern", protocol.dataset("pattern")))
-        self.mixing = _mixing(protocol, len(self.pattern))
+        mixed = _mixed(protocol)
+        name = "row_pattern" if mixed else "pattern"
+        self.pattern = _pattern(required(protocol, name, protocol.dataset(name)))
+        self.mixing = _mixing(protocol, len(self.pattern)) if mixed else None
         for name in ("current", "frequency"):
             if protocol.attribute(name) is not None:
                 setattr(self, name, float(protocol.number(name)))
@@ -272,12 +274,20 @@ def _pattern(node: Node) -> np.ndarray:
     return pattern
 
 
-def _mixing(protocol: Node, rows: int) -> sp.csr_array | None:
-    """Readings as sums of rows of the pattern, (readings, rows); None where each row is one reading."""
-    parts = {name: protocol.dataset(name) for name in ("term_reading", "term_row", "term_share")}
-    if all(node is None for node in parts.values()):
-        return None
-    nodes = {name: required(protocol, name, node) for name, node in parts.items()}
+def _mixed(protocol: Node) -> bool:
+    """Whether readings are sums of rows: what such a file holds has other names than `pattern`, so that no reader,
+    even of format 1.0, takes a row for a reading."""
+    held = [name for name in ("row_pattern", *TERMS) if protocol.dataset(name) is not None]
+    if held and protocol.dataset("pattern") is not None:
+        raise protocol.error(
+            f"holds pattern and {held[0]}", "keep pattern for readings of pairs, or the others for sums"
+        )
+    return bool(held)
+
+
+def _mixing(protocol: Node, rows: int) -> sp.csr_array:
+    """Readings as sums of rows of the pattern, (readings, rows)."""
+    nodes = {name: required(protocol, name, protocol.dataset(name)) for name in TERMS}
     reading = small_array(nodes["term_reading"], (None,), "iu").astype(np.int64)
     row = small_array(nodes["term_row"], (len(reading),), "iu").astype(np.int64)
     share = small_array(nodes["term_share"], (len(reading),), "f")

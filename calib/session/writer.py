@@ -157,7 +157,7 @@ class SessionWriter(FileWriter):
         terminals = make_index(group, "terminal", 4)
         meaning = "electrodes (zero-based): drive+, drive-, sense+, sense-"
         attrs = {"units": "1", "long_name": meaning}
-        attach(make_array(group, "pattern", pattern, attrs), rows, terminals)
+        attach(make_array(group, "pattern" if mixing is None else "row_pattern", pattern, attrs), rows, terminals)
         if "offset" in self._protocol:
             attrs = {"units": "s", "long_name": "when in the scan each reading is taken"}
             attach(make_array(group, "offset", self._protocol["offset"], attrs), readings)

@@ -151,6 +151,16 @@ def test_a_pad_that_is_not_pressed_stays_as_it_is(calibration, later):
     assert any("upper left" in note for note in record.notes)
 
 
+@pytest.mark.parametrize(
+    ("scatter", "advice"), [(0.01, Advice.KEEP), (0.05, Advice.CALIBRATE), (np.nan, Advice.CALIBRATE)]
+)
+def test_what_gains_leave_must_be_worth_a_calibration(calibration, scatter, advice):
+    """A calibration that states errors of 0.3 % is not told to start again for 1 %."""
+    levels = rest_levels(np.zeros((1, 4)), np.zeros(1))
+    found = GainUpdate(np.full(4, 0.005), 1e-6 * np.eye(4), np.ones(4, bool), 4.0, scatter, np.ones(9))
+    assert recorded(calibration, Evidence.KNOWN_FORCE, found, np.ones(4), levels, (LATER, "x")).advice is advice
+
+
 def test_a_session_moves_a_calibration_once(moved, ten):
     """Counted twice, ten presses would seem as sure as twenty, and they are no test of what they moved."""
     with calib.open_session(ten) as session:
@@ -301,7 +311,7 @@ def test_live_gains_and_zero_are_bounded(calibration):
         follower.add(dv, np.full(4, 50.0), False, (i + 1) * S)
     np.testing.assert_allclose(follower.offset, loaded_pressures(calibration))
     assert "not known" in follower.health
-    follower._found = GainUpdate(np.array([2.0, -2.0, 0.0, 0.0]), np.eye(4), np.ones(4, bool), 1.0, np.ones(1))
+    follower._found = GainUpdate(np.array([2.0, -2.0, 0.0, 0.0]), np.eye(4), np.ones(4, bool), 1.0, 0.0, np.ones(1))
     follower._contacts.add(
         1, SeenContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
     )
@@ -393,6 +403,7 @@ def test_readings_that_a_gain_does_not_explain_widen_the_errors():
         for noise in (rng.normal(0, 0.01, 40), rng.normal(0, 0.05, 40))
     )  # fmt: skip
     assert odd.misfit > 3.5
+    assert odd.scatter == pytest.approx(0.05, rel=0.3)
     assert (np.diag(odd.covariance) > 9 * np.diag(sound.covariance)).all()
 
 

@@ -179,14 +179,26 @@ def test_damaged_terms_are_refused(sessions, tmp_path):
         calib.open_session(damaged)
 
 
-@pytest.mark.parametrize("lost", ["term_reading", "term_row", "term_share"])
+@pytest.mark.parametrize("lost", ["row_pattern", "term_reading", "term_row", "term_share"])
 def test_terms_are_not_read_in_part(sessions, tmp_path, lost):
-    """The scan has as many rows as readings: without its terms, it would pass for one of pairs."""
     damaged = tmp_path / "damaged.h5"
     damaged.write_bytes((sessions / "trigonometric.h5").read_bytes())
     with h5py.File(damaged, "r+") as file:
         del file[f"device/eit_protocol/{lost}"]
     with pytest.raises(SessionError, match=f"{lost}: missing"):
+        calib.open_session(damaged)
+
+
+def test_rows_of_sums_are_no_readings(sessions, tmp_path):
+    """The scan has as many rows as readings: a reader that does not know of sums would take one for the other."""
+    damaged = tmp_path / "damaged.h5"
+    damaged.write_bytes((sessions / "trigonometric.h5").read_bytes())
+    with h5py.File(damaged, "r+") as file:
+        protocol = file["device/eit_protocol"]
+        assert "pattern" not in protocol
+        assert len(protocol["row_pattern"]) == file["streams/eit/voltage"].shape[1]
+        protocol["pattern"] = protocol["row_pattern"][()]
+    with pytest.raises(SessionError, match="holds pattern and row_pattern"):
         calib.open_session(damaged)
 
 

@@ -43,6 +43,7 @@ def assess_log(
         full_scale=scale,
         determined=fit.determined,
         misfit=fit.misfit,
+        scatter=fit.scatter,
         session=f"{session.hash}  {session.name}",
         since=calibration.recorded,
         until=session.epoch,

@@ -35,6 +35,7 @@ class LogShift:
     | full_scale     | largest force of the calibration                             |        | N    |
     | determined     | whether the log determines the gain                          |        |      |
     | misfit         | residuals over the stated ones                               |        | 1    |
+    | scatter        | deviation that gain and offset leave; NaN: not recorded      |        | N    |
     | session        | name and SHA-256 of the log                                  |        |      |
     | since, until   | ISO times of the recordings between which the sensor moved   |        |      |
     | notes          | what was left out, and what the log does not determine       |        |      |
@@ -47,6 +48,7 @@ class LogShift:
     full_scale: float
     determined: bool
     misfit: float
+    scatter: float
     session: str
     since: str
     until: str
@@ -63,7 +65,7 @@ class LogShift:
         """What to do about the calibration as it was before this recalibration."""
         if not self.determined:
             return Advice.UNKNOWN_LOG
-        if self.misfit > LARGE_MISFIT:
+        if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE * self.full_scale:  # NaN: early files
             return Advice.CALIBRATE_LOG
         change = np.abs([self.gain / self.before[0] - 1, (self.offset - self.before[1]) / self.full_scale])
         errors = np.array([self.errors[0] / self.before[0], self.errors[1] / self.full_scale])
@@ -119,8 +121,9 @@ class LogShift:
         if "shift" not in attrs:
             return None
         words = json.loads(str(attrs["shift"]))
-        numbers: dict[str, Any] = {name: np.asarray(arrays[f"shift/{name}"], float) for name in _NUMBERS}
-        numbers |= {name: float(numbers[name]) for name in ("gain", "offset", "full_scale", "misfit")}
+        held = {"shift/scatter": np.nan} | dict(arrays)
+        numbers: dict[str, Any] = {name: np.asarray(held[f"shift/{name}"], float) for name in _NUMBERS}
+        numbers |= {name: float(numbers[name]) for name in ("gain", "offset", "full_scale", "misfit", "scatter")}
         texts: dict[str, Any] = {name: str(words[name]) for name in ("session", "since", "until")}
         numbers["determined"] = bool(numbers["determined"])
         found = LogShift(**numbers, **texts, notes=tuple(map(str, words["notes"])))
@@ -138,17 +141,19 @@ _NUMBERS = {
     "full_scale": ("N", "largest force of the calibration"),
     "determined": ("1", "1: the log determines the gain"),
     "misfit": ("1", "residuals over the stated ones"),
+    "scatter": ("N", "deviation that gain and offset leave"),
 }
 _WORDS = ("session", "since", "until", "notes")
 
 
 class ShiftFit(NamedTuple):
-    """Gain and offset, their covariance, whether the gain is determined, and residuals over the stated ones."""
+    """Gain and offset, their covariance, whether the gain is determined; residuals over the stated ones, and in N."""
 
     mean: Float[np.ndarray, " 2"]
     covariance: Float[np.ndarray, "2 2"]
     determined: bool
     misfit: float
+    scatter: float
 
 
 def shift_prior(last: LogShift | None, full_scale: float, drift: GainDrift) -> tuple[np.ndarray, np.ndarray]:
@@ -195,9 +200,10 @@ def fit_shift(
     found = np.linalg.solve(precision, weight @ (rows.T @ left))
     posterior = np.linalg.solve(precision, np.eye(2)) * np.outer(unit, unit)
     gain, offset = mean + found * unit
-    misfit = float(np.sqrt(np.mean(((read - gain * force - offset) / deviation) ** 2)))
+    remains = read - gain * force - offset
+    misfit, scatter = (float(np.sqrt(np.mean(size**2))) for size in (remains / deviation, remains))
     determined = bool(posterior[0, 0] < DETERMINED**2 * covariance[0, 0])
-    return ShiftFit(np.array([gain, offset]), (posterior + posterior.T) / 2, determined, misfit)
+    return ShiftFit(np.array([gain, offset]), (posterior + posterior.T) / 2, determined, misfit, scatter)
 
 
 def full_scale_of(model: LogModel) -> float:

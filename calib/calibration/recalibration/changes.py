@@ -71,6 +71,7 @@ class Recalibration:
     | drift         | of the level at rest during the session; NaN for fewer than 3 rests    | (pads,)      | Pa/h |
     | drift_error   | its standard error                                                     | (pads,)      | Pa/h |
     | misfit        | residuals over the stated ones                                         |              | 1    |
+    | scatter       | deviation of the forces that gains do not explain; NaN: not recorded   |              | 1    |
     | evidence      | known force or ordinary use, which determines gains up to a common one |              |      |
     | pads          | their names                                                            |              |      |
     | session       | name and SHA-256 of the session                                        |              |      |
@@ -89,6 +90,7 @@ class Recalibration:
     drift: np.ndarray
     drift_error: np.ndarray
     misfit: float
+    scatter: float
     evidence: Evidence
     pads: tuple[str, ...]
     session: str
@@ -128,7 +130,7 @@ class Recalibration:
         """What to do about the calibration as it was before this recalibration."""
         if not self.determined.any():
             return Advice.UNKNOWN
-        if self.misfit > LARGE_MISFIT:
+        if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE:  # NaN: files of an early version
             return Advice.CALIBRATE
         if self.significant.any():
             return Advice.RECALIBRATE
@@ -185,6 +187,7 @@ class Recalibration:
             "until": self.until,
             "days": _finite(self.days),
             "misfit": _finite(self.misfit),
+            "scatter": _finite(self.scatter),
             "covariance_log_gain": self.covariance.tolist(),
             "pads": self.rows(),
             "health": self.health,
@@ -226,7 +229,8 @@ class Recalibration:
         found["determined"] = found["determined"].astype(bool)
         found |= {name: str(words[name]) for name in ("session", "since", "until")}
         found |= {name: tuple(map(str, words[name])) for name in ("pads", "notes")}
-        return Recalibration(**found, misfit=float(words["misfit"]), evidence=Evidence(words["evidence"]))
+        found |= {"misfit": float(words["misfit"]), "scatter": float(words.get("scatter", math.nan))}
+        return Recalibration(**found, evidence=Evidence(words["evidence"]))
 
 
 _ARRAYS = {

@@ -384,6 +384,7 @@ def recorded(
         drift=levels.drift,
         drift_error=levels.drift_error,
         misfit=float(update.misfit),
+        scatter=float(update.scatter),
         evidence=kind,
         pads=pads,
         session=origin[1],
