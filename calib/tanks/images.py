@@ -68,7 +68,8 @@ def difference_image(
         frame, reference: numbers of the frames.
         prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x. The default
             hyperparameter suits tanks whose geometry is known to a few percent (docs/tanks.md).
-        fidelity: as for `Tank.model`.
+        fidelity: default: draft, with quadratic elements if ``fit`` is given, as linear ones add a contact resistance
+            to each electrode: 10 % of that of the tank in tests/imaging/test_reference.py.
         fit: fit conductivity and contacts to the reference by `je.imaging.fit_reference`, for the image;
             default: contacts as the tank has them.
 
@@ -120,7 +121,7 @@ def _scaled(
             f"{tank.skin.name}: frame {frame} less frame {reference}, of {count} frames; give two different ones"
         )
     first, last = reference % count, frame % count
-    model = tank.model(fidelity)
+    model = tank.model(fidelity or je.Fidelity.draft(order=1 if fit is None else 2))
     before, after = tank.frames[first], tank.frames[last]
     used = np.isfinite(before) & np.isfinite(after)
     if used.sum() < 3:

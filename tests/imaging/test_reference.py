@@ -68,7 +68,7 @@ def test_level_and_contacts_within_their_errors(saline):
         z, potential = saline(seed, CURRENT * RING)
         frame = _recorded((RING.T @ potential).T.ravel(), seed)
         frame[[3, 77]] = np.nan
-        fit = fit_reference(model, frame)
+        fit = fit_reference(model, frame, ReferenceSettings(scale=0))  # the mesh is finer than the noise
         assert abs(fit.value.level / SIGMA - 1) < 0.02
         assert not fit.untold
         assert 0.7 < fit.misfit < 1.3
@@ -81,6 +81,19 @@ def test_level_and_contacts_within_their_errors(saline):
     assert 0.9 < np.std(pulls) < 1.1
     assert abs(np.mean(levels)) < 0.7
     assert 0.6 < np.std(levels) < 1.4
+
+
+def test_what_a_draft_mesh_leaves_is_in_the_errors(saline):
+    """Contacts of the driven electrodes, readings all but free of noise: the error is that of the mesh."""
+    model = _tank(je.Protocol.from_matrices(CURRENT * RING, RING), edge_length=0.06)
+    levels, contacts = [], []
+    for seed in range(3):
+        z, potential = saline(seed, CURRENT * RING)
+        fit = fit_reference(model, _recorded((RING.T @ potential).T.ravel(), seed, 1e-4))
+        levels.append(np.log(fit.value.level / SIGMA) / fit.standard_error.level)
+        contacts.append(np.log(fit.value.contact / z) / np.asarray(fit.standard_error.contact))
+    assert np.max(np.abs(levels)) < 1.645
+    assert np.sqrt(np.mean(np.square(contacts))) < 1.3
 
 
 @pytest.mark.slow

@@ -49,6 +49,7 @@ class ReferenceSettings(eqx.Module):
     | offset: of each channel                                                  | 0       | V    |
     | shift: of each electrode in each direction                               | 0       | m    |
     | common_mode: of the amplifiers' gain for the common-mode voltage         | 0       | 1    |
+    | scale: of what all readings have in common: mesh, size, current          | 0.003   | 1    |
     """
 
     level: float = 3.0
@@ -58,12 +59,13 @@ class ReferenceSettings(eqx.Module):
     offset: float = 0.0
     shift: float = 0.0
     common_mode: float = 0.0
+    scale: float = MODEL_ERROR
 
     def __check_init__(self) -> None:
         for name, value in vars(self).items():
             if not 0 <= value < np.inf:
                 raise InverseError(f"{name} is {value}; give a standard deviation, zero or more")
-        if not any(vars(self).values()):
+        if not any(value for name, value in vars(self).items() if name != "scale"):
             raise InverseError("all standard deviations are zero; give one above zero to what is unknown")
 
 
@@ -77,6 +79,7 @@ class ReferenceParameters(NamedTuple):
     | gain, offset: of each channel                                 | (channels,)     |
     | shift: of each electrode                                      | (electrodes, 2) |
     | common_mode: gain of `je.effects.CommonMode`                  | ()              |
+    | scale: of all readings, relative to 1                         | ()              |
     """
 
     level: Float[Array, ""]
@@ -85,6 +88,7 @@ class ReferenceParameters(NamedTuple):
     offset: Float[Array, " channels"]
     shift: Float[Array, "electrodes 2"]
     common_mode: Float[Array, ""]
+    scale: Float[Array, ""]
 
 
 class ReferenceFit(eqx.Module):
@@ -131,16 +135,18 @@ def fit_reference(
 ) -> ReferenceFit:
     """Fit conductivity, contacts, channels and places of electrodes to one frame of even content.
 
-    A reading is ``(1 + gain) v + offset`` of its channel, with v that of the model. A gain that all channels have in
-    common has the same effect as another conductivity with contacts in proportion: only the deviations believed before
-    tell them apart. `ReferenceFit.untold` names such directions.
+    A reading is ``(1 + scale) (1 + gain) v + offset``, gain and offset of its channel, with v that of the model. What
+    all readings have in common has the same effect as another conductivity with contacts in proportion: only the
+    deviations believed before tell them apart. `ReferenceFit.untold` names such directions. So `scale` enters the
+    standard error of the conductivity, whose noise averages out over the readings while the error of a mesh does not.
 
     Works under `jax.jit` and `jax.grad`; values that are traced are not checked.
 
     Args:
         model: of the tank. Its contact resistances times its conductivity are the most probable ones before the frame
             is seen, and electrodes with a perfect contact keep it. Whether the mesh resolves a bolt depends on the
-            contact that the model has.
+            contact that the model has. Linear elements near electrodes act like a further contact resistance; fit
+            contacts with a `Fidelity` of order 2.
         frame: V, best a mean over many; readings that are not finite are left out.
         settings: what is unknown, and how far.
         std: standard error of each reading, V; default: 0.3 % of itself, and a thousandth of their rms, enlarged until
@@ -210,6 +216,7 @@ def _spread(model: Model, settings: ReferenceSettings, channels: int) -> np.ndar
         settings.offset * np.eye(channels),
         settings.shift * np.eye(2 * model.electrodes),
         np.array([[settings.common_mode]]),
+        np.array([[settings.scale]]),
     ]
     whole: np.ndarray = block_diag(*blocks)
     return whole[:, whole.any(0)]
@@ -227,9 +234,9 @@ def _alike(touching: np.ndarray, together: float, each: float) -> np.ndarray:
 
 def _parts(values: Float[Array, " n"], electrodes: int, channels: int) -> ReferenceParameters:
     """The unknowns, apart."""
-    counts = [1, electrodes, channels, channels, 2 * electrodes]
-    level, contact, gain, offset, shift, common = jnp.split(values, np.cumsum(counts))
-    return ReferenceParameters(level[0], contact, gain, offset, shift.reshape(electrodes, 2), common[0])
+    counts = [1, electrodes, channels, channels, 2 * electrodes, 1]
+    level, contact, gain, offset, shift, common, scale = jnp.split(values, np.cumsum(counts))
+    return ReferenceParameters(level[0], contact, gain, offset, shift.reshape(electrodes, 2), common[0], scale[0])
 
 
 class _Problem(eqx.Module):
@@ -264,7 +271,7 @@ class _Problem(eqx.Module):
     def read(self, x: Float[Array, " k"]) -> Float[Array, " readings"]:
         """The frame, V."""
         parts = self.parts(x)
-        readings = forward(self.there(parts))
+        readings = (1 + parts.scale) * forward(self.there(parts))
         if self.channel is None:
             return readings
         return (1 + parts.gain[self.channel]) * readings + parts.offset[self.channel]
