@@ -9,6 +9,7 @@ from collections.abc import Collection, Sequence
 from importlib import import_module
 from typing import Any
 
+from .parser import CommandParser
 from .signals import interruption_status, termination_raised
 from .terminal import one_line
 
@@ -64,7 +65,9 @@ def _run(argv: list[str]) -> int:
         if not argv:
             _parser(argv).print_help(sys.stderr)
             return 2
-        args = _parser(argv).parse_args(argv)
+        args, others = _parser(argv).parse_known_args(argv)
+        if others:
+            args.parser.refuse(others)
         status: int = args.command(args)
         return status
     finally:
@@ -93,26 +96,17 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
 
 def parser_with(loaded: Collection[str], argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The parser of all commands, with the arguments of those that are ``loaded``, for a command line ``argv``."""
-    parser = argparse.ArgumentParser(
-        prog="jaxeit",
-        description="Force maps in newtons from EIT-pneumatic robot skins.",
-    )
+    parser = CommandParser(prog="jaxeit", description="Force maps in newtons from EIT-pneumatic robot skins.")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=CommandParser)
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name in loaded:
             module = import_module(f".commands.{name}_command", __name__)
-            command.set_defaults(command=module.run)
+            command.set_defaults(command=module.run, parser=command)
             command.words = argv
             module.add_arguments(command)
     return parser
-
-
-class CommandParser(argparse.ArgumentParser):
-    """The parser of one command. ``words`` is the command line, for a command whose arguments depend on it."""
-
-    words: Sequence[str] = ()
 
 
 class _Version(argparse.Action):

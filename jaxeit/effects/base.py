@@ -141,12 +141,21 @@ Series = Float[Array, "time channels"]
 State: TypeAlias = PyTree[Array]
 
 
+LONGEST = 1.0
+"""Largest length of an effect, m: longer than any skin, and below what a length in mm would be."""
+
+
 def parameter(default: float | tuple[float, ...], *, least: float = 0.0) -> Any:
     """A numeric field that is a pytree leaf, so that a new value does not trigger recompilation.
 
     An effect with a value below ``least`` is refused when it is made, unless jit, grad or vmap hides the value.
     """
     return limited(default, least=least, finite=False, converter=jnp.asarray)
+
+
+def metres(default: float) -> Any:
+    """A `parameter` that is a length, m, of which one above `LONGEST` is refused as well."""
+    return limited(default, least=0.0, most=LONGEST, unit="m", converter=jnp.asarray)
 
 
 class EffectError(ValueError):

@@ -9,7 +9,7 @@ from jax.scipy.special import i0e, i1e
 from jaxtyping import Array, Float, Int
 
 from ..registry import computed
-from .base import AbstractMemoryEffect, AbstractSheetEffect, Line, Series, Sheet, State, parameter
+from .base import AbstractMemoryEffect, AbstractSheetEffect, Line, Series, Sheet, State, metres, parameter
 from .random import own_field
 
 PLAY_OPERATORS = 8
@@ -30,7 +30,7 @@ class CoatingNonUniformity(AbstractSheetEffect):
     """
 
     std: Float[Array, ""] = parameter(0.15)
-    length: Float[Array, ""] = parameter(30e-3)
+    length: Float[Array, ""] = metres(30e-3)
     seed: Int[Array, ""] = parameter(0)
     field: Float[Array, " elements"] | None = computed()  # by `laid`
 
@@ -58,7 +58,7 @@ class ContactGain(AbstractSheetEffect):
     rank: ClassVar[int] = -1  # before the law that turns pressure into conductivity
 
     std: Float[Array, ""] = parameter(0.12)
-    length: Float[Array, ""] = parameter(15e-3)
+    length: Float[Array, ""] = metres(15e-3)
     seed: Int[Array, ""] = parameter(0)
     field: Float[Array, " elements"] | None = computed()  # by `laid`
 
@@ -125,7 +125,7 @@ class HomogenisedIslands(AbstractSheetEffect):
     rank: ClassVar[int] = 1  # after the effects on the sheet's own resistance
 
     fraction: Float[Array, ""] = parameter(1 / 3)
-    radius: Float[Array, ""] = parameter(2e-3)
+    radius: Float[Array, ""] = metres(2e-3)
     contact: Float[Array, ""] = parameter(1.6e-5)
     reference: Float[Array, ""] = parameter(64e3)
     exponent: Float[Array, ""] = parameter(1.0)
@@ -155,8 +155,8 @@ class ProtrusionGrid(AbstractSheetEffect):
 
     rank: ClassVar[int] = -1  # before the law that turns pressure into conductivity
 
-    pitch: Float[Array, ""] = parameter(6e-3)
-    side: Float[Array, ""] = parameter(3.5e-3)
+    pitch: Float[Array, ""] = metres(6e-3)
+    side: Float[Array, ""] = metres(3.5e-3)
 
     def __call__(self, sheet: Sheet) -> Sheet:
         half = sheet.size[:, None] / 2

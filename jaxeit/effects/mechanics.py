@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .base import AbstractLoadEffect, AbstractStageEffect, Indenter, Path, parameter
+from .base import AbstractLoadEffect, AbstractStageEffect, Indenter, Path, metres, parameter
 from .random import normal
 
 RIM_COSINES = np.cos(np.pi * (np.arange(32) + 0.5) / 32)
@@ -26,7 +26,7 @@ class StageError(AbstractStageEffect):
     | ripple: relative std of the speed of ramps | 0.02    | 0 to 0.2  | 1    | assumption |
     """
 
-    position: Float[Array, ""] = parameter(0.02e-3)
+    position: Float[Array, ""] = metres(0.02e-3)
     jitter: Float[Array, ""] = parameter(5e-3)
     ripple: Float[Array, ""] = parameter(0.02)
 
@@ -53,7 +53,7 @@ class LoadSpreading(AbstractLoadEffect):
 
     alternative: ClassVar[str] = "how a load spreads"
 
-    width: Float[Array, ""] = parameter(12e-3)
+    width: Float[Array, ""] = metres(12e-3)
 
     def __call__(
         self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]
@@ -82,7 +82,7 @@ class IndentationSpreading(AbstractLoadEffect):
 
     alternative: ClassVar[str] = "how a load spreads"
 
-    depth: Float[Array, ""] = parameter(10e-3)
+    depth: Float[Array, ""] = metres(10e-3)
 
     def __call__(
         self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]

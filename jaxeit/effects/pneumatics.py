@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from .base import AbstractPadEffect, AbstractPneumaticEffect, Line, Series, State, parameter
+from .base import AbstractPadEffect, AbstractPneumaticEffect, Line, Series, State, metres, parameter
 from .random import own_normal
 
 
@@ -25,7 +25,7 @@ class PadEdgeDip(AbstractPadEffect):
     """
 
     depth: Float[Array, ""] = parameter(0.4)
-    width: Float[Array, ""] = parameter(10e-3)
+    width: Float[Array, ""] = metres(10e-3)
 
     def __call__(
         self, response: Float[Array, "pads elements"], distance: Float[Array, "pads elements"]

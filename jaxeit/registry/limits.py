@@ -23,6 +23,7 @@ class Limits(NamedTuple):
     | open: whether the smallest itself is refused  |
     | finite: whether infinite ones are refused     |
     | whole: whether fractions are refused          |
+    | unit: of the numbers, for messages            |
     """
 
     least: float = -math.inf
@@ -30,6 +31,7 @@ class Limits(NamedTuple):
     open: bool = False
     finite: bool = True
     whole: bool = False
+    unit: str = ""
 
     def outside(self, value: Any) -> np.ndarray:
         """The numbers of a value, an array or a scalar, that have no meaning."""
@@ -40,7 +42,7 @@ class Limits(NamedTuple):
         return found
 
     def __str__(self) -> str:
-        kind = ", a whole number" if self.whole else ""
+        kind = f"{self.unit and ' '}{self.unit}{', a whole number' if self.whole else ''}"
         if math.isfinite(self.most):
             return f"{'more than ' if self.open else ''}{self.least:g} to {self.most:g}{kind}"
         if math.isfinite(self.least):
@@ -56,6 +58,7 @@ def limited(
     most: float = math.inf,
     finite: bool = True,
     whole: bool | None = None,
+    unit: str = "",
     **options: Any,
 ) -> Any:
     """A field of a class whose numbers lie from ``least``, or ``above`` a number, to ``most``.
@@ -63,6 +66,7 @@ def limited(
     Args:
         finite: whether infinite numbers are refused.
         whole: whether fractions are refused; by default where the default is a whole number.
+        unit: of the numbers, for messages.
         options: of `equinox.field`, such as ``static`` and ``converter``.
 
     Example:
@@ -79,7 +83,7 @@ def limited(
             print(error)
     """
     whole = type(default) is int if whole is None else whole
-    limits = Limits(least if above is None else above, most, above is not None, finite, whole)
+    limits = Limits(least if above is None else above, most, above is not None, finite, whole, unit)
     return eqx.field(default=default, metadata={"limits": limits}, **options)
 
 
@@ -108,6 +112,7 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
             continue
         if (wrong := limits.outside(value)).size:
             shown = repr(wrong[0].item()) if limits.whole else f"{wrong[0]:g}"  # 16.0 is no whole number
+            shown += limits.unit and f" {limits.unit}"
             raise error(f"{type(thing).__name__}: {field.name} is {shown}; give {limits}")
 
 

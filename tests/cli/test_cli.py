@@ -124,6 +124,25 @@ def test_a_low_pass_beyond_the_frame_rate(grid_file, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("simulat scene.toml", "argument COMMAND: no 'simulat'; did you mean 'simulate'? (jaxeit --help)"),
+        ("calibrate s.h5 -o c.h5 --recipie=r.toml", "--recipie: not known; did you mean --recipe? (jaxeit calibrate"),
+        ("export mcapp c.h5", "argument FORMAT: no 'mcapp'; did you mean 'mcap'? (jaxeit export --help)"),
+        ("calibrate s.h5", "the following arguments are required: -o/--output (jaxeit calibrate --help)"),
+        ("doctor thoroughly", "thoroughly: not known (jaxeit doctor --help)"),
+    ],
+)
+def test_arguments_that_are_not_known_end_in_one_line(line, message, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    error = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert message in error
+    assert error.count("\n") == 1
+
+
 def test_check_of_the_bundled_sessions(bundled, capsys):
     assert main(["check", *map(str, bundled)]) == 0
     assert "SIMULATED" in capsys.readouterr().out

@@ -256,7 +256,9 @@ def test_an_effect_refuses_a_negative_scatter_length_or_time(effect):
             continue
         for wrong in (-jnp.ones_like(value), np.full(value.shape, np.nan)):
             if value.dtype.kind == "f" or not np.isnan(wrong).any():
-                with pytest.raises(je.effects.EffectError, match=f"{kind.__name__}: {field.name} is (-1|nan); give at"):
+                with pytest.raises(
+                    je.effects.EffectError, match=f"{kind.__name__}: {field.name} is (-1|nan)( m|); give (at|0 to 1 m)"
+                ):
                     kind(**{field.name: wrong})
 
 
@@ -312,6 +314,7 @@ def test_scenes_refuse_what_is_not_an_effect(skin):
         ({"type": "Noise", "stream": "eeg"}, 'give one of "eit"'),
         ({"width": 1.0}, "type: missing"),
         ({"type": "AdcRanges", "gains": 2.0}, "gains: is 2.0; give "),
+        ({"type": "LoadSpreading", "width": 8.0}, "width is 8 m; give 0 to 1 m"),
         ({"type": "ElectrodeFault", "electrode": 1.5}, "electrode: is 1.5; give a whole number"),
     ],
 )

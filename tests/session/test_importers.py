@@ -404,4 +404,4 @@ def test_import_paths_that_lead_to_no_format_are_named(path, message, capsys):
 def test_no_other_format_is_taken(capsys):
     with pytest.raises(SystemExit):
         main(["import", "xlsx", "log.xlsx", "-o", "s.h5"])
-    assert "invalid choice: xlsx (choose from csv, hdf5" in capsys.readouterr().err.replace("'", "")
+    assert "no xlsx; choose from csv, hdf5" in capsys.readouterr().err.replace("'", "")

@@ -2,8 +2,8 @@
 
 import argparse
 
-from .. import CommandParser
 from ..arguments import prepare_outputs, skin_of
+from ..parser import CommandParser
 
 
 def add_arguments(parser: CommandParser) -> None:

@@ -98,8 +98,21 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return interruption_status(interrupt)
-    print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED")
+    print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED{_saturation(args.output)}")
     return _serve(args.output) if args.serve else 0
+
+
+def _saturation(path: str) -> str:
+    """Which streams the scene drives beyond the range of their converters, in words."""
+    import numpy as np
+
+    from ...session import Status, open_session
+
+    with open_session(path) as session:
+        flags = {name: stream.status() for name, stream in session.streams.items()}
+    shares = {n: 100 * np.mean(found & Status.saturated > 0) for n, found in flags.items() if found is not None}
+    parts = [f"{share:.2g} % of {name}" for name, share in shares.items() if share]
+    return f"; beyond the range of their converters: {', '.join(parts)}" if parts else ""
 
 
 def _serve(path: str) -> int:

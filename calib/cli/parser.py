@@ -1,0 +1,42 @@
+"""The parser of the command line: bad arguments end in one line, with the nearest name that is known."""
+
+import argparse
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+from typing import NoReturn
+
+
+class CommandParser(argparse.ArgumentParser):
+    """The parser of one command. ``words`` is the command line, for a command whose arguments depend on it."""
+
+    words: Sequence[str] = ()
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit status 2, and one line in place of the usage, which may be longer than the screen."""
+        self.exit(2, f"{self.prog}: {_nearest_choice(message)} ({self.prog} --help)\n")
+
+    def refuse(self, others: Sequence[str]) -> NoReturn:
+        """End with the first of the arguments that no parser took, and the nearest option."""
+        word = next((word for word in others if word.startswith("-")), others[0]).partition("=")[0]
+        near = difflib.get_close_matches(word, [*_options(self)], 1)
+        self.error(f"{word}: not known" + (f"; did you mean {near[0]}?" if near else ""))
+
+
+def _nearest_choice(message: str) -> str:
+    """The message of argparse, with the nearest choice in place of many."""
+    found = re.fullmatch(r"(argument .*): invalid choice: '(.*)' \(choose from (.*)\)", message)
+    if not found:
+        return message
+    name, word, choices = found.groups()
+    near = difflib.get_close_matches(word, [choice.strip("'") for choice in choices.split(", ")], 1)
+    return f"{name}: no {word!r}; " + (f"did you mean {near[0]!r}?" if near else f"choose from {choices}")
+
+
+def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """The options of a parser and of its subcommands."""
+    for action in parser._actions:
+        yield from action.option_strings
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _options(command)
