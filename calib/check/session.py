@@ -10,6 +10,7 @@ import jaxeit as je
 from ..presses.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
+from ..session.units import wrong_quantity
 from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit
 from .electrodes import check_electrodes
@@ -143,6 +144,9 @@ def _session_findings(session: Session) -> Iterator[Finding]:
             "see the faults at /events, if there are any, and check its end",
         )
     yield from _recorded_faults(session)
+    for name, stream in session.streams.items():
+        if wrong := wrong_quantity(name, stream.unit):
+            yield Finding(Severity.ERROR, f"/streams/{name}", wrong, "correct its unit, or give it another name")
     missing = [n for n in ("eit", "pressure", "force") if n not in session.streams]
     if missing:
         what = f"no stream named {' or '.join(missing)}: checks that need it are left out"

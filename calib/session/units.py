@@ -69,4 +69,19 @@ VARIABLE_UNIT = {
 }
 """SI unit that a main variable of this name must have."""
 
+STREAM_UNIT = {"eit": "V", "pressure": "Pa", "barometer": "Pa", "force": "N", "stage": "m", "temperature": "K"}
+"""SI unit of what a stream of this name measures."""
+
+RAW_UNITS = ("1", "V", "A", "Ohm", "S", "Hz")
+"""SI units in which any sensor may be read, before it is converted to what it measures."""
+
 KNOWN_UNITS = ", ".join(UNITS)
+
+
+def wrong_quantity(stream: str, si: str) -> str:
+    """What is wrong with a stream in this SI unit, such as a pressure in N; empty: nothing."""
+    own = STREAM_UNIT.get(stream, si)
+    if si in (own, *RAW_UNITS):
+        return ""
+    fitting = ", ".join(name for name, unit in UNITS.items() if unit.si == own)
+    return f"{si} is no unit of what a stream of this name measures ({fitting}, or of a raw signal: V, counts)"

@@ -154,10 +154,14 @@ def load_npz(path: str | Path, domain: Domain | None = None, rim: Rim | None = N
             f"{path.name}: holds {sorted(arrays)}; save frames with pattern and amplitude, or with current and "
             "measurement; frames alone need a skin's TOML, as --skin TANK.toml"
         )
-    if "pattern" in arrays:
-        protocol = je.Protocol(arrays["pattern"], float(arrays["amplitude"]))
-        electrodes = int(protocol.pattern.max()) + 1 if rim is None else len(rim)
-    else:
-        protocol = je.Protocol.from_matrices(arrays["current"], arrays["measurement"])
-        electrodes = len(arrays["current"])
+    try:
+        if "pattern" in arrays:
+            protocol = je.Protocol(arrays["pattern"], float(arrays["amplitude"]))
+            electrodes = int(protocol.pattern.max()) + 1 if rim is None else len(rim)
+        else:
+            protocol = je.Protocol.from_matrices(arrays["current"], arrays["measurement"])
+            electrodes = len(arrays["current"])
+    except (ValueError, TypeError) as error:
+        names = "pattern and amplitude" if "pattern" in arrays else "current and measurement"
+        raise TankError(f"{path.name}: {names}: {error}") from None
     return archive_tank(tank_of(path.stem, protocol, electrodes, domain, rim), arrays["frames"])

@@ -197,6 +197,12 @@ def test_a_stream_of_one_sample_does_not_stop_the_check(parts, look):
     has(look(parts), Severity.ERROR, "/streams/force", "fewer than ten")
 
 
+def test_a_pressure_in_newtons_is_no_pressure(parts, look):
+    _, _, rate, time, values = parts.streams["pressure"]
+    parts.streams["pressure"] = ("force", "N", rate, time, values)
+    has(look(parts), Severity.ERROR, "/streams/pressure", "N is no unit of what a stream of this name measures (Pa, ")
+
+
 def array_log(parts, faulty):
     """A log of force and twelve channels that follow it, some of them faulty."""
     rng = np.random.default_rng(4)

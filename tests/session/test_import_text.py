@@ -89,6 +89,14 @@ def test_a_name_that_holds_a_comma_is_told_as_it_is_to_be_written(tmp_path, caps
     assert """column 'p': not there; header names: t, "p, left", f;""" in told
 
 
+def test_the_nearest_name_is_told_and_units_of_another_quantity_are_refused(tmp_path, capsys):
+    path = written(tmp_path, "t,force_z,p\n0,1,2\n1,4,5\n")
+    told = refusal(capsys, path, "--time", "t:s", "--stream", "force=forcez:N")
+    assert "column 'forcez': not there; did you mean 'force_z'?" in told
+    told = refusal(capsys, path, "--time", "t:s", "--stream", "pressure=p:N")
+    assert "--stream pressure: N is no unit of what a stream of this name measures (Pa, hPa, " in told
+
+
 def test_names_may_hold_delimiters_and_line_ends(tmp_path):
     """As Excel writes a head with a line break in it."""
     text = '"t\n(s)","p, left","Force\r\n[N]","say ""g"""\n0,1,2,3\n1,4,5,6\n'

@@ -108,6 +108,9 @@ def test_files_that_do_not_describe_their_tank(bench, tmp_path):
 
     np.savez(tmp_path / "rows.npz", frames=bench.frames, pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
     np.testing.assert_array_equal(load_tank(tmp_path / "rows.npz", je.Disc(RADIUS)).frames, bench.frames)
+    np.savez(tmp_path / "name.npz", frames=bench.frames, pattern="adjacent", amplitude=CURRENT)
+    with pytest.raises(TankError, match=r"name\.npz: pattern and amplitude: the pattern has shape \(\); give one row"):
+        load_tank(tmp_path / "name.npz", je.Disc(RADIUS))
     with pytest.raises(TankError, match="does not tell the shape of the tank"):
         load_tank(tmp_path / "rows.npz")
     reversed_polarity = calib.tanks.Tank(csv.skin, -csv.frames, csv.names)

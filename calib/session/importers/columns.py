@@ -1,6 +1,7 @@
 """Texts that assign the columns of a table to clock and streams: ``0:ms``, ``force=4:N``, ``signal=s0-s3:V``."""
 
 import csv
+import difflib
 import itertools
 import re
 from collections.abc import Sequence
@@ -141,6 +142,8 @@ def column_indices(path: Path, column: str, header: Sequence[str], columns: int)
     names = _range_of_names(path, column, header)
     if names is not None:
         return names
+    if near := difflib.get_close_matches(column, header, 1):
+        raise problem(path, f"column {column!r}", "not there", f"did you mean {near[0]!r}?")
     what = f"not there; header names: {_listed(header) or 'none, it has no header'}"
     raise problem(path, f"column {column!r}", what, "use one of them, or count from zero")
 

@@ -18,7 +18,7 @@ from ..errors import SessionError, printable, problem
 from ..facts import SessionFacts, StreamFacts
 from ..hdf5.storage import IMPORT, file_hash, require_no_session
 from ..tables import Status
-from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT
+from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, wrong_quantity
 from ..writer import SessionWriter, program
 from .base import About
 from .clocks import Clock, clock_of, clock_of_rate, common_start, join_clocks, nanoseconds
@@ -143,6 +143,8 @@ def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About
         if any(column in file.dates for column in found):
             raise problem(path, where, "names a column of dates and times", "name it with --time, or leave it out")
         units[stream.name] = stream.unit or _unit_of(path, where, found, file.header)
+        if wrong := wrong_quantity(stream.name, UNITS[units[stream.name]].si):
+            raise problem(path, where, wrong, "correct the unit, or give the stream another name")
         notes += _contradictions(path, where, units[stream.name], found, file.header)
         wanted = [*wanted, *found]
     if len(wanted) > MAX_COLUMNS:
