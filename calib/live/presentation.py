@@ -1,7 +1,7 @@
 """Present live results to people and programs: the page, lines of JSON on a socket, and further viewers."""
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,11 +69,13 @@ def present(
     """
     where = where or Presentation()
     with ExitStack() as stack:
-        page = stack.enter_context(Page(calibration, control, where.host, where.port))
+        with _named("--port", where.host, where.port):
+            page = stack.enter_context(Page(calibration, control, where.host, where.port))
         viewers: list[Publish] = [page.show_result, *also]
         tell(f"look at {page.url}")
         if where.publish is not None:
-            lines = stack.enter_context(Broadcaster(where.host, where.publish))
+            with _named("--publish", where.host, where.publish):
+                lines = stack.enter_context(Broadcaster(where.host, where.publish))
             tell(f"lines of JSON at {lines.address[0]}:{lines.address[1]}")
             shape = calibration.recon.shape if where.maps and isinstance(calibration, Calibration) else ()
             viewers.append(lambda result: lines.publish([_line(result, shape)]))
@@ -81,6 +83,16 @@ def present(
             tell("anyone who can reach this machine can view the page and measure the rest levels again")
         log = None if where.output is None else stack.enter_context(session_journal(where.output, tell))
         return run_live(calibration, plan, sources, viewers, control, settings, log=log)
+
+
+@contextmanager
+def _named(option: str, host: str, port: int) -> Iterator[None]:
+    """The option and the address before what the system says about them."""
+    try:
+        yield
+    except (OSError, OverflowError) as error:
+        why = str(getattr(error, "strerror", None) or error).partition(" (while attempting")[0]
+        raise OSError(f"{option}: {host}:{port}: {why}; name another port (0: any free one) or --host") from None
 
 
 def _line(result: Result, shape: tuple[int, ...]) -> bytes:

@@ -640,6 +640,18 @@ def test_a_live_show_that_sees_nothing_leaves_nothing(calibration, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_port_in_use_is_named(calibration):
+    plan, sources = plan_recording({"eit": "tcp://127.0.0.1:1", "pressure": "tcp://127.0.0.1:1"}, calibration.skin)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        for option, where in (
+            ("--port", Presentation(port=port)),
+            ("--publish", Presentation(port=0, publish=port)),
+        ):
+            with pytest.raises(OSError, match=rf"^{option}: 127\.0\.0\.1:{port}: Address already in use; name another"):
+                present(calibration, plan, sources, LiveControl(), where)
+
+
 def small_scan():
     """Two readings at rest, two more for the pad that is pressed, every reading each 40 frames."""
     flags = jnp.eye(READINGS, dtype=bool)
