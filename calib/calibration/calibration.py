@@ -50,7 +50,8 @@ class Calibration:
     | notes: remarks for the reader of the results                             |
     | field: gain as a function of the place pressed; None: no such correction |
     | crosstalk: between the pads                                              |
-    | noise: deviation of new readings about the model of the pads             |
+    | noise: deviation of means over parts of presses about the model of the   |
+    |   pads                                                                   |
     | hold_noise: deviation of means over the holds of presses about it        |
     | locator: estimates the place of a contact from a frame; None: no field   |
     | baseline: the paper's curves, one slope per pad, for comparison          |
@@ -65,6 +66,8 @@ class Calibration:
     |   not learned (`learn_layer`)                                            |
     | contact_law: by which readings tell a contact's force where no pad does; |
     |   None: not learned (`learn_layer`)                                      |
+    | sensor: deviation of single readings of the pads at rest, (pads,) Pa;    |
+    |   None: not known                                                        |
     | electrodes: how far they sit from where the skin's file said; None:      |
     |   taken from the file                                                    |
 
@@ -99,13 +102,15 @@ class Calibration:
     layer: LearnedLayer | None = None
     contact_law: ContactLaw | None = None
     electrodes: PlacedElectrodes | None = None
+    sensor: np.ndarray | None = None
 
     @cached_property
     def pads(self) -> PadModel:
         """The model of the pads: curves, field, crosstalk, noise and gains."""
         mixed = self.crosstalk is not None and self.crosstalk.present
         matrix = jnp.asarray(self.crosstalk.matrix, self.dtype) if self.crosstalk is not None and mixed else None
-        return PadModel(self.curves, self.field, matrix, self.noise, self.hold_noise, self.gains)
+        sensor = None if self.sensor is None else jnp.asarray(self.sensor, self.dtype)
+        return PadModel(self.curves, self.field, matrix, self.noise, self.hold_noise, self.gains, sensor)
 
     @property
     def gains(self) -> PadGains | None:

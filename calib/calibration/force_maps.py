@@ -133,7 +133,7 @@ def fused(
     gate: float,
 ) -> ForceEstimate:
     """`force_map` from known images and places (None: places are not estimated); pure."""
-    force, error, valid = law.pads.with_noise(law.pads.forces(pressures, places, before))
+    force, error, valid = law.pads.single(pressures, places, before)
     numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
     if places is None:
         places = nowhere(pressures, 0)

@@ -159,6 +159,7 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         probes=press_probes(presses),
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
         electrodes=found.placed,
+        sensor=presses.sensor_noise,
     )
 
 

@@ -65,9 +65,12 @@ class PadModel(eqx.Module):
     | curves     | pressure-force curve of each pad                                   |              |
     | field      | gain over the place pressed; None: no correction by location       |              |
     | crosstalk  | reading of channel i per own pressure of pad j; None: no crosstalk | (pads, pads) |
-    | noise      | deviation of new readings about the model; None: residuals' own    |              |
+    | noise      | deviation of means over parts of a press about the model; None:    |              |
+    |            | residuals' own                                                     |              |
     | hold_noise | deviation of means over a hold about the model; None: as `noise`   |              |
     | gains      | by which readings have moved since the fit; None: not moved        |              |
+    | sensor     | deviation of a single reading from the mean at rest, Pa; None: not | (pads,)      |
+    |            | known                                                              |              |
     """
 
     curves: FittedCurve
@@ -76,6 +79,7 @@ class PadModel(eqx.Module):
     noise: NoiseLaw | None = None
     hold_noise: NoiseLaw | None = None
     gains: PadGains | None = None
+    sensor: Float[Array, " pads"] | None = None
 
     @property
     def dtype(self) -> np.dtype:
@@ -120,7 +124,11 @@ class PadModel(eqx.Module):
     @property
     def idle_noise(self) -> Float[Array, " pads"]:
         """Standard deviation of the force of each pad without load, N."""
-        return self._noise.floor * self._noise.scale
+        floor = self._noise.floor * self._noise.scale
+        if self.sensor is None:
+            return floor
+        level, noisy = self._continued(jnp.stack([jnp.zeros_like(self.sensor), self.sensor]), None, None).force
+        return jnp.hypot(floor, noisy - level)
 
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
         """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
@@ -132,21 +140,31 @@ class PadModel(eqx.Module):
         factor = jnp.exp(gain.mean)
         return Prediction(force * factor, factor * jnp.sqrt(error**2 + force**2 * gain.variance), valid)
 
-    def with_noise(self, found: Prediction) -> Prediction:
-        """The prediction of a single reading: its standard error includes the noise about the model; pure.
+    def single(
+        self,
+        readings: Float[Array, "n pads"],
+        places: Places | None = None,
+        before: Float[Array, "m pads"] | None = None,
+    ) -> Prediction:
+        """`forces` of single readings: the standard error includes the noise about the model and of the sensors; pure.
 
-        Without a noise law it is that of the residuals of the fitted samples.
+        Curves are fitted to means over parts of presses, which hold little of the sensors' noise. Without a noise law,
+        the noise is that of the residuals of the fitted samples.
         """
-        return found._replace(standard_error=jnp.sqrt(found.standard_error**2 + self._noise.variance(found.force)))
+        found = self.forces(readings, places, before)
+        variance = found.standard_error**2 + self._noise.variance(found.force)
+        if self.sensor is not None:
+            variance += (self.forces(readings + self.sensor, places, before).force - found.force) ** 2
+        return found._replace(standard_error=jnp.sqrt(variance))
 
     def pad_forces(
         self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Force on each pad, its standard error (N) and validity, (n, pads), from readings (n, pads) Pa.
 
-        The standard error is that of a single reading: it holds the uncertainty of curve and field and the noise about
-        them. Without places, the gain is one, and the standard error includes its variation over the pad. A force is
-        not valid outside the fitted pressures, or where the fit of the pad failed.
+        The standard error is that of a single reading: it holds the uncertainty of curve and field, the noise about
+        them, and that of the sensors. Without places, the gain is one, and the standard error includes its variation
+        over the pad. A force is not valid outside the fitted pressures, or where the fit of the pad failed.
         """
         found = pad_forces(self, jnp.asarray(pressures, self.dtype), places)
         return tuple(map(np.asarray, found))  # type: ignore[return-value]
@@ -170,7 +188,7 @@ class PadModel(eqx.Module):
 
     @property
     def multiple(self) -> float:
-        """Half the 90 % interval of a reading, in its standard errors (`with_noise`)."""
+        """Half the 90 % interval of a reading, in its standard errors (`single`)."""
         return float(self._noise.multiple)
 
     @property
@@ -191,7 +209,7 @@ class PadModel(eqx.Module):
 @je.verb
 def pad_forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
     """`PadModel.pad_forces` as one program: arrays (n, pads)."""
-    return model.with_noise(model.forces(pressures, places))
+    return model.single(pressures, places)
 
 
 @je.verb

@@ -144,7 +144,19 @@ class PooledPresses:
 
     def quiet_frames(self, processing: Processing) -> np.ndarray:
         """Frames (n, readings) V before the presses, minus the mean of each rest; the noise is estimated from them."""
-        return np.concatenate([_quiet_frames(recording, processing) for recording in self.recordings])
+        return np.concatenate([np.concatenate(_rests(one, "eit", processing)) for one in self.recordings])
+
+    @cached_property
+    def sensor_noise(self) -> np.ndarray:
+        """Standard deviation of single readings of the pads at rest, (pads,) Pa: the median over the rests.
+
+        Of readings as a live view takes them, without the low-pass by which recordings are corrected. A pad that
+        recovers from a press moves during the rest after it, which makes the deviation of that rest larger.
+        """
+        rests = [rest for one in self.recordings for rest in _rests(one, "pressure") if len(rest)]
+        each = np.array([np.sqrt(finite_mean(rest**2)) for rest in rests]).reshape(len(rests), -1)
+        known = [column[np.isfinite(column)] for column in each.T] or [each] * self.data.pressure.shape[1]
+        return np.array([np.median(column) if len(column) else 0.0 for column in known])
 
 
 def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Processing | None = None) -> PooledPresses:
@@ -231,13 +243,14 @@ def thinned(series: PressSeries, most: int) -> PressSeries:
     )
 
 
-def _quiet_frames(recording: PressMeasurements, processing: Processing) -> np.ndarray:
-    """Corrected frames of the rests before the accepted presses, minus the mean of each rest.
+def _rests(recording: PressMeasurements, name: str, processing: Processing | None = None) -> list[np.ndarray]:
+    """Samples of a stream in the rests before the accepted presses, minus the mean of each rest.
 
-    Subtracting the mean of n frames removes one degree of freedom; the factor sqrt(n / (n - 1)) restores the variance.
+    Subtracting the mean of n samples removes one degree of freedom; the factor sqrt(n / (n - 1)) restores the variance.
+    The first rest is empty. Samples are corrected by the ``processing``; default: not at all.
     """
-    stream, windows = recording.session.stream("eit"), recording.windows.rest_before[recording.presses.accepted]
-    corrections = processing.of(stream)
+    stream, windows = recording.session.stream(name), recording.windows.rest_before[recording.presses.accepted]
+    corrections = () if processing is None else processing.of(stream)
     rests = [np.empty((0, stream.channels))]
     for window in windows:
         first, last = index_ranges(stream.time, window + np.array([-FILTER_MARGIN, FILTER_MARGIN]))
@@ -246,4 +259,4 @@ def _quiet_frames(recording: PressMeasurements, processing: Processing) -> np.nd
         frames = frames[(time >= window[0]) & (time < window[1])]
         if len(frames) > 1:
             rests.append((frames - finite_mean(frames)) * np.sqrt(len(frames) / (len(frames) - 1)))
-    return np.concatenate(rests)
+    return rests

@@ -16,7 +16,7 @@ import numpy as np
 from .belief.filter import Update
 from .belief.programs import Programs
 from .events import Events, Hypothesis
-from .tracks import Backlog, Look, Seen, Tracking, Trial
+from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Trial
 
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
 FAINT, FAINT_FRAMES = 4.0, 2
@@ -27,7 +27,7 @@ KEPT = 8
 # Events that one frame may show.
 EVENTS = 4
 # A look is given up when frames of so many seconds wait: contacts that moved on unseen for so long are not believed.
-PATIENCE = 2.0
+LONGEST_WAIT = 2.0
 
 
 def begun(before: Tracking, otherwise: Tracking, seen: Seen) -> Look:
@@ -47,7 +47,7 @@ def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
 
 def is_given_up(backlog: Backlog) -> bool:
     """Whether so many frames wait that no spare time can be hoped for, as on a machine that is too slow or too busy."""
-    return sum(seen.seconds for seen in backlog.waiting) > PATIENCE
+    return sum(seen.seconds for seen in backlog.waiting) > LONGEST_WAIT
 
 
 def _merged(frames: tuple[Seen, ...]) -> tuple[Seen, ...]:
@@ -99,14 +99,19 @@ def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing more has happened."""
     best = max([look.best, *_possible(look)], key=lambda trial: trial.probability)
     if best is look.best or best.attempt is None:
-        return replace(look, after=look.otherwise)
+        return replace(look, after=_calmer(look.otherwise) if look.events == EVENTS else look.otherwise)
     event = best.event
     update = programs.concluded(event.belief, look.seen.dv, look.seen.pads, best.attempt)
     before = look.before.under(event, event.belief)
-    after = settled(replace(before, since=0, misfit=float(update.misfit)), update)
+    after = settled(replace(before, since=0, patience=PATIENCE, misfit=float(update.misfit)), update)
     best, left = best._replace(event=event._replace(prior=0.0)), look.events - 1
     look = replace(look, before=before, best=best, otherwise=after, events=left, trials=None)
     return look if left else replace(look, after=after)
+
+
+def _calmer(after: Tracking) -> Tracking:
+    """Contacts to which nothing has happened, although a frame looked like it."""
+    return replace(after, patience=min(2 * after.patience, MOST_PATIENCE))
 
 
 def _is_ripple(before: Tracking, trial: Trial) -> bool:

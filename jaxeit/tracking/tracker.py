@@ -32,8 +32,8 @@ from .tracks import Backlog, Look, Seen, Track, Tracking
 UNEXPECTED, SURPRISING = 4.0, 25.0
 # Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
 MOST_GAIN = 4.0
-# A frame that no event explains is asked about again after so many frames, or where it has become so much worse.
-PATIENCE, WORSE = 10, 1.3
+# A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
+WORSE = 1.3
 
 
 class Tracker:
@@ -220,7 +220,7 @@ class Tracker:
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:
             return True
-        return self._is_far(update) and (now.since >= PATIENCE or float(update.misfit) > WORSE * now.misfit)
+        return self._is_far(update) and (now.since >= now.patience or float(update.misfit) > WORSE * now.misfit)
 
     def _is_far(self, update: Update) -> bool:
         size = len(self.filter.compress)

@@ -11,6 +11,10 @@ from .belief.filter import SIZE, Attempt, Belief, Pads
 from .belief.layer import LearnedLayer
 from .events import Hypothesis
 
+# Frames after which a frame that no event explains is asked about again: twice as many each time that nothing is found,
+# as where the model of a held contact errs by more than was stated, and no more than so many.
+PATIENCE, MOST_PATIENCE = 10, 80
+
 
 class Track(NamedTuple):
     """A contact as it is now.
@@ -49,7 +53,8 @@ class Tracking:
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
     | taught: number of contacts that the layer holds of those that have begun |
-    | misfit: chi-square of the last frame that was looked into, and frames since then |
+    | misfit: chi-square of the last frame that was looked into             |
+    | since, patience: frames since then, and until a frame like it is looked into again |
     | considered: what unknown shapes and an unknown coat make the contacts err by |
     | backlog: frames that are not explained yet; the belief is that without events since then |
     """
@@ -62,6 +67,7 @@ class Tracking:
     begun: int = 0
     misfit: float = 0.0
     since: int = 0
+    patience: int = PATIENCE
     considered: ConsiderErrors = field(default_factory=ConsiderErrors)
     backlog: "Backlog | None" = None
     taught: int = 0

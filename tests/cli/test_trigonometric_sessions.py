@@ -99,6 +99,14 @@ def sessions(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def calibrated(sessions):
+    """The folder, with the calibrations of both sessions, from the command line."""
+    for scan in SCANS:
+        assert main(["calibrate", str(sessions / f"{scan}.h5"), "-o", str(sessions / f"cal-{scan}.h5")]) == 0
+    return sessions
+
+
 def test_a_session_holds_the_scan(sessions):
     skin = je.load_skin(sessions / "trigonometric.toml")
     with calib.open_session(sessions / "trigonometric.h5") as session:
@@ -146,16 +154,14 @@ def test_a_scan_too_long_for_a_journal_is_refused(sessions):
         replace(plan, mixing=((0, 0, 1.0),) * 25_001)
 
 
-def test_forces_are_as_with_the_adjacent_scan(sessions, capsys):
+def test_forces_are_as_with_the_adjacent_scan(calibrated, capsys):
     """The pads tell the force with either scan; that of the image alone is as good, and so is the place."""
-    found = {}
+    found, sessions = {}, calibrated
     for scan in SCANS:
         session, calibration = str(sessions / f"{scan}.h5"), str(sessions / f"cal-{scan}.h5")
         assert main(["check", session]) == 0
         told = capsys.readouterr().out
         assert "reciprocity not tested" in told if scan == "trigonometric" else "reciprocity error" in told
-        assert main(["calibrate", session, "-o", calibration]) == 0
-        capsys.readouterr()
         assert main(["evaluate", calibration, session, "--json"]) == 0
         found[scan] = json.loads(capsys.readouterr().out)[f"{scan}.h5"]
         assert main(["apply", calibration, session, "-o", str(sessions / f"map-{scan}.h5")]) == 0
@@ -168,6 +174,25 @@ def test_forces_are_as_with_the_adjacent_scan(sessions, capsys):
     assert through_all["force_rmse"] == pytest.approx(pairs["force_rmse"], rel=0.05)
     assert through_all["force_eit_rmse"] < 1.2 * pairs["force_eit_rmse"]
     assert through_all["localisation_half_mean"] < pairs["localisation_half_mean"]
+
+
+@pytest.mark.parametrize("scan", SCANS)
+def test_each_press_is_one_contact_and_idle_pads_are_idle(calibrated, tmp_path, scan):
+    """Errors of forces hold the noise of single readings, not of the means to which curves are fitted."""
+    session, calibration = str(calibrated / f"{scan}.h5"), str(calibrated / f"cal-{scan}.h5")
+    output = str(tmp_path / "map.h5")
+    assert main(["apply", calibration, session, "-o", output, "--track"]) == 0
+    found = read_archive(output, "skin-forcemap").arrays
+    with calib.open_session(session) as recorded:
+        presses, rest = recorded.presses, recorded.presses.t_press.min()
+        readings = recorded.stream("pressure")
+        before = readings.time < rest
+        raw = readings.read()[before]
+    assert len(set(found["tracks/number"].tolist())) == len(presses)
+    model = calib.load_calibration(calibration)
+    force, error, _ = model.pad_forces(raw - raw.mean(0))
+    inside = np.abs(force) <= model.pads.multiple * error
+    assert 0.85 < inside.mean() < 0.97
 
 
 def test_damaged_terms_are_refused(sessions, tmp_path):

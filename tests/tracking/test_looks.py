@@ -8,8 +8,8 @@ import pytest
 
 from jaxeit.tracking.belief.filter import PIECE, STEPS, Pads
 from jaxeit.tracking.belief.programs import Programs
-from jaxeit.tracking.looks import KEPT, PATIENCE, meanwhile
-from jaxeit.tracking.tracks import Seen
+from jaxeit.tracking.looks import KEPT, LONGEST_WAIT, meanwhile
+from jaxeit.tracking.tracks import MOST_PATIENCE, PATIENCE, Seen
 
 from .conftest import SECONDS, load
 
@@ -89,6 +89,23 @@ def test_a_look_ends_and_a_frame_is_looked_into_again_only_if_it_is_unexpected(f
     assert not all(looking[12:47])
 
 
+def test_what_no_event_explains_is_asked_about_less_and_less_often(tracker, frame_of):
+    """What the model leaves of a press that is held does not pass; the press keeps its number."""
+    rng = np.random.default_rng(4)
+    left = 5 * np.sqrt(1 / np.square(np.asarray(tracker.filter.compress)).sum(0).mean())  # V, of each reading
+    strange = frame_of([load(0.06, 0.08, 12.0)]) + left * rng.normal(size=tracker.filter.finder.readings)
+    now, asked = tracker.start(), []
+    for k in range(200):
+        now = tracker.step(now, strange, SECONDS)
+        if k >= 20 and now.since == 0:
+            asked.append(k)
+    assert now.numbers == (1,)
+    between = np.diff(asked) - 1
+    assert len(between) >= 2
+    assert (between[1:] == np.minimum(2 * between[:-1], MOST_PATIENCE)).all()
+    assert PATIENCE <= between[0] <= MOST_PATIENCE == between[-1]
+
+
 def seen(number):
     return Seen(np.full(1, number), Pads(np.zeros(1), np.ones(1)), 1.0)
 
@@ -126,7 +143,7 @@ def test_contacts_begin_anew_after_an_update_that_is_not_finite(tracker, frame_o
 def test_without_spare_time_contacts_are_given_up_and_found_again_once_there_is_some(tracker, frame_of, followed):
     """A machine that is too slow for looks tells no contact, rather than one that has moved on unseen."""
     now = next(state for state in followed[0] if state.backlog is not None and state.numbers)
-    still, quarter = frame_of(truth(55)), PATIENCE / 4  # one contact is left
+    still, quarter = frame_of(truth(55)), LONGEST_WAIT / 4  # one contact is left
     shown = []
     for _ in range(16):
         now = tracker.step(now, still, quarter, whole=False)

@@ -87,8 +87,9 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
     for kind, kept in (("examples", cal.examples), ("probes", cal.probes)):
         if kept is not None:
             arrays |= {f"{kind}/{name}": value for name, value in kept.arrays().items()}
-    if cal.rest is not None:
-        arrays["pads/rest"] = (cal.rest, "Pa", "gage pressure without contact")
+    for name, known, meaning in (("rest", cal.rest, "gage pressure"), ("sensor", cal.sensor, "deviation of a reading")):
+        if known is not None:
+            arrays[f"pads/{name}"] = (known, "Pa", f"{meaning} without contact")
     if cal.recalibration is not None:
         attrs |= cal.recalibration.attributes()
         arrays |= cal.recalibration.arrays()
@@ -253,7 +254,10 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
         "loops": Loops.restore(arrays, "loops/"),
         "examples": _examples_from(arrays, "examples", len(skin.pads), recon.readings),
         "probes": _examples_from(arrays, "probes", len(skin.pads), recon.readings),
-        "rest": shaped(arrays, "pads/rest", (len(skin.pads),), "f") if "pads/rest" in arrays else None,
+        **{
+            name: shaped(arrays, f"pads/{name}", (len(skin.pads),), "f") if f"pads/{name}" in arrays else None
+            for name in ("rest", "sensor")
+        },
         "recalibration": Recalibration.restore(attrs, arrays, len(skin.pads)),
         "layer": layer_from(arrays),
         "contact_law": law_from(arrays),
