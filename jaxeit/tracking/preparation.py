@@ -35,6 +35,8 @@ GRID = 20
 COAT_VARIANCE = 0.99
 # Usual loads along each side of the sheet, of which an unknown coat changes the signal.
 COAT_PLACES = 5
+# Pixels of the first order to the usual width of a load; least and largest number of them along x.
+PIXELS_A_WIDTH, LEAST_MOST_COLUMNS = 3, (12, 150)
 
 
 @full_precision
@@ -84,7 +86,7 @@ def _loaded_sheet(
 ) -> tuple[GainField, LoadedSheet]:
     """The gain before any contact, and what contacts show."""
     loads, light = settings.loads, partial(on_device, dtype=np.dtype(settings.dtype))
-    coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(settings.columns).on(model)
+    coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(_columns(model, settings)).on(model)
     response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
     background = np.asarray(fine.restrict(sigma)) / np.asarray(fine.restrict(jnp.ones_like(sigma)))
     mean, masks, (points, weights) = (
@@ -113,6 +115,15 @@ def _loaded_sheet(
         law=loads.law,
     )
     return field, sheet
+
+
+def _columns(model: Model, settings: TrackerSettings) -> int:
+    """Pixels along x of the first order. They follow the width of a load, not the sheet: the pixels around a contact
+    reach as far on a small skin as on a large one."""
+    if settings.columns is not None:
+        return settings.columns
+    length = float(np.ptp(np.asarray(model.chart, float)[:, 0]))
+    return int(np.clip(np.ceil(length * PIXELS_A_WIDTH / settings.loads.width), *LEAST_MOST_COLUMNS))
 
 
 def _coat_share(sheet: LoadedSheet, settings: TrackerSettings) -> float:

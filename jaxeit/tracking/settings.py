@@ -30,7 +30,8 @@ class TrackerSettings:
     | most: contacts followed at once                                                | 3       |           |
     | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
     | modes: of the gain around a contact that a frame updates                       | 24      |           |
-    | columns: pixels along x of the first order; pixels: around a contact           | 50, 400 |           |
+    | columns: pixels along x of the first order; None: three to the usual width of a load | None |      |
+    | pixels: around a contact; 400 of a third of the width reach to 3.75 widths     | 400     |           |
     | fidelity: of the mesh that is solved anew; its first order is the model's      | draft   |           |
     | dtype: of these solutions; errors of float32 are far below noise               | float32 |           |
 
@@ -48,7 +49,7 @@ class TrackerSettings:
     most: int = 3
     unknowns: int = 96
     modes: int = 24
-    columns: int = 50
+    columns: int | None = None
     pixels: int = 400
     fidelity: Fidelity = field(default_factory=Fidelity.draft)
     dtype: str = "float32"
@@ -58,5 +59,6 @@ class TrackerSettings:
             if not 0 < getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
         for name in ("most", "unknowns", "modes", "columns", "pixels"):
-            if getattr(self, name) < 1:
-                raise InverseError(f"{name} is {getattr(self, name)}; give one or more")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InverseError(f"{name} is {value}; give one or more")
