@@ -9,6 +9,7 @@ import jaxeit as je
 from jaxeit.imaging.noise import whitened_readings
 from jaxeit.model.bases import Elements
 from jaxeit.model.sensitivity import pair_jacobian
+from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.reanalysis import prepare_reanalysis
 from jaxeit.tracking.belief.response import load_pressure
 from tests.compiled import compiled
@@ -16,6 +17,17 @@ from tests.compiled import compiled
 from .conftest import in_double_precision
 
 LOADS = jnp.array([[0.07, 0.09, np.log(0.012), np.log(15.0), 0, 0], [0.1, 0.1, np.log(0.01), np.log(8.0), 6e-3, 3e-3]])
+
+SQUARE = """
+format = "jaxeit-skin"
+version = 1
+name = "square"
+sheet = {{shape = "rectangle", size = [{side}, {side}], sheet_resistance = 150.0}}
+electrodes = {{kind = "bolt", radius = 0.003, contact = 1e-6, positions = {grid}}}
+protocol = {{pattern = "adjacent", current = 1e-3, reading_time = 1e-5}}
+pressure_sensor = {{maximum = 34474.0, accuracy = 86.0}}
+pads = [{{name = "all", rectangle = [0.0, 0.0, {side}, {side}]}}]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +151,23 @@ def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, 
     wanted = tracker.filter.compress @ (v - blank[0])
     gain = jnp.zeros(exact.modes.shape[1])
     found = compiled(exact.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
+
+
+@pytest.mark.parametrize("side", [0.08, 0.12, 0.3])
+def test_a_contact_is_as_wide_on_a_small_sheet(side):
+    """An image of as many pixels on every sheet would leave out the tails of a load on a small one."""
+    grid = [[x * side, y * side] for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]
+    skin = je.skin.parse_skin(SQUARE.format(side=side, grid=grid))
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    noise = jnp.full(54, 1e-3 * jnp.sqrt(jnp.mean(je.forward(model) ** 2)))
+    small = prepare_tracker(model, skin, noise=noise, sigma=model.background)
+    pressed = jnp.array([[0.45 * side, 0.4 * side, np.log(0.012), np.log(1.0), 0, 0]])
+    pressure = load_pressure(pressed[0], model.centroids)
+    v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
+    wanted = small.filter.compress @ (v - je.forward(model))
+    sheet = small.filter.sheet
+    found = sheet.shown(pressed, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.near(pressed)).readings
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
