@@ -167,7 +167,7 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
 
 
 def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
-    """Distance between estimated and true positions, m."""
+    """Distance between estimated and true positions, (..., 2) m each; (...) m, with a gradient of zero at zero."""
     return _length(jnp.asarray(estimated) - jnp.asarray(true))
 
 

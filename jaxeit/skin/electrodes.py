@@ -92,7 +92,7 @@ class AbstractAreaElectrode(AbstractElectrode):
 
     @abstractmethod
     def elements(self, space: Space) -> np.ndarray:
-        """Numbers of the triangles under the electrode."""
+        """Numbers of the triangles under the electrode, (triangles,)."""
 
     def pieces(self, space: Space, domain: Domain) -> Pieces:
         inside = self.elements(space)
