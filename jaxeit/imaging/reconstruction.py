@@ -136,7 +136,7 @@ class AbstractReconstructor(AbstractPictured):
 
     @property
     def channels(self) -> Bool[Array, " readings"]:
-        """Readings that are used."""
+        """Whether each reading is used, (readings,)."""
         return self.whitening.channels
 
 

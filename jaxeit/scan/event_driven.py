@@ -140,7 +140,7 @@ class EventScanSettings:
             )
 
     def limits(self, pads: int) -> tuple[Float[np.ndarray, " pads"], Float[np.ndarray, " pads"]]:
-        """Onset and release of every pad, Pa.
+        """Onset and release of every pad, (pads,) Pa each.
 
         Raises:
             ProtocolError: if they are not finite and above zero, or a release is above its onset.

@@ -65,7 +65,7 @@ class AbstractElectrode(ABC):
         """
 
     def elements(self, space: Space) -> np.ndarray:
-        """Numbers of the triangles under the electrode; none for an electrode without area."""
+        """Numbers of the triangles under the electrode, (triangles,); none for an electrode without area."""
         return np.zeros(0, int)
 
     def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
