@@ -27,14 +27,13 @@ import numpy as np
 import jaxeit as je
 from calib.calibration.localisation.contact_tracks import ContactTracks
 from calib.calibration.localisation.law_lessons import LawLessons
-from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking, fit_model_error, prepare_tracker
 
 from .force_ways import HELD, LIFTED, PAD_ERROR, SECONDS
 from .harness import Question, Run
-from .problems import BLANKS
-from .rows import Row, grouped
-from .worn_skins import FORCES, Wear, presses, recorded, true_map
+from .problems import Pressed, fit_model
+from .rows import Row, grouped, rounded
+from .second_simulator import FORCES, Wear, presses, recorded, true_map
 
 FIRST_SEED = 7300
 # Presses after which the force is asked, and skins.
@@ -45,7 +44,6 @@ RESTING = 10  # frames of a contact that no pad tells
 WIDTHS = (0.008, 0.018)  # m, of Gaussian loads
 NONE, DEAD = "none", "one is dead"  # pads that tell forces
 INTERVAL = 1.645  # standard errors in half a 90 % interval
-SNR = 1e-3  # noise of a reading over the root mean square of the readings
 
 
 class Skin(NamedTuple):
@@ -64,13 +62,12 @@ def second_simulator(model: je.Model, seed: int, count: int) -> Skin:
     rng = np.random.default_rng([seed, 17])
     given = presses(rng, count)
     found = recorded(seed, given, Wear())
-    noise = np.full(found.untouched.size, found.noise)
-    blank = found.untouched + noise / np.sqrt(BLANKS) * rng.normal(size=noise.size)
-    image = je.prepare(model, basis=je.Pixels(20), noise=noise)
+    blank = found.blank(rng)
+    image = je.prepare(model, basis=je.Pixels(20), noise=found.std)
     masks, centres = np.asarray(je.pad_masks(je.load_skin("testbed"), image).weights), np.asarray(image.centres)
     pads = np.array([true_map(press, centres) for press in given]) @ masks.T
     forces = np.array([press.forces.sum() for press in given])
-    return Skin(found.change, forces, pads, noise, np.asarray(je.fit_background(model, blank)))
+    return Skin(found.change, forces, pads, found.std, np.asarray(je.fit_background(model, blank)))
 
 
 def own_scene(model: je.Model, seed: int, count: int) -> Skin:
@@ -90,9 +87,8 @@ def own_scene(model: je.Model, seed: int, count: int) -> Skin:
     pixels = je.Pixels(20).on(true)
     on_pixels = np.array([pixels.restrict(f * one * true.areas) for f, one in zip(forces, spread, strict=True)])
     pads = on_pixels @ np.asarray(je.pad_masks(skin, pixels).weights).T
-    noise = np.full(v0.size, SNR * np.sqrt(np.mean(v0**2)))
-    blank = v0 + noise / np.sqrt(BLANKS) * rng.normal(size=noise.size)
-    return Skin(np.array(volts) - v0, forces, pads, noise, np.asarray(je.fit_background(model, jnp.asarray(blank))))
+    found = Pressed.of(v0, np.array(volts) - v0)
+    return Skin(found.change, forces, pads, found.std, np.asarray(je.fit_background(model, found.blank(rng))))
 
 
 SCENES: dict[str, Callable[[je.Model, int, int], Skin]] = {
@@ -158,7 +154,7 @@ def judged(tracks: tuple[Track, ...], true: float) -> Row:
 def one_scene(run: Run, scene: str) -> Iterator[Row]:
     """Errors of force on skins of one kind."""
     (stages, given), rows = run.sizes((STAGES[scene], 15), ((0, 2), 2)), []
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     for seed in range(FIRST_SEED, FIRST_SEED + (1 if run.smoke else SKINS[scene])):
         skin = SCENES[scene](model, seed, max(stages) + 1 + given)
         session = Session(model, skin, seed, min(PROBES, max(stages)))
@@ -181,12 +177,9 @@ def summary(presses: int, rows: list[Row]) -> Row:
     """Both ways after so many presses."""
     found: Row = {"presses": presses, "frames": len(rows) // 2, "skins": len({row["seed"] for row in rows})}
     for way, mine in grouped(rows, "way").items():
-        error = np.array([row["error"] for row in mine])
-        found |= {
-            f"{way} error": round(float(np.median(error)), 4),
-            f"{way} error 90": round(float(np.quantile(error, 0.9)), 4),
-            f"{way} covered": round(float(np.mean([row["covered"] for row in mine])), 4),
-        }
+        error, covered = (np.array([row[name] for row in mine]) for name in ("error", "covered"))
+        figures = {"error": np.median(error), "error 90": np.quantile(error, 0.9), "covered": covered.mean()}
+        found |= rounded({f"{way} {name}": value for name, value in figures.items()})
     return found | {"used": len({row["seed"] for row in rows if row["used"]})}
 
 

@@ -13,8 +13,6 @@ through the law of pressure, and presses on a contact layer whose gain is uneven
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 from typing import Any
 
@@ -72,11 +70,8 @@ class Bench:
     def pressed(self, effects: tuple) -> np.ndarray:
         """Change of all readings by the presses, (presses, candidates) V, on a skin with these effects."""
         loads = np.full((len(self.sites), 1), LOAD)
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "every.toml"
-            path.write_text(je.skin.with_rows(self.skin, self.every).toml, encoding="utf-8")
-            edge = 0.06 if self.smoke else 0.026
-            return pressed(effects, self.sites[:, None], loads, edge, skin=str(path)).change
+        whole, edge = je.skin.with_rows(self.skin, self.every), 0.06 if self.smoke else 0.026
+        return pressed(effects, self.sites[:, None], loads, edge, skin=whole).change
 
     def seen(self, pattern: np.ndarray, change: np.ndarray) -> np.ndarray:
         """What a scan reads of the presses, less the untouched skin, without noise, (presses, readings) V."""

@@ -17,7 +17,6 @@ second simulator with other coats, tips and noise. None should be announced.
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,8 +34,8 @@ from jaxeit.imaging import KnownPresses, find_misplacement, fit_electrodes
 from tests.oracles import bench as oracle
 
 from .harness import ROOT, Question, Run
-from .rows import Row, averaged, grouped
-from .worn_skins import Wear, presses, recorded
+from .rows import Row, group_means, rounded
+from .second_simulator import Wear, presses, recorded, session_of
 
 SCENE = ROOT / "data" / "sessions" / "testbed_grid.toml"
 MISPLACED = 1.1e-3  # m
@@ -51,8 +50,7 @@ def measure(run: Run) -> Iterator[Row]:
         there = je.skin.with_positions(skin, skin.electrode_positions + shift)
         rows += list(calibrated(bench, skin, there, run.sizes((FILED, FITTED, TRUE), (FILED, TRUE))))
         print(f"seed {seed}", flush=True)
-    means = [averaged(of_skin) | {"skins": len(of_skin)} for of_skin in grouped(rows, "electrodes").values()]
-    yield {"rows": means}
+    yield {"rows": group_means(rows, "electrodes", count="skins")}
 
 
 def calibrated(bench: Bench, skin: je.Skin, there: je.Skin, ways: tuple[str, ...]) -> Iterator[Row]:
@@ -107,7 +105,7 @@ def summary(every: list[Row], fitted: list[Row]) -> Row:
     found["said_fitted"] = np.mean([row["said_fitted"] for row in fitted])
     for name in filter(lambda name: "place" in name, fitted[0]):
         found[name] = np.median([each for row in fitted for each in row[name]])
-    return {name: round(float(value), 3) for name, value in found.items()}
+    return rounded(found, 3)
 
 
 class Drilled:
@@ -158,24 +156,10 @@ class Drilled:
         yield f"load_place{way}_mm", [1e3 * float(one) for one in nearest if np.isfinite(one)]
 
 
-def said_by_check(session: calib.Session) -> str:
-    """What `jaxeit check` says of the places of the electrodes."""
-    return said_by(check_session(session), session)
-
-
 def said_by(report: CheckReport, session: calib.Session) -> str:
-    """The same, by a report without it."""
+    """What `jaxeit check` says of the places of the electrodes, whose report is given without that."""
     report = with_placement(report, session)
     return next((finding.what for finding in report.findings if finding.where == WHERE), "")
-
-
-@contextmanager
-def session_of(bench: oracle.Bench) -> Iterator[calib.Session]:
-    """A session of the second simulator."""
-    with tempfile.TemporaryDirectory() as folder:
-        oracle.write(Path(folder) / "session.h5", oracle.simulate(bench))
-        with calib.open_session(Path(folder) / "session.h5") as session:
-            yield session
 
 
 HONEST_SEED = 7500
@@ -203,8 +187,10 @@ def honest(run: Run) -> Iterator[Row]:
         with calib.open_session(path) as session:
             sizes.append(size_of(session))
     for scene in run.sizes(("hot_day", "sliding", "two_contacts", "chest_two_contacts"), ()):
-        with tempfile.TemporaryDirectory() as folder, simulated(scene, Path(folder)) as session:
-            sizes.append(size_of(session))
+        with tempfile.TemporaryDirectory() as folder:
+            path = simulate(load_bench(scene), Path(folder) / "session.h5")
+            with calib.open_session(path) as session:
+                sizes.append(size_of(session))
     for name, bench in run.sizes(list(HONEST.items()), []):
         for seed in range(HONEST_SEED, HONEST_SEED + 2):
             with session_of(replace(bench, skin_seed=seed, seed=seed)) as session:
@@ -212,12 +198,7 @@ def honest(run: Run) -> Iterator[Row]:
             print(name, seed, sizes[-1], flush=True)
     said, size, evidence = np.array(sizes).T
     row = {"sessions": len(said), "said": float(said.sum()), "size_mm": size.max(), "evidence": evidence.max()}
-    yield {"honest": [{name: round(float(value), 3) for name, value in row.items()}]}
-
-
-def simulated(scene: str, folder: Path) -> calib.Session:
-    """A session of a shipped scene, by the first simulator."""
-    return calib.open_session(simulate(load_bench(scene), folder / "session.h5"))
+    yield {"honest": [rounded(row, 3)]}
 
 
 def size_of(session: calib.Session) -> tuple[float, float, float]:

@@ -69,22 +69,24 @@ def conductivities(cells: int, batch: int, dtype: str) -> jax.Array:
     return jnp.asarray(problem.sigma * (1 + 0.5 * press), dtype)
 
 
-def row(found: Program, dtype: str, cells: int, batch: int, off: float, repeats: int) -> Row:
-    """Times and memory of a program."""
+def median_ms(call: Callable, repeats: int, budget: float) -> float:
+    return 1e3 * float(np.median(in_turns({0: call}, repeats, budget)[0]))
+
+
+def row(call: Callable, dtype: str, cells: int, batch: int, off: float, repeats: int, budget: float = 2.0) -> Row:
+    """Times of a call for a batch, whose results are off by so much of the largest value."""
     if not off <= LOOSE[dtype]:
         raise SystemExit(f"{dtype} is off by {off:.1e} of the largest value: nothing is timed")
-    ms = 1e3 * float(np.median(in_turns({0: found.call}, repeats, budget=2.0)[0]))
+    ms, nodes = median_ms(call, repeats, budget), len(problem_of(cells).mesh.nodes)
+    about: Row = {"dtype": dtype, "nodes": nodes, "batch": batch, "difference": off}
+    return about | {"median_ms": ms, "per_s": 1e3 * batch / ms}
+
+
+def cost(found: Program) -> Row:
+    """What a program takes before it runs, and in memory."""
     memory = found.compiled.memory_analysis()
-    return {
-        "dtype": dtype,
-        "nodes": len(problem_of(cells).mesh.nodes),
-        "batch": batch,
-        "median_ms": ms,
-        "per_s": 1e3 * batch / ms,
-        "compile_s": found.compile_s,
-        "memory_mb": (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 1e6,
-        "difference": off,
-    }
+    used = (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 1e6
+    return {"compile_s": found.compile_s, "memory_mb": used}
 
 
 # --- what is computed: for a model, and one conductivity
@@ -125,7 +127,7 @@ def measured(what: str, cells: int, dtype: str, batch: int, repeats: int, dense:
     out = found.call()
     chosen = np.unique(np.linspace(0, batch - 1, CHECKED).astype(int)) if what == "forward" else [batch - 1]
     off = max(difference(np.asarray(out[k], float), exact(what, cells, np.asarray(sigma[k], float))) for k in chosen)
-    return {"what": what} | row(found, dtype, cells, batch, off, repeats)
+    return {"what": what} | row(found.call, dtype, cells, batch, off, repeats) | cost(found)
 
 
 # --- parts
@@ -197,23 +199,10 @@ def by_cudss(cells: int, dtype: str, batch: int) -> Row:
     prepare_s, tool = seconds(cudss.Forward, problem_of(cells), batch, dtype)
     out = tool(sigma)
     off = difference(np.asarray(out[-1], float), exact("forward", cells, np.asarray(sigma[-1], float)))
-    if not off <= LOOSE[dtype]:
-        raise SystemExit(f"{cudss.NAME} is off by {off:.1e} of the largest value: nothing is timed")
-    ms = 1e3 * float(np.median(in_turns({0: lambda: tool(sigma)}, 10, budget=3.0)[0]))
-    solver = 1e3 * float(np.median(in_turns({0: partial(tool.batch.solve, tool.assembled(sigma))}, 10, 3.0)[0]))
+    found = {"tool": cudss.NAME, "what": "forward"} | row(lambda: tool(sigma), dtype, cells, batch, off, 10, 3.0)
+    found |= {"solver_ms": median_ms(partial(tool.batch.solve, tool.assembled(sigma)), 10, 3.0)}
     tool.batch.close()
-    return {
-        "tool": cudss.NAME,
-        "what": "forward",
-        "dtype": dtype,
-        "nodes": len(problem_of(cells).mesh.nodes),
-        "batch": batch,
-        "median_ms": ms,
-        "solver_ms": solver,
-        "per_s": 1e3 * batch / ms,
-        "prepare_s": prepare_s,
-        "difference": off,
-    }
+    return found | {"prepare_s": prepare_s}
 
 
 def learning(run: Run) -> Iterator[Row]:

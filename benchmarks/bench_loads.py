@@ -30,14 +30,13 @@ from matplotlib.figure import Figure
 from scipy.stats import binom, chi2, norm
 
 import jaxeit as je
-from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
 from jaxeit.contacts.loads.comparison import Comparison
 
 from .clock import seconds
 from .harness import Question, Run
-from .problems import Pressed, matched, pressed, uneven
-from .rows import Row, grouped
+from .problems import Pressed, fit_model, matched, pressed, uneven
+from .rows import Row, grouped, rounded
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.015, 0.02, 0.025, 0.03, 0.04), (1.0, 1 / 3)
@@ -151,7 +150,7 @@ def prepared(model: je.Model, found: Pressed, seed: int, decibels: int, known: b
     rng = np.random.default_rng([seed, decibels, known])
     found = found._replace(noise=found.noise * 10 ** ((60 - decibels) / 20))
     blank, frames = found.frames(rng)
-    noise = np.full(blank.size, found.noise)
+    noise = found.std
     sheet = je.fit_background(model, blank) if known else None
     finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
     fitter: LoadFitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
@@ -217,8 +216,8 @@ def means(every: list[Row], key: str) -> list[Row]:
     """Means of rows that share a name."""
     rows = []
     for name, mine in grouped(every, key).items():
-        found = {k: round(float(np.mean([row[k] for row in mine])), 4) for k in mine[0] if k != key}
-        rows.append({key: name, "frames": len(mine)} | found)
+        found = {k: np.mean([row[k] for row in mine]) for k in mine[0] if k != key}
+        rows.append({key: name, "frames": len(mine)} | rounded(found))
     return rows
 
 
@@ -242,7 +241,7 @@ def calibration_error(rows: list[Row]) -> float:
 def kinds(run: Run, skin: str = "testbed", seeds: int = 3) -> tuple[list[Row], list[Row]]:
     """Rows of all touches of a skin, and the reliability of their probabilities."""
     seeds, singles, others = run.sizes((seeds, 10, 3), (1, 1, 1))
-    model = je.discretise(je.Scene(je.load_skin(skin)), FIDELITY)
+    model = fit_model(skin)
     low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
     every, stated, true = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + seeds):
@@ -278,7 +277,7 @@ def measure_ellipses(run: Run) -> Iterator[Row]:
 
 def _cases(seeds: Iterable[int], count: int, measure: Callable[..., Iterable[Row]]) -> Iterator[Row]:
     """What a measure says of single tips of all shapes, at all levels of noise, on known and unknown sheets."""
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     for seed in seeds:
         rng = np.random.default_rng(seed)
         given = [list(shaped(rng, shape, count)) for shape in SHAPES]

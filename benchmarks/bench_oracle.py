@@ -17,7 +17,7 @@ error, with that which the presses of the calibration show, and with a contact l
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,10 +31,11 @@ from calib.calibration.evaluation import Evaluation
 from calib.calibration.localisation.ellipses import INSIDE_90
 from calib.fitting.validation import rmse
 from calib.session import Session, open_archive
-from tests.oracles.bench import Bench, Faults, simulate, write
+from tests.oracles.bench import Bench, Faults
 
 from .harness import Question, Run
-from .rows import Row, averaged, grouped
+from .rows import Row, averaged, group_means, rounded
+from .second_simulator import session_of
 
 BOTH = {
     "none": Faults(),
@@ -94,12 +95,8 @@ def _row(name: str, where: str, calibrations: list[Calibration], benches: list[B
     return {"rows": [row]}
 
 
-@contextmanager
-def _recorded(bench: Bench, faults: Faults, seed: int) -> Iterator[Session]:
-    with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder) / "session.h5", simulate(replace(bench, faults=faults, seed=seed)))
-        with calib.open_session(Path(folder) / "session.h5") as session:
-            yield session
+def _recorded(bench: Bench, faults: Faults, seed: int) -> AbstractContextManager[Session]:
+    return session_of(replace(bench, faults=faults, seed=seed))
 
 
 def predicted(calibration: Calibration, bench: Bench, faults: Faults) -> Row:
@@ -112,7 +109,7 @@ def predicted(calibration: Calibration, bench: Bench, faults: Faults) -> Row:
     row |= {name: value for name, value in found.summary().items() if name.startswith("coverage")}
     for name, place in found.estimated.items():
         row[f"{name}_mm"] = 1e3 * float(np.linalg.norm(place - found.position, axis=1).mean())
-    return {name: round(float(value), 4) for name, value in row.items()}
+    return rounded(row)
 
 
 # --- a week later
@@ -134,7 +131,7 @@ def weeks(run: Run) -> Iterator[Row]:
         for moved, faults in (("yes", WEEK), ("no", Faults())):
             rows += [{"moved": moved} | row for row in updated(calibration, skin, faults, run.smoke)]
             print(rows[-1], flush=True)
-    yield {"weeks": [averaged(rows) | {"skins": len(rows)} for rows in grouped(rows, "gains", "moved").values()]}
+    yield {"weeks": group_means(rows, "gains", "moved", count="skins")}
 
 
 def updated(calibration: Calibration, bench: Bench, faults: Faults, smoke: bool) -> Iterator[Row]:
@@ -185,7 +182,7 @@ def tracks(run: Run) -> Iterator[Row]:
             with _recorded(replace(later, skin_seed=seed), faults, seed=3) as session:
                 rows += [{"skin": name, "model error": way} | _followed(c, session) for way, c in ways.items()]
             print(*rows[-len(ways) :], sep="\n", flush=True)
-    yield {"tracks": [averaged(same) | {"skins": len(same)} for same in grouped(rows, "skin", "model error").values()]}
+    yield {"tracks": group_means(rows, "skin", "model error", count="skins")}
 
 
 def _followed(calibration: Calibration, session: Session) -> Row:

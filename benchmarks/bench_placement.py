@@ -9,8 +9,6 @@ parts of the sheet.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import jax.numpy as jnp
@@ -78,10 +76,7 @@ def errors(run: Run, skin: je.Skin, noise: float, bounds: tuple[np.ndarray, np.n
 def fits(run: Run, skin: je.Skin, model: je.Model, noise: float, sites: np.ndarray) -> dict[str, np.ndarray]:
     """Errors of the contacts fitted at sites, (presses,) mm, for both noises and for none; NaN: none found."""
     loads = np.full((len(sites), 1), LOAD)
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "skin.toml"
-        path.write_text(skin.toml, encoding="utf-8")
-        change = pressed((), sites[:, None], loads, 0.06 if run.smoke else 0.026, skin=str(path)).change
+    change = pressed((), sites[:, None], loads, 0.06 if run.smoke else 0.026, skin=skin).change
     settings = je.contacts.ContactSettings(most=2, columns=21 if run.smoke else 41)
     rng, errors = np.random.default_rng(SEED + 1), {}
     for name, std, part in (("fit", noise, 1.0), ("loud", LOUD * noise, 1.0), ("exact", noise, 0.0)):

@@ -27,56 +27,27 @@ import jax
 import numpy as np
 
 import jaxeit as je
-from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, Proposal
-from tests.oracles.bench import contact
-from tests.oracles.bench.mesh import make_mesh
-from tests.oracles.bench.session import coating, transfer_frames
-from tests.oracles.bench.sheet import make_sheet, readings
-from tests.oracles.bench.skin import SKINS, Skin, read_skin
 
 from .bench_loads import Touch, reliability, touches
 from .clock import seconds
 from .harness import Question, Run
-from .problems import BLANKS, matched
-from .rows import Row, grouped
+from .problems import Pressed, fit_model, matched
+from .rows import Row, grouped, rounded
+from .second_simulator import Press, Wear, described, recorded as pressed
 
 NAMES = ("one", "two, 1:1, 20 mm", "two, 1:1, 30 mm", "edge, 40 mm", "edge, 60 mm", "three")
 SHIPPED = ("testbed", "chest")
-TIP, SCATTER, COAT, SPACING = 0.012, 0.1, 0.15, 3e-3
+TIP = 0.012  # m
 FIRST_SEED = 4300
 DEAD = 7  # electrode
 FITS, NETWORK, BOTH = "fits", "network", "both"
 
 
-class Recorded(NamedTuple):
-    """Readings of the untouched skin (readings,) V, their change by each touch (touches, readings) V, without noise."""
-
-    untouched: np.ndarray
-    change: np.ndarray
-
-    @property
-    def noise(self) -> float:
-        """Of a reading, 60 dB below their rms, V."""
-        return 1e-3 * float(np.sqrt(np.mean(self.untouched**2)))
-
-
-def recorded(name: str, seed: int, given: list[Touch], misplaced: float = 0.0) -> Recorded:
+def recorded(name: str, seed: int, given: list[Touch], misplaced: float = 0.0) -> Pressed:
     """A skin of a name and a seed under touches, by the second simulator."""
-    skin, own = described(name), np.random.default_rng([seed, 11])
-    bolts = skin.bolts + misplaced * own.standard_normal(skin.bolts.shape)
-    layer = contact.make_layer(skin, bolts, SCATTER, own)
-    mesh = make_mesh(skin, bolts, SPACING)
-    sigma = coating(mesh.points[mesh.triangles].mean(1), COAT, own) / skin.resistance
-    sheet = make_sheet(mesh, sigma, skin.contact)
-    volts = [readings(z, skin.pattern, skin.current) for z in transfer_frames(layer, sheet, _loads(layer, given))]
-    untouched = readings(sheet.untouched, skin.pattern, skin.current)
-    return Recorded(untouched, np.array(volts) - untouched)
-
-
-def described(name: str) -> Skin:
-    """A shipped skin, as the second simulator reads it."""
-    return read_skin(SKINS / f"{name}.toml")
+    tips = [Press(touch.places[touch.loads > 0], touch.loads[touch.loads > 0], TIP) for touch in given]
+    return pressed(seed, tips, Wear(misplaced=misplaced), name)
 
 
 def touched(name: str, rng: np.random.Generator, singles: int, others: int) -> list[Touch]:
@@ -90,16 +61,6 @@ def counted(touch: Touch) -> LoadKind:
     length = float(np.linalg.norm(there[-1] - there[0]))
     least = {LoadKind.TWO: usual.nearest, LoadKind.EDGE: usual.shortest}.get(touch.kind, 0.0)
     return touch.kind if length >= least else LoadKind.ONE
-
-
-def _loads(layer: contact.Layer, given: list[Touch]) -> np.ndarray:
-    """Load on each patch, (touches, patches) N."""
-
-    def of_touch(touch: Touch) -> np.ndarray:
-        tips = zip(touch.places, touch.loads, strict=True)
-        return sum(load * contact.shares(layer, place, "flat", TIP, load) for place, load in tips if load)
-
-    return np.array([of_touch(touch) for touch in given])
 
 
 class Answer(NamedTuple):
@@ -141,9 +102,8 @@ def noisy_frames(name: str, seed: int, singles: int, others: int) -> Iterator[tu
     """Touches of `NAMES` on the skin of a seed, with a noisy frame each."""
     rng = np.random.default_rng(seed)
     given = [touch for touch in touched(name, rng, singles, others) if touch.name in NAMES]
-    found, model = recorded(name, seed, given), je.discretise(je.Scene(je.load_skin(name)), FIDELITY)
-    blank = found.untouched + found.noise / np.sqrt(BLANKS) * rng.normal(size=found.untouched.size)
-    noise, sheet = np.full(blank.size, found.noise), je.fit_background(model, blank)
+    found, model = recorded(name, seed, given), fit_model(name)
+    noise, sheet = found.std, je.fit_background(model, found.blank(rng))
     fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
     ready = Ready(je.contacts.load_proposal(name), fitter, je.prepare_contacts(model, noise=noise, sigma=sheet))
     for touch, change in zip(given, found.change, strict=True):
@@ -208,8 +168,7 @@ def _means(every: list[Row]) -> Iterator[Row]:
         for name, mine in grouped(of_way, "name").items():
             means = {key: float(np.mean([row[key] for row in mine])) for key in ("told", "several", "surprise")}
             means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
-            rounded = {key: round(value, 4) for key, value in means.items()}
-            yield {"touch": name, "way": way, "frames": len(mine)} | rounded
+            yield {"touch": name, "way": way, "frames": len(mine)} | rounded(means)
 
 
 def stated(run: Run) -> Iterator[Row]:
@@ -239,7 +198,7 @@ def _announced(name: str, unlike: list[Row]) -> list[Row]:
 
 
 def _unlike(
-    name: str, proposal: Proposal, seed: int, given: list[Touch], found: Recorded, rng: np.random.Generator
+    name: str, proposal: Proposal, seed: int, given: list[Touch], found: Pressed, rng: np.random.Generator
 ) -> Iterator[tuple[str, float]]:
     """Share of frames that are announced as unlike the training, for several kinds of frames."""
     noise = found.noise * rng.normal(size=found.change.shape)

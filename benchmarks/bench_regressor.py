@@ -29,16 +29,15 @@ import numpy as np
 from scipy.stats import chi2
 
 import jaxeit as je
-from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.tracking import LearnedLayer
 
 from .clock import seconds
 from .force_ways import Answer, Bench, Way
 from .harness import Question, Run
-from .problems import matched
+from .problems import fit_model, matched
 from .regressor import STEPS, Adapted, prepared
 from .rows import Row, grouped
-from .worn_skins import Press, Wear, true_map
+from .second_simulator import Press, Wear, true_map
 
 FIRST_SEED = 5200
 PRESSES = 120  # of ordinary use
@@ -116,7 +115,7 @@ def _trained(kept: str | None, skins: int, steps: int) -> Adapted:
 def compared(run: Run) -> Iterator[Row]:
     """All ways on fresh skins."""
     skins, count = run.sizes((6, (PRESSES, 8, 5)), (1, (2, 1, 1)))
-    adapted, model = trained(run), je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    adapted, model = trained(run), fit_model()
     every: list[Row] = []
     for seed in range(FIRST_SEED, FIRST_SEED + skins):
         every += measured(Bench(adapted, model, seed, Wear(), count))
@@ -127,7 +126,7 @@ def compared(run: Run) -> Iterator[Row]:
 def unlike(run: Run) -> Iterator[Row]:
     """Single tips on skins that are not as those of the training: what it costs, and what says so."""
     skins, count = run.sizes((1, (30, 10, 0)), (1, (30, 1, 0)))
-    adapted, model = trained(run), je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    adapted, model = trained(run), fit_model()
     for what, wear in UNLIKE.items():
         rows: list[Row] = []
         for seed in range(FIRST_SEED + 100, FIRST_SEED + 100 + skins):
@@ -154,7 +153,7 @@ def _unlike(bench: Bench) -> Iterator[Row]:
 def drift(run: Run) -> Iterator[Row]:
     """Presses of an hour on skins that age: each is told from its readings alone before it teaches anything."""
     skins, count = run.sizes((2, (AGED, 1, 0)), (1, (6, 1, 0)))
-    adapted, model = trained(run), je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    adapted, model = trained(run), fit_model()
     rows: list[Row] = []
     for seed in range(FIRST_SEED + 200, FIRST_SEED + 200 + skins):
         rows += _aged(Bench(adapted, model, seed, Wear(ages=True), count))

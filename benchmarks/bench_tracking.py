@@ -22,15 +22,14 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 import jaxeit as je
-from calib.calibration.localisation.load_windows import FIDELITY
 from calib.live.follower import PIECES
 from jaxeit.tracking import Tracker, Tracking, prepare_tracker
 
 from .bench_loads import NOISES, SHAPES, TIP_SPREAD, WITHIN, Touch, shaped
 from .clock import seconds
 from .harness import Question, Run, with_one_blas_thread
-from .problems import matched, pressed, uneven
-from .rows import Row, averaged, grouped
+from .problems import fit_model, matched, pressed, uneven
+from .rows import Row, group_means, rounded
 
 RATE, RISE = 100.0, 0.1  # frames a second; s until a tip presses with its full force
 LOAD, SPREAD = 15.0, 0.012  # N; m, width of the load of a tip
@@ -135,7 +134,7 @@ class Bench:
         blank = pressed(self._effects, np.full((1, 1, 2), 0.1), np.zeros((1, 1)))
         blank = blank._replace(noise=blank.noise * 10 ** ((60 - decibels) / 20))
         untouched, _ = blank.frames(self.rng)
-        self.noise = np.full(untouched.size, blank.noise)
+        self.noise = blank.std
         sheet = je.fit_background(model, untouched) if known else None
         self.tracker: Tracker = prepare_tracker(model, self.skin, noise=self.noise, sigma=sheet)
 
@@ -206,7 +205,7 @@ def judged(bench: Bench, scene: Scene) -> Row:
 def scenes(run: Run) -> Iterator[Row]:
     """Each kind of scene on several skins."""
     seeds, trials = run.sizes((4, 5), (1, 1))
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     rows: list[Row] = []
     for seed in range(400, 400 + seeds):
         bench, rng = Bench(model, seed), np.random.default_rng(seed)
@@ -214,10 +213,7 @@ def scenes(run: Run) -> Iterator[Row]:
             every = [crossing(rng), *(sequence(rng, d) for d in DISTANCES), *(edge(rng, length) for length in LENGTHS)]
             rows += [judged(bench, scene) for scene in every]
         print(f"seed {seed}", flush=True)
-    yield {
-        "seeds": seeds,
-        "scenes": [averaged(same) | {"trials": len(same)} for same in grouped(rows, "scene").values()],
-    }
+    yield {"seeds": seeds, "scenes": group_means(rows, "scene", count="trials")}
 
 
 def delayed(bench: Bench, scene: Scene, frames: list[Shown], pieces: int | None) -> Row:
@@ -241,7 +237,7 @@ def delayed(bench: Bench, scene: Scene, frames: list[Shown], pieces: int | None)
 def schedules(run: Run) -> Iterator[Row]:
     """The same frames with looks into unexpected ones at once, and piece by piece."""
     seeds, trials = run.sizes((2, 3), (1, 1))
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     rows: list[Row] = []
     for seed in range(600, 600 + seeds):
         bench, rng = Bench(model, seed), np.random.default_rng(seed)
@@ -250,13 +246,12 @@ def schedules(run: Run) -> Iterator[Row]:
                 frames = bench.frames(scene)
                 rows += [delayed(bench, scene, frames, pieces) for pieces in (None, PIECES)]
         print(f"seed {seed}", flush=True)
-    every = grouped(rows, "scene", "schedule").values()
-    yield {"schedules": [averaged(same) | {"trials": len(same)} for same in every]}
+    yield {"schedules": group_means(rows, "scene", "schedule", count="trials")}
 
 
 def times(run: Run) -> Iterator[Row]:
     """Wall and processor time of ordinary frames with one and two contacts, in turn, and of pieces of looks."""
-    bench = Bench(je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY), 700)
+    bench = Bench(fit_model(), 700)
     (repeats,) = run.sizes((300,), (3,))
     scene = sequence(np.random.default_rng(700), 0.04)
     frames = bench.frames(scene)
@@ -273,13 +268,13 @@ def times(run: Run) -> Iterator[Row]:
         wall, used = 1e3 * np.transpose(found)
         row = {"contacts": count, "p50_ms": np.median(wall), "p99_ms": np.quantile(wall, 0.99)}
         rows.append(row | {"processor_p50_ms": np.median(used), "processor_p10_ms": np.quantile(used, 0.1)})
-    yield {"times": [{name: round(float(value), 3) for name, value in row.items()} for row in rows]}
+    yield {"times": [rounded(row, 3) for row in rows]}
 
 
 def learning(run: Run) -> Iterator[Row]:
     """Presses at unknown places, one after the other: place and force, as the gain of the contact layer is learned."""
     seeds, count = run.sizes((4, PRESSES), (1, 2))
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     rows: list[Row] = []
     for seed in range(500, 500 + seeds):
         bench = Bench(model, seed)
@@ -307,13 +302,13 @@ def learning(run: Run) -> Iterator[Row]:
                     }
                 )
         print(f"seed {seed}", flush=True)
-    yield {"presses": [averaged(same, "none") for same in grouped(rows, "learned", "presses").values()]}
+    yield {"presses": group_means(rows, "learned", "presses", sd_of="none")}
 
 
 def coverage(run: Run) -> Iterator[Row]:
     """Single tips of several shapes, each followed while it presses and rests."""
     seeds, count = run.sizes((3, 4), (1, 1))
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     rows: list[Row] = []
     for seed in range(FIRST_SHAPES, FIRST_SHAPES + seeds):
         rng, changes = np.random.default_rng(seed), {}
@@ -330,7 +325,7 @@ def coverage(run: Run) -> Iterator[Row]:
                         rows.append({"shape": touch.name, "decibels": decibels, "sheet": _sheet(known)} | row)
         print(f"shapes, seed {seed}", flush=True)
     keys = ("shape", "decibels", "sheet", "pads")
-    yield {"coverage": [averaged(same, "none") | {"trials": len(same)} for same in grouped(rows, *keys).values()]}
+    yield {"coverage": group_means(rows, *keys, count="trials", sd_of="none")}
 
 
 def _sheet(known: bool) -> str:

@@ -11,9 +11,8 @@ import jaxeit as je
 from jaxeit.contacts import Loads
 from jaxeit.tracking import LearnedLayer, Tracker, prepare_tracker
 
-from .problems import BLANKS
 from .regressor import Adapted, Belief
-from .worn_skins import Wear, pairs, presses, recorded, true_map
+from .second_simulator import Wear, pairs, presses, recorded, true_map
 
 STAGES = (0, 30, 120)  # presses of ordinary use, after which the ways are asked
 USUAL = 0.012  # m, width of a load
@@ -67,12 +66,12 @@ class Bench:
         self.given = presses(rng, count[1], wear.tip) + pairs(rng, count[2])
         found = recorded(seed, [*self.used, *self.given], wear)
         self.changes, self.frames = np.split(found.change, [len(self.used)])
-        self.noise = np.full(found.untouched.size, found.noise)
+        self.noise = found.std
         self.frames = self.frames + self.noise * self.rng.normal(size=self.frames.shape)
         self.truth = np.array([true_map(press, adapted.centres) for press in self.given])
         self.pads = self.told(self.truth)
-        blank = found.untouched + found.noise / np.sqrt(BLANKS) * self.rng.normal(size=found.untouched.size)
-        skin, options = je.load_skin("testbed"), {"noise": self.noise, "sigma": je.fit_background(model, blank)}
+        sheet = je.fit_background(model, found.blank(self.rng))
+        skin, options = je.load_skin("testbed"), {"noise": self.noise, "sigma": sheet}
         self.image = je.prepare(model, basis=je.Pixels(20), **options)
         self.masks = je.pad_masks(skin, self.image)
         self.fitter, self.finder = (f(model, **options) for f in (je.contacts.prepare_loads, je.prepare_contacts))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
+from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.linalg import NestedDissection
 from tests.oracles.disc import disc_potentials
 from tests.oracles.rectangle import green
@@ -141,17 +142,35 @@ BLANKS = 100  # untouched frames, to whose mean the coat is fitted
 
 
 class Pressed(NamedTuple):
-    """Readings (readings,) V of the untouched testbed, their change (presses, readings) V, and the noise of one,
+    """Readings (readings,) V of an untouched skin, their change (presses, readings) V, and the noise of one,
     60 dB below their rms, V."""
 
     untouched: np.ndarray
     change: np.ndarray
     noise: float
 
+    @classmethod
+    def of(cls, untouched: np.ndarray, change: np.ndarray) -> "Pressed":
+        """Readings and changes, with the noise that belongs to them."""
+        return cls(untouched, change, 1e-3 * float(np.sqrt(np.mean(untouched**2))))
+
+    @property
+    def std(self) -> np.ndarray:
+        """The noise of each reading, (readings,) V."""
+        return np.full(self.untouched.size, self.noise)
+
+    def blank(self, rng: np.random.Generator) -> np.ndarray:
+        """The mean of the untouched frames, with noise."""
+        return self.untouched + self.noise / np.sqrt(BLANKS) * rng.normal(size=self.untouched.size)
+
     def frames(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """The mean of the untouched frames, and the changes, with noise."""
-        blank = self.untouched + self.noise / np.sqrt(BLANKS) * rng.normal(size=self.untouched.size)
-        return blank, self.change + self.noise * rng.normal(size=self.change.shape)
+        return self.blank(rng), self.change + self.noise * rng.normal(size=self.change.shape)
+
+
+def fit_model(skin: str = "testbed") -> je.Model:
+    """The mesh on which contacts are fitted to recordings of a skin."""
+    return je.discretise(je.Scene(je.load_skin(skin)), FIDELITY)
 
 
 def uneven(seed: int) -> tuple[je.effects.AbstractEffect, ...]:
@@ -168,18 +187,18 @@ def pressed(
     loads: np.ndarray,
     edge_length: float = 0.026,
     spread: float = 0.012,
-    skin: str = "testbed",
+    skin: str | je.Skin = "testbed",
 ) -> Pressed:
     """A skin pressed by tips of 20 mm at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own.
 
     The pad spreads each tip to a Gaussian of standard deviation ``spread``, m.
     """
     effects = (je.effects.LoadSpreading(spread), *effects, je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
-    scene = je.Scene(je.load_skin(skin), effects)
+    scene = je.Scene(je.load_skin(skin) if isinstance(skin, str) else skin, effects)
     model = je.discretise(scene, je.Fidelity.standard(edge_length=edge_length))
     untouched = np.asarray(je.forward(model))
     touched = np.asarray(_touched(model, jnp.asarray(places), jnp.asarray(loads)))
-    return Pressed(untouched, touched - untouched, 1e-3 * float(np.sqrt(np.mean(untouched**2))))
+    return Pressed.of(untouched, touched - untouched)
 
 
 def _forwards(model: je.Model, places: jax.Array, loads: jax.Array) -> jax.Array:

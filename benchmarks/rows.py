@@ -17,6 +17,16 @@ def grouped(rows: Iterable[Row], *names: str) -> dict[Any, list[Row]]:
     return found
 
 
+def group_means(rows: Iterable[Row], *names: str, count: str = "", sd_of: str = "") -> list[Row]:
+    """The mean of each group of rows, as `averaged` forms it, with the number of its rows under ``count``."""
+    return [averaged(same, sd_of) | ({count: len(same)} if count else {}) for same in grouped(rows, *names).values()]
+
+
+def rounded(row: Row, digits: int = 4) -> Row:
+    """The numbers of a row as floats with so many digits behind the point."""
+    return {name: round(float(value), digits) for name, value in row.items()}
+
+
 def averaged(rows: Sequence[Row], sd_of: str = "") -> Row:
     """Labels of the first row, and the mean of each number over the rows that have it (None or NaN: has not).
 

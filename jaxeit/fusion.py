@@ -101,7 +101,7 @@ class ForceMap(eqx.Module):
 
     @property
     def pressure(self) -> Float[Array, "... pixels"]:
-        """Mean pressure on each pixel, Pa; zero where a pixel misses the sheet."""
+        """Mean pressure on each pixel, (..., pixels) Pa; zero where a pixel misses the sheet."""
         area = jnp.where(self.areas > 0, self.areas, 1.0)
         return jnp.where(self.areas > 0, self.force / area, 0.0)
 

@@ -167,7 +167,7 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
 
 
 def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
-    """Distance between estimated and true positions, m."""
+    """Distance between estimated and true positions, (..., 2) m each; (...) m, with a gradient of zero at zero."""
     return _length(jnp.asarray(estimated) - jnp.asarray(true))
 
 
@@ -194,7 +194,7 @@ def inward_bias(
 
 @full_precision
 def image_sum(image: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " pixels"]) -> Float[Array, "..."]:
-    """Integral of the image over the sheet, S m^2."""
+    """Integral of the image (..., pixels) S over the sheet, (...) S m^2, by the areas of the pixels (pixels,) m^2."""
     return jnp.asarray(image) @ jnp.asarray(areas)
 
 
@@ -315,7 +315,7 @@ def _greit_figures(
 def image_correlation(
     image: Float[ArrayLike, "... pixels"], truth: Float[ArrayLike, "... pixels"], areas: Float[ArrayLike, " pixels"]
 ) -> Float[Array, "..."]:
-    """Pearson's correlation of two images over the sheet, each pixel weighted by its area; -1 to 1.
+    """Pearson's correlation (...) of two images (..., pixels), each pixel weighted by its area; -1 to 1.
 
     0 where either image is constant, so that a mean over many frames stays finite. Pixels without area are ignored.
     """

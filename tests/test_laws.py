@@ -206,13 +206,6 @@ def test_the_recorder_and_the_readers_of_files_import_no_jax():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-def test_public_functions_of_jaxeit_are_documented():
-    for name in je.__all__:
-        thing = getattr(je, name)
-        if callable(thing):
-            assert thing.__doc__, name
-
-
 @pytest.mark.parametrize("order", [1, 2])
 def test_models_hold_arrays_of_one_precision_only(skin, order):
     model = je.discretise(je.Scene(skin), je.Fidelity.draft(dtype="float32", order=order))

@@ -9,7 +9,7 @@ import pytest
 from benchmarks import bench_regressor
 from benchmarks.force_ways import peaks
 from benchmarks.regressor import Adapted, Belief, Errors, Regressor, inputs
-from benchmarks.worn_skins import Press, true_map
+from benchmarks.second_simulator import Press, true_map
 from calib.learning.inputs import Compression
 
 PIXELS, READINGS, MODES = 20, 6, 3

@@ -1,5 +1,6 @@
 """The documentation site shows every public name once, and asks nothing of the network."""
 
+import ast
 import os
 import re
 import subprocess
@@ -7,14 +8,16 @@ import sys
 from collections import Counter
 from html.parser import HTMLParser
 from importlib import import_module, util
-from inspect import isroutine
+from inspect import getdoc, isclass, isfunction, isroutine
+from itertools import pairwise
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 import calib
 import jaxeit as je
-from tests.test_laws import _public_names
+from tests.test_laws import _own_methods, _public_names
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +82,30 @@ def test_every_room_begins_with_a_program(names, pages):
         head = page.partition("\n## ")[0]
         assert "```python\n" in head, f"give the docstring of {path} a section Example"
         assert names.room_program(path).count("\n") >= 5, path
+
+
+def _described_values(module):
+    """Names of the values of a module that a docstring follows."""
+    lines = ast.parse(Path(module.__file__).read_text(encoding="utf-8")).body
+    for line, after in pairwise(lines):
+        if isinstance(line, ast.Assign | ast.AnnAssign) and isinstance(after, ast.Expr):
+            yield from (part.id for part in ast.walk(line) if isinstance(part, ast.Name))
+
+
+def _undescribed(name, thing, values):
+    """A public name without a docstring, and methods and properties that neither its class nor a base describes."""
+    if not (getdoc(thing) if isroutine(thing) or isclass(thing) else (name, id(thing)) in values):
+        yield name
+    methods = [part for part in _own_methods(thing) if isfunction(part)] if isclass(thing) else []
+    described = {part.__name__ for part in methods if part.__doc__}
+    yield from (f"{name}.{method}" for method in sorted({part.__name__ for part in methods} - described))
+
+
+def test_every_public_name_has_a_docstring(names):
+    public = {name: thing for listed in names.public_names().values() for name, thing in listed.items()}
+    ours = [module for path, module in sys.modules.items() if path.partition(".")[0] in ("jaxeit", "calib")]
+    values = {(name, id(vars(module).get(name))) for module in ours for name in _described_values(module)}
+    assert [missing for name, thing in public.items() for missing in _undescribed(name, thing, values)] == []
 
 
 def test_programs_are_found_by_what_they_import(names):

@@ -4,10 +4,9 @@ A shard is a function of the card and of its number, computed by one thread: equ
 number of processes. A shard that lies in the folder whole is not made again.
 """
 
-import contextlib
 import pickle
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -119,19 +118,10 @@ def write_training_frames(
     """
     if jobs < 1:
         raise BenchError(f"{jobs} jobs; give one or more")
-    made = FrameSet(
-        bench,
-        frames,
-        bench.seed if seed is None else seed,
-        fidelity or je.Fidelity.standard(),
-        _with_rows(pixels or je.Pixels(), bench.scene.skin),
-        scenes or RandomScenes(),
-        file_format,
-    )
-    folder = Path(folder)
-    versions = {"jaxeit": metadata.version("jaxeit"), "jax": jax.__version__, "numpy": np.__version__}
-    if file_format == "parquet":
-        versions["pyarrow"] = library("pyarrow", EXTRA).__version__
+    seed, fidelity = bench.seed if seed is None else seed, fidelity or je.Fidelity.standard()
+    pixels = _with_rows(pixels or je.Pixels(), bench.scene.skin)
+    made = FrameSet(bench, frames, seed, fidelity, pixels, scenes or RandomScenes(), file_format)
+    folder, versions = Path(folder), _versions(file_format)
     # A folder may get more frames, so that the number of frames is no part of the mark.
     mark = digest(describe(replace(made, frames=1)), str(VERSION), *versions.values())
     claim_folder(folder, card_of(made, mark, versions))
@@ -140,17 +130,20 @@ def write_training_frames(
     to_make = sum(map(made.rows, left))
     _require_space(folder, made.nbytes(left))
     begin(to_make, made.nbytes(left))
+    _run(executor, jobs, _tasks(folder, made, mark, left), lambda number: tell(made.rows(number)))
+    return WrittenFrames(folder, frames, to_make, _finish_folder(folder, made))
+
+
+def _versions(file_format: str) -> dict[str, str]:
+    """Versions of the libraries that the bytes of a shard depend on."""
+    found = {"jaxeit": metadata.version("jaxeit"), "jax": jax.__version__, "numpy": np.__version__}
+    return found | ({"pyarrow": library("pyarrow", EXTRA).__version__} if file_format == "parquet" else {})
+
+
+def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> dict[int, _Task]:
+    """The tasks that make the shards of these numbers."""
     choices, chosen = pickle.dumps(made), settings()
-    tasks = {number: _Task(str(folder.absolute()), number, choices, mark, chosen) for number in left}
-    with contextlib.ExitStack() as stack:
-        if tasks and executor is None:
-            executor = stack.enter_context(spawned_pool(min(jobs, len(tasks))))
-        if executor is not None:
-            _run(executor, tasks, lambda number: tell(made.rows(number)))
-    files.finish(folder, range(made.shards), made.described)
-    paths = [files.path(folder, number) for number in range(made.shards)]
-    _write_hashes(folder, paths)
-    return WrittenFrames(folder, frames, to_make, sum(path.stat().st_size for path in paths))
+    return {number: _Task(str(folder.absolute()), number, choices, mark, chosen) for number in numbers}
 
 
 def _with_rows(pixels: je.Pixels, skin: je.Skin) -> je.Pixels:
@@ -168,7 +161,16 @@ def _require_space(folder: Path, nbytes: int) -> None:
         )
 
 
-def _run(executor: Executor, tasks: Mapping[int, _Task], tell: Callable[[int], object]) -> None:
+def _run(executor: Executor | None, jobs: int, tasks: Mapping[int, _Task], tell: Callable[[int], object]) -> None:
+    """Make all shards, by the executor or by a pool of so many processes, which lasts as long as the work."""
+    if executor is not None:
+        _run_in(executor, tasks, tell)
+    elif tasks:
+        with spawned_pool(min(jobs, len(tasks))) as pool:
+            _run_in(pool, tasks, tell)
+
+
+def _run_in(executor: Executor, tasks: Mapping[int, _Task], tell: Callable[[int], object]) -> None:
     futures = {}
     try:
         futures = {executor.submit(make_shard, task): number for number, task in tasks.items()}
@@ -184,11 +186,15 @@ def _run(executor: Executor, tasks: Mapping[int, _Task], tell: Callable[[int], o
             future.cancel()  # after an interruption, the shards that have not begun
 
 
-def _write_hashes(folder: Path, paths: list[Path]) -> None:
-    """Write the hashes of all shards as ``sha256sum --check`` reads them."""
+def _finish_folder(folder: Path, made: FrameSet) -> int:
+    """Write what stands beside the shards, and their hashes for ``sha256sum --check``; returns their bytes."""
+    files = SHARDS[made.file_format]
+    files.finish(folder, range(made.shards), made.described)
+    paths = [files.path(folder, number) for number in range(made.shards)]
     lines = [f"{file_hash(path)}  {path.name}\n" for path in paths]
     with replacing(folder / HASHES) as temporary:
         temporary.write_text("".join(lines), encoding="ascii")
+    return sum(path.stat().st_size for path in paths)
 
 
 # --- in the worker -------------------------------------------------------------------------------

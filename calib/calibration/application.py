@@ -64,19 +64,13 @@ def apply(
     proposed = chosen_proposal(proposal, calibration.skin, tell) if loads is not None else None
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
-    calibration, outside = agreement_of_use(calibration, session)
-    doubt = placement_note(calibration.skin, _untouched(session, levels), np.asarray(calibration.recon.channels))
-    outside = (*outside, doubt) if doubt else outside
+    calibration, outside = _agreement(calibration, session, levels)
     attrs = _attributes(calibration, session) | {"ignored_errors": "\n".join(ignored), "outside": "\n".join(outside)}
     for line in outside:
         tell(f"note: {line}")
     blocks = FrameBlocks(session, processing, levels)
     with ArchiveWriter(path, FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
-        kinds = _rows(calibration, session.epoch)
-        sizes = _add_coordinates(writer, calibration)
-        for name, (dims, units, meaning, dtype) in kinds.items():
-            tail = tuple(sizes[dim] for dim in dims)
-            writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
+        kinds = _begin_rows(writer, calibration, session.epoch)
         also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress, proposed)]
         also += [_Tracks(calibration, writer, blocks)] if track else []
         for block, found in estimated(calibration, progress(blocks)):
@@ -86,6 +80,24 @@ def apply(
         for one in also:
             tell(one.end())
     return Path(path)
+
+
+def _agreement(
+    calibration: Calibration, session: Session, levels: Mapping[str, Level]
+) -> tuple[Calibration, tuple[str, ...]]:
+    """The calibration, with wider intervals where pads and image disagree; and what lies outside of it, in words."""
+    calibration, outside = agreement_of_use(calibration, session)
+    doubt = placement_note(calibration.skin, _untouched(session, levels), np.asarray(calibration.recon.channels))
+    return calibration, (*outside, doubt) if doubt else outside
+
+
+def _begin_rows(writer: ArchiveWriter, calibration: Calibration, epoch: str) -> Iterable[str]:
+    """Write all coordinates but time, and begin the arrays with a row for each frame; returns their names."""
+    sizes, kinds = _add_coordinates(writer, calibration), _rows(calibration, epoch)
+    for name, (dims, units, meaning, dtype) in kinds.items():
+        tail = tuple(sizes[dim] for dim in dims)
+        writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
+    return kinds
 
 
 def _untouched(session: Session, levels: Mapping[str, Level]) -> np.ndarray:

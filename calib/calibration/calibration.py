@@ -132,7 +132,7 @@ class Calibration:
         return recorded_processing(self.provenance)
 
     def own_pressures(self, pressures: ArrayLike) -> np.ndarray:
-        """The pads' own pressures, without crosstalk, from readings of the pads (n, pads) Pa."""
+        """The pads' own pressures (n, pads) Pa, without crosstalk, from readings of the pads (n, pads) Pa."""
         return np.asarray(self.pads.own(jnp.asarray(pressures, self.dtype)))
 
     def pad_forces(
@@ -191,7 +191,13 @@ class Calibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration, whole or not at all, as HDF5 in the format skin-calibration."""
+        """Write the calibration, whole or not at all, as HDF5 in the format skin-calibration.
+
+        The file is sealed: `load_calibration` refuses one whose numbers were changed.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
         write_archive(path, FORMAT, *to_archive(self))
 
 

@@ -128,7 +128,6 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
 def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
     presses, imager, response = found.presses, found.imager, found.response
     choice, model = response.choice, response.model
-    doubt = placement_note(found.skin, presses.untouched, presses.channels)
     return Calibration(
         skin=found.skin,
         recon=imager.recon,
@@ -137,15 +136,7 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         evaluation=_held_out_evaluation(found),
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=(
-            *ignored,
-            *presses.notes,
-            *([found.placed.note] if found.placed else []),
-            *([doubt] if doubt else []),
-            *([f"chosen: {choice.why}"] if choice.why else []),
-            *_not_predicted(found.skin, found.held_out.pad_force),
-            *imager.notes,
-        ),
+        notes=(*ignored, *_notes(found)),
         field=model.field,
         crosstalk=presses.crosstalk,
         noise=found.held_out.noise,
@@ -160,6 +151,19 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
         electrodes=found.placed,
         sensor=presses.sensor_noise,
+    )
+
+
+def _notes(found: _Found) -> tuple[str, ...]:
+    """What the operator should know of the stages."""
+    presses, choice = found.presses, found.response.choice
+    return (
+        *presses.notes,
+        *([found.placed.note] if found.placed else []),
+        *filter(None, [placement_note(found.skin, presses.untouched, presses.channels)]),
+        *([f"chosen: {choice.why}"] if choice.why else []),
+        *_not_predicted(found.skin, found.held_out.pad_force),
+        *found.imager.notes,
     )
 
 

@@ -118,7 +118,7 @@ class ChannelTable:
 
     @property
     def bad(self) -> np.ndarray:
-        """Readings with any flag."""
+        """Whether each reading has any flag, (readings,)."""
         return np.asarray(self.dead | self.saturated | self.noisy)
 
 

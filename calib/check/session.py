@@ -54,16 +54,9 @@ def check_session(
     """
     findings = [*_session_findings(session)]
     skin = check_skin(session, skin, findings)
-    statistics = stream_statistics(session, skin, progress, findings)
-    for stats in statistics.values():
-        findings += stream_findings(stats)
-        if not session.simulated:  # a simulation may be free of noise
-            findings += [*copy_findings(stats), *stuck_findings(stats), *dropout_findings(stats)]
-            findings += clipping_findings(stats, skin)
-    findings += shift_findings(statistics)
+    statistics = _checked_streams(session, skin, progress, findings)
     presses, source = list_presses(session, statistics, findings)
     evidence = press_evidence(statistics, presses, findings)
-    presses = presses if evidence is None else evidence.presses
     channels, order = check_eit(session, statistics.get("eit"), presses, evidence, skin, transfer, findings)
     pads = check_pads(statistics, skin, findings)
     places = check_electrodes(skin, channels, order, findings) if electrodes else ()
@@ -80,10 +73,24 @@ def check_session(
         pads=pads,
         channels=channels,
         order=order,
-        presses=press_summary(presses, source),
+        presses=press_summary(presses if evidence is None else evidence.presses, source),
         onsets=onsets,
         electrodes=places,
     )
+
+
+def _checked_streams(
+    session: Session, skin: je.Skin | None, progress: Progress, findings: list[Finding]
+) -> dict[str, StreamStatistics]:
+    """Read every stream once; returns what is kept of each."""
+    statistics = stream_statistics(session, skin, progress, findings)
+    for stats in statistics.values():
+        findings += stream_findings(stats)
+        if not session.simulated:  # a simulation may be free of noise
+            findings += [*copy_findings(stats), *stuck_findings(stats), *dropout_findings(stats)]
+            findings += clipping_findings(stats, skin)
+    findings += shift_findings(statistics)
+    return statistics
 
 
 def _compare(

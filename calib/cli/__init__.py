@@ -10,8 +10,8 @@ from importlib import import_module
 from typing import Any
 
 from .parser import CommandParser
-from .signals import interruption_status, termination_raised
-from .terminal import one_line
+from .signals import termination_raised
+from .terminal import one_line, say, say_interrupted
 
 COMMANDS = {
     "simulate": "simulate a bench session from a scene file",
@@ -44,16 +44,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and _nobody_reads():
             return 128 + signal.SIGPIPE  # as a shell reports a program that the signal ended
-        print(f"jaxeit: {one_line(error)}", file=sys.stderr)
+        say(one_line(error))
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        print(f"jaxeit: {OUT_OF_MEMORY} ({one_line(error)[:200]})", file=sys.stderr)
+        say(f"{OUT_OF_MEMORY} ({one_line(error)[:200]})")
         return 2
     except KeyboardInterrupt as interrupt:
-        print(f"jaxeit: {str(interrupt) or 'interrupted'}; nothing was written", file=sys.stderr)
-        return interruption_status(interrupt)
+        return say_interrupted(interrupt, "nothing was written")
 
 
 OUT_OF_MEMORY = "this machine has too little memory for it; use less data, a coarser fidelity or fewer pixels"

@@ -7,11 +7,24 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from .signals import interruption_status
+
 if TYPE_CHECKING:
     import jaxeit as je
 
 LONG_NODES = 5000
 """Number of mesh nodes with which the first voltages take about 10 s, including mesh and compilation."""
+
+
+def say(line: str) -> None:
+    """Print a line about the work on standard error, where it does not mix with results."""
+    print(f"jaxeit: {line}", file=sys.stderr, flush=True)
+
+
+def say_interrupted(interrupt: KeyboardInterrupt, what: str) -> int:
+    """Say that the work was interrupted, and ``what`` is left of it; returns the exit status."""
+    say(f"{str(interrupt) or 'interrupted'}; {what}")
+    return interruption_status(interrupt)
 
 
 def one_line(error: Exception) -> str:
@@ -64,7 +77,7 @@ def announce_model(skin: "je.Skin", fidelity: "je.Fidelity") -> None:
     nodes = je.model.expected_mesh_nodes(skin, fidelity)
     if nodes > LONG_NODES:
         sizes = f"{len(skin.electrodes)} electrodes, {skin.protocol.readings:,} readings, about {nodes:,} mesh nodes"
-        print(f"jaxeit: {skin.name}: {sizes}: this takes a while", file=sys.stderr, flush=True)
+        say(f"{skin.name}: {sizes}: this takes a while")
 
 
 def file_size(path: str) -> int:

@@ -30,12 +30,12 @@ class AbstractLoss(AbstractChoice):
         return r * jnp.sqrt(self.ratio(jnp.minimum((r / w) ** 2, 0.1 * jnp.finfo(r.dtype).max)))
 
     def psi(self, r: Array) -> Array:
-        """Influence of a residual: the derivative of half the loss."""
+        """Influence of residuals r of any shape: the derivative of half the loss."""
         found: Array = jax.grad(lambda x: jnp.sum(self.transform(x) ** 2) / 2)(r)
         return found
 
     def dpsi(self, r: Array) -> Array:
-        """Derivative of `psi`."""
+        """Derivative of `psi` at residuals r of any shape."""
         found: Array = jax.jvp(self.psi, (r,), (jnp.ones_like(r),))[1]
         return found
 

@@ -123,7 +123,7 @@ class PadModel(eqx.Module):
 
     @property
     def idle_noise(self) -> Float[Array, " pads"]:
-        """Standard deviation of the force of each pad without load, N."""
+        """Standard deviation of the force of each pad without load, (pads,) N."""
         floor = self._noise.floor * self._noise.scale
         if self.sensor is None:
             return floor

@@ -77,26 +77,44 @@ def train_proposal(
         raise BenchError(f"{frames} frames are too few to hold skins out; give {MIN_SHARDS * SHARD_FRAMES:,} or more")
     skin.protocol.rows("a proposal")
     fidelity, parts = fidelity or je.Fidelity.draft(dtype="float32"), Path(f"{path}.parts")
-    skins, made = -(-frames // SHARD_FRAMES), itertools.count(1)
-    write_training_frames(
-        training_bench(skin),
-        parts / "frames",
-        frames,
-        seed=seed,
-        scenes=scenes_for(skin, fidelity),
-        fidelity=fidelity,
-        pixels=PIXELS,
-        executor=executor,
-        jobs=jobs,
-        tell=lambda _: progress("skins", next(made), skins),
-    )
-    every = open_training_frames(parts / "frames")
+    workers = {"executor": executor, "jobs": jobs}
+    every = _simulated(skin, parts / "frames", frames, seed, fidelity, partial(progress, "skins"), **workers)
     choices = digest(every.card["mark"], str((frames, epochs, seed)))[:16]
     checkpoint = parts / f"checkpoint-{choices}.eqx"
     proposal = _trained(skin, every, epochs, seed, checkpoint, lambda done: progress("epochs", done, epochs))
     proposal.save(path)
     shutil.rmtree(parts)
     return proposal
+
+
+def _simulated(
+    skin: je.Skin,
+    folder: Path,
+    frames: int,
+    seed: int,
+    fidelity: je.Fidelity,
+    tell: Callable[[int, int], object],
+    **workers: Any,
+) -> TrainingFrames:
+    """Scenes drawn at random; those that lie in the folder are not simulated again.
+
+    Args:
+        tell: called with the number of skins that are done, and of all.
+        workers: as for `calib.write_training_frames`.
+    """
+    skins, made = -(-frames // SHARD_FRAMES), itertools.count(1)
+    write_training_frames(
+        training_bench(skin),
+        folder,
+        frames,
+        seed=seed,
+        scenes=scenes_for(skin, fidelity),
+        fidelity=fidelity,
+        pixels=PIXELS,
+        tell=lambda _: tell(next(made), skins),
+        **workers,
+    )
+    return open_training_frames(folder)
 
 
 def _trained(

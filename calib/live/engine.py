@@ -327,21 +327,20 @@ class Engine:
         offset = 0.0 if self._recalibrator is None else self._recalibrator.offset
         return np.asarray(arrival.beside - self._rest_levels.levels[1] - offset)
 
+    def _changed(self, arrival: ReceivedFrame) -> np.ndarray:
+        """Change of each reading (readings,) V; only once the rest levels are measured."""
+        assert self._rest_levels.levels is not None
+        return np.asarray(arrival.values - self._rest_levels.levels[0])
+
     def step(self, arrival: ReceivedFrame, dropped: int = 0) -> FrameResult | None:
         """Process one frame; None while the rest levels are being measured, and once contacts can be followed."""
-        if self._rest_levels.levels is None:
-            self._add_rest(arrival)
+        if not self._is_ready(arrival):
             return None
-        if self._follower is not None and not self._follower.ready:
-            self._follower.prepare(self._rest_levels.frames)
-            return None
-        frame, pressure = arrival.values - self._rest_levels.levels[0], self.pressed(arrival)
+        frame, pressure = self._changed(arrival), self.pressed(arrival)
         lost, silent = ~np.isfinite(frame), ~np.isfinite(pressure)
         pressed = np.where(silent, 0.0, pressure)
         found = self._programs.map(frame, pressed, self._current_places(), self._before)
-        if self._law.remembers:
-            own = np.asarray(self._law.moved(self._programs.gains).pads.own(jnp.asarray(pressure[None])))
-            self._before = remembered(np.concatenate([self._before, own]))
+        self._remember(pressure)
         self._schedule_search(frame, bool(found.loaded.any()))
         self._recalibrate(frame, pressure, bool(found.loaded.any()), arrival.host)
         self._note_negative(found.negative & ~silent, found.loaded & ~silent, arrival.host)
@@ -366,6 +365,22 @@ class Engine:
             unsearched=self.unsearched,
             kinds=self._kinds(frame, force, bool(found.loaded.any())),
         )
+
+    def _is_ready(self, arrival: ReceivedFrame) -> bool:
+        """Whether this frame can be processed; otherwise it is a frame at rest, or contacts cannot be followed yet."""
+        if self._rest_levels.levels is None:
+            self._add_rest(arrival)
+            return False
+        if self._follower is not None and not self._follower.ready:
+            self._follower.prepare(self._rest_levels.frames)
+            return False
+        return True
+
+    def _remember(self, pressure: np.ndarray) -> None:
+        """Keep a pressure for a curve with memory."""
+        if self._law.remembers:
+            own = np.asarray(self._law.moved(self._programs.gains).pads.own(jnp.asarray(pressure[None])))
+            self._before = remembered(np.concatenate([self._before, own]))
 
     def _kinds(self, frame: np.ndarray, force: np.ndarray, touched: bool) -> KindEstimate | None:
         """What touches the skin; readings that the calibration leaves out are missing."""

@@ -187,21 +187,10 @@ def run_live(
         PriorityError: if real-time scheduling is refused.
     """
     settings = settings or LiveSettings()
-    recalibrator, director = None, None
-    engine: Engine | LogEngine
-    if isinstance(calibration, LogCalibration):
-        _check_log(calibration, sources, settings)
-        engine = LogEngine(calibration, settings.rest)
-    else:
-        _check(calibration, sources)
-        follower = LiveFollower(calibration) if settings.track else None
-        if settings.recalibrate:
-            layer = None if follower is None else follower.learned
-            recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
-        proposal = chosen_proposal(settings.proposal, calibration.skin, control.warn)
-        engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower, proposal=proposal)
+    engine, recalibrator = _engine(calibration, sources, control, settings)
     queue = FrameQueue(*(source.plan for source in sources))
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
+    director = None
     if settings.event_driven:
         control.state = "choosing the readings for each place of the skin"
         director = prepare_director(cast(Calibration, calibration), sources[0].plan.number, recorder.receivers[0].send)
@@ -214,6 +203,23 @@ def run_live(
     if recorder.failure is not None:
         raise LiveError(f"live: {recorder.failure}") from recorder.failure
     return count
+
+
+def _engine(
+    calibration: Calibration | LogCalibration, sources: Sequence[Source], control: LiveControl, settings: LiveSettings
+) -> tuple[Engine | LogEngine, LiveRecalibrator | None]:
+    """The engine, and what moves its calibration, if that was asked for; refuses streams that do not fit."""
+    if isinstance(calibration, LogCalibration):
+        _check_log(calibration, sources, settings)
+        return LogEngine(calibration, settings.rest), None
+    _check(calibration, sources)
+    follower, recalibrator = LiveFollower(calibration) if settings.track else None, None
+    if settings.recalibrate:
+        layer = None if follower is None else follower.learned
+        recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
+    proposal = chosen_proposal(settings.proposal, calibration.skin, control.warn)
+    engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower, proposal=proposal)
+    return engine, recalibrator
 
 
 def _check(calibration: Calibration, sources: Sequence[Source]) -> None:

@@ -1,6 +1,6 @@
 """Measure the presses of a session: position, change of the readings, pad pressures and force of each press."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..session.mixing import same_scan
 from ..session.units import SECOND
 from .corrections import AbstractBaseline, AbstractCorrection, LowPass, TwoSided, WindowMeans, sample_rate
 from .detection import find_presses
-from .means import hold_positions, press_means
+from .means import PressMeans, hold_positions, press_means
 from .samples import PressSamples, press_samples
 from .streams import finite_mean, index_ranges, recording_end
 from .times import reject
@@ -106,31 +106,16 @@ def measure(
     presses = _presses(session, streams["force"], place_needed)
     windows = press_windows(presses, processing.windows, recording_end(streams.values()))
     presses = reject_without_samples(presses, windows, streams.values(), processing.baseline)
-    chosen = {name: processing.of(stream) for name, stream in streams.items()}
-    held = {
-        name: press_means(stream, windows, baseline=processing.baseline, corrections=chosen[name])
-        for name, stream in streams.items()
-    }
+    held = _held(streams, windows, processing)
     means = {name: found.change.mean for name, found in held.items()}
     channels, lost = _finite_channels(means["eit"], presses.accepted)
     _require_pads(session, skin, means["pressure"][presses.accepted])
     force = means["force"][:, 0]
-    presses = reject(presses, _without_force(force, means["pressure"]))
+    presses = _with_force(session, presses, force, means["pressure"])
     kept = presses.accepted
-    if not kept.any():
-        raise _error(session, "/presses", _why_none(presses), "see jaxeit check")
-    samples = press_samples(
-        streams["force"],
-        streams["pressure"],
-        presses,
-        windows,
-        baseline=processing.baseline,
-        corrections=chosen["force"],
-    )
-    position = np.stack([presses.x, presses.y], 1)[kept]
     return PressMeasurements(
         session=session,
-        position=position,
+        position=np.stack([presses.x, presses.y], 1)[kept],
         dv=means["eit"][kept],
         pressure=means["pressure"][kept],
         force=force[kept],
@@ -138,7 +123,7 @@ def measure(
         rest=held["pressure"].baseline[kept],
         noise=_frame_noise(held["eit"].change, kept),
         channels=channels,
-        samples=samples,
+        samples=_samples(streams, presses, windows, processing),
         presses=presses,
         windows=windows,
         notes=(*processing.notes(streams.values()), *lost, *_set_aside(presses)),
@@ -232,12 +217,33 @@ def _require_pads(session: Session, skin: je.Skin, pressure: np.ndarray) -> None
         )
 
 
-def _without_force(force: np.ndarray, pressure: np.ndarray) -> Sequence[str]:
+def _held(streams: dict[str, Stream], windows: PressWindows, processing: Processing) -> dict[str, PressMeans]:
+    """What each stream holds during the presses, corrected."""
+    return {
+        name: press_means(stream, windows, baseline=processing.baseline, corrections=processing.of(stream))
+        for name, stream in streams.items()
+    }
+
+
+def _with_force(session: Session, presses: PressTable, force: np.ndarray, pressure: np.ndarray) -> PressTable:
+    """The presses, without those that miss force (presses,) or pressure; raises SessionError if none is left."""
     finite = np.isfinite(force) & np.isfinite(pressure).all(1)
-    return [
+    reasons = [
         "" if ok and f > 0 else ("no force" if ok else "force or pressure missing in the hold")
         for ok, f in zip(finite, force, strict=True)
     ]
+    presses = reject(presses, reasons)
+    if not presses.accepted.any():
+        raise _error(session, "/presses", _why_none(presses), "see jaxeit check")
+    return presses
+
+
+def _samples(
+    streams: dict[str, Stream], presses: PressTable, windows: PressWindows, processing: Processing
+) -> PressSamples:
+    """Pressure and force over whole presses; those of the force correct both."""
+    force, pressure, corrections = streams["force"], streams["pressure"], processing.of(streams["force"])
+    return press_samples(force, pressure, presses, windows, baseline=processing.baseline, corrections=corrections)
 
 
 def _why_none(presses: PressTable) -> str:

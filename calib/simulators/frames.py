@@ -28,7 +28,7 @@ class AbstractFrames(eqx.Module):
     def __call__(
         self, model: je.Model, sigma: Float[Array, " elements"] | je.model.CoatedSheet
     ) -> Float[Array, " readings"]:
-        """Readings, V."""
+        """Readings, (readings,) V, of a conductivity (elements,) S or a coated sheet."""
 
 
 class Solved(AbstractFrames):

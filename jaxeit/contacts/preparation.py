@@ -69,11 +69,8 @@ def prepare_contacts(
             no coating explains the untouched frame.
         SceneError: if ``model`` is no model, such as a skin.
     """
-    require_model(model)
-    require_known("prepare_contacts", InverseError, model, noise, untouched, sigma, channels)
+    sigma, found = sheet_and_readings("prepare_contacts", model, noise, untouched, sigma, channels)
     settings = settings or ContactSettings()
-    sigma = sheet_of(model, untouched, sigma, channels)
-    found = whitened_readings(model, noise, channels)
     nodes = nodes_of(model, settings.widths, settings.columns)
     slopes, background = _slopes(model, found, sigma)
     seen, beside = reached(tabulate(model, slopes, nodes.fewer(3)))
@@ -96,6 +93,24 @@ def prepare_contacts(
     )
     ready: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, settings.false_alarm)))
     return ready
+
+
+def sheet_and_readings(
+    name: str,
+    model: Model,
+    noise: Float[ArrayLike, "..."],
+    untouched: Float[ArrayLike, " readings"] | None,
+    sigma: Float[Array, " elements"] | None,
+    channels: Bool[ArrayLike, " readings"] | None,
+) -> tuple[Float[Array, " elements"] | None, Whitened]:
+    """Conductivity of the untouched sheet, S, None: even; and what whitens readings, both on the host.
+
+    Args:
+        name: of the function that was called with the others, as `prepare_contacts` describes them.
+    """
+    require_model(model)
+    require_known(name, InverseError, model, noise, untouched, sigma, channels)
+    return sheet_of(model, untouched, sigma, channels), whitened_readings(model, noise, channels)
 
 
 def _slopes(model: Model, found: Whitened, sigma: Float[Array, " elements"] | None) -> tuple[np.ndarray, float]:

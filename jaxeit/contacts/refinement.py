@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import require_known, verb
 from ..imaging.noise import InverseError, Whitening, whitened_readings
@@ -114,18 +114,28 @@ def _refined(
         throw=False,
     )
     misfit = found.state.square / max(len(y) - 4 * count, 1)
-    normal = found.state.quadratic.hessian.matrix
-    covariance = normal_inverse(normal, jnp.ones(4 * count, bool))(jnp.eye(4 * count, dtype=y.dtype))
-    own = covariance.reshape(count, 4, count, 4)[np.arange(count), :, np.arange(count)] * jnp.maximum(misfit, 1)
-    bound = ((found.value <= low) | (found.value >= high)).reshape(count, 4).any(1)
-    result = jnp.where(bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
+    covariance = _own_covariances(found, count) * jnp.maximum(misfit, 1)
     theta = found.value.reshape(count, 4)
     return Contacts(
         present=contacts.present,
         position=contacts.position.at[:count].set(theta[:, :2]),
         width=contacts.width.at[:count].set(jnp.exp(theta[:, 2])),
         amplitude=contacts.amplitude.at[:count].set(theta[:, 3]),
-        covariance=contacts.covariance.at[:count].set(own),
+        covariance=contacts.covariance.at[:count].set(covariance),
         misfit=misfit,
-        result=contacts.result.at[:count].set(jnp.where(found.state.converged, result, ContactResult.NOT_CONVERGED)),
+        result=contacts.result.at[:count].set(_results(found, low, high)),
     )
+
+
+def _results(found: optx.Solution[Array, Any], low: Float[Array, " m"], high: Float[Array, " m"]) -> Int[Array, " n"]:
+    """How the fit of each contact ended."""
+    at_bound = ((found.value <= low) | (found.value >= high)).reshape(-1, 4).any(1)
+    ended = jnp.where(at_bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
+    return jnp.where(found.state.converged, ended, ContactResult.NOT_CONVERGED)
+
+
+def _own_covariances(found: optx.Solution[Array, Any], count: int) -> Float[Array, "n 4 4"]:
+    """Covariance of the four numbers of each contact, for whitened readings of variance one."""
+    normal = found.state.quadratic.hessian.matrix
+    covariance = normal_inverse(normal, jnp.ones(4 * count, bool))(jnp.eye(4 * count, dtype=normal.dtype))
+    return covariance.reshape(count, 4, count, 4)[np.arange(count), :, np.arange(count)]

@@ -47,7 +47,7 @@ class Contacts(eqx.Module):
 
     @property
     def strength(self) -> Float[Array, "... K"]:
-        """Integral of the bump over the plane, ``2 pi a s^2``, S m^2: what grows with the force."""
+        """Integral of each bump over the plane, ``2 pi a s^2``, (..., K) S m^2: what grows with the force."""
         return 2 * jnp.pi * self.amplitude * self.width**2
 
 

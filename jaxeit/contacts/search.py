@@ -124,16 +124,21 @@ class ContactFinder(eqx.Module):
         return self.whitening.channels.shape[0]
 
     def bumps(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> Bumps:
-        """How a frame depends on contacts."""
+        """How the numbers that a frame holds depend on contacts.
+
+        Args:
+            root, whole: of the frame, as `compressed` gives them: what mixes the responses where readings are missing,
+                and whether none is.
+        """
         return Bumps(self.responses, self.low, self.high, root, whole)
 
     def atom_table(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> Atoms:
-        """Bumps from which contacts are started, as a frame shows them."""
+        """Bumps from which contacts are started, as a frame shows them; ``root`` and ``whole`` as for `bumps`."""
         lengths = lengths_of(self.atoms, self.norms, root, whole)
         return Atoms(self.atoms, self.starts, self.norms, self.alike, lengths)
 
     def frame(self, dv: Float[Array, " readings"]) -> Contacts:
-        """The contacts in one frame."""
+        """The contacts in one frame, (readings,) V; the finder itself takes any number of frames and checks them."""
         there = jnp.isfinite(dv) & self.whitening.channels
         seen, whole = self.compressed(dv)
         bumps = self.bumps(seen.root, whole)
@@ -142,7 +147,7 @@ class ContactFinder(eqx.Module):
         return self._contacts(bumps, seen, found, jnp.any(there))
 
     def compressed(self, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""]]:
-        """A frame as it is searched, and whether no reading that is used is missing."""
+        """A frame, (readings,) V, as it is searched, and whether no reading that is used is missing (NaN)."""
         channels = self.whitening.channels
         whole = jnp.all((jnp.isfinite(dv) & channels) == channels)
         seen = jax.lax.cond(whole, lambda dv: self._complete_frame(dv), lambda dv: self._incomplete_frame(dv), dv)

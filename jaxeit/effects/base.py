@@ -204,19 +204,23 @@ class AbstractLoadEffect(AbstractEffect):
     def __call__(
         self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]
     ) -> Float[Array, " elements"]:
-        """The pressure per unit load after this effect, 1/m^2, from that before it."""
+        """The pressure per unit load (elements,) 1/m^2 after this effect, from that before it.
+
+        Args:
+            centroids: of the elements, (elements, 2) m.
+        """
 
 
 class AbstractHistoryEffect(AbstractEffect):
     """An effect on a series of samples, which it processes block by block."""
 
     def start(self, first: Float[Array, " channels"]) -> State:
-        """The state before the first sample, from the series' value at rest; by default empty."""
+        """The state before the first sample, from the series' value at rest, (channels,); by default empty."""
         return ()
 
     @abstractmethod
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        """The block after this effect, and the state for the next."""
+        """The block (time, channels) after this effect, from that before it, and the state for the next block."""
 
 
 class AbstractMemoryEffect(AbstractHistoryEffect):
@@ -251,7 +255,7 @@ class AbstractContactEffect(AbstractEffect):
 
     @abstractmethod
     def __call__(self, contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
-        """The conductances after this effect; 0 stands for a perfect contact and remains 0."""
+        """The conductances (electrodes,) after this effect; 0 stands for a perfect contact and remains 0."""
 
 
 class AbstractTerminalEffect(AbstractEffect):
@@ -262,7 +266,7 @@ class AbstractTerminalEffect(AbstractEffect):
 
     @abstractmethod
     def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:
-        """The voltages of a frame after this effect, V."""
+        """The voltages of a frame, (readings,) V, after this effect, from those before it."""
 
 
 class AbstractPadEffect(AbstractEffect):
@@ -292,7 +296,7 @@ class AbstractScanEffect(AbstractEffect):
     def __call__(
         self, when: Float[Array, " readings"], nominal: Float[Array, " readings"]
     ) -> Float[Array, " readings"]:
-        """The times after this effect, s; ``nominal`` are those of the skin's protocol."""
+        """The times (readings,) s after this effect; ``nominal`` are those of the skin's protocol."""
 
 
 class AbstractReadoutEffect(AbstractHistoryEffect):
@@ -369,14 +373,14 @@ def keys(effects: Iterable[AbstractEffect], key: Key[Array, ""]) -> list[Key[Arr
 
 
 def history_start(effects: Iterable[AbstractHistoryEffect], first: Float[Array, " channels"]) -> tuple[State, ...]:
-    """States of these history effects before the first sample, from the series' value at rest."""
+    """States of these history effects before the first sample, from the series' value at rest, (channels,)."""
     return tuple(effect.start(first) for effect in effects)
 
 
 def history(
     effects: Iterable[AbstractHistoryEffect], series: Series, states: tuple[State, ...], line: Line
 ) -> tuple[Series, tuple[State, ...]]:
-    """A block of a series after these effects, in the order given, and their states for the next block."""
+    """A block (time, channels) of a series after these effects, in the order given; their states for the next block."""
     after = []
     effects = tuple(effects)
     for effect, state, key in zip(effects, states, keys(effects, line.key), strict=True):

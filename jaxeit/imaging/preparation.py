@@ -128,13 +128,7 @@ def prepare(
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     sigma = sheet_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
-    problem = Problem(
-        jacobian=pair_jacobian(model, sigma, image, found.electrodes, jnp.asarray(found.factor, model.dtype)),
-        readings=jnp.sum(found.whitening.channels).astype(model.dtype),
-        hyperparameter=jnp.asarray(jnp.nan, model.dtype),
-        prior=prior,
-        picture=image.picture,
-    )
+    problem = _problem(model, sigma, image, found, prior)
     chosen = _chosen(hyperparameter, problem, found, noise is not None)
     check_range(chosen, method, model.dtype)
     problem = replace(problem, hyperparameter=jnp.asarray(chosen, model.dtype))
@@ -142,24 +136,45 @@ def prepare(
     compress = jnp.asarray(found.compress, model.dtype)
     asked = replace(problem, prior=_traced(prior, model.dtype))
     recon, followed = _build(asked, _traced(linear, model.dtype), compress, found.whitening, noise is not None)
-    recon = replace(recon, whitening=found.whitening, picture=image.picture)  # inside jit, what is known stays known
-    _require_finite(recon)
     settings = {"method": _stated(method), "prior": _stated(prior), "hyperparameter": _stated(chosen)}
     about = Provenance({"jaxeit": _VERSION, **settings, "rank": _rank(found, followed), **(provenance or {})})
-    if isinstance(method, AbstractIterativeMethod):
-        eqx.filter_eval_shape(
-            method.image, problem, problem.jacobian[:, 0]
-        )  # what does not fit is refused here, not at a frame
-        return IterativeReconstructor(
-            compress=compress,
-            problem=problem,
-            method=method,
-            predict=recon.predict,
-            whitening=recon.whitening,
-            picture=recon.picture,
-            provenance=about,
-        )
-    return replace(recon, provenance=about)
+    # Inside jit, what is known stays known.
+    recon = replace(recon, whitening=found.whitening, picture=image.picture, provenance=about)
+    _require_finite(recon)
+    return recon if isinstance(method, AbstractLinearMethod) else _iterative(method, problem, compress, recon)
+
+
+def _problem(
+    model: Model,
+    sigma: Float[Array, " elements"] | None,
+    image: BasisMap,
+    found: Whitened,
+    prior: AbstractPrior,
+) -> Problem:
+    """The problem of whitened readings, of which the hyperparameter is still open: NaN."""
+    return Problem(
+        jacobian=pair_jacobian(model, sigma, image, found.electrodes, jnp.asarray(found.factor, model.dtype)),
+        readings=jnp.sum(found.whitening.channels).astype(model.dtype),
+        hyperparameter=jnp.asarray(jnp.nan, model.dtype),
+        prior=prior,
+        picture=image.picture,
+    )
+
+
+def _iterative(
+    method: AbstractIterativeMethod, problem: Problem, compress: Float[Array, "r k"], linear: Reconstructor
+) -> IterativeReconstructor:
+    """The reconstructor of a method that solves a problem for each frame; the rest is that of the linear one."""
+    eqx.filter_eval_shape(method.image, problem, problem.jacobian[:, 0])  # refuses what does not fit, before any frame
+    return IterativeReconstructor(
+        compress=compress,
+        problem=problem,
+        method=method,
+        predict=linear.predict,
+        whitening=linear.whitening,
+        picture=linear.picture,
+        provenance=linear.provenance,
+    )
 
 
 def _traced(choice: T, dtype: np.dtype) -> T:

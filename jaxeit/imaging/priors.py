@@ -23,27 +23,27 @@ class AbstractPrecision(eqx.Module):
 
     @abstractmethod
     def matrix(self) -> Float[Array, "basis basis"]:
-        """R itself."""
+        """R itself, (basis, basis)."""
 
     @abstractmethod
     def times(self, x: Float[Array, "basis ..."]) -> Float[Array, "basis ..."]:
-        """``R x``."""
+        """``R x`` of one x, or of several side by side, (basis, ...)."""
 
     @abstractmethod
     def solve(self, x: Float[Array, "basis ..."]) -> Float[Array, "basis ..."]:
-        """``R^-1 x``."""
+        """``R^-1 x`` of one x, or of several side by side, (basis, ...)."""
 
     @abstractmethod
     def variance(self) -> Float[Array, " basis"]:
-        """The diagonal of ``R^-1``."""
+        """The diagonal of ``R^-1``, (basis,)."""
 
     @abstractmethod
     def seen(self, j: Float[Array, "k basis"]) -> Float[Array, "k basis"]:
-        """``J Gamma^-1``, Gamma as in `residual`."""
+        """``J Gamma^-1`` of a J of k rows, (k, basis); Gamma as in `residual`."""
 
     @abstractmethod
     def image(self, z: Float[Array, "basis ..."]) -> Float[Array, "basis ..."]:
-        """``Gamma^-1 z``: ``x^T R x = |z|^2``."""
+        """``x = Gamma^-1 z``, (basis, ...), for which ``x^T R x = |z|^2``."""
 
     @abstractmethod
     def residual(self, x: Float[Array, " basis"]) -> Float[Array, " rows"]:

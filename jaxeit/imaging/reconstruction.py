@@ -136,7 +136,7 @@ class AbstractReconstructor(AbstractPictured):
 
     @property
     def channels(self) -> Bool[Array, " readings"]:
-        """Readings that are used."""
+        """Whether each reading is used, (readings,)."""
         return self.whitening.channels
 
 
@@ -184,7 +184,7 @@ class Reconstructor(AbstractReconstructor):
 
     @property
     def matrix(self) -> Float[Array, "basis readings"]:
-        """Q as one matrix, S/V; a reconstructor is applied without it."""
+        """Q as one matrix, (basis, readings) S/V; a reconstructor is applied without it."""
         return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
 
     def on_host(

@@ -6,6 +6,7 @@ blurred edge lies at half the height, however high. Beside a piece of large cont
 a little; such regions are left out.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,7 +29,7 @@ from .absolute.images import (
     gauss_newton,
     reading_weights,
 )
-from .level_set import FittedLevel, LevelSet, fitted_level, signed_distances
+from .level_set import LevelSet, fitted_level, signed_distances
 from .noise import InverseError, require_real
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
@@ -121,26 +122,19 @@ def segment(
     """
     require_model(model)
     require_known("segment", InverseError, model.background)
-    require_real(reference=reference, frame=frame)
-    before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
-    for values in (before, after):
-        require_frame(values, even)
+    seen = _seen(model, reference, frame, missed)
     require_positive(relative_error=relative_error, absolute_error=absolute_error)
     require_positive(floor=floor, least=least, weakest=weakest, pixels=pixels)
     image = _picture_basis(model, basis)
-    left = before - even if missed is None else jnp.asarray(missed, model.dtype)
-    seen = _Seen(even, before, after - before, left)
     if penalty is None:
         penalty = IsotropicVariation(weight=WEIGHT * seen.used(model.dtype))
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
     found, std = _believed_image(physics, penalty, seen, relative_error, absolute_error)
     classes = half_height_classes(on_grid(found, image.picture, (pixels, pixels)), floor, least, weakest)
     classes = classes if start is None else _checked_start(start, classes.shape)
-    if borders is None or not classes.any():
-        unfitted = jnp.asarray(jnp.nan, model.dtype)
-        return Segmentation(found, image.picture, classes, found * unfitted, std, unfitted, unfitted)
-    classes, fit = _shaped(physics, penalty, seen, std, classes, borders)
-    return Segmentation(found, image.picture, classes, fit.pieces, std, fit.misfit, fit.objective)
+    unfitted = jnp.asarray(jnp.nan, model.dtype)
+    before = Segmentation(found, image.picture, classes, found * unfitted, std, unfitted, unfitted)
+    return before if borders is None or not classes.any() else _shaped(physics, penalty, seen, before, borders)
 
 
 def _checked_start(start: Int[ArrayLike, "rows columns"], shape: tuple[int, ...]) -> Int[np.ndarray, "rows columns"]:
@@ -184,6 +178,20 @@ class _Seen(NamedTuple):
         return relative_error * jnp.abs(self.change) + absolute_error * size + share * jnp.abs(self.left)
 
 
+def _seen(
+    model: Model,
+    reference: Float[ArrayLike, " readings"],
+    frame: Float[ArrayLike, " readings"],
+    missed: Float[ArrayLike, " readings"] | None,
+) -> _Seen:
+    """The readings of both frames; raises InverseError for what is no frame of the model."""
+    require_real(reference=reference, frame=frame)
+    before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
+    for values in (before, after):
+        require_frame(values, even)
+    return _Seen(even, before, after - before, before - even if missed is None else jnp.asarray(missed, model.dtype))
+
+
 def _believed_image(
     physics: LogConductivity, penalty: AbstractPenalty, seen: _Seen, relative_error: float, absolute_error: float
 ) -> tuple[Float[Array, " basis"], Float[Array, " readings"]]:
@@ -204,16 +212,17 @@ def _shaped(
     physics: LogConductivity,
     penalty: AbstractPenalty,
     seen: _Seen,
-    std: Float[Array, " readings"],
-    classes: Int[np.ndarray, "rows columns"],
+    before: Segmentation,
     borders: LevelSet,
-) -> tuple[Int[np.ndarray, "rows columns"], FittedLevel]:
-    """Classes whose borders explain the readings, from those given; and the fit."""
-    picture, start = physics.image.picture, signed_distances(classes, physics.image.picture)
-    weight, readings = reading_weights(seen.target, std)
+) -> Segmentation:
+    """Classes whose borders explain the readings, from the classes before."""
+    start = signed_distances(before.classes, before.picture)
+    weight, readings = reading_weights(seen.target, before.errors)
     posterior = ImagePosterior(physics, penalty, readings, weight)
     fit = fitted_level(posterior, start, seen.used(physics.model.dtype), borders)
-    return np.where(on_grid(fit.level, picture, classes.shape) > 0, start.owner + 1, UNCHANGED), fit
+    inside = on_grid(fit.level, before.picture, before.classes.shape) > 0
+    classes = np.where(inside, start.owner + 1, UNCHANGED)
+    return replace(before, classes=classes, pieces=fit.pieces, misfit=fit.misfit, objective=fit.objective)
 
 
 def on_grid(

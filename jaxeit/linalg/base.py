@@ -133,15 +133,15 @@ class AbstractLinearSolver(AbstractChoice):
 
     @abstractmethod
     def solve(self, factor: Any, rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
-        """The solutions for k right-hand sides."""
+        """The solutions (n, k) for k right-hand sides (n, k)."""
 
     @abstractmethod
     def columns(self, factor: Any) -> Float[Array, "n r"]:
-        """The columns of the inverse that belong to `SparsityPattern.root`."""
+        """The r columns of the inverse that belong to `SparsityPattern.root`, (n, r)."""
 
     @abstractmethod
     def corner(self, plan: Any, values: Float[Array, " nnz"]) -> Float[Array, "r r"]:
-        """The inverse on `SparsityPattern.root` alone; a direct method needs no substitution for it."""
+        """The inverse on `SparsityPattern.root` alone, (r, r); a direct method needs no substitution for it."""
 
 
 def unit_columns(plan: AbstractPlan, dtype: Any) -> Float[Array, "n r"]:

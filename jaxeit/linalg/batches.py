@@ -94,20 +94,13 @@ def lanewise(
     """
     function = full_precision(function)
     single = custom_vmap(function)
+    plainly: Callable[[P, Array], T] = jax.vmap(function, (None, 0))
 
     @custom_vmap
     def several(plan: P, values: Array) -> T:
-        plainly: Callable[[P, Array], T] = jax.vmap(function, (None, 0))
         if len(values) < MIN_BATCH or not suits(plan):
             return plainly(plan, values)
-        portions = -(-values.size * values.dtype.itemsize // PORTION_BYTES)
-        width = -(-len(values) // portions)
-        return by_platform(
-            plan,
-            values,
-            cpu=partial(_in_portions, lanes, True, lane_count(values.dtype)),
-            default=partial(_in_portions, lanes, False, width),
-        )
+        return _in_lanes(lanes, plan, values)
 
     @single.def_vmap
     def _(size: int, batched: Sequence[Any], plan: P, values: Array) -> tuple[T, Any]:
@@ -121,7 +114,7 @@ def lanewise(
             flat = several(plan, values.reshape(size * count, -1))
             found = jax.tree.map(lambda a: a.reshape(size, count, *a.shape[1:]), flat)
         else:
-            found = _mapped(jax.vmap(function, (None, 0)), batched, plan, values)
+            found = _mapped(plainly, batched, plan, values)
         return found, jax.tree.map(lambda _: True, found)
 
     return single
@@ -137,6 +130,18 @@ def _mapped(function: Callable[[P, Array], T], batched: Sequence[Any], plan: P, 
     mapped, shared = eqx.partition((plan, values), tuple(batched))
     found: T = jax.vmap(lambda mapped: function(*eqx.combine(mapped, shared)))(mapped)
     return found
+
+
+def _in_lanes(lanes: Callable[[P, bool], Callable[[Array], T]], plan: P, values: Float[Array, "batch nnz"]) -> T:
+    """``lanes`` of all values, in the portions that suit the platform."""
+    portions = -(-values.size * values.dtype.itemsize // PORTION_BYTES)
+    width = -(-len(values) // portions)
+    return by_platform(
+        plan,
+        values,
+        cpu=partial(_in_portions, lanes, True, lane_count(values.dtype)),
+        default=partial(_in_portions, lanes, False, width),
+    )
 
 
 def _in_portions(

@@ -62,17 +62,7 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
 
     if not CUTS_STACKS:
         return whole
-
-    def in_portions(stacks: Stacks, portion: int) -> Stacks:
-        def step(i: Array, stacks: Stacks) -> Stacks:
-            part = [lax.dynamic_slice_in_dim(stack, i * portion, portion) for stack in stacks]
-            done = function(*part)
-            kept, changed = stacks[: -len(done)], stacks[-len(done) :]
-            pairs = zip(changed, done, strict=True)
-            return *kept, *(lax.dynamic_update_slice_in_dim(old, new, i * portion, 0) for old, new in pairs)
-
-        done: Stacks = lax.fori_loop(0, stacks[0].shape[0] // portion, step, stacks)
-        return done
+    in_portions = partial(_in_portions, function)
 
     @custom_vmap
     def stacked(*stacks: Array) -> Stacks:
@@ -97,6 +87,20 @@ def portioned(function: Callable[..., Any], operations: int = 1) -> Callable[...
         return apart, jax.tree.map(lambda _: True, apart)
 
     return stacked
+
+
+def _in_portions(function: Callable[..., Any], stacks: Stacks, portion: int) -> Stacks:
+    """``function`` of ``portion`` matrices at a time, which divide the stacks; its results replace the last stacks."""
+
+    def step(i: Array, stacks: Stacks) -> Stacks:
+        part = [lax.dynamic_slice_in_dim(stack, i * portion, portion) for stack in stacks]
+        done = function(*part)
+        kept, changed = stacks[: -len(done)], stacks[-len(done) :]
+        pairs = zip(changed, done, strict=True)
+        return *kept, *(lax.dynamic_update_slice_in_dim(old, new, i * portion, 0) for old, new in pairs)
+
+    done: Stacks = lax.fori_loop(0, stacks[0].shape[0] // portion, step, stacks)
+    return done
 
 
 def portion_of(count: int, rows: int, columns: int, operations: int = 1) -> int:

@@ -136,9 +136,7 @@ def discretise(
     _require_kinds(scene, fidelity)
     require_dtype(fidelity.dtype)
     skin = scene.skin
-    for effect in scene.effects:
-        if effect.of_pairs:
-            skin.protocol.rows(f"the effect {type(effect).__name__}")
+    _require_pairs(scene)
     sheet, metal = _spaces(scene, fidelity, None if mesh is None else mesh.check(min_angle))
     values = _model_arrays(skin, sheet.mesh)
     electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
@@ -174,6 +172,13 @@ def _require_kinds(scene: Any, fidelity: Any) -> None:
         raise SceneError(f"{type(scene).__name__} is not a scene; make one, such as jaxeit.Scene(skin, effects=())")
     if not isinstance(fidelity, Fidelity):
         raise FidelityError(f"{type(fidelity).__name__} is not a fidelity; make one, such as jaxeit.Fidelity.draft()")
+
+
+def _require_pairs(scene: Scene) -> None:
+    """Refuse an effect on the circuit of a reading where the protocol's readings have none."""
+    for effect in scene.effects:
+        if effect.of_pairs:
+            scene.skin.protocol.rows(f"the effect {type(effect).__name__}")
 
 
 def _model_arrays(skin: Skin, mesh: Mesh) -> dict[str, np.ndarray]:

@@ -25,7 +25,8 @@ from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.triangles import Mesh
 from .discretisation import Model, require_model
 from .forward_model import Coefficients, Fields, coefficients, fields, series_resistance, terminal_matrix, voltages
-from .system import Entries, stiffness_places
+from .stiffness import TableBatch
+from .system import Entries, System, stiffness_places
 
 # The cosine between rim edges that meet in a corner, which no electrode passes.
 CORNER = np.cos(np.radians(30))
@@ -260,15 +261,30 @@ def _moved(
     flat = chart[model.triangles]
     upright = cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]) > 0
     slopes = jnp.where(jnp.all(upright), slopes, jnp.nan)
+    stretch = _sizes(nodes, motion.corners) / _sizes(model.nodes, motion.corners)
+    after = _moved_system(system, motion, slopes, areas, stretch)
+    # What is pressed on the sheet, and the places of an image, stay with the elements: they have no derivative.
+    fixed = (nodes, chart, chart[model.triangles].mean(1), areas)
+    nodes, chart, centroids, areas = jax.tree.map(jax.lax.stop_gradient, fixed)
+    return replace(model, nodes=nodes, chart=chart, centroids=centroids, areas=areas, system=after)
+
+
+def _moved_system(
+    system: System,
+    motion: Motion,
+    slopes: Float[Array, "elements k r"],
+    areas: Float[Array, " elements"],
+    stretch: Float[Array, " p"],
+) -> System:
+    """The system of elements with other slopes and areas, m^2, and of pieces of contacts that are stretched."""
     stiffness = slopes @ slopes.swapaxes(1, 2)
     entries = [jnp.where(place < 0, 0, stiffness.ravel()[jnp.maximum(place, 0)]) for place in motion.places]
     above = system.under[system.dofs[system.bridge_element]]
-    one, other = ((above == system.bridge_electrodes[:, k, None]).astype(nodes.dtype) for k in (0, 1))
-    stretch = _sizes(nodes, motion.corners) / _sizes(model.nodes, motion.corners)
+    one, other = ((above == system.bridge_electrodes[:, k, None]).astype(slopes.dtype) for k in (0, 1))
     mass = system.contact_mass * stretch[:, None, None]
     near = areas[system.near_element]
     discs = jnp.zeros_like(system.measure).at[system.near_electrode].add(near)
-    after = replace(
+    return replace(
         system,
         slopes=slopes,
         sheet=tuple(Entries(old.element, weight) for old, weight in zip(system.sheet, entries, strict=True)),
@@ -279,10 +295,6 @@ def _moved(
         near_share=near / discs[system.near_electrode],
         moved=True,
     )
-    # What is pressed on the sheet, and the places of an image, stay with the elements: they have no derivative.
-    fixed = (nodes, chart, chart[model.triangles].mean(1), areas)
-    nodes, chart, centroids, areas = jax.tree.map(jax.lax.stop_gradient, fixed)
-    return replace(model, nodes=nodes, chart=chart, centroids=centroids, areas=areas, system=after)
 
 
 def _areas(corners: Float[Array, "n 3 d"]) -> Float[Array, " n"]:
@@ -358,27 +370,13 @@ def _sheet_change(
     batch = min(BATCH_ELEMENTS, len(model.triangles))
 
     def add(i: Int[Array, ""], sums: Float[Array, "electrodes 2 a b"]) -> Float[Array, "electrodes 2 a b"]:
-        # The last batch repeats elements of the one before, so that all batches have one size.
-        start = jnp.minimum(i * batch, len(model.triangles) - batch)
-        corners, dofs, slopes, weight = (
-            jax.lax.dynamic_slice_in_dim(table, start, batch)
-            for table in (model.triangles, system.dofs, system.slopes, sigma)
-        )
-        weight = jnp.where(start + jnp.arange(batch) >= i * batch, weight, 0)
+        part = TableBatch.number(i, batch, len(model.triangles))
+        corners, dofs, slopes = part.cut(model.triangles), part.cut(system.dofs), part.cut(system.slopes)
+        weight = jnp.where(part.fresh, part.cut(sigma), 0)
         flat = jnp.einsum("ekr,eka->era", slopes, potential[dofs]).reshape(batch, -1, 2, model.electrodes)
         xx, yy, xy = (jnp.einsum("eqa,eqb->eab", flat[:, :, c], flat[:, :, d]) for c, d in ((0, 0), (1, 1), (0, 1)))
         products = jnp.stack([xx, yy, xy], 1)
-        # The slopes of the barycentric coordinates l_i, 1/m, and the frame that they are in: its axes are those of
-        # the place, which is the sum of l_i times corner i.
-        places = model.nodes[corners]
-        areas = _areas(places)
-        slope = jnp.asarray(element_slopes(places, areas, P1)) / jnp.sqrt(areas)[:, None, None]
-        frame = jnp.einsum("enc,enx->ecx", slope, places)
-        velocity = weight[:, None, None, None] * jnp.einsum("ecx,enxs->encs", frame, motion.space_step[corners])
-        bent = jnp.einsum("encs,end->ensdc", velocity, slope)
-        spread = bent[..., 0, 0] + bent[..., 1, 1]
-        crossed = -2 * (bent[..., 0, 1] + bent[..., 1, 0])  # of which the result keeps the symmetric half
-        shares = jnp.stack([spread - 2 * bent[..., 0, 0], spread - 2 * bent[..., 1, 1], crossed], -1)
+        shares = _corner_shares(model.nodes[corners], weight, motion.space_step[corners])
         owner = motion.electrode[corners]
         rows = jnp.zeros((model.electrodes, batch, 2, 3), model.dtype).at[owner, jnp.arange(batch)[:, None]].add(shares)
         return sums + jnp.einsum("oesk,ekab->osab", rows, products)
@@ -386,3 +384,25 @@ def _sheet_change(
     none = jnp.zeros((model.electrodes, 2, model.electrodes, model.electrodes), model.dtype)
     found: Array = jax.lax.fori_loop(0, -(-len(model.triangles) // batch), add, none)
     return 0.5 * (found + found.swapaxes(2, 3))
+
+
+def _corner_shares(
+    places: Float[Array, "e 3 d"], weight: Float[Array, " e"], step: Float[Array, "e 3 d 2"]
+) -> Float[Array, "e 3 2 3"]:
+    """Change of the energy of elements by each shift of each corner, per product xx, yy and xy of slopes of two fields.
+
+    Args:
+        places: of the corners, m.
+        weight: conductivity of each element, S.
+        step: change of each place per shift of its electrode.
+    """
+    areas = _areas(places)
+    # The slopes of the barycentric coordinates l_i, 1/m, and the frame that they are in: its axes are those of the
+    # place, which is the sum of l_i times corner i.
+    slope = jnp.asarray(element_slopes(places, areas, P1)) / jnp.sqrt(areas)[:, None, None]
+    frame = jnp.einsum("enc,enx->ecx", slope, places)
+    velocity = weight[:, None, None, None] * jnp.einsum("ecx,enxs->encs", frame, step)
+    bent = jnp.einsum("encs,end->ensdc", velocity, slope)
+    spread = bent[..., 0, 0] + bent[..., 1, 1]
+    crossed = -2 * (bent[..., 0, 1] + bent[..., 1, 0])  # of which the result keeps the symmetric half
+    return jnp.stack([spread - 2 * bent[..., 0, 0], spread - 2 * bent[..., 1, 1], crossed], -1)

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Integer, Shaped
+from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
 from scipy import sparse
 
 from ..linalg.base import on_device
@@ -25,6 +25,29 @@ HOST_BATCH_ELEMENTS = 1 << 18  # elements whose H the host computes at once: thi
 # Entries of H up to which XLA's loops are faster than a library: for more, they recompute H x for each field and take
 # twice as long.
 MAX_LOOPED_ENTRIES = 40
+
+
+class TableBatch(NamedTuple):
+    """Neighbouring lines of a table. The last batch repeats lines of the one before, so that all have one size.
+
+    | meaning                                 | shape   |
+    |-----------------------------------------|---------|
+    | start: the first line                   | ()      |
+    | fresh: lines that are in no batch before | (size,) |
+    """
+
+    start: Int[Array, ""]
+    fresh: Bool[Array, " size"]
+
+    @classmethod
+    def number(cls, i: Int[Array, ""], size: int, lines: int) -> "TableBatch":
+        """Batch i of ``size`` lines, of a table that has at least as many."""
+        start = jnp.minimum(i * size, lines - size)
+        return cls(start, start + jnp.arange(size) >= i * size)
+
+    def cut(self, table: Shaped[Array, "lines ..."]) -> Shaped[Array, "size ..."]:
+        """These lines of a table."""
+        return jax.lax.dynamic_slice_in_dim(table, self.start, len(self.fresh))
 
 
 class Stiffness(eqx.Module):
@@ -56,30 +79,23 @@ class Stiffness(eqx.Module):
         lines, rows, width = self.entry.shape
         # At least two batches, since XLA would unroll a loop of one step and fuse it with the code around it.
         batch = max(1, min(-(-lines // 2), BATCH_ROWS // rows))
-        here = jnp.arange(batch)
+        here = jnp.arange(batch)[:, None]
         product = stacked_product if rows * width <= MAX_LOOPED_ENTRIES else partial(jnp.einsum, "lna,lnb->lab")
         first, second = pairs
 
         def add(i: Int[Array, ""], sums: Float[Array, "size pairs"]) -> Float[Array, "size pairs"]:
-            # The last batch repeats lines of the one before, so that all batches have one size.
-            start = jnp.minimum(i * batch, lines - batch)
-
-            def cut(table: Shaped[Array, "lines ..."]) -> Shaped[Array, "batch ..."]:
-                return jax.lax.dynamic_slice_in_dim(table, start, batch)
-
-            dofs, column, entry = cut(self.dofs), cut(self.column), cut(self.entry)
+            part = TableBatch.number(i, batch, lines)
+            dofs, column, entry = part.cut(self.dofs), part.cut(self.column), part.cut(self.entry)
             x = potential.at[dofs].get(mode="promise_in_bounds")
             x = x[:, 1:] - x[:, :1]
             terms = (
-                entry[..., c, None] * x.at[here[:, None], column[..., c]].get(mode="promise_in_bounds")
-                for c in range(width)
+                entry[..., c, None] * x.at[here, column[..., c]].get(mode="promise_in_bounds") for c in range(width)
             )
             half = product(x, cast(Array, sum(terms)))
             found = half[:, first, second] + half[:, second, first]
             if coefficient is None:
-                return jax.lax.dynamic_update_slice_in_dim(sums, found, start, 0)
-            fresh = start + here >= i * batch
-            return sums.at[cut(coefficient)].add(jnp.where(fresh[:, None], found, 0))
+                return jax.lax.dynamic_update_slice_in_dim(sums, found, part.start, 0)
+            return sums.at[part.cut(coefficient)].add(jnp.where(part.fresh[:, None], found, 0))
 
         none = jnp.zeros((size, len(first)), potential.dtype)
         found: Array = jax.lax.fori_loop(0, -(-lines // batch), add, none)
@@ -130,39 +146,54 @@ class _Halves(NamedTuple):
 def _halves(
     element: np.ndarray, weight: np.ndarray, dofs: np.ndarray, slopes: np.ndarray, unknowns: int, rounding: float
 ) -> _Halves:
-    lines = len(element)
     line, place = np.nonzero(weight)
-    chosen, width = element[line, place], dofs.shape[1]
+    chosen = element[line, place]
     root = slopes[chosen]
-    own = weight[line, place, None, None] * (root @ root.swapaxes(1, 2))
-    # One sparse matrix holds all lines; every line has its own rows, one for each of its unknowns.
-    known, row = np.unique(line[:, None] * unknowns + dofs[chosen], return_inverse=True)
-    row = row.reshape(-1, width)
-    owner, count = known // unknowns, len(known)
+    table, owner, local, row = _numbered(line, dofs[chosen], len(element), unknowns)
+    lower = _lower_triangle(row, weight[line, place, None, None] * (root @ root.swapaxes(1, 2)), len(owner))
+    first, second = lower.row, lower.col
+    value = np.where(first == second, 0.5, 1) * lower.data
+    largest = np.zeros(len(element))
+    np.maximum.at(largest, owner[first], np.abs(value))
+    kept = (local[first] > 0) & (local[second] > 0) & (np.abs(value) > rounding * largest[owner[first]])
+    first, second, value = first[kept], second[kept], value[kept]
+    first, second = _balanced(first, second, len(owner))
+    order = np.argsort(first, kind="stable")
+    first, second, value = first[order], second[order], value[order]
+    slot = np.arange(len(first)) - np.searchsorted(first, first)
+    return _Halves(table, owner[first], local[first] - 1, local[second] - 1, slot, value)
+
+
+class _Numbering(NamedTuple):
+    """Rows of one sparse matrix that holds all lines: every line has its own rows, one for each of its unknowns."""
+
+    table: np.ndarray  # (lines, nodes): the unknowns of each line
+    owner: np.ndarray  # (rows,): the line of each row
+    local: np.ndarray  # (rows,): the number of each row in its line
+    row: np.ndarray  # (elements, k): the row of each node
+
+
+def _numbered(line: np.ndarray, dofs: np.ndarray, lines: int, unknowns: int) -> _Numbering:
+    """Rows for the unknowns (elements, k) of elements that belong to lines."""
+    known, row = np.unique(line[:, None] * unknowns + dofs, return_inverse=True)
+    owner = known // unknowns
     begin = np.searchsorted(owner, np.arange(lines))
-    local = np.arange(count) - begin[owner]
+    local = np.arange(len(known)) - begin[owner]
     table = np.zeros((lines, local.max(initial=0) + 1), int)
     table[:] = np.append(known % unknowns, 0)[begin, None]
     table[owner, local] = known % unknowns
+    return _Numbering(table, owner, local, row.reshape(dofs.shape))
 
-    i, j = np.tril_indices(width)
+
+def _lower_triangle(row: np.ndarray, own: np.ndarray, count: int) -> sparse.coo_array:
+    """The sum of the elements' matrices (elements, k, k), of ``count`` rows; what is above its diagonal is left out."""
+    i, j = np.tril_indices(row.shape[1])
     places = np.maximum(row[:, i], row[:, j]), np.minimum(row[:, i], row[:, j])
     # Two nodes of an element may be one unknown (an electrode); the entry between them then counts twice.
     twice = (row[:, i] == row[:, j]) & (i != j)
     values = np.where(twice, 2, 1) * own[:, i, j]
     lower = sparse.coo_array((values.ravel(), tuple(place.ravel() for place in places)), (count, count))
-    lower = lower.tocsr().tocoo()  # sums entries of several elements
-    first, second = lower.row, lower.col
-    value = np.where(first == second, 0.5, 1) * lower.data
-    largest = np.zeros(lines)
-    np.maximum.at(largest, owner[first], np.abs(value))
-    kept = (local[first] > 0) & (local[second] > 0) & (np.abs(value) > rounding * largest[owner[first]])
-    first, second, value = first[kept], second[kept], value[kept]
-    first, second = _balanced(first, second, count)
-    order = np.argsort(first, kind="stable")
-    first, second, value = first[order], second[order], value[order]
-    slot = np.arange(len(first)) - np.searchsorted(first, first)
-    return _Halves(table, owner[first], local[first] - 1, local[second] - 1, slot, value)
+    return lower.tocsr().tocoo()  # sums entries of several elements
 
 
 def _balanced(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

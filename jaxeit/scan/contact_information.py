@@ -106,7 +106,7 @@ class PlaceSensitivity(eqx.Module):
 
     @verb
     def voltages(self, pattern: Integer[ArrayLike, "readings 4"]) -> Float[Array, " readings"]:
-        """Readings of the untouched sheet, V."""
+        """Readings of the untouched sheet, (readings,) V."""
         found: Array = four_terminal(self.transfer, jnp.asarray(pattern))
         return found
 
@@ -126,7 +126,7 @@ class PlaceSensitivity(eqx.Module):
     def errors(
         self, pattern: Integer[ArrayLike, "readings 4"], dead: Integer[ArrayLike, ""] | None = None
     ) -> Float[Array, " sites"]:
-        """Expected error of the place of a contact at each site: root of the sum of both variances, m.
+        """Expected error of the place of a contact at each site, (sites,) m: root of the sum of both variances.
 
         Args:
             pattern: the readings of a frame.

@@ -88,3 +88,4 @@ def _determinant(place: Float[Array, "2 2"]) -> Float[Array, ""]:
 
 
 CRITERIA: Registry[AbstractCriterion] = Registry(AbstractCriterion, "criterion", "jaxeit.criteria")
+"""Criteria by the names that the command line uses."""

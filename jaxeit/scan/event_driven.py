@@ -1,6 +1,8 @@
 """Event-driven scans: pressure and the last contacts select the next readings."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -138,7 +140,7 @@ class EventScanSettings:
             )
 
     def limits(self, pads: int) -> tuple[Float[np.ndarray, " pads"], Float[np.ndarray, " pads"]]:
-        """Onset and release of every pad, Pa.
+        """Onset and release of every pad, (pads,) Pa each.
 
         Raises:
             ProtocolError: if they are not finite and above zero, or a release is above its onset.
@@ -187,39 +189,53 @@ def prepare_event_scan(
     require_known(
         "prepare_event_scan", ProtocolError, model, settings.onset, settings.release, noise, hyperparameter, sigma
     )
-    if not skin.pads:
-        raise ProtocolError(
-            f"the skin {skin.name!r} has no pads, and their pressure directs the scan; give a skin with pads"
-        )
-    skin.protocol.rows("an event-driven scan")
+    _require_pads(skin)
     begins, ends = settings.limits(len(skin.pads))
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels(20)).on(model)
     centres = _grid(skin.domain, settings.radius)
-    kinds = {
-        "idle": (jnp.ones((1, image.size)), settings.idle),
-        "by_pad": (pad_masks(skin, image).weights, settings.local),
-        "by_place": (jnp.stack([around(image.picture, centre, settings.radius) for centre in centres]), settings.local),
-    }
-    expected, found = covariance_of_region(model, Noser(), image, noise, hyperparameter, sigma), {}
-    for name, (regions, count) in kinds.items():
-        covariances = (expected(region.astype(model.dtype)) for region in regions)
-        choices = [
-            choose_readings(k, min(count, len(k)), settings.selection, pattern=model.pattern, switch=settings.switch)
-            for k in covariances
-        ]
-        rows = [choice.rows for choice in choices]
-        none = jnp.zeros((len(rows), model.pattern.shape[0]), bool)
-        found[name] = none.at[jnp.arange(len(rows))[:, None], jnp.stack(rows)].set(True)
+    places = jnp.stack([around(image.picture, centre, settings.radius) for centre in centres])
+    expected = covariance_of_region(model, Noser(), image, noise, hyperparameter, sigma)
+    chosen = partial(_chosen_readings, model, settings, expected)
     return EventScan(
-        idle=found["idle"][0],
-        by_pad=found["by_pad"],
-        by_place=found["by_place"],
+        idle=chosen(jnp.ones((1, image.size)), settings.idle)[0],
+        by_pad=chosen(pad_masks(skin, image).weights, settings.local),
+        by_place=chosen(places, settings.local),
         centres=jnp.asarray(centres, model.dtype),
         pad_of=jnp.asarray(np.stack([Polygon(pad.outline).contains(centres) for pad in skin.pads], 1)),
         onset=jnp.asarray(begins, model.dtype),
         release=jnp.asarray(ends, model.dtype),
         every=jnp.asarray(settings.every),
     )
+
+
+def _require_pads(skin: Skin) -> None:
+    """Refuse a skin whose scan no pressure can direct."""
+    if not skin.pads:
+        raise ProtocolError(
+            f"the skin {skin.name!r} has no pads, and their pressure directs the scan; give a skin with pads"
+        )
+    skin.protocol.rows("an event-driven scan")
+
+
+def _chosen_readings(
+    model: Model,
+    settings: EventScanSettings,
+    expected: Callable[[Float[Array, " basis"]], Float[Array, "readings readings"]],
+    regions: Float[Array, "regions basis"],
+    count: int,
+) -> Bool[Array, "regions readings"]:
+    """The readings to take for each region, of which it shows most: ``count`` of them, or all.
+
+    Args:
+        expected: covariance of the readings, of changes in a region.
+    """
+    covariances = (expected(region.astype(model.dtype)) for region in regions)
+    rows = [
+        choose_readings(k, min(count, len(k)), settings.selection, pattern=model.pattern, switch=settings.switch).rows
+        for k in covariances
+    ]
+    none = jnp.zeros((len(rows), model.pattern.shape[0]), bool)
+    return none.at[jnp.arange(len(rows))[:, None], jnp.stack(rows)].set(True)
 
 
 def _grid(domain: Domain, pitch: float) -> Float[np.ndarray, "regions 2"]:

@@ -65,7 +65,7 @@ class AbstractElectrode(ABC):
         """
 
     def elements(self, space: Space) -> np.ndarray:
-        """Numbers of the triangles under the electrode; none for an electrode without area."""
+        """Numbers of the triangles under the electrode, (triangles,); none for an electrode without area."""
         return np.zeros(0, int)
 
     def lumped_radius(self, space: Space, sheet_resistance: float) -> float:
@@ -92,7 +92,7 @@ class AbstractAreaElectrode(AbstractElectrode):
 
     @abstractmethod
     def elements(self, space: Space) -> np.ndarray:
-        """Numbers of the triangles under the electrode."""
+        """Numbers of the triangles under the electrode, (triangles,)."""
 
     def pieces(self, space: Space, domain: Domain) -> Pieces:
         inside = self.elements(space)

@@ -123,7 +123,7 @@ class Protocol:
         return len(self.pattern) if self.mixing is None else self.mixing.shape[0]
 
     def only(self, rows: Integer[np.ndarray, " count"] | Bool[np.ndarray, " readings"]) -> "Protocol":
-        """The protocol of these readings, by number or by a flag for each."""
+        """The protocol of these readings, by number (count,) or by a flag for each (readings,)."""
         if self.mixing is None:
             return replace(self, pattern=self.pattern[rows])
         mixing = self.mixing[np.flatnonzero(rows) if rows.dtype == bool else rows]
@@ -165,7 +165,7 @@ class Protocol:
 
     @property
     def reading_offsets(self) -> Float[np.ndarray, " readings"]:
-        """When each reading is taken, in seconds after the first."""
+        """When each reading is taken, (readings,) s after the first."""
         return self.slots * self.reading_time
 
     @property

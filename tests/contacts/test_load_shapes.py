@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-import jaxeit as je
-from benchmarks.bench_loads import FIDELITY, TIP_SPREAD, seen, shaped, simulated
+from benchmarks.bench_loads import TIP_SPREAD, seen, shaped, simulated
+from benchmarks.problems import fit_model
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [700, 710])
 def test_rings_are_found_where_they_are(seed):
     """At 80 dB, on a known sheet, where a ring looks like a narrow bump of a load that saturates the layer."""
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = fit_model()
     given = list(shaped(np.random.default_rng(seed), "ring", 8))
     found = simulated(seed, given, spread=TIP_SPREAD)
     for one in seen(model, found, given, seed, 80, True):

@@ -37,10 +37,34 @@ if TYPE_CHECKING:
     from ..calibration import Calibration
 
 T = TypeVar("T")
+Described = dict[str, tuple[Any, str, str]]  # arrays by name: values, unit and meaning
 
 
 def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
     """The attributes and the arrays that hold a calibration."""
+    attrs = _attributes(cal)
+    arrays = _image_arrays(cal.recon, cal.masks) | _pad_arrays(cal)
+    if cal.field is not None and cal.locator is not None:
+        arrays |= field_arrays(cal.field) | _locator_arrays(cal.locator)
+    for where, part in (
+        ("presses/", cal.evaluation),
+        ("loops/", cal.loops),
+        ("examples/", cal.examples),
+        ("probes/", cal.probes),
+        ("", cal.recalibration),
+        ("", cal.electrodes),
+    ):
+        if part is not None:
+            arrays |= {where + name: value for name, value in part.arrays().items()}
+    if cal.layer is not None:
+        arrays |= layer_arrays(cal.layer)
+    if cal.contact_law is not None:
+        arrays |= law_arrays(cal.contact_law)
+    given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
+    return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
+
+
+def _attributes(cal: "Calibration") -> dict[str, Any]:
     attrs: dict[str, Any] = {
         "skin": cal.skin.name,
         "skin_toml": cal.skin.toml,
@@ -52,19 +76,27 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         **{f"provenance_{k}": v for k, v in cal.provenance.items()},
         **{f"evaluation_{k}": v for k, v in cal.evaluation.attributes().items()},
     }
-    recon, masks, curves = cal.recon, cal.masks, cal.curves
-    arrays = {
-        **{
-            f"image/{name}": (array, *je.imaging.NUMBERS[name][1:])
-            for name, array in je.imaging.to_numbers(recon).items()
-        },
+    if cal.baseline is not None:
+        attrs["image_gain"] = cal.image_gain
+    if cal.recalibration is not None:
+        attrs |= cal.recalibration.attributes()
+    return attrs
+
+
+def _image_arrays(recon: je.Reconstructor | je.imaging.IterativeReconstructor, masks: je.PadMasks) -> Described:
+    numbers = je.imaging.to_numbers(recon)
+    return {
+        **{f"image/{name}": (array, *je.imaging.NUMBERS[name][1:]) for name, array in numbers.items()},
         "image/extent": (recon.extent, "m", "x0, x1, y0, y1 of the picture"),
         "image/masks": (masks.weights, "1", "share of each pad in each pixel"),
     }
-    for name, meaning in _CURVE_FIELDS.items():
-        arrays[f"pads/{name}"] = (getattr(curves, name), "", meaning)
-    for f in fields(curves.curve):
-        arrays[f"pads/curve-{f.name}"] = (getattr(curves.curve, f.name), "Pa", "what the curve left open, as fitted")
+
+
+def _pad_arrays(cal: "Calibration") -> Described:
+    """Curves, crosstalk, noise, and pressures without contact of the pads, and the paper's curves."""
+    arrays, curve = _curve_arrays("pads/", cal.curves), cal.curves.curve
+    for f in fields(curve):
+        arrays[f"pads/curve-{f.name}"] = (getattr(curve, f.name), "Pa", "what the curve left open, as fitted")
     if cal.crosstalk is not None:
         arrays["pads/crosstalk"] = (cal.crosstalk.matrix, "1", "reading of channel i per own pressure of pad j")
         arrays["pads/crosstalk_se"] = (cal.crosstalk.standard_error, "1", "of the crosstalk; NaN: not determined")
@@ -72,35 +104,19 @@ def to_archive(cal: "Calibration") -> tuple[dict[str, Any], dict[str, Any]]:
         law = getattr(cal, name.replace("-", "_"))
         if law is not None:
             arrays |= {f"pads/{name}-{f.name}": (getattr(law, f.name), *_NOISE_FIELDS[f.name]) for f in fields(law)}
-    if cal.baseline is not None:
-        attrs["image_gain"] = cal.image_gain
-        for name, meaning in _CURVE_FIELDS.items():
-            arrays[f"baseline/{name}"] = (getattr(cal.baseline, name), "", meaning)
-    if cal.field is not None and cal.locator is not None:
-        arrays |= field_arrays(cal.field)
-        for name, array in locator_numbers(cal.locator).items():
-            arrays[f"locator/{name}"] = (array, "", "of the estimator of the place, as the library names it")
-    for name, value in cal.evaluation.arrays().items():
-        arrays[f"presses/{name}"] = value
-    if cal.loops is not None:
-        arrays |= {f"loops/{name}": value for name, value in cal.loops.arrays().items()}
-    for kind, kept in (("examples", cal.examples), ("probes", cal.probes)):
-        if kept is not None:
-            arrays |= {f"{kind}/{name}": value for name, value in kept.arrays().items()}
     for name, known, meaning in (("rest", cal.rest, "gage pressure"), ("sensor", cal.sensor, "deviation of a reading")):
         if known is not None:
             arrays[f"pads/{name}"] = (known, "Pa", f"{meaning} without contact")
-    if cal.recalibration is not None:
-        attrs |= cal.recalibration.attributes()
-        arrays |= cal.recalibration.arrays()
-    if cal.layer is not None:
-        arrays |= layer_arrays(cal.layer)
-    if cal.contact_law is not None:
-        arrays |= law_arrays(cal.contact_law)
-    if cal.electrodes is not None:
-        arrays |= cal.electrodes.arrays()
-    given = {k: (np.asarray(v), u, text) for k, (v, u, text) in arrays.items()}
-    return attrs | {SEAL: seal(attrs, {k: v for k, (v, _, _) in given.items()})}, given
+    return arrays if cal.baseline is None else arrays | _curve_arrays("baseline/", cal.baseline)
+
+
+def _curve_arrays(where: str, fitted: FittedCurve) -> Described:
+    return {where + name: (getattr(fitted, name), "", meaning) for name, meaning in _CURVE_FIELDS.items()}
+
+
+def _locator_arrays(locator: AbstractLocator) -> Described:
+    meaning = "of the estimator of the place, as the library names it"
+    return {f"locator/{name}": (array, "", meaning) for name, array in locator_numbers(locator).items()}
 
 
 _NOISES = ("noise", "hold-noise")  # of a reading, of a mean over a hold
@@ -170,13 +186,11 @@ def _part(provenance: Mapping[str, str], key: str, read: Callable[[TomlTable], T
     return parse_toml(provenance["recipe"], "calibration: recipe", lambda table: read(table.table(key)))
 
 
-def field_arrays(found: FittedField) -> dict[str, tuple[Any, str, str]]:
+def field_arrays(found: FittedField) -> Described:
     """The arrays of a field of gain, by name: values, unit and meaning."""
     choice = {f"choice-{f.name}": getattr(found.field, f.name) for f in fields(found.field)}
     place = {f"geometry-{f.name}": getattr(found.geometry, f.name) for f in fields(Geometry)}
-    out: dict[str, tuple[Any, str, str]] = {
-        f"location/{name}": (value, "", "setting of the field") for name, value in choice.items()
-    }
+    out: Described = {f"location/{name}": (value, "", "setting of the field") for name, value in choice.items()}
     out |= {f"location/{name}": (value, "m", "outlines of pads and rim") for name, value in place.items()}
     return out | {f"location/{name}": (getattr(found, name), u, text) for name, (u, text) in _FIELD_FIELDS.items()}
 
@@ -216,49 +230,26 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     """
     attrs, arrays = archive.attrs, archive.arrays
     skin = je.skin.parse_skin(str(attrs["skin_toml"]), "calibration: skin_toml")
-    numbers = {k.removeprefix("image/"): v for k, v in arrays.items() if k.startswith("image/")}
-    shape = int(attrs["image_rows"]), int(attrs["image_columns"])
     provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
-    imaging = _imaging(provenance) if "jacobian" in numbers else None
-    recon = je.imaging.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])), None, imaging)
-    kind = CURVES.find(provenance["curve"])
-    # Early versions stored the reference pressure of the power law under another name.
-    old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
-    choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
-    for name, array in choices.items():
-        shaped(choices, name, (len(skin.pads), *array.shape[1:]), "f")
-    curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
-    fitted = _fitted(arrays, "pads/", len(skin.pads), kind())
+    recon, pads = _recon_from(archive, provenance), len(skin.pads)
+    masks = jnp.asarray(shaped(arrays, "image/masks", (pads, recon.areas.size), "f"))
+    of_pads = _pads_from(arrays, CURVES.find(provenance["curve"]), pads)
     _require_possible(arrays)
-    located = provenance.get("location", "none") != "none"
     parts = {
         "skin": skin,
         "recon": recon,
-        "masks": je.PadMasks(
-            jnp.asarray(shaped(arrays, "image/masks", (len(skin.pads), recon.areas.size), "f")),
-            recon.areas,
-            recon.shape,
-        ),
-        "curves": FittedCurve(curve=curve, **fitted),
+        "masks": je.PadMasks(masks, recon.areas, recon.shape),
+        **of_pads,
         "evaluation": Evaluation.restore(attrs, arrays, "evaluation_", "presses/"),
         "provenance": provenance,
         "simulated": bool(attrs["simulated"]),
         "notes": tuple(filter(None, str(attrs["notes"]).split("\n"))),
-        "crosstalk": _crosstalk_from(arrays, len(skin.pads)),
-        "noise": _noise_from(arrays, "noise", fitted),
-        "hold_noise": _noise_from(arrays, "hold-noise", fitted),
-        "field": field_from(arrays, FIELDS.find(provenance["location"])) if located else None,
-        "locator": _locator_from(arrays, recon.dtype) if located else None,
-        "baseline": _baseline_from(arrays, len(skin.pads)),
+        **_location_from(arrays, provenance.get("location", "none"), recon.dtype),
         "image_gain": float(attrs.get("image_gain", "nan")),
         "loops": Loops.restore(arrays, "loops/"),
-        "examples": _examples_from(arrays, "examples", len(skin.pads), recon.readings),
-        "probes": _examples_from(arrays, "probes", len(skin.pads), recon.readings),
-        **{
-            name: shaped(arrays, f"pads/{name}", (len(skin.pads),), "f") if f"pads/{name}" in arrays else None
-            for name in ("rest", "sensor")
-        },
-        "recalibration": Recalibration.restore(attrs, arrays, len(skin.pads)),
+        "examples": _examples_from(arrays, "examples", pads, recon.readings),
+        "probes": _examples_from(arrays, "probes", pads, recon.readings),
+        "recalibration": Recalibration.restore(attrs, arrays, pads),
         "layer": layer_from(arrays),
         "contact_law": law_from(arrays),
         "electrodes": PlacedElectrodes.restore(arrays, len(skin.electrodes)),
@@ -266,6 +257,41 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     }
     _require_sealed(archive)  # last: what does not fit is named by the checks above
     return parts
+
+
+def _recon_from(archive: Archive, provenance: Mapping[str, str]) -> je.imaging.AbstractReconstructor:
+    attrs = archive.attrs
+    numbers = {k.removeprefix("image/"): v for k, v in archive.arrays.items() if k.startswith("image/")}
+    shape = int(attrs["image_rows"]), int(attrs["image_columns"])
+    imaging = _imaging(provenance) if "jacobian" in numbers else None
+    return je.imaging.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])), None, imaging)
+
+
+def _pads_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractCurve], pads: int) -> dict[str, Any]:
+    """What `_pad_arrays` described."""
+    curves = _curves_from(arrays, kind, pads)
+    return {
+        "curves": curves,
+        "crosstalk": _crosstalk_from(arrays, pads),
+        "noise": _noise_from(arrays, "noise", curves.residual_rms),
+        "hold_noise": _noise_from(arrays, "hold-noise", curves.residual_rms),
+        **{
+            name: shaped(arrays, f"pads/{name}", (pads,), "f") if f"pads/{name}" in arrays else None
+            for name in ("rest", "sensor")
+        },
+        "baseline": _baseline_from(arrays, pads),
+    }
+
+
+def _curves_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractCurve], pads: int) -> FittedCurve:
+    """The curves of all pads, with what the curve left open."""
+    # Early versions stored the reference pressure of the power law under another name.
+    old = {"pads/curve-reference": arrays["pads/reference"]} if "pads/reference" in arrays else {}
+    choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
+    for name, array in choices.items():
+        shaped(choices, name, (pads, *array.shape[1:]), "f")
+    curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
+    return FittedCurve(curve=curve, **_fitted(arrays, "pads/", pads, kind()))
 
 
 def field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> FittedField:
@@ -282,9 +308,12 @@ def field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> F
     return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
 
 
-def _locator_from(arrays: Mapping[str, np.ndarray], dtype: Any) -> AbstractLocator:
+def _location_from(arrays: Mapping[str, np.ndarray], name: str, dtype: Any) -> dict[str, Any]:
+    """The correction by location of this name, and the estimator of the place; neither for "none"."""
+    if name == "none":
+        return {"field": None, "locator": None}
     numbers = {k.removeprefix("locator/"): v for k, v in arrays.items() if k.startswith("locator/")}
-    return locator_from_numbers(numbers, dtype)
+    return {"field": field_from(arrays, FIELDS.find(name)), "locator": locator_from_numbers(numbers, dtype)}
 
 
 def _examples_from(arrays: Mapping[str, np.ndarray], kind: str, pads: int, readings: int) -> PressExamples | None:
@@ -307,11 +336,10 @@ def _crosstalk_from(arrays: Mapping[str, np.ndarray], pads: int) -> Crosstalk | 
     return Crosstalk(matrix, error)
 
 
-def _noise_from(arrays: Mapping[str, np.ndarray], name: str, fitted: Mapping[str, jax.Array]) -> NoiseLaw | None:
-    """The noise law of this name; None for a file of an early version."""
+def _noise_from(arrays: Mapping[str, np.ndarray], name: str, rms: jax.Array) -> NoiseLaw | None:
+    """The noise law of this name, for residuals (pads,) of the curves; None for a file of an early version."""
     if f"pads/{name}-floor" not in arrays:
         return None
-    rms = fitted["residual_rms"]
     shapes = {"scale": (len(rms),)}
     numbers = {f.name: shaped(arrays, f"pads/{name}-{f.name}", shapes.get(f.name, ()), "f") for f in fields(NoiseLaw)}
     return NoiseLaw(**{name: jnp.asarray(number, rms.dtype) for name, number in numbers.items()})

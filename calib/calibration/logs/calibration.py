@@ -98,7 +98,7 @@ class LogCalibration:
         return self.model.location is not None
 
     def unseen(self, force: Float[np.ndarray, " n"]) -> str:
-        """What forces over time (N) do that those of the calibration did not, in a sentence; empty: nothing."""
+        """What forces (n,) N over time do that those of the calibration did not, in a sentence; empty: nothing."""
         return unseen_direction(self.model.travel, travel_of(force))
 
     @property
@@ -129,7 +129,11 @@ class LogCalibration:
         return tuple(unit.replace("Pa", own) for unit in self.model.curve.curve.units)
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration, whole or not at all, as HDF5 in the format log-calibration."""
+        """Write the calibration, whole or not at all, as HDF5 in the format log-calibration.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
         fields: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         write_archive(path, FORMAT, *log_archive(fields))
 

@@ -1,5 +1,6 @@
 """Recalibration of a log's calibration from a log with known force; see `shift`."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -32,8 +33,6 @@ def assess_log(
         )
     except ValueError as error:
         raise SessionError(f"{session.name}: /streams/{signal.name}: {error}") from None
-    outside = int((series.complete & ~found.valid).sum())
-    notes = [f"{outside} of {int(series.complete.sum())} samples left out: outside the calibrated range"]
     before = np.array([1.0, 0.0]) if calibration.shift is None else moved[0]
     return LogShift(
         gain=float(fit.mean[0]),
@@ -47,8 +46,15 @@ def assess_log(
         session=f"{session.hash}  {session.name}",
         since=calibration.recorded,
         until=session.epoch,
-        notes=(*ignored, *(notes if outside else [])),
+        notes=(*ignored, *_left_out(series.complete, found.valid)),
     )
+
+
+def _left_out(complete: np.ndarray, valid: np.ndarray) -> Iterator[str]:
+    """A note on the samples (n,) outside the calibrated range, if there are any."""
+    outside = int((complete & ~valid).sum())
+    if outside:
+        yield f"{outside} of {int(complete.sum())} samples left out: outside the calibrated range"
 
 
 def recalibrate_log(

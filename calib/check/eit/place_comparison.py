@@ -39,9 +39,7 @@ def contact_findings(evidence: PressEvidence, skin: je.Skin, channels: ChannelTa
     usual = (alike < 0) == ((alike < 0).sum() >= len(alike) / 2)
     part = flagged_part(~usual)
     if part is not None:
-        when = part.text(evidence.times[evidence.seen[rows]], int(eit.time[0]))
-        what = f"the changes of the readings have the opposite sign {when}"
-        yield Finding(Severity.ERROR, "/streams/eit", what, "look for frames that were negated, or subtracted, there")
+        yield _sign_finding(part.text(evidence.times[evidence.seen[rows]], int(eit.time[0])))
         return
     rows, contacts, alike = rows[usual], contacts[usual], np.abs(alike[usual])
     # The fields in closed form do not hold for all sheets, such as one with a corner that points inwards.
@@ -64,6 +62,11 @@ def contact_findings(evidence: PressEvidence, skin: je.Skin, channels: ChannelTa
     elif clear and ((away > MAX_SINGLE * pitch) & (alike > CLEARLY_ALIKE)).any():
         other = (away > MAX_SINGLE * pitch) & (alike > CLEARLY_ALIKE)
         yield _single(evidence.number[numbers[other]], site[other], contacts[other], pitch)
+
+
+def _sign_finding(when: str) -> Finding:
+    what = f"the changes of the readings have the opposite sign {when}"
+    return Finding(Severity.ERROR, "/streams/eit", what, "look for frames that were negated, or subtracted, there")
 
 
 def _located(

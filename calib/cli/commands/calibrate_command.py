@@ -3,9 +3,10 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ...calibration import Recipe
 from ...calibration.recipe_text import NONE
@@ -13,6 +14,11 @@ from ...session import Session
 from ..arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
 from ..terminal import announce_model, stage_bar, title
+
+if TYPE_CHECKING:
+    from ...calibration import Calibration
+    from ...calibration.evaluation import Evaluation
+    from ...calibration.logs.evaluation import LogEvaluation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +60,6 @@ def _calibrate_together(args: argparse.Namespace) -> int:
     from jaxeit.skin import parse_skin
 
     from ...calibration.evaluation import render_table
-    from ...calibration.layer import render_layer
     from ...calibration.procedure import STAGES, calibrate, evaluate
     from ...session import open_session
 
@@ -76,21 +81,40 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         write_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
         own = calibration.evaluation.summary() | {"notes": list(calibration.notes)}
-        results = {"calibration": own} | {n: e.summary() for n, e in tried.items()}
-        print(json.dumps(results, indent=2, sort_keys=True))
+        _print_json(own, tried)
         return 0
-    names = ", ".join(Path(path).name for path in args.sessions)
-    print(render_table(calibration.evaluation, title(names, calibration.simulated)))
-    for note in calibration.notes:
-        print(f"  note: {note}")
-    if calibration.layer is not None:
-        print(f"  {render_layer(calibration.layer, calibration.recon)}")
-    if calibration.contact_law is not None:
-        print(f"  force without pads: {calibration.contact_law.render()}")
+    print(_rendered(calibration, title(_names(args), calibration.simulated)))
     for name, found in tried.items():
         print("\n" + render_table(found, title(name, tests[name].simulated)))
-    print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
+    _print_written(args)
     return 0
+
+
+def _rendered(calibration: "Calibration", heading: str) -> str:
+    """What a calibration attains, and what is to be known of it."""
+    from ...calibration.evaluation import render_table
+    from ...calibration.layer import render_layer
+
+    lines = [render_table(calibration.evaluation, heading), *(f"  note: {note}" for note in calibration.notes)]
+    if calibration.layer is not None:
+        lines.append(f"  {render_layer(calibration.layer, calibration.recon)}")
+    if calibration.contact_law is not None:
+        lines.append(f"  force without pads: {calibration.contact_law.render()}")
+    return "\n".join(lines)
+
+
+def _print_json(own: dict[str, Any], tried: "Mapping[str, Evaluation | LogEvaluation]") -> None:
+    """Print the figures of a calibration and those of the test sessions."""
+    results = {"calibration": own} | {name: found.summary() for name, found in tried.items()}
+    print(json.dumps(results, indent=2, sort_keys=True))
+
+
+def _names(args: argparse.Namespace) -> str:
+    return ", ".join(Path(path).name for path in args.sessions)
+
+
+def _print_written(args: argparse.Namespace) -> None:
+    print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
 
 
 def _calibrate_many(args: argparse.Namespace) -> int:
@@ -100,10 +124,7 @@ def _calibrate_many(args: argparse.Namespace) -> int:
     from ...batch.cluster import dask_executor
     from ...batch.sessions import Outcome, calibrate_many, render_outcomes
 
-    if args.test:
-        raise ValueError("--test is for one calibration; try those of a folder with jaxeit evaluate")
-    if args.report:
-        raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
+    _refuse_single(args)
     with ExitStack() as stack:
         executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
         bar = stack.enter_context(tqdm(total=len(args.sessions), desc="sessions", disable=None, leave=False))
@@ -131,6 +152,14 @@ def _calibrate_many(args: argparse.Namespace) -> int:
     return 2 if any(outcome.reason for outcome in outcomes) else 0
 
 
+def _refuse_single(args: argparse.Namespace) -> None:
+    """Refuse what one calibration from all sessions takes, and a folder of calibrations does not."""
+    if args.test:
+        raise ValueError("--test is for one calibration; try those of a folder with jaxeit evaluate")
+    if args.report:
+        raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
+
+
 _NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
 
 
@@ -154,13 +183,11 @@ def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence
 
         write_log_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
-        results = {"calibration": calibration.evaluation.summary()} | {n: e.summary() for n, e in tried.items()}
-        print(json.dumps(results, indent=2, sort_keys=True))
+        _print_json(calibration.evaluation.summary(), tried)
         return 0
-    names = ", ".join(Path(path).name for path in args.sessions)
-    print(render_log(title(names, calibration.simulated), calibration))
+    print(render_log(title(_names(args), calibration.simulated), calibration))
     print("\n" + render_evaluation(calibration.evaluation))
     for name, found in tried.items():
         print("\n" + render_evaluation(found, name))
-    print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
+    _print_written(args)
     return 0

@@ -1,12 +1,11 @@
 """`jaxeit check`."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..arguments import skin_of
-from ..terminal import one_line, progress_bar
+from ..terminal import one_line, progress_bar, say
 
 if TYPE_CHECKING:
     from ...session import Session
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
                 report = report if args.electrodes else with_placement(report, session, skin)
                 report = report if health is None else with_health(report, health(session))
         except SessionError as error:
-            print(f"jaxeit: {one_line(error)}", file=sys.stderr)
+            say(one_line(error))
             worst = 2
             continue
         print(to_json(report) if args.json else render(report, verbose=args.all))

@@ -1,20 +1,22 @@
 """`jaxeit design`."""
 
 import argparse
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..arguments import above_zero, count, prepare_results, require_matplotlib_for, skin_of
 from ..terminal import announce_model, progress_bar
 
 if TYPE_CHECKING:
     import jaxeit as je
-    from jaxeit.scan import DesignSettings, PlacementLimits, PlaceSensitivity, ScanDesign
+    from jaxeit.scan import AbstractCriterion, DesignSettings, PlacementLimits, PlaceSensitivity, ScanDesign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The skin, the time of a frame, and what is wanted of it."""
-    from jaxeit.scan import CRITERIA, DesignSettings, PlacementLimits
+    from jaxeit.scan import CRITERIA, DesignSettings
 
     usual = DesignSettings()
     parser.add_argument("skin", metavar="SKIN", help="a shipped skin by its name, or the TOML file of your own")
@@ -39,6 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--noise", type=above_zero, metavar="V", help=text)
     text = "further noise of a reading, as part of its voltage, such as 1e-3; default: 0"
     parser.add_argument("--relative-noise", type=above_zero, default=0.0, metavar="PART", help=text)
+    _add_placement_arguments(parser)
+    parser.add_argument("--picture", metavar="MAP.png", help="draw the expected error over the sheet, before and after")
+
+
+def _add_placement_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `_limits` reads."""
+    from jaxeit.scan import PlacementLimits
+
     moving = parser.add_argument_group("places of the electrodes")
     text = "also move the electrodes to where the scan places contacts best; takes minutes"
     moving.add_argument("--move", action="store_true", help=text)
@@ -52,13 +62,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     moving.add_argument("--farthest", type=above_zero, metavar="M", help=text)
     text = "give up mirror symmetries that the electrodes have"
     moving.add_argument("--asymmetric", action="store_true", help=text)
-    parser.add_argument("--picture", metavar="MAP.png", help="draw the expected error over the sheet, before and after")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the skin with the designed scan, and print what is expected of it."""
-    from dataclasses import replace
-    from functools import partial
     from time import perf_counter
 
     import jaxeit as je
@@ -70,19 +77,50 @@ def run(args: argparse.Namespace) -> int:
     prepare_results(args, "output", "picture")
     if args.picture:
         require_matplotlib_for("--picture")
-    began, skin, criterion = (
-        perf_counter(),
-        skin_of(args.skin),
-        je.scan.CRITERIA.make(args.criterion, allow_import=True),
-    )
-    skin.protocol.rows("jaxeit design")
-    if args.sense_channels is not None:
-        skin = replace(skin, protocol=replace(skin.protocol, sense_channels=args.sense_channels))
+    began, skin = perf_counter(), _asked_skin(args)
+    criterion = je.scan.CRITERIA.make(args.criterion, allow_import=True)
     limits, readings = _limits(args), _readings(args, skin)
+    announce_model(skin, je.Fidelity.draft())
+    made = _designed(args, skin, criterion, limits, readings)
+    with replacing(Path(args.output)) as new:
+        new.write_text(made.skins[1].toml, encoding="utf-8")
+    print("\n".join(_report(made, args.switch)))
+    print(f"{args.output}: written after {perf_counter() - began:.0f} s")
+    if args.picture:
+        _write_picture(made, Path(args.picture))
+    return 0
+
+
+def _asked_skin(args: argparse.Namespace) -> "je.Skin":
+    """The skin with as many readings at once as were asked for; its scan must be one of rows."""
+    skin = skin_of(str(args.skin))
+    skin.protocol.rows("jaxeit design")
+    if args.sense_channels is None:
+        return skin
+    return replace(skin, protocol=replace(skin.protocol, sense_channels=args.sense_channels))
+
+
+class _Design(NamedTuple):
+    """The skin and what is expected of it, before and after; and the scan."""
+
+    skins: tuple["je.Skin", "je.Skin"]
+    sensitivities: tuple["PlaceSensitivity", "PlaceSensitivity"]
+    scan: "ScanDesign"
+
+
+def _designed(
+    args: argparse.Namespace,
+    skin: "je.Skin",
+    criterion: "AbstractCriterion",
+    limits: "PlacementLimits | None",
+    readings: int,
+) -> _Design:
+    """The design of the scan; where electrodes may move, that of the scan after they have."""
+    import jaxeit as je
+
     settings = je.scan.DesignSettings(
         width=args.width, columns=args.columns, noise=args.noise, relative=args.relative_noise
     )
-    announce_model(skin, je.Fidelity.draft())
     scan = partial(
         je.scan.design_scan,
         readings=readings,
@@ -101,13 +139,7 @@ def run(args: argparse.Namespace) -> int:
         after = _sensitivity(better, settings)
         found = scan(after)
     better = je.skin.with_rows(better, found.pattern, skin.protocol.sense_channels)
-    with replacing(Path(args.output)) as new:
-        new.write_text(better.toml, encoding="utf-8")
-    print("\n".join(_report((skin, better), (before, after), found, args.switch)))
-    print(f"{args.output}: written after {perf_counter() - began:.0f} s")
-    if args.picture:
-        _write_picture((skin, better), (before, after), Path(args.picture))
-    return 0
+    return _Design((skin, better), (before, after), found)
 
 
 def _sensitivity(skin: "je.Skin", settings: "DesignSettings") -> "PlaceSensitivity":
@@ -157,17 +189,12 @@ def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
     return found
 
 
-def _report(
-    skins: tuple["je.Skin", "je.Skin"],
-    sensitivities: tuple["PlaceSensitivity", "PlaceSensitivity"],
-    found: "ScanDesign",
-    switch: float,
-) -> list[str]:
+def _report(made: _Design, switch: float) -> list[str]:
     import numpy as np
 
-    before, after = skins
-    columns = [_figures(*pair, switch) for pair in zip(skins, sensitivities, strict=True)]
-    sensitivity = sensitivities[0]
+    (before, after), found = made.skins, made.scan
+    columns = [_figures(*pair, switch) for pair in zip(made.skins, made.sensitivities, strict=True)]
+    sensitivity = made.sensitivities[0]
     sites, width = len(sensitivity.sites), 1e3 * float(sensitivity.width)
     heads = ("", "before", "after")
     rows = [heads, *((name, columns[0][name], columns[1][name]) for name in columns[0])]
@@ -208,9 +235,7 @@ def _figures(skin: "je.Skin", sensitivity: "PlaceSensitivity", switch: float) ->
     }
 
 
-def _write_picture(
-    skins: tuple["je.Skin", "je.Skin"], sensitivities: tuple["PlaceSensitivity", "PlaceSensitivity"], path: Path
-) -> None:
+def _write_picture(made: _Design, path: Path) -> None:
     import numpy as np
 
     from ...report.figures.designs import ExpectedErrors, design_figure
@@ -220,6 +245,6 @@ def _write_picture(
         f"{name}: {skin.protocol.readings} readings": ExpectedErrors(
             skin, np.asarray(sensitivity.sites), np.asarray(sensitivity.errors(skin.protocol.pattern))
         )
-        for name, skin, sensitivity in zip(("before", "after"), skins, sensitivities, strict=True)
+        for name, skin, sensitivity in zip(("before", "after"), made.skins, made.sensitivities, strict=True)
     }
     write_figure(design_figure(maps), path)

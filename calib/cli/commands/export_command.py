@@ -1,17 +1,22 @@
 """`jaxeit export`."""
 
 import argparse
-import sys
+from collections.abc import Callable
 
 from ..arguments import prepare_results
-from ..terminal import progress_bar
+from ..terminal import progress_bar, say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to write, from which file, and where to."""
     kinds = parser.add_subparsers(title="formats", required=True, metavar="FORMAT", dest="format")
-    text = "one C99 header without allocation: a frame to image, force map and pad forces in float32"
-    header = kinds.add_parser("c", help=text, description=text[0].upper() + text[1:] + ".")
+    for name, (text, add, export) in _FORMATS.items():
+        kind = kinds.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        add(kind)
+        kind.set_defaults(export=export)
+
+
+def _add_header(header: argparse.ArgumentParser) -> None:
     header.add_argument("calibration", metavar="CALIBRATION.h5")
     header.add_argument("-o", "--output", required=True, metavar="SKIN.h")
     text = "prefix of the names in the header, in lower case (default: %(default)s)"
@@ -20,18 +25,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     header.add_argument("--without-location", action="store_true", help=text)
     text = "place of the contact by this estimator of the image, in place of the fits of the calibration; such as half"
     header.add_argument("--place", metavar="ESTIMATOR", help=text)
-    header.set_defaults(export=_write_header)
-    text = "a force map or a session as a bag of ROS 2 (MCAP) for ros2 bag play and Foxglove, with jaxeit[tables]"
-    bag = kinds.add_parser("mcap", help=text, description=text[0].upper() + text[1:] + ".")
+
+
+def _add_bag(bag: argparse.ArgumentParser) -> None:
     bag.add_argument("source", metavar="FORCEMAP.h5", help="a force map of jaxeit apply, or a session")
     text = "a folder of rosbag2, or one file if the name ends in .mcap"
     bag.add_argument("-o", "--output", required=True, metavar="BAG", help=text)
     bag.add_argument("--prefix", default="/skin", help="first part of the topics (default: %(default)s)")
     text = "frame of coordinates in which the skin lies (default: %(default)s)"
     bag.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
-    bag.set_defaults(export=_write_bag)
-    text = "force maps as a LeRobot dataset of version 3.0, each force map an episode, with jaxeit[tables]"
-    dataset = kinds.add_parser("lerobot", help=text, description=text[0].upper() + text[1:] + ".")
+
+
+def _add_dataset(dataset: argparse.ArgumentParser) -> None:
     dataset.add_argument("sources", nargs="+", metavar="FORCEMAP.h5", help="force maps of jaxeit apply")
     dataset.add_argument("-o", "--output", required=True, metavar="DATASET", help="a new folder")
     text = "what was done, in words (default: %(default)s)"
@@ -40,12 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     dataset.add_argument("--fps", type=int, help=text)
     text = "force on a pixel that is white in an image (default: the largest one, rounded up)"
     dataset.add_argument("--full-scale", type=float, metavar="N", help=text)
-    dataset.set_defaults(export=_write_dataset)
-    text = "frames of jaxeit simulate --random-scenes as Parquet, a file for each shard, with jaxeit[tables]"
-    table = kinds.add_parser("parquet", help=text, description=text[0].upper() + text[1:] + ".")
+
+
+def _add_table(table: argparse.ArgumentParser) -> None:
     table.add_argument("source", metavar="FRAMES", help="the folder of the frames")
     table.add_argument("-o", "--output", required=True, metavar="FOLDER", help="an empty or a new folder")
-    table.set_defaults(export=_write_table)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,11 +68,7 @@ def _write_header(args: argparse.Namespace) -> object:
     prepare_results(args, "output")
     calibration = load_calibration(args.calibration)
     options = {"prefix": args.prefix, "without_location": args.without_location, "place": args.place}
-    return export_c(calibration, args.output, **options, tell=_tell)
-
-
-def _tell(line: str) -> None:
-    print(f"jaxeit: {line}", file=sys.stderr)
+    return export_c(calibration, args.output, **options, tell=say)
 
 
 def _write_bag(args: argparse.Namespace) -> object:
@@ -89,3 +89,28 @@ def _write_table(args: argparse.Namespace) -> object:
     from ...batch.parquet_frames import export_training_frames
 
     return export_training_frames(args.source, args.output, progress=progress_bar("shards"))
+
+
+# Format -> what it is, the arguments of its writer, and the writer.
+_FORMATS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], object]]] = {
+    "c": (
+        "one C99 header without allocation: a frame to image, force map and pad forces in float32",
+        _add_header,
+        _write_header,
+    ),
+    "mcap": (
+        "a force map or a session as a bag of ROS 2 (MCAP) for ros2 bag play and Foxglove, with jaxeit[tables]",
+        _add_bag,
+        _write_bag,
+    ),
+    "lerobot": (
+        "force maps as a LeRobot dataset of version 3.0, each force map an episode, with jaxeit[tables]",
+        _add_dataset,
+        _write_dataset,
+    ),
+    "parquet": (
+        "frames of jaxeit simulate --random-scenes as Parquet, a file for each shard, with jaxeit[tables]",
+        _add_table,
+        _write_table,
+    ),
+}

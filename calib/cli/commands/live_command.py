@@ -1,25 +1,41 @@
 """`jaxeit live`."""
 
 import argparse
-import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from ..arguments import above_zero, add_proposal_argument, prepare_outputs, proposal_of
 from ..signals import orderly_end
+from ..terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from contextlib import AbstractContextManager
 
     from ...calibration import Calibration, LogCalibration
-    from ...live.loop import LiveControl
+    from ...live.loop import LiveControl, LiveSettings
     from ...record.plan import RecordingPlan
+    from ...record.recorder import StopRequest
     from ...record.sources import Source
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """A calibration, the URLs of its streams, and the outputs of the results."""
+    """A calibration, the URLs of its streams, the outputs of the results, and how frames are processed."""
+    _add_stream_arguments(parser)
+    _add_output_arguments(parser)
+    text = "request the next readings from the device: few at rest, those around the contact during a contact"
+    parser.add_argument("--event-driven", action="store_true", help=text)
+    text = "follow contacts from frame to frame: each keeps its number, with ellipse and force"
+    parser.add_argument("--track", action="store_true", help=text)
+    add_proposal_argument(parser, "the network of jaxeit train that tells what touches the skin, in each frame")
+    text = "let zero and relative gains of the pads follow their drift, and write the moved calibration"
+    parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
+    text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
+    parser.add_argument("--realtime", action="store_true", help=text)
+
+
+def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
+    """The calibration, the devices, and for how long."""
     parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
     text = "URL of the EIT stream, as for jaxeit record; not for the calibration of a log"
     parser.add_argument("--eit", metavar="URL", help=text)
@@ -33,6 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "time within which every device must begin to send; default: 10"
     parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help=text)
     parser.add_argument("--seconds", type=above_zero, help="duration; default: until Ctrl-C")
+
+
+def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """The page, the programs and the file that get the results."""
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on; default: this machine only")
     parser.add_argument("--port", type=int, default=8765, help="port of the page; 0: any free port; default: 8765")
     text = "send results as lines of JSON to programs that connect to this port; 0: any free port"
@@ -51,24 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "frame of coordinates in which the skin lies, for --ros2 and --foxglove (default: %(default)s)"
     parser.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record the streams at the same time")
-    text = "request the next readings from the device: few at rest, those around the contact during a contact"
-    parser.add_argument("--event-driven", action="store_true", help=text)
-    text = "follow contacts from frame to frame: each keeps its number, with ellipse and force"
-    parser.add_argument("--track", action="store_true", help=text)
-    add_proposal_argument(parser, "the network of jaxeit train that tells what touches the skin, in each frame")
-    text = "let zero and relative gains of the pads follow their drift, and write the moved calibration"
-    parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
-    text = "use real-time scheduling (SCHED_FIFO), so that frames are processed promptly on a busy machine (Linux)"
-    parser.add_argument("--realtime", action="store_true", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
     """Show force maps until the user stops the command."""
     _set_up_process(args)
-    from threading import Timer
-
     from ...calibration import load_calibration
-    from ...live.loop import LiveControl, LiveSettings, Publish
+    from ...live.loop import LiveControl, Publish
     from ...live.presentation import Presentation, present
     from ...record.recorder import StopRequest
 
@@ -76,36 +85,53 @@ def run(args: argparse.Namespace) -> int:
     calibration = load_calibration(args.calibration)
     plan, sources = _planned(args, calibration)
     orders = StopRequest()
-    show = LiveControl(stop=orders.stop, warn=_tell)
+    show = LiveControl(stop=orders.stop, warn=say)
     also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
-    timer = Timer(args.seconds or 0.0, orders.stop_recording)
-    timer.daemon = True
     with orderly_end(orders, planned=False), ExitStack() as stack:
         also += [stack.enter_context(viewer).show_result for viewer in _viewers(args, calibration, show)]
         if args.seconds is not None:
-            timer.start()
+            stack.enter_context(_timed(args.seconds, orders))
         count = present(
             calibration,
             plan,
             sources,
             show,
             Presentation(args.host, args.port, args.publish, args.publish_maps, args.output),
-            LiveSettings(
-                event_driven=args.event_driven,
-                realtime=args.realtime,
-                rest=args.rest,
-                wait=args.wait,
-                track=args.track,
-                proposal=proposal_of(args.proposal),
-                recalibrate=args.recalibrate is not None,
-                moved=args.recalibrate,
-            ),
+            _settings(args),
             also=also,
-            tell=_tell,
+            tell=say,
         )
-        timer.cancel()
-    _tell(f"{count} frames")
+    say(f"{count} frames")
     return orders.status
+
+
+@contextmanager
+def _timed(seconds: float, orders: "StopRequest") -> "Iterator[None]":
+    """Within this context a stop is requested after so many seconds."""
+    from threading import Timer
+
+    timer = Timer(seconds, orders.stop_recording)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _settings(args: argparse.Namespace) -> "LiveSettings":
+    from ...live.loop import LiveSettings
+
+    return LiveSettings(
+        event_driven=args.event_driven,
+        realtime=args.realtime,
+        rest=args.rest,
+        wait=args.wait,
+        track=args.track,
+        proposal=proposal_of(args.proposal),
+        recalibrate=args.recalibrate is not None,
+        moved=args.recalibrate,
+    )
 
 
 def _viewers(
@@ -120,13 +146,13 @@ def _viewers(
         return
     from ...live.bridges import Bridge, FoxgloveServer, RosNode
 
-    options = {"prefix": args.prefix, "frame_id": args.frame_id, "track": args.track, "warn": _tell}
+    options = {"prefix": args.prefix, "frame_id": args.frame_id, "track": args.track, "warn": say}
     if args.ros2 is not None:
         yield Bridge(calibration, RosNode(args.ros2), **options)
     if args.foxglove is not None:
         server = FoxgloveServer(args.host, args.foxglove)
         yield Bridge(calibration, server, **options)
-        _tell(f"open {server.address} in Foxglove")
+        say(f"open {server.address} in Foxglove")
 
 
 def _planned(
@@ -158,10 +184,6 @@ def _set_up_process(args: argparse.Namespace) -> None:
     from ...runtime import set_up_live
 
     set_up_live()
-
-
-def _tell(line: str) -> None:
-    print(f"jaxeit: {line}", file=sys.stderr)
 
 
 def _require_rerun() -> None:

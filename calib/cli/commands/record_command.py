@@ -1,11 +1,10 @@
 """`jaxeit record`."""
 
 import argparse
-import sys
 
 from ..arguments import above_zero, prepare_outputs, skin_of
 from ..signals import orderly_end
-from ..terminal import status_line
+from ..terminal import say, status_line
 
 _STREAMS = ("eit", "pressure", "force", "stage", "temperature", "barometer")
 
@@ -43,9 +42,7 @@ def run(args: argparse.Namespace) -> int:
                 plan, sources, args.output, seconds=args.seconds, wait=args.wait, stop_request=orders, progress=progress
             )
     except KeyboardInterrupt:
-        print(
-            f"jaxeit: interrupted; the recording is kept: jaxeit recover {journal_path(args.output)}", file=sys.stderr
-        )
+        say(f"interrupted; the recording is kept: jaxeit recover {journal_path(args.output)}")
         return 130
     print(summary.render())
     return orders.status or (0 if summary.complete else 2)

@@ -2,19 +2,21 @@
 
 import argparse
 import shlex
-import sys
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..arguments import count, prepare_outputs, prepare_results, skin_of
-from ..signals import interruption_status
-from ..terminal import announce_model, progress_bar
+from ..terminal import announce_model, progress_bar, say, say_interrupted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from jaxeit import Fidelity
+
+    from ...batch.random_frames import WrittenFrames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,11 +95,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         simulate(bench, args.output, progress=progress_bar("blocks"))
     except KeyboardInterrupt as interrupt:
-        print(
-            f"jaxeit: {str(interrupt) or 'interrupted'}; the same command goes on from {args.output}.part",
-            file=sys.stderr,
-        )
-        return interruption_status(interrupt)
+        return say_interrupted(interrupt, f"the same command goes on from {args.output}.part")
     print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED{_saturation(args.output)}")
     return _serve(args.output) if args.serve else 0
 
@@ -214,8 +212,6 @@ def _simulate_robot(args: argparse.Namespace) -> int:
 
 def _simulate_random_scenes(args: argparse.Namespace) -> int:
     """Write frames for training; an interruption leaves whole shards, from which the same command goes on."""
-    from tqdm import tqdm
-
     import jaxeit as je
 
     from ...batch.cluster import dask_executor
@@ -225,14 +221,7 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
     bench, start = load_bench(args.scene), time.monotonic()
     with ExitStack() as stack:
         executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
-        bar = stack.enter_context(tqdm(desc="frames", unit="", unit_scale=True, disable=None, leave=False))
-
-        def begin(frames: int, nbytes: int) -> None:
-            bar.reset(frames)
-            if frames:
-                text = f"{frames:,} frames to write, at most {nbytes / 1e6:,.1f} MB"
-                print(f"jaxeit: {text}", file=sys.stderr, flush=True)
-
+        begin, tell = stack.enter_context(_frame_bar())
         try:
             written = write_training_frames(
                 bench,
@@ -245,13 +234,30 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
                 executor=executor,
                 jobs=args.jobs or 1,
                 begin=begin,
-                tell=bar.update,
+                tell=tell,
             )
         except KeyboardInterrupt as interrupt:
-            text = str(interrupt) or "interrupted"
-            print(f"jaxeit: {text}; the same command goes on from the shards in {args.output}", file=sys.stderr)
-            return interruption_status(interrupt)
-    rate = written.made / (time.monotonic() - start)
-    made = f", {written.made:,} of them now at {rate:,.0f} frames/s" if written.made else ", all of them there before"
-    print(f"{args.output}: {written.frames:,} frames, {written.nbytes / 1e6:,.1f} MB{made}, SIMULATED")
+            return say_interrupted(interrupt, f"the same command goes on from the shards in {args.output}")
+    print(f"{args.output}: {_frames_text(written, time.monotonic() - start)}, SIMULATED")
     return 0
+
+
+@contextmanager
+def _frame_bar() -> "Iterator[tuple[Callable[[int, int], None], Callable[[int], object]]]":
+    """A progress bar: its begin takes the number of frames to write, and of their bytes; its update frames written."""
+    from tqdm import tqdm
+
+    with tqdm(desc="frames", unit="", unit_scale=True, disable=None, leave=False) as bar:
+
+        def begin(frames: int, nbytes: int) -> None:
+            bar.reset(frames)
+            if frames:
+                say(f"{frames:,} frames to write, at most {nbytes / 1e6:,.1f} MB")
+
+        yield begin, bar.update
+
+
+def _frames_text(written: "WrittenFrames", seconds: float) -> str:
+    rate = written.made / seconds
+    made = f"{written.made:,} of them now at {rate:,.0f} frames/s" if written.made else "all of them there before"
+    return f"{written.frames:,} frames, {written.nbytes / 1e6:,.1f} MB, {made}"

@@ -1,14 +1,13 @@
 """`jaxeit train`."""
 
 import argparse
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from ..arguments import count, prepare_results, skin_of
-from ..signals import interruption_status
+from ..terminal import say_interrupted
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,9 +43,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             found = train_proposal(skin, args.output, seed=args.seed, jobs=args.jobs, progress=progress, **given)
         except KeyboardInterrupt as interrupt:
-            text = str(interrupt) or "interrupted"
-            print(f"jaxeit: {text}; the same command goes on from {args.output}.parts", file=sys.stderr)
-            return interruption_status(interrupt)
+            return say_interrupted(interrupt, f"the same command goes on from {args.output}.parts")
     told = found.about["held_out"]
     print(f"of {told['frames']:,} frames of {told['skins']} skins held out, {told['kinds_told']:.0%} are told rightly:")
     for name, row in told["kinds"].items():

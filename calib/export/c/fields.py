@@ -129,13 +129,22 @@ def _edge(fitted: FittedField) -> FieldInC:
     """Without the size of `edge-size`: an image does not tell the width, and such a feature counts as its mean."""
     edge = cast(PadEdge, fitted.field)
     bumps, pairs = edge.bumps, edge.bumps - 1 if edge.corners else 0
+    formula = (
+        f"B-splines of the distance to the sides of the pad and to the rim, over octaves of {float(edge.width):g} m"
+    )
+    operations = (15 + 8 * bumps) * fitted.geometry.start.shape[1] + 15 * len(fitted.geometry.rim) + 24 * bumps
     last = 2 * bumps + pairs
-    scale = _literal(float(edge.width))
+    return FieldInC(formula, _by_pad(fitted, last), _edge_body(bumps, pairs, _literal(float(edge.width))), operations)
+
+
+def _edge_body(bumps: int, pairs: int, scale: str) -> tuple[str, ...]:
+    """The log of the gain in C, of so many bumps over octaves of a distance, and pairs of them at corners."""
+    last = 2 * bumps + pairs
     corners = (
         f"for (uint32_t k = 0; k < {pairs}; k++)",
         f"    log_gain += b[{2 * bumps} + k] * skin_bspline(nearest - (float)k) * skin_bspline(second - (float)k);",
     )
-    body = (
+    return (
         f"float log_gain = -b[{last}], nearest = INFINITY, second = INFINITY;",
         "for (uint32_t s = 0; s < SKIN_SIDES; s++) {",
         "    const float *side = skin_side[pad][s];",
@@ -157,11 +166,6 @@ def _edge(fitted: FittedField) -> FieldInC:
         *(corners if pairs else ()),
         "return log_gain;",
     )
-    formula = (
-        f"B-splines of the distance to the sides of the pad and to the rim, over octaves of {float(edge.width):g} m"
-    )
-    operations = (15 + 8 * bumps) * fitted.geometry.start.shape[1] + 15 * len(fitted.geometry.rim) + 24 * bumps
-    return FieldInC(formula, _by_pad(fitted, last), body, operations)
 
 
 def _product(formula: str, one: str, statements: Statements = lambda fitted: ()) -> Callable[[FittedField], FieldInC]:

@@ -91,14 +91,9 @@ def export_c(
         ExportError: if a part of the calibration cannot be exported; the message says which and what to do.
         OSError: if the file cannot be written.
     """
-    if not _PREFIX.fullmatch(prefix):
-        raise ExportError(
-            f"prefix {prefix!r}: give a lower-case letter, then lower-case letters, digits and underscores, 31 at most"
-        )
     if isinstance(calibration, LogCalibration):
         raise ExportError("a log has no EIT and therefore no image; export the calibration of a skin")
-    if place is not None and without_location:
-        raise ExportError("place: is of no use without the correction by location; give one of the two")
+    _require_choices(prefix, without_location, place)
     chosen = calibration if place is None else with_image_places(calibration, place)
     numbers = numbers_of(chosen, without_location=without_location)
     remarks = [] if place is None else consequences(calibration, chosen)
@@ -111,14 +106,26 @@ def export_c(
         "CURVE": _indented(numbers.curve.body),
         **_location_parts(numbers.location),
     }
-    text = _filled(TEMPLATE, parts)
-    text = re.sub(r"\bskin_", f"{prefix}_", text)
-    text = re.sub(r"\bSKIN_", f"{prefix.upper()}_", text)
     with replacing(Path(path)) as temporary:
-        temporary.write_text(text, encoding="ascii", newline="\n")
+        temporary.write_text(_renamed(_filled(TEMPLATE, parts), prefix), encoding="ascii", newline="\n")
     for remark in remarks:
         tell(remark)
     return sizes
+
+
+def _require_choices(prefix: str, without_location: bool, place: str | None) -> None:
+    if not _PREFIX.fullmatch(prefix):
+        raise ExportError(
+            f"prefix {prefix!r}: give a lower-case letter, then lower-case letters, digits and underscores, 31 at most"
+        )
+    if place is not None and without_location:
+        raise ExportError("place: is of no use without the correction by location; give one of the two")
+
+
+def _renamed(text: str, prefix: str) -> str:
+    """The header with another prefix of its names."""
+    text = re.sub(r"\bskin_", f"{prefix}_", text)
+    return re.sub(r"\bSKIN_", f"{prefix.upper()}_", text)
 
 
 def _filled(template: Path, parts: dict[str, str]) -> str:

@@ -63,25 +63,8 @@ def numbers_of(calibration: Calibration, *, without_location: bool = False) -> N
     Raises:
         ExportError: if a part of the calibration cannot be exported.
     """
-    recon = calibration.recon
-    if not isinstance(recon, je.Reconstructor):
-        raise ExportError(
-            f"method {type(recon).__name__}: solves a problem for each frame, which cannot be exported; calibrate with "
-            "a linear method, such as --method one-step"
-        )
-    if recon.whitening.weight.ndim == 2:
-        raise ExportError(
-            "noise: the covariance between readings needs tables of readings squared, which are not exported; "
-            "calibrate with --noise equal or --noise measured"
-        )
-    if recon.whitening.shares is not None:
-        raise ExportError(
-            "protocol: readings of many electrodes, as of a trigonometric scan, and of amplifiers with a CommonMode "
-            'are not exported; calibrate a skin with a scan of pairs, such as pattern = "adjacent"'
-        )
+    recon = _exportable(calibration.recon)
     pairs, weight = np.asarray(recon.whitening.pairs), np.asarray(recon.whitening.weight, float)
-    if max(len(weight), recon.predict.shape[0], len(calibration.masks.areas)) > np.iinfo(np.uint16).max:
-        raise ExportError("more than 65,535 readings, pairs of electrodes or pixels; calibrate with fewer --pixels")
     current = float(recon.whitening.current)
     predict = current**2 * np.asarray(recon.predict, float)
     predict = (predict + predict.T) / 2
@@ -101,6 +84,28 @@ def numbers_of(calibration: Calibration, *, without_location: bool = False) -> N
         mask_area=area,
         location=location_in_c(calibration) if located else None,
     )
+
+
+def _exportable(recon: je.imaging.AbstractReconstructor) -> je.Reconstructor:
+    """The reconstructor; raises ExportError for one that the header's functions cannot compute."""
+    if not isinstance(recon, je.Reconstructor):
+        raise ExportError(
+            f"method {type(recon).__name__}: solves a problem for each frame, which cannot be exported; calibrate with "
+            "a linear method, such as --method one-step"
+        )
+    if recon.whitening.weight.ndim == 2:
+        raise ExportError(
+            "noise: the covariance between readings needs tables of readings squared, which are not exported; "
+            "calibrate with --noise equal or --noise measured"
+        )
+    if recon.whitening.shares is not None:
+        raise ExportError(
+            "protocol: readings of many electrodes, as of a trigonometric scan, and of amplifiers with a CommonMode "
+            'are not exported; calibrate a skin with a scan of pairs, such as pattern = "adjacent"'
+        )
+    if max(recon.readings, recon.predict.shape[0], len(recon.areas)) > np.iinfo(np.uint16).max:
+        raise ExportError("more than 65,535 readings, pairs of electrodes or pixels; calibrate with fewer --pixels")
+    return recon
 
 
 def _open_part(predict: np.ndarray, pairs: np.ndarray, weight: np.ndarray) -> np.ndarray:

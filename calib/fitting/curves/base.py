@@ -119,13 +119,13 @@ class AbstractCurve(AbstractChoice):
         return np.zeros((0, self.size))
 
     def at(self, scale: Scale) -> "AbstractCurve":
-        """The curve with its open settings, such as a reference pressure, taken from the samples."""
+        """The curve with its open settings, such as a reference pressure, taken from the sizes of the samples."""
         del scale
         return self
 
     @abc.abstractmethod
     def __call__(self, params: Params, pressure: Values) -> Values:
-        """Force in N at `pressure` in Pa; NaN pressure gives NaN force."""
+        """Force (...) N at `pressure` (...) Pa, for parameters (parameters,); NaN pressure gives NaN force."""
 
     def seen(self, pressure: Series) -> Float[Array, "samples ..."]:
         """The part of the curve that does not depend on the parameters, computed once per fit; input of `given`."""
@@ -137,11 +137,11 @@ class AbstractCurve(AbstractChoice):
 
     @abc.abstractmethod
     def inverse(self, params: Params, force: Values) -> Values:
-        """Pressure in Pa at which the curve gives `force` in N."""
+        """Pressure (...) Pa at which the curve with parameters (parameters,) gives `force` (...) N."""
 
     @abc.abstractmethod
     def free(self, params: Params, scale: Scale) -> Params:
-        """Parameters in free coordinates: dimensionless, unbounded, of order one."""
+        """Parameters (parameters,) in free coordinates: dimensionless, unbounded, of order one."""
 
     @abc.abstractmethod
     def bound(self, free: Params, scale: Scale) -> Params:
@@ -149,7 +149,11 @@ class AbstractCurve(AbstractChoice):
 
     @abc.abstractmethod
     def initial(self, pressure: Series, force: Series, valid: Mask, scale: Scale) -> Params:
-        """A robust start for the fit, always finite and inside the bounds."""
+        """A robust start (parameters,) for the fit, always finite and inside the bounds.
+
+        Args:
+            pressure, force, valid: samples (samples,) in Pa and N, and which of them count.
+        """
 
 
 class PositiveSlopes(AbstractCurve):

@@ -39,7 +39,7 @@ from jaxeit.least_squares import ImplicitStep, LevenbergMarquardt
 from ..losses import AbstractLoss, SoftL1
 from ..results import FitError, FitResult
 from .base import AbstractCurve, scale_of
-from .covariance import CurveMinimum, covariance_at
+from .covariance import CurveCovariance, CurveMinimum, covariance_at
 from .fitted import FittedCurve
 from .problem import CurveProblem
 from .samples import Numbers, Samples, bucket, gather
@@ -167,7 +167,7 @@ def fit_samples(
     A valid sample that is not finite makes the whole fit NOT_FINITE, with NaN parameters. `n_groups` = 0 means
     that the samples are independent.
     """
-    used, problem, present = _prepare(curve, samples, loss, n_groups)
+    used, problem, present = fit = _prepare(curve, samples, loss, n_groups)
     curve, scale = problem.curve, problem.scale
     end, ended = _solve(problem, solver, max_steps, rounds)
     found = covariance_at(end, problem)
@@ -176,7 +176,6 @@ def fit_samples(
     params = curve.bound(end.free, scale)
     limits = _pressure_range(used)
     groups = _groups_used(used, n_groups)
-    raw = jnp.where(used.valid, used.force - curve.given(params, problem.samples.pressure), 0.0)
     clean = jnp.all(present | ~samples.valid)
     result = _judge(
         finite=clean & (n > 0) & jnp.all(jnp.isfinite(params)),
@@ -186,6 +185,17 @@ def fit_samples(
         determined=(found.rank == k) & found.enough,
         inside=~jnp.any(end.vanished) | (found.missed < MAX_CONTRADICTION),
     )
+    return _estimates(fit, params, end, found, result)
+
+
+def _estimates(
+    fit: _Fit, params: Float[Array, " k"], end: CurveMinimum, found: CurveCovariance, result: Int[Array, ""]
+) -> FittedCurve:
+    """What the fit tells of its curve; NaN for what its result code does not let be used."""
+    used, curve = fit.used, fit.problem.curve
+    n, k = jnp.sum(used.valid), end.free.size
+    limits = _pressure_range(used)
+    raw = jnp.where(used.valid, used.force - curve.given(params, fit.problem.samples.pressure), 0.0)
     unusable = (result == FitResult.NOT_FINITE) | (result == FitResult.TOO_FEW)
     return FittedCurve(
         curve=curve,
@@ -195,8 +205,8 @@ def fit_samples(
         scale=jnp.where(unusable, jnp.nan, end.spread),
         residual_rms=jnp.where(unusable, jnp.nan, jnp.sqrt(jnp.sum(raw**2) / (n - k).astype(raw.dtype))),
         n=n,
-        n_missing=jnp.sum(~present),
-        n_groups=groups,
+        n_missing=jnp.sum(~fit.present),
+        n_groups=_groups_used(used, fit.problem.n_groups),
         rank=found.rank,
         result=result,
     )

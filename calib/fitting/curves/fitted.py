@@ -56,7 +56,7 @@ class FittedCurve(eqx.Module):
 
     @property
     def standard_errors(self) -> Float[Array, "*pads k"]:
-        """Standard errors of the parameters, in their units."""
+        """Standard errors of the parameters, (pads, k) or (k,) of one pad, in their units."""
         return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def pad(self, index: int) -> "FittedCurve":

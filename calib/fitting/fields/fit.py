@@ -98,6 +98,16 @@ def _robust_posterior(
     return found, square, degrees
 
 
+def _counted(
+    places: Places, log_ratio: Float[Array, " n"], share: Float[Array, "n pads"], weight: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, "n pads"], Float[Array, " n"]]:
+    """Log ratios, shares and weights, without the presses that are not finite or whose place is not known."""
+    finite = jnp.isfinite(log_ratio) & jnp.all(jnp.isfinite(share), -1)
+    known = jnp.all(places.known | (share <= 0), -1)
+    weight = jnp.where(finite & known, weight, 0)
+    return jnp.where(weight > 0, log_ratio, 0), jnp.where(finite[:, None], share, 0), weight
+
+
 def fit_field(
     field: AbstractField,
     geometry: Geometry,
@@ -136,11 +146,7 @@ def fit_field(
             )
             print(f"{fitting.FIELDS.text(field)}: scatter {found.noise:.3f} of {found.spread:.3f}")
     """
-    finite = jnp.isfinite(log_ratio) & jnp.all(jnp.isfinite(share), -1)
-    known = jnp.all(places.known | (share <= 0), -1)
-    weight = jnp.where(finite & known, weight, 0)
-    share = jnp.where(finite[:, None], share, 0)
-    y = jnp.where(weight > 0, log_ratio, 0)
+    y, share, weight = _counted(places, log_ratio, share, weight)
     reach = _supported_box(field, geometry, places, jnp.where(weight[:, None] > 0, share, 0), reach)
     z, centre = _centred_features(pad_features(field, geometry, places, reach), share, weight)
     shapes = jnp.asarray(np.tile(field.shapes(), (1, 1 if field.shared else geometry.pads)), z.dtype)

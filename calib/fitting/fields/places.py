@@ -30,7 +30,7 @@ class Places(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, "n pads"]:
-        """Whether the place of a contact on each pad is known."""
+        """Whether the place of a contact on each pad is known, (n, pads)."""
         return jnp.sum(self.weight, 1) > 0
 
     def __getitem__(self, rows: Integer[ArrayLike, " m"]) -> "Places":

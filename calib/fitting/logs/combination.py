@@ -204,7 +204,8 @@ class SmoothSignal(AbstractCombination):
     def tracker(self) -> "LagTracker":
         return LagTracker(self)
 
-    def forces(self, at: np.ndarray) -> np.ndarray:
+    def forces(self, at: Float[np.ndarray, "n inputs"]) -> Float[np.ndarray, " n"]:
+        """Force (n,) N at inputs of `lag_inputs`, in blocks of rows; NaN where an input is NaN."""
         return np.concatenate([self._force(at[k : k + ROWS]) for k in range(0, len(at), ROWS)] or [np.empty(0)])
 
     def _force(self, at: np.ndarray) -> np.ndarray:

@@ -9,12 +9,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..._compile import full_precision, require_known, verb
-from ...imaging.absolute.background import sheet_of
-from ...imaging.noise import InverseError, whitened_readings
-from ...model.discretisation import Model, require_model
+from ..._compile import full_precision, verb
+from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ..bump_responses import mean_conductivity, points_of
+from ..preparation import sheet_and_readings
 from .fitter import LoadFitter
 from .pressure import MOST, SIZE, Form
 from .settings import LoadSettings
@@ -44,11 +43,8 @@ def prepare_loads(
     Raises:
         InverseError: as for `prepare_contacts`.
     """
-    require_model(model)
-    require_known("prepare_loads", InverseError, model, noise, untouched, sigma, channels)
+    sigma, found = sheet_and_readings("prepare_loads", model, noise, untouched, sigma, channels)
     settings = settings or LoadSettings()
-    sigma = sheet_of(model, untouched, sigma, channels)
-    found = whitened_readings(model, noise, channels)
     put = partial(jnp.asarray, dtype=model.dtype)
     known = sigma is not None
     sigma = conductivity(model) if sigma is None else put(sigma)

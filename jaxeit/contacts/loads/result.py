@@ -40,7 +40,7 @@ class LoadShape(eqx.Module):
 
     @property
     def position_covariance(self) -> Float[Array, "n 2 2"]:
-        """Covariance of each position, m^2."""
+        """Covariance of each of n positions, (n, 2, 2) m^2."""
         size = len(self.covariance) // len(self.force)
         return jnp.stack([self.covariance[k : k + 2, k : k + 2] for k in range(0, len(self.covariance), size)])
 
@@ -51,7 +51,7 @@ class LoadShape(eqx.Module):
 
     @property
     def ends_covariance(self) -> Float[Array, "4 4"]:
-        """Covariance of x, y of the first end and of the second end of an edge, m^2."""
+        """Covariance of x, y of the first end and of the second end of an edge, (4, 4) m^2."""
         place = jnp.eye(2, len(self.covariance))
         half = jnp.eye(2, len(self.covariance), k=4) if len(self.covariance) == 6 else jnp.zeros_like(place)
         both = jnp.concatenate([place - half, place + half])

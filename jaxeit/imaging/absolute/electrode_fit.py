@@ -104,7 +104,7 @@ class ElectrodeFit(eqx.Module):
 
     @property
     def standard_error(self) -> Float[Array, "electrodes 2"]:
-        """Of each shift, m; as large as the deviation before the fit where the readings tell nothing."""
+        """Standard error of each shift, (electrodes, 2) m; the deviation before the fit where readings tell nothing."""
         return jnp.sqrt(jnp.diagonal(self.covariance)).reshape(self.shift.shape)
 
 

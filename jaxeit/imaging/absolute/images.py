@@ -38,11 +38,11 @@ class LogConductivity(eqx.Module):
     background: Float[Array, ""]
 
     def sigma(self, x: Float[Array, " basis"]) -> Float[Array, " elements"]:
-        """Conductivity of the elements, S."""
+        """Conductivity of the elements, (elements,) S, of an image x, (basis,)."""
         return self.background * jnp.exp(self.image.expand(x))
 
     def voltages(self, x: Float[Array, " basis"]) -> Float[Array, " readings"]:
-        """Readings, V."""
+        """Readings, (readings,) V, of an image x, (basis,)."""
         return forward(self.model, self.sigma(x))
 
     def slopes(self, x: Float[Array, " basis"]) -> Float[Array, "readings basis"]:
@@ -56,7 +56,7 @@ class AbstractPenalty(AbstractChoice):
 
     @abstractmethod
     def value(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, ""]:
-        """The penalty of an image x."""
+        """The penalty of an image x, (basis,)."""
 
     @abstractmethod
     def matrix(self, picture: Picture, x: Float[Array, " basis"]) -> Float[Array, "basis basis"]:

@@ -22,7 +22,7 @@ class OneStep(AbstractLinearMethod):
         return one_step_image(problem, problem.precision(), y)[0]
 
     def variance(self, problem: Problem) -> Float[Array, " basis"]:
-        """The diagonal of ``(J^T J + l^2 R)^-1``, the posterior of a Gaussian image."""
+        """The diagonal of ``(J^T J + l^2 R)^-1``, the posterior of a Gaussian image; (basis,) S^2."""
         precision = problem.precision()
         b = precision.seen(problem.jacobian)
         (k, n), level = b.shape, problem.level(b)

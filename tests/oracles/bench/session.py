@@ -81,12 +81,17 @@ def _times(end: float, rate: float) -> np.ndarray:
 
 def transfer_frames(layer: contact.Layer, sheet: Sheet, loads: np.ndarray) -> np.ndarray:
     """Transfer matrix of the bolts for each frame of loads (frames, patches), ohm."""
-    live = (conducts := contact.conductances(layer, loads)).any(0)
+    return transfers(layer, sheet, contact.conductances(layer, loads))
+
+
+def transfers(layer: contact.Layer, sheet: Sheet, conducts: np.ndarray) -> np.ndarray:
+    """Transfer matrix of the bolts for each frame of conductances (frames, patches) S, ohm."""
+    live = conducts.any(0)
     if not live.any():
-        return np.broadcast_to(sheet.untouched, (len(loads), *sheet.untouched.shape))
+        return np.broadcast_to(sheet.untouched, (len(conducts), *sheet.untouched.shape))
     chosen = contact.Layer(layer.places[live], layer.island[live], layer.touch[live], layer.gain[live])
     between, bolts = green(sheet, mean_potentials(sheet.mesh, contact.samples(chosen)))
-    found = np.empty((len(loads), *sheet.untouched.shape))
+    found = np.empty((len(conducts), *sheet.untouched.shape))
     for k, g in enumerate(conducts[:, live]):
         on = np.flatnonzero(g)
         joined = contact.joined(g[on], chosen.island[on])

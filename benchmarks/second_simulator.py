@@ -1,17 +1,24 @@
-"""Skins of the second simulator under presses, and the true force maps of these."""
+"""Skins of the second simulator: its sessions; skins under presses, and the true force maps of these."""
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+import calib
+from tests.oracles import bench as oracle
 from tests.oracles.bench import contact
 from tests.oracles.bench.mesh import make_mesh
-from tests.oracles.bench.session import coating
-from tests.oracles.bench.sheet import Sheet, green, make_sheet, mean_potentials, readings, touched
-from tests.oracles.bench.skin import Skin
+from tests.oracles.bench.session import coating, transfers
+from tests.oracles.bench.sheet import Sheet, make_sheet, readings
+from tests.oracles.bench.skin import SKINS, Skin, read_skin
 
-from .bench_proposal import SCATTER, SPACING, Recorded, described
+from .problems import Pressed
 
+SCATTER, SPACING = 0.1, 3e-3  # of the log of the protrusions; of the mesh, m
 FORCES, TIPS = (4.0, 25.0), (0.006, 0.03)  # N, m
 DISTANCE = 0.03  # m, of two contacts
 AGED, AGED_FIELD = -0.3, 0.2  # change of the log gain from the first press to the last: its mean, standard deviation
@@ -37,6 +44,21 @@ class Wear(NamedTuple):
     ages: bool = False
 
 
+@contextmanager
+def session_of(bench: oracle.Bench) -> Iterator[calib.Session]:
+    """A session of a bench."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.h5"
+        oracle.write(path, oracle.simulate(bench))
+        with calib.open_session(path) as session:
+            yield session
+
+
+def described(name: str) -> Skin:
+    """A shipped skin, as the second simulator reads it."""
+    return read_skin(SKINS / f"{name}.toml")
+
+
 def presses(rng: np.random.Generator, count: int, tip: float | None = None) -> list[Press]:
     """Single tips anywhere."""
     return [
@@ -57,9 +79,9 @@ def pairs(rng: np.random.Generator, count: int) -> list[Press]:
     ]
 
 
-def recorded(seed: int, given: list[Press], wear: Wear) -> Recorded:
+def recorded(seed: int, given: list[Press], wear: Wear, name: str = "testbed") -> Pressed:
     """A skin of a seed under presses, of which each change is that from the untouched skin of its time."""
-    skin, own = described("testbed"), np.random.default_rng([seed, 11])
+    skin, own = described(name), np.random.default_rng([seed, 11])
     bolts = skin.bolts + wear.misplaced * own.standard_normal(skin.bolts.shape)
     layer, mesh = contact.make_layer(skin, bolts, SCATTER, own), make_mesh(skin, bolts, SPACING)
     sigma = coating(mesh.points[mesh.triangles].mean(1), wear.coat, own) / skin.resistance
@@ -76,21 +98,13 @@ def recorded(seed: int, given: list[Press], wear: Wear) -> Recorded:
     if wear.ages:
         of_bolts = np.where(mesh.bolt[mesh.bolt >= 0] == LOOSE, LOOSENED, 1.0) * skin.contact
         changes.append(_changes(skin, layer, make_sheet(mesh, sigma, of_bolts[:, None, None]), conducts[begin:]))
-    return Recorded(readings(sheet.untouched, skin.pattern, skin.current), np.concatenate(changes))
+    return Pressed.of(readings(sheet.untouched, skin.pattern, skin.current), np.concatenate(changes))
 
 
 def _changes(skin: Skin, layer: contact.Layer, sheet: Sheet, conducts: np.ndarray) -> np.ndarray:
     """Change of the readings (presses, readings) V by the conductances of patches (presses, patches) S."""
-    live = conducts.any(0)
-    chosen = contact.Layer(layer.places[live], layer.island[live], layer.touch[live], layer.gain[live])
-    between, bolts = green(sheet, mean_potentials(sheet.mesh, contact.samples(chosen)))
-    found = []
-    for conductance in conducts[:, live]:
-        on = np.flatnonzero(conductance)
-        joined = contact.joined(conductance[on], chosen.island[on])
-        transfer = touched(sheet, between[np.ix_(on, on)], bolts[on], joined)
-        found.append(readings(transfer - sheet.untouched, skin.pattern, skin.current))
-    return np.array(found)
+    moved = transfers(layer, sheet, conducts) - sheet.untouched
+    return np.array([readings(each, skin.pattern, skin.current) for each in moved])
 
 
 def true_map(press: Press, centres: np.ndarray) -> np.ndarray:
