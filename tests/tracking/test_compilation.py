@@ -7,11 +7,23 @@ import pytest
 
 import jaxeit as je
 from jaxeit.tracking import compile_tracker
+from jaxeit.tracking.belief.programs import Programs
+
+
+@pytest.fixture(params=[False, True], ids=["traced", "kept"])
+def bound(request, tracker, monkeypatch, tmp_path):
+    """The tracker, its programs kept in a folder or not."""
+    if request.param:
+        je.cache_programs(tmp_path)
+        monkeypatch.setattr(tracker, "programs", Programs(tracker.filter))
+    yield tracker
+    je.cache_programs(None)
 
 
 @pytest.mark.slow
-def test_no_frame_waits_for_a_compilation(model, tracker, blank, request):
-    """Births, an unexpected frame, missing readings, and deaths."""
+def test_no_frame_waits_for_a_compilation(model, bound, blank, request):
+    """Births, an unexpected frame, missing readings, and deaths; looks piece by piece too."""
+    tracker = bound
     v0, noise = blank
     rng, points, law = np.random.default_rng(5), np.asarray(model.centroids), tracker.settings.loads.law
 
@@ -34,6 +46,10 @@ def test_no_frame_waits_for_a_compilation(model, tracker, blank, request):
         pads = (np.array([10.0, 0, 0, np.nan]), np.ones(4)) if n % 2 else ()
         now = tracker.step(now, dv, 0.01 * (n + 1), *pads)
         counts.append(len(now.tracks))
+    for dv in frames:
+        now = tracker.step(now, dv, 0.01, np.ones(4), np.ones(4), whole=False)
+        for _ in range(8):
+            now = tracker.look(now)
     assert not seen
     assert max(counts) == 2
     assert counts[0] == 0

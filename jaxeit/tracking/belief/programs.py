@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -27,25 +28,25 @@ class Programs:
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, seconds: float
     ) -> tuple[Belief, Update]:
         """See `filter.followed`."""
-        return self._followed(belief, dv, pads, np.asarray(seconds, self._dtype))
+        return self._followed(_free(belief), dv, pads, np.asarray(seconds, self._dtype))
 
     def predicted(self, belief: Belief, seconds: float) -> Belief:
         """See `filter.predicted`."""
-        return self._predicted(belief, np.asarray(seconds, self._dtype))
+        return self._predicted(_free(belief), np.asarray(seconds, self._dtype))
 
     def attempted(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt | None
     ) -> Attempt:
         """See `filter.attempted`."""
-        return self._attempted(belief, dv, pads, attempt)
+        return self._attempted(_free(belief), dv, pads, attempt)
 
     def concluded(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt) -> Update:
         """See `filter.concluded`."""
-        return self._concluded(belief, dv, pads, attempt)
+        return self._concluded(_free(belief), dv, pads, attempt)
 
     def consider_covariance(self, belief: Belief, pads: Pads) -> Float[np.ndarray, "K 6 6"]:
         """See `consider.consider_covariance`."""
-        return np.asarray(self._consider_covariance(belief, pads))
+        return np.asarray(self._consider_covariance(_free(belief), pads))
 
     def unexplained_place(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads
@@ -60,4 +61,14 @@ class Programs:
 
     def unexplained(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Float[np.ndarray, " r"]:
         """See `filter.unexplained`."""
-        return np.asarray(self._unexplained(belief, dv, pads))
+        return np.asarray(self._unexplained(_free(belief), dv, pads))
+
+
+def _free(belief: Belief) -> Belief:
+    """The belief as arrays that are bound to no device.
+
+    JAX binds the results of kept programs (`jaxeit.cache_programs`) to their device, those of `jnp.asarray` not, and
+    compiles a program once for each mixture of both: a frame would wait for it.
+    """
+    found: Belief = jax.tree.map(np.asarray, belief)
+    return found
