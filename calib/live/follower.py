@@ -16,7 +16,7 @@ from .results import TouchEstimates
 FIRST_SECONDS = 0.01  # before the first frame that is followed
 # Pieces of a look into an unexpected frame that follow one frame, at most; and the time, s, after which a piece is done
 # even if the next frame waits for it.
-PIECES, MAX_PAUSE = 8, 0.03
+PIECES, MAX_PAUSE = 8, 0.012
 SMOOTHING = 0.2  # weight of a piece in the mean time that one takes
 
 Prepare = Callable[[Calibration, np.ndarray, np.ndarray | None], Tracker]

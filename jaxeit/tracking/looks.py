@@ -99,7 +99,7 @@ def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing more has happened."""
     best = max([look.best, *_possible(look)], key=lambda trial: trial.probability)
     if best is look.best or best.attempt is None:
-        return replace(look, after=_calmer(look.otherwise) if look.events == EVENTS else look.otherwise)
+        return replace(look, after=calmer(look.otherwise) if look.events == EVENTS else look.otherwise)
     event = best.event
     update = programs.concluded(event.belief, look.seen.dv, look.seen.pads, best.attempt)
     before = look.before.under(event, event.belief)
@@ -109,7 +109,7 @@ def _judged(look: Look, programs: Programs) -> Look:
     return look if left else replace(look, after=after)
 
 
-def _calmer(after: Tracking) -> Tracking:
+def calmer(after: Tracking) -> Tracking:
     """Contacts to which nothing has happened, although a frame looked like it."""
     return replace(after, patience=min(2 * after.patience, MOST_PATIENCE))
 

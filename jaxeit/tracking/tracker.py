@@ -22,7 +22,7 @@ from .belief.filter import SEEN, SIZE, TOLD, Belief, ContactFilter, Pads, Update
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
-from .looks import begun, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
+from .looks import begun, calmer, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
 from .preparation import prepare_filter
 from .settings import TrackerSettings
 from .tracks import Backlog, Look, Seen, Track, Tracking
@@ -34,6 +34,8 @@ UNEXPECTED, SURPRISING = 4.0, 25.0
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
 WORSE = 1.3
+# Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
+UNSEEN = 0.01
 
 
 class Tracker:
@@ -136,7 +138,7 @@ class Tracker:
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
-            now = replace(without_contacts(now), backlog=None)
+            now = self._given_up(now, seen)
         if now.backlog is not None:
             moved, update = self.programs.followed(now.belief, *seen)
             # What the contacts do not explain would bend them: until it is explained they move on as they did.
@@ -149,6 +151,14 @@ class Tracker:
         while whole and now.backlog is not None:
             now = self._looked(now, now.backlog)
         return now
+
+    def _given_up(self, now: Tracking, seen: Seen) -> Tracking:
+        """Without the frames that wait, and without contacts that have moved on unseen and do not explain the frame."""
+        _, update = self.programs.followed(now.belief, *seen)
+        signal = float(np.sum(np.square(np.asarray(update.loudness))))
+        if is_finite(update) and float(update.misfit) - len(self.filter.compress) < UNSEEN * signal:
+            return replace(calmer(now), backlog=None, since=0, misfit=float(update.misfit))
+        return replace(without_contacts(now), backlog=None)
 
     def look(self, now: Tracking) -> Tracking:
         """A piece more of what is left to be explained, if anything is: `Tracking.backlog`.
