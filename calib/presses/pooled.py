@@ -231,13 +231,13 @@ def thinned(series: PressSeries, most: int) -> PressSeries:
     A part with a missing sample has no mean (NaN).
     """
     press, pressure, force = series
-    starts = np.flatnonzero(np.r_[True, press[1:] != press[:-1]]) if len(press) else np.empty(0, int)
+    if not len(press):
+        return series
+    starts = np.flatnonzero(np.r_[True, press[1:] != press[:-1]])
     ends = np.append(starts[1:], len(press))
     cuts = [np.linspace(a, b, min(most, b - a) + 1).astype(int)[:-1] for a, b in zip(starts, ends, strict=True)]
-    first = np.concatenate([*cuts, np.empty(0, int)]).astype(int)
+    first = np.concatenate(cuts).astype(int)
     count = np.diff(np.append(first, len(press)))
-    if not len(first):
-        return series
     return PressSeries(
         press[first], np.add.reduceat(pressure, first) / count[:, None], np.add.reduceat(force, first) / count
     )

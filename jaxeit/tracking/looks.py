@@ -30,9 +30,13 @@ EVENTS = 4
 LONGEST_WAIT = 2.0
 
 
-def begun(before: Tracking, otherwise: Tracking, seen: Seen) -> Look:
-    """Begin to look into a frame: contacts as they were predicted, and as the frame leaves them if nothing happened."""
-    return Look(seen, before, otherwise, Trial(_as_is(before)), EVENTS)
+def begun(before: Tracking, otherwise: Tracking, seen: Seen, unfinished: bool = False) -> Look:
+    """Begin to look into a frame: contacts as they were predicted, and as the frame leaves them if nothing happened.
+
+    Args:
+        unfinished: whether the update that led to the latter had not converged.
+    """
+    return Look(seen, before, otherwise, Trial(_as_is(before)), EVENTS, unfinished)
 
 
 def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
@@ -67,7 +71,7 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
     if not look.best.ended:
         return replace(look, best=_further(look.best, look.seen, programs))
     if look.trials is None:
-        return replace(look, trials=_trials(look, programs, events))
+        return _asked(look, programs, events)
     best = max(trial.probability for trial in [look.best, *_possible(look)])
     for k, trial in enumerate(look.trials):
         if not (trial.ended or trial.is_hopeless(best)):
@@ -80,14 +84,22 @@ def _further(trial: Trial, seen: Seen, programs: Programs) -> Trial:
     return trial._replace(attempt=programs.attempted(trial.event.belief, seen.dv, seen.pads, trial.attempt))
 
 
-def _trials(look: Look, programs: Programs, events: Events) -> tuple[Trial, ...]:
-    """What may have happened."""
+def _asked(look: Look, programs: Programs, events: Events) -> Look:
+    """The look with what may have happened.
+
+    A force that grows severalfold between two frames is beyond the few evaluations of an ordinary update, which then
+    explains the rest of the frame by gain. If nothing has happened, the contacts are those of the careful update.
+    """
     attempt = look.best.attempt
     assert attempt is not None
     best = programs.concluded(look.before.belief, look.seen.dv, look.seen.pads, attempt)
     place = programs.unexplained_place(best.belief, look.seen.dv, look.seen.pads)
     possible = events.possible(_as_is(look.before), look.before.begun, place, look.seen.seconds)
-    return tuple(map(Trial, possible))
+    look = replace(look, trials=tuple(map(Trial, possible)))
+    if not look.unfinished or not float(best.misfit) < look.otherwise.misfit:
+        return look
+    otherwise = settled(replace(look.before, since=0, misfit=float(best.misfit)), best)
+    return replace(look, otherwise=otherwise, unfinished=False)
 
 
 def _possible(look: Look) -> list[Trial]:
@@ -105,7 +117,7 @@ def _judged(look: Look, programs: Programs) -> Look:
     before = look.before.under(event, event.belief)
     after = settled(replace(before, since=0, patience=PATIENCE, misfit=float(update.misfit)), update)
     best, left = best._replace(event=event._replace(prior=0.0)), look.events - 1
-    look = replace(look, before=before, best=best, otherwise=after, events=left, trials=None)
+    look = replace(look, before=before, best=best, otherwise=after, events=left, unfinished=False, trials=None)
     return look if left else replace(look, after=after)
 
 

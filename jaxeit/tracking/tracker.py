@@ -183,7 +183,7 @@ class Tracker:
         before, look, waiting = backlog.before, backlog.look, backlog.waiting
         if look is not None:
             otherwise, look = look.otherwise, looked(look, self.programs, self.events)
-            if look.otherwise is not otherwise:  # something has happened
+            if look.otherwise is not otherwise:  # something has happened, or the update has come further
                 now = self._until_now(look.otherwise, waiting)
             if look.after is not None:
                 before, look = look.after, None
@@ -198,7 +198,7 @@ class Tracker:
         if not is_finite(update) or not self._is_unexpected(now, update):
             return replace(after, since=now.since + 1), None
         after = replace(after, since=0, misfit=float(update.misfit))
-        return after, begun(replace(now, belief=moved), after, seen)
+        return after, begun(replace(now, belief=moved), after, seen, unfinished=not bool(update.converged))
 
     def _until_now(self, after: Tracking, waiting: tuple[Seen, ...]) -> Tracking:
         """What is believed while frames wait: the contacts after the last event have moved on."""

@@ -141,6 +141,7 @@ class Look:
     | seen: the frame                                                                     |
     | before: contacts before it, after the events that have been found                   |
     | otherwise: contacts after it if nothing more has happened                           |
+    | unfinished: whether `otherwise` is from an update that had not converged            |
     | best: the contacts before it                                                        |
     | events: number of events that are still looked for                                  |
     | trials: what else may have happened; None: not asked yet                            |
@@ -152,6 +153,7 @@ class Look:
     otherwise: Tracking
     best: Trial
     events: int
+    unfinished: bool = False
     trials: tuple[Trial, ...] | None = None
     after: Tracking | None = None
 

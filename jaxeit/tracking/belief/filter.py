@@ -83,6 +83,7 @@ class Update(NamedTuple):
     | surprise: square of the change of the belief, in its standard deviations  | ()    |
     | loudness: of each contact's signal, in standard deviations                | (K,)  |
     | solves: evaluations of what the contacts show                             | ()    |
+    | converged: further evaluations would not change it                        | ()    |
     """
 
     belief: Belief
@@ -91,6 +92,7 @@ class Update(NamedTuple):
     surprise: Float[Array, ""]
     loudness: Float[Array, " K"]
     solves: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 class Attempt(NamedTuple):
@@ -371,6 +373,7 @@ def _nothing(
         surprise=none,
         loudness=jnp.zeros(0, frame.y.dtype),
         solves=jnp.asarray(0),
+        converged=jnp.asarray(True),
     )
 
 
@@ -385,6 +388,7 @@ def _update(problem: _Problem, z: Float[Array, " a"], state: LeastSquaresState) 
         surprise=z @ z,
         loudness=_loudness(normal, problem.factor, len(problem.belief.contacts)) * ratio,
         solves=state.steps,
+        converged=state.converged,
     )
 
 
