@@ -146,17 +146,18 @@ class PooledPresses:
         """Frames (n, readings) V before the presses, minus the mean of each rest; the noise is estimated from them."""
         return np.concatenate([np.concatenate(_rests(one, "eit", processing)) for one in self.recordings])
 
-    @cached_property
+    @property
     def sensor_noise(self) -> np.ndarray:
-        """Standard deviation of single readings of the pads at rest, (pads,) Pa: the median over the rests.
+        """Standard deviation of single readings of the pads at rest, (pads,) Pa, the median of rests; 0 without any.
 
         Of readings as a live view takes them, without the low-pass by which recordings are corrected. A pad that
         recovers from a press moves during the rest after it, which makes the deviation of that rest larger.
         """
         rests = [rest for one in self.recordings for rest in _rests(one, "pressure") if len(rest)]
-        each = np.array([np.sqrt(finite_mean(rest**2)) for rest in rests]).reshape(len(rests), -1)
-        known = [column[np.isfinite(column)] for column in each.T] or [each] * self.data.pressure.shape[1]
-        return np.array([np.median(column) if len(column) else 0.0 for column in known])
+        if not rests:
+            return np.zeros(self.data.pressure.shape[1])
+        each = np.array([np.sqrt(finite_mean(rest**2)) for rest in rests])
+        return np.asarray(np.nanmedian(np.where(np.isfinite(each).any(0), each, 0.0), 0))
 
 
 def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Processing | None = None) -> PooledPresses:

@@ -7,11 +7,13 @@ from calib.presses.corrections import LowPass, PreOnly, TwoSided
 from calib.presses.detection import DetectionLimits, find_presses, noise_level
 from calib.presses.means import dominant_pad, hold_positions, press_means
 from calib.presses.onsets import crossing, onset_delays
+from calib.presses.pooled import PooledPresses, PressData
 from calib.presses.samples import press_samples
 from calib.presses.streams import ArrayStream, PressError, index_ranges, resample
 from calib.presses.times import PressTimes, reject
 from calib.presses.windows import WindowLengths, press_windows, reject_without_samples
 from calib.session.units import SECOND
+from tests.helpers import stand_in
 
 RAMP, HOLD, RELEASE, REST = 1.0, 2.0, 1.0, 2.5
 
@@ -257,3 +259,13 @@ def test_dominant_pad_and_position():
     np.testing.assert_allclose(hold_positions(timeline(times), stage), [[0.03, 0.05, 0.0], [0.1, 0.2, 0.0]])
     assert hold_positions(timeline(times[:0]), stage).shape == (0, 3)
     assert TwoSided().weights(0.5, 0.0, 1.0) == (0.5, 0.5)
+
+
+def test_noise_at_rest_is_zero_where_no_rest_tells_it(monkeypatch):
+    """Of slow streams, no rest holds two samples; a pad may never hold a finite one."""
+    pooled = stand_in(PooledPresses, recordings=(None,), data=stand_in(PressData, pressure=np.zeros((5, 2))))
+    rests = [np.empty((0, 2))]
+    monkeypatch.setattr("calib.presses.pooled._rests", lambda recording, name: rests)
+    np.testing.assert_array_equal(pooled.sensor_noise, [0.0, 0.0])
+    rests += [size * np.array([[1.0, np.nan], [-1.0, np.nan]]) for size in (2.0, 3.0, 9.0)]
+    np.testing.assert_allclose(pooled.sensor_noise, [3.0, 0.0])
