@@ -26,6 +26,8 @@ MIN_LOUDNESS, RIPPLE = 12.0, 0.05
 KEPT = 8
 # Events that one frame may show.
 EVENTS = 4
+# Evaluations after which the contacts before a frame are known not to explain it, so that one more may begin.
+BIRTH_STEPS = 24
 # A look is given up when frames of so many seconds wait: contacts that moved on unseen for so long are not believed.
 LONGEST_WAIT = 2.0
 
@@ -77,6 +79,8 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
         if not (trial.ended or trial.is_hopeless(best)):
             trials = (*look.trials[:k], _further(trial, look.seen, programs), *look.trials[k + 1 :])
             return replace(look, trials=trials)
+    if _is_born(look, _most_probable(look)) and look.best.is_short_of(BIRTH_STEPS):
+        return replace(look, best=_further(look.best, look.seen, programs))
     return _judged(look, programs)
 
 
@@ -107,9 +111,17 @@ def _possible(look: Look) -> list[Trial]:
     return [trial for trial in look.trials or () if trial.ended and not _is_ripple(look.before, trial)]
 
 
+def _most_probable(look: Look) -> Trial:
+    return max([look.best, *_possible(look)], key=lambda trial: trial.probability)
+
+
+def _is_born(look: Look, trial: Trial) -> bool:
+    return len(trial.event.numbers) > len(look.before.numbers)
+
+
 def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing more has happened."""
-    best = max([look.best, *_possible(look)], key=lambda trial: trial.probability)
+    best = _most_probable(look)
     if best is look.best or best.attempt is None:
         return replace(look, after=calmer(look.otherwise) if look.events == EVENTS else look.otherwise)
     event = best.event

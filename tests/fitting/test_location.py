@@ -415,3 +415,9 @@ def test_thinned_presses_keep_their_means_and_order():
     assert rows.tolist() == [0] * 5 + [1] * 3 + [2]
     np.testing.assert_allclose(load, [0.5, 2.5, 4.5, 6.5, 8.5, 10, 11, 12, 13])
     np.testing.assert_allclose(pressure[:, 1], 2 * load)
+
+
+def test_no_press_is_thinned_to_none():
+    """As of a pad that no press rests on alone."""
+    none = thinned(PressSeries(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)), 5)
+    assert [part.shape for part in none] == [(0,), (0, 2), (0,)]

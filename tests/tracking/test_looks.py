@@ -170,3 +170,19 @@ def test_without_spare_time_a_contact_that_rests_keeps_its_number(tracker, frame
         assert now.numbers == (1,)
     assert now.backlog is None
     assert np.linalg.norm(now.tracks[0].position - held[0][:2]) < 1e-3
+
+
+@pytest.mark.parametrize("place", [(0.06, 0.08), (0.137, 0.022), (0.098, 0.1)])
+def test_a_force_that_grows_severalfold_in_each_frame_is_one_contact(tracker, frame_of, place):
+    """As the onset of a press at ten frames a second; the pads tell the force too."""
+    seconds, now = 0.1, tracker.start()
+    sheet = tracker.filter.sheet
+    for force in (0.3, 1.2, 4.8, 12.0, 12.0):
+        loads = jnp.asarray([load(*place, force)])
+        on_pads = np.asarray(sheet.on_pads(loads, sheet.near(loads))).sum(0)
+        now = tracker.step(now, frame_of(loads.tolist()), seconds, on_pads, np.hypot(0.05, 0.05 * on_pads))
+        (track,) = now.tracks
+        assert track.number == 1
+        assert track.force == pytest.approx(force, rel=0.15)
+        away = track.position - place
+        assert away @ np.linalg.solve(track.covariance, away) < 16  # four standard deviations: 0.03 % of contacts
