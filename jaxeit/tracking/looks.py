@@ -73,7 +73,7 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
     if not look.best.ended:
         return replace(look, best=_further(look.best, look.seen, programs))
     if look.trials is None:
-        return _asked(look, programs, events)
+        return replace(look, trials=_trials(look, programs, events))
     best = max(trial.probability for trial in [look.best, *_possible(look)])
     for k, trial in enumerate(look.trials):
         if not (trial.ended or trial.is_hopeless(best)):
@@ -88,22 +88,17 @@ def _further(trial: Trial, seen: Seen, programs: Programs) -> Trial:
     return trial._replace(attempt=programs.attempted(trial.event.belief, seen.dv, seen.pads, trial.attempt))
 
 
-def _asked(look: Look, programs: Programs, events: Events) -> Look:
-    """The look with what may have happened.
-
-    A force that grows severalfold between two frames is beyond the few evaluations of an ordinary update, which then
-    explains the rest of the frame by gain. If nothing has happened, the contacts are those of the careful update.
-    """
-    attempt = look.best.attempt
-    assert attempt is not None
-    best = programs.concluded(look.before.belief, look.seen.dv, look.seen.pads, attempt)
+def _trials(look: Look, programs: Programs, events: Events) -> tuple[Trial, ...]:
+    """What may have happened."""
+    best = _concluded(look, look.best, programs)
     place = programs.unexplained_place(best.belief, look.seen.dv, look.seen.pads)
     possible = events.possible(_as_is(look.before), look.before.begun, place, look.seen.seconds)
-    look = replace(look, trials=tuple(map(Trial, possible)))
-    if not look.unfinished or not float(best.misfit) < look.otherwise.misfit:
-        return look
-    otherwise = settled(replace(look.before, since=0, misfit=float(best.misfit)), best)
-    return replace(look, otherwise=otherwise, unfinished=False)
+    return tuple(map(Trial, possible))
+
+
+def _concluded(look: Look, trial: Trial, programs: Programs) -> Update:
+    assert trial.attempt is not None
+    return programs.concluded(trial.event.belief, look.seen.dv, look.seen.pads, trial.attempt)
 
 
 def _possible(look: Look) -> list[Trial]:
@@ -123,14 +118,27 @@ def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing more has happened."""
     best = _most_probable(look)
     if best is look.best or best.attempt is None:
-        return replace(look, after=calmer(look.otherwise) if look.events == EVENTS else look.otherwise)
+        after = _carefully(look, programs) if look.unfinished else look.otherwise
+        return replace(look, after=calmer(after) if look.events == EVENTS else after)
     event = best.event
-    update = programs.concluded(event.belief, look.seen.dv, look.seen.pads, best.attempt)
+    update = _concluded(look, best, programs)
     before = look.before.under(event, event.belief)
     after = settled(replace(before, since=0, patience=PATIENCE, misfit=float(update.misfit)), update)
     best, left = best._replace(event=event._replace(prior=0.0)), look.events - 1
     look = replace(look, before=before, best=best, otherwise=after, events=left, unfinished=False, trials=None)
     return look if left else replace(look, after=after)
+
+
+def _carefully(look: Look, programs: Programs) -> Tracking:
+    """Contacts to which nothing has happened, after a frame that was beyond an ordinary update.
+
+    Where a force grows severalfold between two frames, the few evaluations of an ordinary update end before the force
+    is found, and the gain explains the rest of the frame.
+    """
+    update = _concluded(look, look.best, programs)
+    if not float(update.misfit) < look.otherwise.misfit:
+        return look.otherwise
+    return settled(replace(look.before, since=0, misfit=float(update.misfit)), update)
 
 
 def calmer(after: Tracking) -> Tracking:

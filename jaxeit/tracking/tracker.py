@@ -183,7 +183,7 @@ class Tracker:
         before, look, waiting = backlog.before, backlog.look, backlog.waiting
         if look is not None:
             otherwise, look = look.otherwise, looked(look, self.programs, self.events)
-            if look.otherwise is not otherwise:  # something has happened, or the update has come further
+            if look.otherwise is not otherwise:  # something has happened
                 now = self._until_now(look.otherwise, waiting)
             if look.after is not None:
                 before, look = look.after, None

@@ -158,31 +158,15 @@ def test_without_spare_time_contacts_are_given_up_and_found_again_once_there_is_
     assert np.linalg.norm(now.tracks[0].position - truth(55)[0][:2]) < 2e-3
 
 
-def test_without_spare_time_a_contact_that_rests_keeps_its_number(tracker, frame_of):
-    """It explains the frame, whatever was asked of one before."""
-    now, held = tracker.start(), [load(0.06, 0.08, 12.0)]
-    for _ in range(20):
-        now = tracker.step(now, frame_of(held), SECONDS)
-    now = tracker.step(now, frame_of([*held, load(0.06, 0.12, 9.0)]), SECONDS, whole=False)
-    assert now.backlog is not None
-    for _ in range(16):
-        now = tracker.step(now, frame_of(held), LONGEST_WAIT / 4, whole=False)
-        assert now.numbers == (1,)
-    assert now.backlog is None
-    assert np.linalg.norm(now.tracks[0].position - held[0][:2]) < 1e-3
-
-
-@pytest.mark.parametrize("place", [(0.06, 0.08), (0.137, 0.022), (0.098, 0.1)])
-def test_a_force_that_grows_severalfold_in_each_frame_is_one_contact(tracker, frame_of, place):
-    """As the onset of a press at ten frames a second; the pads tell the force too."""
-    seconds, now = 0.1, tracker.start()
-    sheet = tracker.filter.sheet
-    for force in (0.3, 1.2, 4.8, 12.0, 12.0):
+@pytest.mark.parametrize("place", [(0.137, 0.022), (0.098, 0.1)])
+def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_of, place):
+    """Beyond the few evaluations of an ordinary update; the look into the frame must not lose what it finds."""
+    now, sheet = tracker.start(), tracker.filter.sheet
+    for force in (0.5, 25.0, 25.0):
         loads = jnp.asarray([load(*place, force)])
         on_pads = np.asarray(sheet.on_pads(loads, sheet.near(loads))).sum(0)
-        now = tracker.step(now, frame_of(loads.tolist()), seconds, on_pads, np.hypot(0.05, 0.05 * on_pads))
-        (track,) = now.tracks
-        assert track.number == 1
-        assert track.force == pytest.approx(force, rel=0.15)
-        away = track.position - place
-        assert away @ np.linalg.solve(track.covariance, away) < 16  # four standard deviations: 0.03 % of contacts
+        now = tracker.step(now, frame_of(loads.tolist()), 0.1, on_pads, np.hypot(0.05, 0.05 * on_pads))
+        assert now.numbers == (1,)
+    (track,) = now.tracks
+    assert track.force == pytest.approx(force, rel=0.1)
+    assert np.linalg.norm(track.position - place) < 2e-3
