@@ -30,6 +30,11 @@ def is_fitted(provenance: Mapping[str, str], session: Session) -> bool:
     return any(_is_listed(provenance, name, session) for name in ("sessions", "recalibrations"))
 
 
+def is_calibrated_from(provenance: Mapping[str, str], session: Session) -> bool:
+    """Whether a calibration of this provenance was fitted to the very file of a session."""
+    return _is_listed(provenance, "sessions", session)
+
+
 def require_not_moved_by(provenance: Mapping[str, str], session: Session) -> None:
     """Refuse a session by which a calibration was moved before: counted twice, it would seem surer than it is.
 

@@ -11,6 +11,7 @@ from ..check.acceptance import accept
 from ..presses.table import Processing, resting_levels
 from ..session import Session, SessionError
 from .calibration import Calibration
+from .fitted_sessions import is_calibrated_from
 from .force_maps import USED
 from .frame_blocks import FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import ContactTracks, NotFollowed, probe_presses, quiet_tracker
@@ -72,7 +73,10 @@ def learn_layer(
         what = (
             "the presses of the calibration are less probable with what was learned of the contact layer than without"
         )
-        raise SessionError(f"{session.name}: {what}; calibrate again, or leave the layer as it is (no --learn-layer)")
+        advice = "press it in more places, or leave the layer as it is (no --learn-layer)"
+        if not is_calibrated_from(calibration.provenance, session):
+            advice = f"calibrate again, {advice}"
+        raise SessionError(f"{session.name}: {what}; {advice}")
     return replace(calibration, layer=learned, contact_law=lessons.law())
 
 

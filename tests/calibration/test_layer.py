@@ -166,10 +166,16 @@ def test_a_layer_under_which_the_calibrations_presses_are_less_probable_is_refus
     monkeypatch.setattr(je.tracking, "press_evidence", evidence)
     with (
         calib.open_session(session) as use,
-        pytest.raises(SessionError, match=r"use\.h5: the presses .* less probable"),
+        pytest.raises(
+            SessionError, match=r"use\.h5: the presses .* less probable .*; calibrate again, press it in more"
+        ),
     ):
         learn_layer(replace(calibration, probes=probes), use)
     assert [layer is None for layer in asked] == [False, True]
+    with calib.open_session(session) as use:
+        fitted = calibration.provenance | {"sessions": f"{use.hash}  use.h5"}
+        with pytest.raises(SessionError, match=r"than without; press it in more places"):
+            learn_layer(replace(calibration, probes=probes, provenance=fitted), use)
 
 
 def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker, tmp_path, capsys):

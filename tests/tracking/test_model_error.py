@@ -13,7 +13,7 @@ from jaxeit.tracking.model_error import STEP
 from .conftest import SECONDS, load
 
 PLACES = np.random.default_rng(3).uniform(0.04, 0.16, (6, 2))
-RADIUS = 0.018  # of a ring, m
+RADIUS = 0.020  # of a ring, m
 WRONG = 0.05  # of the signal, by which a wrong model errs
 
 
