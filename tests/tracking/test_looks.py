@@ -158,6 +158,20 @@ def test_without_spare_time_contacts_are_given_up_and_found_again_once_there_is_
     assert np.linalg.norm(now.tracks[0].position - truth(55)[0][:2]) < 2e-3
 
 
+def test_without_spare_time_a_contact_that_rests_keeps_its_number(tracker, frame_of):
+    """It explains the frame, whatever was asked of one before."""
+    now, held = tracker.start(), [load(0.06, 0.08, 12.0)]
+    for _ in range(20):
+        now = tracker.step(now, frame_of(held), SECONDS)
+    now = tracker.step(now, frame_of([*held, load(0.06, 0.12, 9.0)]), SECONDS, whole=False)
+    assert now.backlog is not None
+    for _ in range(16):
+        now = tracker.step(now, frame_of(held), LONGEST_WAIT / 4, whole=False)
+        assert now.numbers == (1,)
+    assert now.backlog is None
+    assert np.linalg.norm(now.tracks[0].position - held[0][:2]) < 1e-3
+
+
 @pytest.mark.parametrize("place", [(0.137, 0.022), (0.098, 0.1)])
 def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_of, place):
     """Beyond the few evaluations of an ordinary update; the look into the frame must not lose what it finds."""
