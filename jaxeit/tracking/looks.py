@@ -26,8 +26,6 @@ MIN_LOUDNESS, RIPPLE = 12.0, 0.05
 KEPT = 8
 # Events that one frame may show.
 EVENTS = 4
-# Evaluations after which the contacts before a frame are known not to explain it, so that one more may begin.
-BIRTH_STEPS = 24
 # A look is given up when frames of so many seconds wait: contacts that moved on unseen for so long are not believed.
 LONGEST_WAIT = 2.0
 
@@ -79,8 +77,6 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
         if not (trial.ended or trial.is_hopeless(best)):
             trials = (*look.trials[:k], _further(trial, look.seen, programs), *look.trials[k + 1 :])
             return replace(look, trials=trials)
-    if _is_born(look, _most_probable(look)) and look.best.is_short_of(BIRTH_STEPS):
-        return replace(look, best=_further(look.best, look.seen, programs))
     return _judged(look, programs)
 
 
@@ -108,10 +104,6 @@ def _possible(look: Look) -> list[Trial]:
 
 def _most_probable(look: Look) -> Trial:
     return max([look.best, *_possible(look)], key=lambda trial: trial.probability)
-
-
-def _is_born(look: Look, trial: Trial) -> bool:
-    return len(trial.event.numbers) > len(look.before.numbers)
 
 
 def _judged(look: Look, programs: Programs) -> Look:

@@ -118,11 +118,6 @@ class Trial(NamedTuple):
         """Whether the update has come to its end."""
         return self.attempt is not None and bool(self.attempt.ended)
 
-    def is_short_of(self, steps: int) -> bool:
-        """Whether the update has not converged, in fewer evaluations than these."""
-        state = None if self.attempt is None else self.attempt.state
-        return state is not None and not bool(state.converged) and int(state.steps) < steps
-
     @property
     def probability(self) -> float:
         """Log of the probability of event and frame, up to a constant; of an update that is not finite, none."""

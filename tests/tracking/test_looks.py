@@ -172,11 +172,13 @@ def test_without_spare_time_a_contact_that_rests_keeps_its_number(tracker, frame
     assert np.linalg.norm(now.tracks[0].position - held[0][:2]) < 1e-3
 
 
-@pytest.mark.parametrize("place", [(0.137, 0.022), (0.098, 0.1)])
-def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_of, place):
+@pytest.mark.parametrize(
+    ("place", "before", "after"), [((0.137, 0.022), 0.5, 25.0), ((0.098, 0.1), 0.5, 25.0), ((0.06, 0.08), 0.3, 12.0)]
+)
+def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_of, place, before, after):
     """Beyond the few evaluations of an ordinary update; the look into the frame must not lose what it finds."""
     now, sheet = tracker.start(), tracker.filter.sheet
-    for force in (0.5, 25.0, 25.0):
+    for force in (before, after, after):
         loads = jnp.asarray([load(*place, force)])
         on_pads = np.asarray(sheet.on_pads(loads, sheet.near(loads))).sum(0)
         now = tracker.step(now, frame_of(loads.tolist()), 0.1, on_pads, np.hypot(0.05, 0.05 * on_pads))

@@ -41,6 +41,9 @@ NO_LOAD = 1e-6
 FALL, CAREFUL_FALL = 10.0, 1.0
 # Evaluations of an update; of one that begins far from its end, and of a piece of such a one.
 STEPS, MANY_STEPS, PIECE = 6, 12, 2
+# Forces begin as grown where the log of one has by more than this, and by no more than so many times; of two contacts
+# whose signals differ by less than this share the growth is not told apart.
+GROWN, MOST_GROWTH, ALIKE = 0.7, 1e3, 1e-6
 
 
 def _solver(fall: float) -> LevenbergMarquardt:
@@ -196,11 +199,23 @@ class _Problem(NamedTuple):
         contacts = before + change[: before.size].reshape(-1, SEEN)
         found = self.tracker.sheet.shown(contacts, gain, modes, self.near)
 
+        seen = self._told(found.readings, found.reading_slopes)
+        return Shown(seen[0], found.pads, self.factor.T @ seen[1], self.factor.T @ found.pad_slopes)
+
+    def signals(self) -> Float[Array, "K r"]:
+        """What each contact shows before the frame, to first order."""
+        belief = self.belief
+        (found,) = self._told(self.tracker.sheet.signals(belief.contacts[:, :SEEN], belief.gain, self.near))
+        return found
+
+    def _told(self, *readings: Array) -> tuple[Array, ...]:
+        """Whitened readings as the frame has them, which may lack some."""
+
         def mixed(*a: Array) -> tuple[Array, ...]:
             return tuple(one @ self.frame.root.T for one in a)
 
-        seen = jax.lax.cond(self.whole, lambda *a: a, mixed, found.readings, found.reading_slopes)
-        return Shown(seen[0], found.pads, self.factor.T @ seen[1], self.factor.T @ found.pad_slopes)
+        found: tuple[Array, ...] = jax.lax.cond(self.whole, lambda *a: a, mixed, *readings)
+        return found
 
     def residual(self, z: Float[Array, " a"], shown: Shown) -> Float[Array, " n"]:
         """What is left of the frame, of the pads and of the belief before, in standard deviations."""
@@ -278,16 +293,42 @@ def _scales(
 
 
 def _fitted(
-    problem: _Problem, solver: LevenbergMarquardt, steps: int, attempt: Attempt | None = None
+    problem: _Problem,
+    solver: LevenbergMarquardt,
+    steps: int,
+    begin: Float[Array, " a"],
+    state: LeastSquaresState | None = None,
 ) -> optx.Solution[Array, Any]:
     """The change z under which the frame is most probable, after so many evaluations more."""
-    begun = {} if attempt is None else {"state": attempt.state}
-    start = jnp.zeros(len(problem.active), problem.factor.dtype) if attempt is None else attempt.z
-    options: dict[str, Any] = {"quadratic": _quadratic} | begun
+    options: dict[str, Any] = {"quadratic": _quadratic} | ({} if state is None else {"state": state})
     found: optx.Solution[Array, Any] = optx.least_squares(
-        _residual, solver, start, problem, options, max_steps=steps, adjoint=ImplicitStep(), throw=False
+        _residual, solver, begin, problem, options, max_steps=steps, adjoint=ImplicitStep(), throw=False
     )
     return found
+
+
+def _begun(problem: _Problem) -> Float[Array, " a"]:
+    """The change z at which an update begins that may begin far from its end: none, or that of forces that have grown.
+
+    Steps in the logarithm of a force do not reach one that has grown severalfold, and would move the contact instead.
+    The frame tells by how much signals have grown, as they are nearly linear in forces; what a force tells of the other
+    numbers goes with it, by their covariance.
+    """
+    count = len(problem.belief.contacts)
+    forces = problem.factor[3 : SEEN * count : SEEN]
+    signals = problem.signals()
+    normal = signals @ signals.T
+    root = lapack.cholesky(normal + ALIKE * jnp.trace(normal) * jnp.eye(count), lower=True)
+    times = lapack.cho_solve((root, True), signals @ problem.frame.y)
+    growth = jnp.log(jnp.clip(times, 1.0, MOST_GROWTH))
+    covariance = lapack.cholesky(forces @ forces.T, lower=True)
+    grown, still = forces.T @ lapack.cho_solve((covariance, True), growth), jnp.zeros_like(problem.factor[0])
+
+    def square(z: Float[Array, " a"]) -> Float[Array, ""]:
+        return jnp.sum(_residual(z, problem) ** 2)
+
+    better = jax.lax.cond(jnp.max(growth) > GROWN, lambda: square(grown) < square(still), lambda: jnp.asarray(False))
+    return jnp.where(better, grown, still)
 
 
 @verb
@@ -307,7 +348,7 @@ def updated(
     if not len(belief.contacts):
         return _nothing(tracker, belief, dv, pads, seconds)
     problem = _problem(tracker, belief, dv, pads, seconds)
-    found = _fitted(problem, ORDINARY, STEPS)
+    found = _fitted(problem, ORDINARY, STEPS, jnp.zeros(len(problem.active), problem.factor.dtype))
     return _update(problem, found.value, found.state)
 
 
@@ -327,7 +368,8 @@ def attempted(
         update = _nothing(tracker, belief, dv, pads, tracker.persistence)
         return Attempt(jnp.zeros(0, update.evidence.dtype), None, update.evidence, update.loudness, jnp.asarray(True))
     problem = _problem(tracker, belief, dv, pads, tracker.persistence)
-    found = _fitted(problem, CAREFUL, PIECE, attempt)
+    begin = _begun(problem) if attempt is None else attempt.z
+    found = _fitted(problem, CAREFUL, PIECE, begin, None if attempt is None else attempt.state)
     update = _update(problem, found.value, found.state)
     ended = found.state.converged | (found.state.steps >= MANY_STEPS)
     return Attempt(found.value, found.state, update.evidence, update.loudness, ended)

@@ -161,6 +161,14 @@ class LoadedSheet(eqx.Module):
         pressures = jax.vmap(load_pressure, (0, None))(contacts.astype(self.points.dtype), places)
         return (pressures @ area).astype(contacts.dtype)
 
+    def signals(self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Near) -> Float[Array, "K r"]:
+        """What each contact by itself shows in the readings, to first order."""
+        pixels, own = near.pixels, near.own_pixels
+        pressures = jax.vmap(load_pressure, (0, None))(contacts.astype(self.points.dtype), self.pixels[pixels])
+        factor = jnp.exp(self.pixel_modes[pixels] @ gain.astype(self.pixel_modes.dtype))
+        relative, _, _ = self._conducting(jnp.where(own, pressures, 0), factor)
+        return (relative @ self.pixel_response[pixels]).astype(contacts.dtype)
+
     def shown(
         self,
         contacts: Float[Array, "K 6"],
