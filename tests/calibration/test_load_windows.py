@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 import calib
 import jaxeit as je
@@ -96,6 +97,9 @@ def test_the_shipped_network_is_chosen_by_the_skin(skin):
     assert chosen_proposal(je.contacts.shipped_proposal, other, lines.append) is None
     assert len(lines) == 1
     assert "jaxeit train SKIN -o PROPOSAL.npz" in lines[0]
+    summed = replace(skin.protocol, mixing=scipy.sparse.csr_array(scipy.sparse.eye_array(skin.protocol.readings)))
+    assert chosen_proposal(je.contacts.shipped_proposal, replace(skin, protocol=summed), lines.append) is None
+    assert "none can be trained for its scan" in lines[1]
     with pytest.raises(InverseError, match="trained for another skin"):
         chosen_proposal(found, other, lines.append)
 

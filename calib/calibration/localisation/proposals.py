@@ -23,8 +23,11 @@ def chosen_proposal(choice: ProposalChoice, skin: je.Skin, tell: Callable[[str],
     if found is not None:
         found.require_skin(skin)
     elif choice is not None:
-        tell(
-            f"note: no network is shipped that proposes what touches the skin {skin.name}; train one with "
-            "`jaxeit train SKIN -o PROPOSAL.npz`, and give it as --proposal PROPOSAL.npz"
-        )
+        tell(f"note: no network is shipped that proposes what touches the skin {skin.name}; {_advice(skin)}")
     return found
+
+
+def _advice(skin: je.Skin) -> str:
+    if skin.protocol.mixing is not None:
+        return "none can be trained for its scan, whose readings are sums over pairs of electrodes"
+    return "train one with `jaxeit train SKIN -o PROPOSAL.npz`, and give it as --proposal PROPOSAL.npz"
