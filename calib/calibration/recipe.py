@@ -42,8 +42,8 @@ class Recipe:
     | fidelity: accuracy of the finite-element model from which images are computed               | standard         |
     | even_sheet: take the sheet for even; otherwise the untouched frames tell its conductivity   | False            |
     | fit_electrodes: put the electrodes where untouched frames and presses tell that they sit     | False            |
-    | learn_layer: follow the contacts through the sessions and keep what they tell of the contact | False           |
-    |   layer's gain, by which `apply` and `live` then follow contacts                            |                  |
+    | learn_layer: keep what the presses tell of the contact layer's gain, by which `apply` and    | False           |
+    |   `live` then follow contacts                                                               |                  |
 
     The default is the recipe of the paper (arXiv 2605.28468), except that the paper takes the sheet for even. Sequences
     of curves and locations become tuples.

@@ -85,6 +85,12 @@ class PressMeasurements:
     windows: PressWindows
     notes: tuple[str, ...]
 
+    @property
+    def noise_of_means(self) -> np.ndarray:
+        """Standard deviation of a reading averaged over a hold of median length, (readings,) V."""
+        held = index_ranges(self.session.stream("eit").time, self.windows.hold[self.presses.accepted])
+        return np.asarray(self.noise / np.sqrt(np.median(np.diff(held))))
+
 
 def measure(
     session: Session, skin: je.Skin, processing: Processing | None = None, *, place_needed: bool = True

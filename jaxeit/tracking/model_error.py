@@ -113,10 +113,7 @@ def _evidence(
     tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads, layer: LearnedLayer | None = None
 ) -> float:
     """Log of the probability of a frame with one contact, up to a constant that all model errors share."""
-    programs, before = tracker.programs, tracker.start(layer).belief
-    left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
-    belief, attempt = tracker.events.with_contact(before, programs.explaining_place(left)), None
-    while attempt is None or not attempt.ended:
-        attempt = programs.attempted(belief, frame, pads, attempt)
+    before = tracker.start(layer).belief
+    left = tracker.programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
     share = 1 - float(tracker.filter.error_share) * float(left @ left) / len(left)  # 1 / s^2
-    return float(attempt.evidence) + 0.5 * len(left) * float(np.log(share))
+    return float(tracker.press_update(before, frame, pads).evidence) + 0.5 * len(left) * float(np.log(share))

@@ -36,6 +36,8 @@ MOST_GAIN = 4.0
 WORSE = 1.3
 # Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
 UNSEEN = 0.01
+# Evaluations of the fit of a single press.
+PRESS_STEPS = 24
 
 
 class Tracker:
@@ -135,6 +137,57 @@ class Tracker:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         seen = Seen(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
         return self._with_considered(self._taught(bounded(self._stepped(now, seen, whole))), seen.pads)
+
+    def press(
+        self,
+        dv: Float[ArrayLike, " readings"],
+        pad_forces: Float[ArrayLike, " pads"] | None = None,
+        pad_errors: Float[ArrayLike, " pads"] | None = None,
+        *,
+        layer: LearnedLayer | None = None,
+    ) -> Tracking:
+        """What a frame tells in which one round contact presses and nothing else, as the mean over the hold of a press.
+
+        No other event is compared, so that this takes a tenth of the time of a `step` in which a contact begins. There
+        is no contact if the update is not finite.
+
+        Args:
+            dv, pad_forces, pad_errors: as for `step`.
+            layer: as for `start`.
+
+        Raises:
+            InverseError: if an array has another shape.
+
+        Example:
+            held = tracker.press(frames[0])  # V, a press on the bench
+            print(held.tracks, tracker.learned(held).contacts)
+        """
+        now = self.start(layer)
+        update = self.press_update(now.belief, self.frame(dv), self.pads(pad_forces, pad_errors))
+        if not is_finite(update):
+            return now
+        found = replace(now, belief=update.belief, misfit=float(update.misfit), begun=1)
+        return bounded(replace(found, numbers=(1,), edges=(False,), faint=(0,)))
+
+    def press_update(self, before: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
+        """The belief after a frame in which one contact presses, from a belief without contacts.
+
+        Where the noise is far below the signal, a fit that begins between the wrong bolts may end off the sheet. So
+        other places are tried until the contact explains the frame, and the most probable contact counts.
+        """
+        found: list[Update] = []
+        for place in self.programs.explaining_places(self.programs.unexplained(before, frame, pads)):
+            found.append(self._updated(self.events.with_contact(before, place), frame, pads))
+            if is_finite(found[-1]) and bool(found[-1].converged) and not self._is_far(found[-1]):
+                break
+        return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
+
+    def _updated(self, belief: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
+        """A careful update, as of a contact that begins."""
+        attempt = self.programs.attempted(belief, frame, pads, None)
+        while attempt.state is not None and not attempt.state.converged and attempt.state.steps < PRESS_STEPS:
+            attempt = self.programs.attempted(belief, frame, pads, attempt)
+        return self.programs.concluded(belief, frame, pads, attempt)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):

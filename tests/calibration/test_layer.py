@@ -10,7 +10,7 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.calibration import procedure
+from calib.calibration import layer as layer_module, procedure
 from calib.calibration.layer import FORGOTTEN, learn_layer, render_layer
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import NotFollowed, quiet_tracker
@@ -20,7 +20,7 @@ from calib.live.follower import LiveFollower
 from calib.live.recalibrator import LiveRecalibrator
 from calib.session import SessionError
 from jaxeit.contacts.loads.settings import LoadSettings
-from jaxeit.tracking import GainField, LearnedLayer, Smoother, Tracker, Tracking
+from jaxeit.tracking import GainField, LearnedLayer, Smoother, Track, Tracker, Tracking
 
 from ..helpers import stand_in
 from .damage import damage
@@ -54,6 +54,15 @@ class FakeTracker(Tracker):
         self.steps += 1
         return stand_in(Tracking, tracks=(), begun=CONTACTS, backlog=None, layer=now.layer)
 
+    def press(self, dv, forces, errors, *, layer=None):
+        self.started.append(layer)
+        place, none = np.zeros(2), np.zeros(2)
+        track = Track(1, place, np.eye(2), 0.012, float(np.sum(forces)), 0.1, none, none)
+        return stand_in(Tracking, tracks=(track,), begun=1, layer=layer)
+
+    def told_by_pads(self, tracks, errors=None):
+        return np.array([False for _ in tracks])
+
     def learned(self, now):
         return self.tells._replace(contacts=now.begun + (0 if now.layer is None else now.layer.contacts))
 
@@ -66,7 +75,8 @@ def better_with_contacts(tracker, dv, forces, errors, layer):
 @pytest.fixture
 def tracker(layer, monkeypatch):
     tracker = FakeTracker(layer)
-    monkeypatch.setattr(contact_tracks, "prepare_calibrated_tracker", lambda *_: tracker)
+    for user in (contact_tracks, layer_module):
+        monkeypatch.setattr(user, "prepare_calibrated_tracker", lambda *_: tracker)
     monkeypatch.setattr(je.tracking, "press_evidence", better_with_contacts)
     monkeypatch.setattr(Smoother, "__init__", lambda *_: None)
     monkeypatch.setattr(Smoother, "add", lambda *_: [])
@@ -75,8 +85,18 @@ def tracker(layer, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def session(later, tmp_path_factory):
-    return later.record(tmp_path_factory.mktemp("use") / "use.h5", PLACES, FORCE, load_cell=FORCE)
+def presses(later, tmp_path_factory):
+    """A session that tells its presses and the force of a load cell."""
+    return later.record(tmp_path_factory.mktemp("bench") / "bench.h5", PLACES, FORCE, load_cell=FORCE)
+
+
+@pytest.fixture(scope="module")
+def session(presses, tmp_path_factory):
+    """The same as ordinary use, which tells no presses."""
+    use = Path(shutil.copy(presses, tmp_path_factory.mktemp("use") / "use.h5"))
+    with h5py.File(use, "r+") as file:
+        del file["presses"]
+    return use
 
 
 def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
@@ -138,6 +158,18 @@ def test_learning_starts_from_what_was_learned_before_less_a_part(calibration, s
     assert tracker.steps > 2 * 100
 
 
+def test_each_press_that_a_session_tells_is_one_contact(calibration, presses, tracker, layer):
+    """It begins with what those before it told, and no frame is followed."""
+    with calib.open_session(presses) as bench:
+        once = learn_layer(calibration, bench)
+        again = learn_layer(once, bench)
+    assert tracker.steps == 0
+    contacts = [None if one is None else one.contacts for one in tracker.started]
+    assert contacts == [None, *range(1, 2 * len(PLACES))]
+    np.testing.assert_allclose(tracker.started[len(PLACES)].mean, (1 - FORGOTTEN) * layer.mean)
+    assert (once.layer.contacts, again.layer.contacts) == (len(PLACES), 2 * len(PLACES))
+
+
 def test_a_session_that_tells_nothing_is_refused(calibration, session, tracker, monkeypatch):
     with calib.open_session(session) as use:
         monkeypatch.setattr(FakeTracker, "step", lambda self, now, *_, **__: now)
@@ -178,22 +210,22 @@ def test_a_layer_under_which_the_calibrations_presses_are_less_probable_is_refus
             learn_layer(replace(calibration, probes=probes, provenance=fitted), use)
 
 
-def test_the_commands_learn_keep_and_use_the_layer(calibration, session, tracker, tmp_path, capsys):
+def test_the_commands_learn_keep_and_use_the_layer(calibration, presses, tracker, tmp_path, capsys):
     old, new, out = (str(tmp_path / name) for name in ("old.h5", "new.h5", "out.h5"))
     calibration.save(old)
-    assert main(["recalibrate", old, str(session), "-o", new, "--learn-layer"]) == 0
+    assert main(["recalibrate", old, str(presses), "-o", new, "--learn-layer"]) == 0
     told = capsys.readouterr().out
-    assert f"learned from {CONTACTS} contacts" in told
+    assert f"learned from {len(PLACES)} contacts" in told
     assert "force without pads: as the model tells it; 0 contacts do not speak for another law" in told
-    assert main(["apply", new, str(session), "-o", out, "--track"]) == 0
-    assert tracker.started[-1].contacts == CONTACTS
-    assert main(["recalibrate", new, str(session), "-o", out, "--learn-layer", "--json"]) == 2
+    assert main(["apply", new, str(presses), "-o", out, "--track"]) == 0
+    assert tracker.started[-1].contacts == len(PLACES)
+    assert main(["recalibrate", new, str(presses), "-o", out, "--learn-layer", "--json"]) == 2
     assert "has moved this calibration before" in capsys.readouterr().err
-    later = shutil.copy(session, tmp_path / "later.h5")
+    later = shutil.copy(presses, tmp_path / "later.h5")
     with h5py.File(later, "r+") as file:
         file.attrs["title"] = np.bytes_(b"on the day after")
     assert main(["recalibrate", new, str(later), "-o", out, "--learn-layer", "--json"]) == 0
-    assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
+    assert calib.load_calibration(out).layer.contacts == 2 * len(PLACES)
 
 
 @pytest.mark.slow
@@ -202,13 +234,14 @@ def test_calibrate_learns_from_all_its_sessions(tracker, bundled, tmp_path, monk
     stages = []
     with calib.open_session(bundled[0]) as session, calib.open_session(bundled[1]) as other:
         found = calib.calibrate([session, other], recipe=recipe, progress=stages.append, ignore_errors=True)
-    assert found.layer.contacts == 2 * CONTACTS
+        presses = len(session.presses) + len(other.presses)
+    assert found.layer.contacts == presses
     assert stages[-1] == "learning the contact layer"
     monkeypatch.setattr(procedure, "calibrate", lambda *_, **__: found)
     out = str(tmp_path / "calibration.h5")
     assert main(["calibrate", *map(str, bundled), "-o", out, "--learn-layer"]) == 0
-    assert f"learned from {2 * CONTACTS} contacts" in capsys.readouterr().out
-    assert calib.load_calibration(out).layer.contacts == 2 * CONTACTS
+    assert f"learned from {presses} contacts" in capsys.readouterr().out
+    assert calib.load_calibration(out).layer.contacts == presses
 
 
 def test_live_goes_on_with_the_layer_and_writes_it(calibration, tracker, layer, tmp_path):

@@ -9,6 +9,7 @@ from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import GainField, LearnedLayer
 from jaxeit.tracking.belief.layer import OUTLIER, PRESS_VARIANCES
+from jaxeit.tracking.belief.programs import APART
 from jaxeit.tracking.tracker import MOST_GAIN, bounded
 
 from .conftest import SECONDS, load
@@ -79,6 +80,45 @@ def test_presses_of_known_force_tell_the_gain_where_they_are(layer):
     assert (np.abs(mean - np.log(STRONGER)) < 2.5 * deviation).all()
     assert (np.abs(mean[:3] - np.log(STRONGER)) < 0.15).all()
     assert deviation[:3].max() < 0.5 * deviation[3]
+
+
+def test_presses_one_by_one_tell_the_gain_too(tracker, frame_of):
+    """Frames by themselves, at the same places: the gain is told within what is stated, and then the force."""
+    known = None
+    for x, y in PLACES:
+        now = tracker.press(frame_of([load(x, y, 10.0)], STRONGER), FORCES + 1e-9, np.full(4, 0.2), layer=known)
+        assert len(now.tracks) == now.begun == 1
+        assert np.linalg.norm(now.tracks[0].position - [x, y]) < 1e-3
+        known = tracker.learned(now)
+    assert known.contacts == len(PLACES)
+    mean, deviation = known.at(np.array(PLACES))
+    assert (np.abs(mean - np.log(STRONGER)) < 2 * deviation).all()
+    frame = frame_of([load(0.05, 0.055, 10.0)], STRONGER)
+    errors = [abs(tracker.press(frame, layer=one).tracks[0].force / 10 - 1) for one in (None, known)]
+    assert errors[1] < min(0.5 * errors[0], 0.06)
+
+
+def test_a_press_between_the_wrong_bolts_is_begun_elsewhere(tracker, frame_of, monkeypatch):
+    """The best atom may be 20 mm off; from there the fit ends off the sheet, or with another width."""
+    true = np.array([0.15, 0.12])
+    frame = frame_of([load(*true, 20.0)])
+    starts = tracker.programs._starts
+    wrong = starts[np.argmax(np.linalg.norm(starts - true, axis=1))]
+    best = tracker.programs.explaining_places
+    monkeypatch.setattr(tracker.programs, "explaining_places", lambda left: iter([wrong]))
+    assert np.linalg.norm(tracker.press(frame).tracks[0].position - true) > 0.02
+    monkeypatch.setattr(tracker.programs, "explaining_places", lambda left: iter([wrong, *best(left)]))
+    assert np.linalg.norm(tracker.press(frame).tracks[0].position - true) < 1e-3
+
+
+def test_places_where_a_contact_may_begin_are_apart(tracker, frame_of):
+    left = tracker.programs.unexplained(
+        tracker.start().belief, tracker.frame(frame_of([load(0.1, 0.1, 9.0)])), tracker.pads(None, None)
+    )
+    places = np.array(list(tracker.programs.explaining_places(left)))
+    np.testing.assert_array_equal(places[0], tracker.programs.explaining_place(left))
+    away = np.linalg.norm(places[:, None] - places, axis=-1)
+    assert away[np.triu_indices(len(places), 1)].min() >= APART
 
 
 def test_what_was_learned_tells_the_force_without_pads(tracker, frame_of, layer):

@@ -1,29 +1,35 @@
 """What contacts whose force the pads tell say of the law by which readings tell it."""
 
-from typing import NamedTuple
-
 import numpy as np
 
-from jaxeit.tracking import ContactLaw, LearnedLayer, Tracker, Tracking
+from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking
 
 # Distance, m, within which a contact by its readings alone is the one that the pads tell of.
 NEAR = 0.02
 
 
-class _Strongest(NamedTuple):
-    """Number and place (m) of a contact, its force (N) by pads, and the change of the frame (readings,) V."""
+def law_told(
+    law: ContactLaw, tracker: Tracker, told: Track, change: np.ndarray, layer: LearnedLayer | None
+) -> ContactLaw:
+    """The law after a contact that the pads tell of, which is looked at once more by its readings alone.
 
-    number: int
-    place: np.ndarray
-    force: float
-    change: np.ndarray
+    A frame by itself: an error of the model counts once.
+
+    Args:
+        told: the contact by readings and pads.
+        change: of the frame, (readings,) V.
+        layer: gain of the contact layer as it was known before this contact; a later gain would know the force already.
+    """
+    alone = tracker.press(change, layer=layer).tracks
+    if not alone or np.linalg.norm(alone[0].position - told.position) >= NEAR:
+        return law
+    return law.told(alone[0], told.force)
 
 
 class LawLessons:
     """Compares contacts that are followed with the pads to what their readings alone tell; `watch` of `ContactTracks`.
 
-    Of each contact that is alone, the frame of its largest force is looked at once more without the pads, with the gain
-    of the contact layer as it was known before this contact: a later gain would know the force already.
+    Of each contact that is alone, the frame of its largest force is asked (`law_told`).
 
     Args:
         layer: with which the contacts are followed from the first frame on.
@@ -34,7 +40,7 @@ class LawLessons:
         self._tracker, self._layer = tracker, layer
         self._law = ContactLaw.unknown() if law is None else law
         self._quiet: Tracking | None = None
-        self._strongest: _Strongest | None = None
+        self._strongest: tuple[Track, np.ndarray] | None = None
 
     def __call__(self, now: Tracking, change: np.ndarray, errors: np.ndarray) -> None:
         """Take what is known after a frame with the change (readings,) V and errors of the pads (pads,) N."""
@@ -44,12 +50,10 @@ class LawLessons:
             self._quiet = now
         if len(tracks) != 1 or not self._tracker.told_by_pads(tracks, errors)[0]:
             return
-        one, best = tracks[0], self._strongest
-        if best is not None and best.number != one.number:
+        if self._strongest is not None and self._strongest[0].number != tracks[0].number:
             self._learn()
-            best = None
-        if best is None or one.force > best.force:
-            self._strongest = _Strongest(one.number, np.array(one.position), one.force, np.array(change))
+        if self._strongest is None or tracks[0].force > self._strongest[0].force:
+            self._strongest = tracks[0], np.array(change)
 
     def law(self) -> ContactLaw:
         """The law after all contacts so far."""
@@ -57,11 +61,8 @@ class LawLessons:
         return self._law
 
     def _learn(self) -> None:
-        best, self._strongest = self._strongest, None
-        if best is None:
+        if self._strongest is None:
             return
         layer = self._layer if self._quiet is None else self._tracker.learned(self._quiet)
-        # A frame by itself: an error of the model counts once.
-        alone = self._tracker.step(self._tracker.start(layer), best.change, self._tracker.settings.persistence).tracks
-        if len(alone) == 1 and np.linalg.norm(alone[0].position - best.place) < NEAR:
-            self._law = self._law.told(alone[0], best.force)
+        self._law = law_told(self._law, self._tracker, *self._strongest, layer)
+        self._strongest = None

@@ -1,6 +1,6 @@
 """The compiled programs of a tracker, for calls from a loop in Python."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import numpy as np
@@ -9,6 +9,9 @@ from jaxtyping import Array, Float
 from ..._compile import bind
 from .consider import consider_covariance
 from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, predicted, unexplained
+
+# Places where the fit of a contact begins, and their least distance, m.
+STARTS, APART = 4, 0.01
 
 
 class Programs:
@@ -58,6 +61,14 @@ class Programs:
         """Where a contact would explain most of what is `unexplained`, m."""
         place: np.ndarray = self._starts[int(np.argmax(self._atoms @ left))]
         return place
+
+    def explaining_places(self, left: Float[np.ndarray, " r"]) -> Iterator[Float[np.ndarray, "2"]]:
+        """Where a contact would explain what is `unexplained`, m: the best place, then others that are `APART`."""
+        score = self._atoms @ left
+        for _ in range(STARTS):
+            place = self._starts[int(np.argmax(score))]
+            yield place
+            score = np.where(np.linalg.norm(self._starts - place, axis=1) < APART, -np.inf, score)
 
     def unexplained(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Float[np.ndarray, " r"]:
         """See `filter.unexplained`."""
