@@ -6,18 +6,21 @@ import numpy as np
 import pytest
 
 import calib
+import jaxeit as je
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import ContactTracks
 from calib.calibration.localisation.law_lessons import LawLessons
 from calib.live.follower import LiveFollower
 from calib.session import SessionError
-from jaxeit.tracking import ContactLaw, TimedTracks, Track, Tracker, TrackerSettings, Tracking
+from jaxeit.tracking import ContactLaw, GainField, LearnedLayer, TimedTracks, Track, Tracker, TrackerSettings, Tracking
 
 from ..helpers import stand_in
 from .damage import damage
 
 PLACE, WIDTH, SECOND = np.array([0.05, 0.05]), 0.012, 10**9
 WEAKER = 0.5  # true force over that of readings alone
+CORNERS = np.array([[0.0, 0.0], [0.2, 0.2]])
+LAYER = LearnedLayer.unknown(GainField.over(CORNERS, CORNERS, je.contacts.LoadSettings(gain_length=0.05), level=0.3))
 
 
 def track(force, number=1, place=PLACE):
@@ -34,17 +37,16 @@ def known_law(seed, count=20):
 
 class FakeTracker(Tracker):
     """A frame holds the force of the one contact; without pads it counts for twice as much. `layers` are those begun
-    with, `seconds` those of frames."""
+    with, `presses` the frames that are asked by themselves."""
 
     def __init__(self):
-        self._settings, self.layers, self.seconds, self.number = TrackerSettings(), [], [], 0
+        self._settings, self.layers, self.presses = TrackerSettings(), [], []
 
     def start(self, layer=None):
         self.layers.append(layer)
         return stand_in(Tracking, tracks=(), begun=0, backlog=None)
 
     def step(self, now, dv, seconds, pad_forces=None, pad_errors=None, *, whole=True):
-        self.seconds.append(seconds)
         force, told = float(dv[0]), pad_errors is not None and bool(np.isfinite(pad_errors).any())
         if not force:
             return stand_in(Tracking, tracks=(), begun=now.begun, backlog=None)
@@ -52,8 +54,13 @@ class FakeTracker(Tracker):
         tracks = (track(force if told else force / WEAKER, begun),)
         return stand_in(Tracking, tracks=tracks, begun=begun, backlog=None)
 
+    def press(self, dv, pad_forces=None, pad_errors=None, *, layer=None):
+        assert pad_errors is None
+        self.presses.append(float(dv[0]))
+        return self.step(self.start(layer), dv, 0.5)
+
     def learned(self, now):
-        return ("layer after", now.begun)
+        return LAYER._replace(contacts=now.begun)
 
     def told_by_pads(self, tracks, pad_errors=None):
         told = pad_errors is not None and bool(np.isfinite(pad_errors).any())
@@ -106,8 +113,8 @@ def test_each_contact_teaches_its_largest_force_by_a_frame_of_its_own():
     law = lessons.law()
     assert law.contacts == 2
     np.testing.assert_allclose(np.exp([law.low[0], law.high[0]]), [10, 20])
-    assert tracker.layers[1:] == [("layer after", 0), ("layer after", 1)]
-    assert tracker.seconds.count(TrackerSettings().persistence) == 2
+    assert [layer.contacts for layer in tracker.layers[1:]] == [0, 1]
+    assert tracker.presses == [10, 20]
 
 
 def test_contacts_that_no_pad_tells_teach_nothing():

@@ -41,10 +41,13 @@ def layer():
 
 
 class FakeTracker(Tracker):
-    """Three contacts begin with the first frame and tell the gain that is given; `started` holds the layers before."""
+    """Three contacts begin with the first frame and tell the gain that is given.
+
+    `started` holds the layers before, and `asked` those before presses that are told by their readings alone.
+    """
 
     def __init__(self, tells):
-        self.tells, self.started, self.steps = tells, [], 0
+        self.tells, self.started, self.asked, self.steps = tells, [], [], 0
 
     def start(self, layer=None):
         self.started.append(layer)
@@ -54,14 +57,18 @@ class FakeTracker(Tracker):
         self.steps += 1
         return stand_in(Tracking, tracks=(), begun=CONTACTS, backlog=None, layer=now.layer)
 
-    def press(self, dv, forces, errors, *, layer=None):
-        self.started.append(layer)
-        place, none = np.zeros(2), np.zeros(2)
-        track = Track(1, place, np.eye(2), 0.012, float(np.sum(forces)), 0.1, none, none)
+    def press(self, dv, forces=None, errors=None, *, layer=None):
+        """Readings alone tell the force that the pads told last."""
+        if forces is None:
+            self.asked.append(layer)
+        else:
+            self.started.append(layer)
+            self.force = float(np.sum(forces))
+        track = Track(1, np.zeros(2), np.eye(2), 0.012, self.force, 0.1, np.zeros(2), np.zeros(2))
         return stand_in(Tracking, tracks=(track,), begun=1, layer=layer)
 
     def told_by_pads(self, tracks, errors=None):
-        return np.array([False for _ in tracks])
+        return np.full(len(tracks), errors is not None)
 
     def learned(self, now):
         return self.tells._replace(contacts=now.begun + (0 if now.layer is None else now.layer.contacts))
@@ -164,6 +171,8 @@ def test_each_press_that_a_session_tells_is_one_contact(calibration, presses, tr
         once = learn_layer(calibration, bench)
         again = learn_layer(once, bench)
     assert tracker.steps == 0
+    assert [id(one) for one in tracker.asked] == [id(one) for one in tracker.started]
+    assert (once.contact_law.contacts, again.contact_law.contacts) == (len(PLACES), 2 * len(PLACES))
     contacts = [None if one is None else one.contacts for one in tracker.started]
     assert contacts == [None, *range(1, 2 * len(PLACES))]
     np.testing.assert_allclose(tracker.started[len(PLACES)].mean, (1 - FORGOTTEN) * layer.mean)
@@ -216,7 +225,7 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, presses, tracker
     assert main(["recalibrate", old, str(presses), "-o", new, "--learn-layer"]) == 0
     told = capsys.readouterr().out
     assert f"learned from {len(PLACES)} contacts" in told
-    assert "force without pads: as the model tells it; 0 contacts do not speak for another law" in told
+    assert f"force without pads: as the model tells it; {len(PLACES)} contacts do not speak for another law" in told
     assert main(["apply", new, str(presses), "-o", out, "--track"]) == 0
     assert tracker.started[-1].contacts == len(PLACES)
     assert main(["recalibrate", new, str(presses), "-o", out, "--learn-layer", "--json"]) == 2
