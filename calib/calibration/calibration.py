@@ -62,8 +62,8 @@ class Calibration:
     | tried: candidate curves and fields, with their held-out errors           |
     | rest: gage pressure of the pads without contact, (pads,) Pa              |
     | recalibration: how pads have moved since; None: never recalibrated       |
-    | layer: gain of the contact layer, by which contacts are followed; None:  |
-    |   not learned (`learn_layer`)                                            |
+    | layer: gain of the contact layer, by which contacts are followed and     |
+    |   loads are fitted; None: not learned (`learn_layer`)                    |
     | contact_law: by which readings tell a contact's force where no pad does; |
     |   None: not learned (`learn_layer`)                                      |
     | sensor: deviation of single readings of the pads at rest, (pads,) Pa;    |

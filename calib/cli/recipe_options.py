@@ -61,7 +61,7 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
         "put the electrodes where untouched frames and presses tell that they sit; the places of presses must be right"
     )
     group.add_argument("--fit-electrodes", action="store_true", help=text)
-    text = "keep what the presses tell of the contact layer's gain; helps `--track` of apply and live"
+    text = "keep what the presses tell of the contact layer's gain; helps apply `--loads`, `--track`"
     group.add_argument("--learn-layer", action="store_true", help=text)
     _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")
     add_low_pass_argument(group)

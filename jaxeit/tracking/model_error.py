@@ -74,7 +74,8 @@ def press_evidence(
     """
     require_known("press_evidence", InverseError, dv, pad_forces, pad_errors)
     seen = _seen(tracker, dv, pad_forces, pad_errors)
-    return np.array([_evidence(tracker, frame, pads, layer) for frame, pads in seen])
+    before = tracker.start(layer).belief
+    return np.array([float(tracker.press_update(before, frame, pads).evidence) for frame, pads in seen])
 
 
 def _seen(
@@ -109,11 +110,16 @@ def _with_model_error(tracker: Tracker, error: float) -> Tracker:
     return Tracker(changed, settings, tracker.area, tracker.field)
 
 
-def _evidence(
-    tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads, layer: LearnedLayer | None = None
-) -> float:
-    """Log of the probability of a frame with one contact, up to a constant that all model errors share."""
-    before = tracker.start(layer).belief
-    left = tracker.programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
+def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads) -> float:
+    """Log of the probability of a frame with one contact, up to a constant that all model errors share.
+
+    The contact begins as contacts of the tracker do. Where its fit then ends elsewhere, a tracker that believes its
+    model less goes less astray.
+    """
+    programs, before = tracker.programs, tracker.start().belief
+    left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
+    belief, attempt = tracker.events.with_contact(before, programs.explaining_place(left)), None
+    while attempt is None or not attempt.ended:
+        attempt = programs.attempted(belief, frame, pads, attempt)
     share = 1 - float(tracker.filter.error_share) * float(left @ left) / len(left)  # 1 / s^2
-    return float(tracker.press_update(before, frame, pads).evidence) + 0.5 * len(left) * float(np.log(share))
+    return float(attempt.evidence) + 0.5 * len(left) * float(np.log(share))

@@ -10,10 +10,12 @@ import scipy.sparse
 import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
+from calib.calibration.localisation import load_windows
 from calib.calibration.localisation.load_windows import WindowedFrames
 from calib.calibration.localisation.proposals import chosen_proposal
 from calib.cli import main
 from jaxeit.imaging import InverseError
+from jaxeit.tracking import GainField, LearnedLayer
 
 from ..place_logs import place_log, write_place_log
 
@@ -35,6 +37,29 @@ def test_windows_hold_touched_frames_of_the_length_asked_for():
     np.testing.assert_allclose(seen.quiet.untouched, [3.05, 2.95], atol=0.01)
     assert seen.quiet.noise is not None
     assert WindowedFrames(1.0, 2).quiet.noise is None
+
+
+class Asked(Exception):
+    """The fit of loads is prepared."""
+
+
+def test_loads_are_fitted_with_the_layer_that_the_calibration_learned(calibration, monkeypatch):
+    corners, readings = np.array([[0.0, 0.0], [0.2, 0.2]]), calibration.recon.readings
+    layer = LearnedLayer.unknown(GainField.over(corners, corners, je.contacts.LoadSettings(gain_length=0.05), 0.3))
+
+    def prepare(*_, gain, **__):
+        raise Asked(gain)
+
+    monkeypatch.setattr(je.contacts, "prepare_loads", prepare)
+    monkeypatch.setattr(load_windows, "fit_untouched_sheet", lambda *_: (None, ()))
+    seen, noise = WindowedFrames(0.1, readings), np.random.default_rng(0).normal(size=(60, readings))
+    loaded = np.arange(60) >= 40
+    seen.add(np.arange(60) * S // 100, noise, noise, loaded, np.where(loaded, 9.0, 0.0))
+    seen.close()
+    for known in (layer, None):
+        with pytest.raises(Asked) as asked:
+            load_windows.fit_windows(replace(calibration, layer=known), seen)
+        assert asked.value.args[0] is known
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,8 @@
 """Loads fitted through the pressure law: what they are, how many, where, and how sure."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -197,12 +200,69 @@ def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     sheet = prepare_loads(model, noise=noise).sheet
     theta, forms = rows(SPOT)
     white = jax.jit(lambda sigma: sheet.white(transfer(model, coefficients(model, sigma))))
-    factor = sheet._pressed(theta, forms, jnp.ones_like(sheet.sigma), sheet.points)
+    factor = sheet._pressed(theta, forms) / sheet.sigma
     change = lambda mode: (lambda s: white(s * factor) - white(s))(sheet.sigma * jnp.exp(sheet.coat[:, mode]))  # noqa: E731
     slopes = compiled(sheet.unknowns, theta, forms).nuisances[:, -sheet.coat.shape[1] :]
     strongest = int(jnp.argmax(jnp.linalg.norm(slopes, axis=0)))
     seen = change(strongest) - (white(sheet.sigma * factor) - white(sheet.sigma))
     assert np.linalg.norm(seen - slopes[:, strongest]) < 0.25 * np.linalg.norm(seen)
+
+
+class Gain(NamedTuple):
+    """A gain of the contact layer that is known: its mean at points, from which a mode differs as the settings say."""
+
+    mean: Callable[[np.ndarray], np.ndarray]
+    deviation: float
+
+    def over(self, points):
+        modes = LoadSettings().gain * field_modes(points, LoadSettings().gain_length)
+        return self.mean(points), modes, self.deviation**2 * np.eye(modes.shape[1])
+
+
+def test_a_gain_of_which_nothing_is_known_changes_nothing(ready):
+    """The errors of the readings by the modes of the gain, and the readings."""
+    fitter, _, _, noise = ready
+    model, sigma = fitter.sheet.model, fitter.sheet.sigma
+    same = prepare_loads(model, noise=noise, sigma=sigma, gain=Gain(lambda points: np.zeros(len(points)), 1.0)).sheet
+    theta, forms = rows(SPOT)
+    one, other = (compiled(sheet.unknowns, theta, forms) for sheet in (fitter.sheet, same))
+    np.testing.assert_allclose(other.value, one.value, atol=1e-9 * float(jnp.abs(one.value).max()))
+    errors = [np.asarray(each.nuisances @ each.nuisances.T) for each in (one, other)]
+    np.testing.assert_allclose(errors[1], errors[0], atol=1e-9 * np.abs(errors[0]).max())
+
+
+def test_a_gain_that_is_even_and_known_is_a_factor_of_the_force(ready):
+    """The law sees pressure times gain: half the force under twice the gain shows the same, and so do its slopes."""
+    fitter, _, _, noise = ready
+    model, sigma = fitter.sheet.model, fitter.sheet.sigma
+    even = Gain(lambda points: np.full(len(points), np.log(2.0)), 1.0)
+    twice = prepare_loads(model, noise=noise, sigma=sigma, gain=even).sheet
+    one, other = (
+        compiled(sheet.unknowns, *rows(SPOT.at[3].add(log)))
+        for sheet, log in ((fitter.sheet, 0.0), (twice, -np.log(2.0)))
+    )
+    for name in ("value", "loads", "shapes"):
+        expected = np.asarray(getattr(one, name))
+        np.testing.assert_allclose(getattr(other, name), expected, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+
+
+def test_a_gain_that_is_known_places_loads_where_they_are(ready):
+    """Frames of an uneven layer on another mesh, with the field that they were simulated by."""
+    fitter, finder, frames, noise = ready
+    known = Gain(lambda points: float(GAIN.std) * np.asarray(GAIN._field(jnp.asarray(points))), 0.1)
+    wiser = prepare_loads(fitter.sheet.model, noise=noise, sigma=fitter.sheet.sigma, gain=known)
+    away = []
+    for frame, (kind, (places, forces)) in zip(frames, TOUCHES.values(), strict=True):
+        if kind in (LoadKind.ONE, LoadKind.TWO):
+            found = [each(frame, finder(frame)) for each in (fitter, wiser)]
+            assert found[1].kind is kind
+            assert abs(found[1].best.force.sum() / forces.sum() - 1) < 0.05
+            away.append(
+                [np.linalg.norm(each.of(kind).position[:, None] - places, axis=-1).min(0).max() for each in found]
+            )
+    before, after = np.array(away).T
+    assert after.max() < 0.8e-3
+    assert after.mean() < 0.6 * before.mean()
 
 
 def test_fields_that_are_not_known_have_their_size_and_length():

@@ -121,6 +121,16 @@ def test_places_where_a_contact_may_begin_are_apart(tracker, frame_of):
     assert away[np.triu_indices(len(places), 1)].min() >= APART
 
 
+def test_the_gain_for_fits_of_loads_is_that_of_the_next_press(layer):
+    """Its covariance is that of the layer and an effect of the press."""
+    points = np.array(PLACES)
+    mean, modes, covariance = layer.over(points)
+    of_layer, deviation = layer.at(points)
+    np.testing.assert_array_equal(mean, of_layer)
+    effect = layer.press_variance * (modes**2).sum(1)
+    np.testing.assert_allclose(((modes @ covariance) * modes).sum(1), deviation**2 + effect)
+
+
 def test_what_was_learned_tells_the_force_without_pads(tracker, frame_of, layer):
     """The skin goes on working when no pad tells the force: at most half of the error without learning."""
     errors = [np.log(press(tracker, frame_of, known, 0.052, 0.055).force / 10) for known in (None, layer)]

@@ -115,7 +115,7 @@ def fit_windows(
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
-    fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels)
+    fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels, gain=calibration.layer)
     finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
     found = [_found(fitter, finder, proposal, window, channels) for window in progress(seen.windows)]
     loads, distance = zip(*found, strict=True)

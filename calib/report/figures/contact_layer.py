@@ -60,8 +60,8 @@ def about_layer(layer: LearnedLayer, law: ContactLaw | None) -> tuple[str, str]:
     level = number_text(100 * layer.field.deviation, 0)
     caption = (
         f"How strongly the contact layer answers to pressure, as told by {layer.contacts} contacts whose forces the "
-        "pads knew; 1 is the layer of the model. Contacts are followed with it. Where nobody pressed, the standard "
-        f"deviation is that of a layer of which nothing is known, {level} % or more: press there."
+        "pads knew; 1 is the layer of the model. Contacts and loads are placed with it. Where nobody pressed, the "
+        f"standard deviation is that of a layer of which nothing is known, {level} % or more: press there."
     )
     return alt, caption if law is None else f"{caption} Force where no pad tells it: {law.render()}."
 

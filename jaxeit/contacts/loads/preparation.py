@@ -1,6 +1,7 @@
 """Preparing the fit of loads: everything that does not depend on the frame."""
 
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -17,10 +18,21 @@ from ..preparation import sheet_and_readings
 from .fitter import LoadFitter
 from .pressure import MOST, SIZE, Form
 from .settings import LoadSettings
-from .sheet import PressedSheet
+from .sheet import KnownGain, PressedSheet
 from .starts import Starts
 
 REACH = 2.5  # widths from the middle of a usual load within which elements count
+
+
+@runtime_checkable
+class AbstractGain(Protocol):
+    """What is known of the log gain of the contact layer."""
+
+    def over(
+        self, points: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n g"], Float[np.ndarray, "g g"]]:
+        """Its mean at points, its modes there, and the covariance of these under the next press."""
+        ...
 
 
 @full_precision
@@ -32,6 +44,7 @@ def prepare_loads(
     untouched: Float[ArrayLike, " readings"] | None = None,
     sigma: Float[Array, " elements"] | None = None,
     channels: Bool[ArrayLike, " readings"] | None = None,
+    gain: AbstractGain | None = None,
 ) -> LoadFitter:
     """Prepare the fit of loads to frames of a skin, for use offline.
 
@@ -39,6 +52,8 @@ def prepare_loads(
         model: of edges not above 0.05 of the sheet; a draft moves a load by 0.15 mm, which is in no covariance.
         settings: default `LoadSettings()`.
         noise, untouched, sigma, channels: as for `prepare_contacts`.
+        gain: of the contact layer, as it was learned (`tracking.LearnedLayer`), in place of that of the settings;
+            default: not known.
 
     Raises:
         InverseError: as for `prepare_contacts`.
@@ -50,7 +65,7 @@ def prepare_loads(
     sigma = conductivity(model) if sigma is None else put(sigma)
     chart = np.asarray(model.chart, float)
     low, high = chart.min(0), chart.max(0)
-    sheet = _sheet(model, settings, sigma, settings.coat_spread(known), put(found.factor), found.electrodes)
+    sheet = _sheet(model, settings, sigma, settings.coat_spread(known), put(found.factor), found.electrodes, gain)
     return LoadFitter(
         sheet=sheet,
         whitening=found.whitening,
@@ -76,11 +91,16 @@ def _sheet(
     coat: float,
     factor: Float[Array, "r k"],
     electrodes: np.ndarray,
+    known: AbstractGain | None,
 ) -> PressedSheet:
     """The sheet under loads, with the modes of all that is not known of it."""
     put = partial(jnp.asarray, dtype=model.dtype)
     points, weights = points_of(model, settings.width)
     centroids = np.einsum("q,eqd->ed", weights, points)
+    gain, about = settings.gain * field_modes(centroids, settings.gain_length), None
+    if known is not None:
+        mean, gain, covariance = known.over(centroids)
+        about = KnownGain(put(np.exp(mean)), put(covariance))
     modes = coat * field_modes(centroids, settings.coat_length) if coat else np.zeros((len(centroids), 0))
     sheet = PressedSheet(
         model=model,
@@ -90,12 +110,13 @@ def _sheet(
         untouched=jnp.zeros(len(factor), model.dtype),
         points=put(points),
         weights=put(weights),
-        gain=put(settings.gain * field_modes(centroids, settings.gain_length)),
+        gain=put(gain),
         coat=put(modes),
         by_coat=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),
         law=settings.law,
         reach=min(len(centroids), 2 * _reach(centroids, REACH * settings.width)),
+        known=about,
     )
     return _without_loads(sheet)
 

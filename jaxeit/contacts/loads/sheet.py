@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...effects.material import ContactPiezoresistance
+from ...linalg import lapack
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, fields, series_resistance, transfer
 from ...model.sensitivity import element_slopes
@@ -57,6 +58,19 @@ class Unknowns(NamedTuple):
     elongation: Float[Array, "r 2"]
 
 
+class KnownGain(eqx.Module):
+    """What is known of the contact layer's gain before a frame.
+
+    | meaning                                                   | shape       | unit |
+    |-----------------------------------------------------------|-------------|------|
+    | factor: of the pressure on each element, exp of the mean  | (elements,) | 1    |
+    | covariance: of the modes of the log gain                  | (g, g)      | 1    |
+    """
+
+    factor: Float[Array, " elements"]
+    covariance: Float[Array, "g g"]
+
+
 class PressedSheet(eqx.Module):
     """The sheet under loads.
 
@@ -70,6 +84,7 @@ class PressedSheet(eqx.Module):
     | coat: modes of the log conductivity that is not known                 | (elements, c)    | 1     |
     | by_coat: slopes of the whitened readings in these without loads       | (r, c)           |       |
     | shape: standard deviation of the moments of a load's shape            | ()               | 1     |
+    | known: of the gain; None: its modes have a deviation of one, and mean zero |             |       |
     | reach: number of elements that loads change                           |                  |       |
     """
 
@@ -86,15 +101,16 @@ class PressedSheet(eqx.Module):
     shape: Float[Array, ""]
     law: ContactPiezoresistance
     reach: int = eqx.field(static=True)
+    known: KnownGain | None = None
 
     def response(self, loads: Parameters, forms: Forms) -> Float[Array, " r"]:
         """Whitened readings of loads."""
-        z = transfer(self.model, coefficients(self.model, self._pressed(loads, forms, self.sigma, self.points)))
+        z = transfer(self.model, coefficients(self.model, self._pressed(loads, forms)))
         return self.white(z) - self.untouched
 
     def linearised(self, loads: Parameters, forms: Forms) -> Linearised:
         """Readings, and their slopes in the conductivity of the elements that the loads change most."""
-        sigma = self._pressed(loads, forms, self.sigma, self.points)
+        sigma = self._pressed(loads, forms)
         near = jax.lax.top_k(sigma / self.sigma, self.reach)[1]
         theta = coefficients(self.model, sigma)
         x = fields(self.model, theta)
@@ -104,20 +120,22 @@ class PressedSheet(eqx.Module):
 
     def slopes(self, at: Linearised, loads: Parameters, forms: Forms) -> Float[Array, "r m"]:
         """Slopes of the readings in all parameters of the loads."""
-        sigma, points = self.sigma[at.near], self.points[at.near]
-        by_loads = jax.jacfwd(lambda loads: self._pressed(loads, forms, sigma, points))(loads)
-        return self._mixed(at, by_loads.reshape(len(sigma), -1))
+        by_loads = jax.jacfwd(lambda loads: self._pressed(loads, forms, at.near))(loads)
+        return self._mixed(at, by_loads.reshape(len(at.near), -1))
 
     def unknowns(self, loads: Parameters, forms: Forms) -> Unknowns:
         """Slopes of the readings in gain, coat and shapes of loads, and in the loads themselves."""
         at = self.linearised(loads, forms)
         points = self.points[at.near]
-        here = pressure(loads, forms, points)
+        factor = self._factor(at.near)
+        here = pressure(loads, forms, points) * factor
         slope = jax.jvp(self.law.factor, (here,), (jnp.ones_like(here),))[1]
         by_pressure = self.sigma[at.near, None] * slope * self.weights
-        by_gain = jnp.sum(by_pressure * here, 1)
+        by_gain, by_pressure = jnp.sum(by_pressure * here, 1), by_pressure * factor
         there = jax.lax.top_k(by_gain @ self.gain[at.near], min(MODES, self.gain.shape[1]))[1]
         gain = by_gain[:, None] * self.gain[at.near[:, None], there]
+        if self.known is not None:
+            gain = gain @ lapack.cholesky(self.known.covariance[jnp.ix_(there, there)], lower=True)
         shapes, tilts = shape_directions(loads, forms, points), tilt_directions(loads, forms, points)
         bent = jnp.concatenate([self.shape * shapes, self.shape * tilts, elongations(loads[0], points)], -1)
         mixed = self._mixed(at, jnp.concatenate([gain, jnp.einsum("eq,eqd->ed", by_pressure, bent)], 1))
@@ -125,7 +143,7 @@ class PressedSheet(eqx.Module):
         _, by_shapes, by_tilts, elongation = jnp.split(mixed, ends, 1)
         nuisances = mixed[:, : ends[1]]
         if self.coat.shape[1]:
-            by_coat = self.coat_slopes(self._pressed(loads, forms, self.sigma, self.points)) - self.by_coat
+            by_coat = self.coat_slopes(self._pressed(loads, forms)) - self.by_coat
             nuisances = jnp.concatenate([nuisances, by_coat], 1)
         return Unknowns(at.value, nuisances, by_shapes, by_tilts, self.slopes(at, loads, forms), elongation)
 
@@ -142,10 +160,15 @@ class PressedSheet(eqx.Module):
         return self.factor @ z[self.pairs[:, 0], self.pairs[:, 1]]
 
     def _pressed(
-        self, loads: Parameters, forms: Forms, sigma: Float[Array, " e"], points: Float[Array, "e q 2"]
+        self, loads: Parameters, forms: Forms, elements: Int[Array, " e"] | slice = slice(None)
     ) -> Float[Array, " e"]:
-        """Conductivity of elements under loads."""
-        return sigma * (self.law.factor(pressure(loads, forms, points)) @ self.weights)
+        """Conductivity of elements under loads, S."""
+        felt = pressure(loads, forms, self.points[elements]) * self._factor(elements)
+        return self.sigma[elements] * (self.law.factor(felt) @ self.weights)
+
+    def _factor(self, elements: Int[Array, " e"] | slice) -> Float[Array, "e 1"] | float:
+        """Factor of the pressure on elements: the mean gain, where it is known."""
+        return 1.0 if self.known is None else self.known.factor[elements, None]
 
     def _mixed(self, at: Linearised, change: Float[Array, "e d"]) -> Float[Array, "r d"]:
         """What a change of the conductivity near the loads does to the readings."""

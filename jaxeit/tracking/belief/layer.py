@@ -189,6 +189,13 @@ class LearnedLayer(NamedTuple):
         variance = ((modes @ self.covariance) * modes).sum(1)
         return modes @ self.mean, np.sqrt(np.maximum(variance, 0))
 
+    def over(
+        self, points: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n g"], Float[np.ndarray, "g g"]]:
+        """Mean of the log gain at points (n, 2) m, its modes there, and their covariance under the next press."""
+        modes = self.field.modes_at(points)
+        return modes @ self.mean, modes, self.under_press
+
     def aged(self, share: float) -> "LearnedLayer":
         """After a time in which this share of what was learned, from 0 to 1, has been forgotten.
 
