@@ -88,7 +88,8 @@ def _loaded_sheet(
     loads, light = settings.loads, partial(on_device, dtype=np.dtype(settings.dtype))
     coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(_columns(model, settings)).on(model)
     response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
-    background = np.asarray(fine.restrict(sigma)) / np.asarray(fine.restrict(jnp.ones_like(sigma)))
+    total, covered = (np.asarray(fine.restrict(values)) for values in (sigma, jnp.ones_like(sigma)))
+    background = np.divide(total, covered, out=np.zeros_like(total), where=covered > 0)  # 0 beside the sheet
     mean, masks, (points, weights) = (
         _carried(model, sigma, coarse),
         pad_masks(skin, fine),

@@ -40,6 +40,19 @@ def frame_of(model, blank):
     )
 
 
+@pytest.fixture(scope="module")
+def cornered():
+    """Tracker of an L-shaped sheet, whose pads meet at the inner corner."""
+    outline = np.array([(0.0, 0.0), (0.16, 0.0), (0.16, 0.08), (0.08, 0.08), (0.08, 0.16), (0.0, 0.16)])
+    places = [(x, y) for y in (0.02, 0.06, 0.1, 0.14) for x in (0.02, 0.06, 0.1, 0.14) if min(x, y) < 0.08]
+    electrodes = tuple(je.AreaPatch(place, 0.003, 1e-6) for place in places)
+    pads = (je.Pad("right", outline[[0, 1, 2, 3]]), je.Pad("up", outline[[0, 3, 4, 5]]))
+    protocol = je.Protocol(je.skin.adjacent(len(places)), 1e-3)
+    skin = je.Skin("corner", je.Polygon(outline), 150.0, electrodes, protocol, pads)
+    model = je.discretise(je.Scene(skin, effects=()), je.Fidelity.draft())
+    return prepare_tracker(model, skin, SETTINGS, noise=np.full(protocol.readings, 1e-5), sigma=model.background)
+
+
 def load(x, y, force, width=0.012):
     return [x, y, np.log(width), np.log(force), 0.0, 0.0]
 

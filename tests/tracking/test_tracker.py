@@ -150,3 +150,11 @@ def test_wrong_frames_are_refused(tracker, given, said):
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(InverseError, match=next(iter(wrong))):
         TrackerSettings(**wrong)
+
+
+def test_pixels_beside_a_sheet_that_is_no_rectangle_have_no_response(cornered):
+    sheet = cornered.filter.sheet
+    beside = np.asarray(sheet.pad_area).sum(1) == 0
+    assert beside.any()
+    assert np.isfinite(sheet.pixel_response).all()  # NaN here loses the contacts near the corner
+    assert not np.asarray(sheet.pixel_response)[beside].any()
