@@ -164,7 +164,8 @@ def load_bench(path: str | Path) -> Bench:
     if path in presets() and not Path(path).exists():
         text = (SCENE_FOLDER / f"{path}.toml").read_text(encoding="utf-8")
     elif not path.endswith(".toml") and not Path(path).exists():
-        raise BenchError(f"{path}: no such scene file or preset; presets: {', '.join(presets())}")
+        hint = f"did you mean {path}.toml?" if Path(f"{path}.toml").exists() else f"presets: {', '.join(presets())}"
+        raise BenchError(f"{path}: no such scene file or preset; {hint}")
     else:
         text = je.toml.read_text(Path(path))
     return je.toml.parse_toml(text, path, lambda table: _bench(table, text, Path(path).parent), allow_import=True)

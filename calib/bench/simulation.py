@@ -43,8 +43,11 @@ def simulate(
         progress: wraps the iteration over blocks, such as `tqdm.tqdm`.
 
     Raises:
-        ValueError: if the scene cannot be discretised or the file not written.
+        ValueError: if the skin has no pads, the scene cannot be discretised or the file not written.
     """
+    if not bench.scene.skin.pads:
+        other = "je.forward, and frames of --random-scenes, need none"
+        raise BenchError(f"the skin {bench.scene.skin.name!r} has no pads for a session to hold; add [[pads]]; {other}")
     fidelity = SIMULATION if fidelity is None else fidelity
     path = Path(path)
     made = simulated_streams(bench, fidelity)

@@ -217,11 +217,26 @@ def _median(values: np.ndarray) -> float:
 
 def _conclusion(report: CheckReport) -> Iterator[str]:
     errors, warnings = report.count(Severity.ERROR), report.count(Severity.WARNING)
+    lacks = " and ".join(_lacks(report))
     if not errors and not warnings:
-        yield "Nothing wrong was found."
+        yield from _wrapped("", "Nothing wrong was found." + (f" A calibration needs {lacks} too." if lacks else ""))
         return
     counts = [counted(errors, "error"), counted(warnings, "warning")]
-    known = any(stream.name == "force" for stream in report.streams)
-    usable = "It can be calibrated." if known else "It can be used; a calibration needs the force too."
+    usable = f"It can be used; a calibration needs {lacks} too." if lacks else "It can be calibrated."
     end = "Correct the errors before the calibration." if errors else usable
-    yield ", ".join(c for c in counts if c) + ". " + end
+    yield from _wrapped("", ", ".join(c for c in counts if c) + ". " + end)
+
+
+def _lacks(report: CheckReport) -> Iterator[str]:
+    """What a calibration needs and the session has not. A log without EIT needs the force alone."""
+    names = {stream.name for stream in report.streams}
+    if "force" not in names:
+        yield "the force"
+    if "eit" not in names:
+        return
+    if "pressure" not in names:
+        yield "the pressures of the pads"
+    if "force" in names and not report.presses.accepted:
+        yield "presses"
+    if "stage" not in names and report.presses.source != "table":
+        yield "the places of the presses (a stream named stage, or a table of presses)"

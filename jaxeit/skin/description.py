@@ -36,7 +36,7 @@ class Pad:
 
 
 MAX_OVERLAP = 0.9  # of the smaller of two pads: more is one pad that is listed twice
-OVERLAP_POINTS = 40  # along each side of the box that two pads have in common
+BOX_POINTS = 40  # along each side of a box that is examined
 
 
 class SkinError(ValueError):
@@ -64,11 +64,17 @@ def pad_overlap(first: Pad, second: Pad) -> float:
     high = np.minimum(first.outline.max(0), second.outline.max(0))
     if (high <= low).any():
         return 0.0
-    at = (np.arange(OVERLAP_POINTS) + 0.5) / OVERLAP_POINTS
-    points = low + np.stack(np.meshgrid(at, at), -1).reshape(-1, 2) * (high - low)
+    points = _points_in_box(low, high)
     shapes = Polygon(first.outline), Polygon(second.outline)
     common = shapes[0].contains(points) & shapes[1].contains(points)
     return float(common.mean() * np.prod(high - low) / min(shape.area for shape in shapes))
+
+
+def _points_in_box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Points (points, 2) m on a grid over the box between two corners."""
+    at = (np.arange(BOX_POINTS) + 0.5) / BOX_POINTS
+    shares = np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
+    return np.asarray(low + shares * (high - low))
 
 
 @dataclass(frozen=True)
@@ -208,11 +214,13 @@ def _sheet(table: TomlTable) -> tuple[Domain, float, AbstractSurface | None]:
     shape = table.choice("shape", "rectangle", "disc", "polygon")
     domain: Domain
     if shape == "rectangle":
-        domain = Rectangle(*table.vector("size", 2, "[width, height] in m"))
+        key, domain = "size", Rectangle(*table.vector("size", 2, "[width, height] in m"))
     elif shape == "disc":
-        domain = Disc(table.positive("radius", "a length in m"))
+        key, domain = "radius", Disc(table.positive("radius", "a length in m"))
     else:
-        domain = Polygon(table.array("vertices", 2, "corners [[x, y], ...] in m"))
+        key, domain = "vertices", Polygon(table.array("vertices", 2, "corners [[x, y], ...] in m"))
+    if (across := np.ptp(domain.bounds, 0).max()) > _MAX_ACROSS:
+        raise table.error(key, f"the sheet is {across:g} m across, more than {_MAX_ACROSS:g} m; give lengths in m")
     resistance = table.positive("sheet_resistance", "ohm per square")
     surface = _surface(table.table("surface"), domain) if table.has("surface") else None
     table.done()
@@ -258,6 +266,7 @@ def _protocol(table: TomlTable, electrodes: int) -> Protocol:
         raise table.error("pattern", str(error)) from None
 
 
+_MAX_ACROSS = 20.0  # m: a larger sheet was given in mm
 _MIN_PAD_WIDTH = 1e-3  # of the shorter side of the sheet
 _PAD_REACH = 1.0  # of the sheet's width and height: a pad may jut out, but not by a sheet's size
 
@@ -282,7 +291,16 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
         what = f"is {size:.3g} m wide, too little for a pad of this sheet of {sides} m"
         raise table.error(key, f"{what}; give all lengths in m")
     table.done()
-    return Pad(name, np.asarray(outline, float))
+    pad = Pad(name, np.asarray(outline, float))
+    if not _meets(pad, domain):
+        raise table.error(key, "no part of the pad lies on the sheet; give its corners in m, from the sheet's origin")
+    return pad
+
+
+def _meets(pad: Pad, domain: Domain) -> bool:
+    """Whether a part of the pad lies on the sheet, by points on a grid over its box."""
+    points = _points_in_box(pad.outline.min(0), pad.outline.max(0))
+    return bool((Polygon(pad.outline).contains(points) & domain.contains(points)).any())
 
 
 def _sensor(table: TomlTable) -> PressureSensor:

@@ -38,7 +38,7 @@ def named_protocol(
         print(f"{scan.readings} readings of drives through all electrodes")
     """
     if name != "trigonometric":
-        return Protocol(named_pattern(name, electrodes), current, frequency, reading_time)
+        return Protocol(_named_rows(name, electrodes, NAMES), current, frequency, reading_time)
     if not (np.isfinite(current) and current > 0):
         raise ProtocolError(f"the current is {current} A; give a positive number")
     senses = np.eye(electrodes) - np.roll(np.eye(electrodes), 1, 0)
@@ -87,6 +87,11 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
     """
     if name == "trigonometric":
         raise ProtocolError("the trigonometric pattern has no rows of four electrodes; use named_protocol")
+    return _named_rows(name, electrodes, ROW_NAMES)
+
+
+def _named_rows(name: str, electrodes: int, names: str) -> np.ndarray:
+    """The rows of `named_pattern`; ``names`` is what the error for another name lists."""
     kind, _, number = name.partition("-")
     if name == "adjacent":
         return adjacent(electrodes)
@@ -96,7 +101,7 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
         return opposite(electrodes)
     if kind == "skip" and number.isascii() and number.isdecimal() and len(number) < 6:
         return skip(electrodes, int(number))
-    raise ProtocolError(f"{name!r} is no pattern; give {ROW_NAMES}")
+    raise ProtocolError(f"{name!r} is no pattern; give {names}")
 
 
 def adjacent(electrodes: int) -> np.ndarray:

@@ -10,6 +10,8 @@ from ..toml import TomlError, TomlTable
 def read_positions(table: TomlTable) -> list[tuple[float, float]]:
     """The places of ``positions`` or of the table ``grid``, m."""
     given = table.has("positions")
+    if given and table.has("grid"):
+        raise table.error("positions", "the electrodes have a grid too; give one of the two")
     rows = table.array("positions", 2, "[[x, y], ...] in m") if given else _grid(table.table("grid"))
     return [(float(x), float(y)) for x, y in rows]
 
@@ -20,9 +22,11 @@ def read_positions_inside(table: TomlTable, domain: Domain) -> list[tuple[float,
     outside = ~domain.contains(np.array(positions))
     if outside.any():
         number = int(np.argmax(outside))
-        problem = f"electrode {number} at {positions[number]} m lies outside the sheet"
+        (x0, y0), (x1, y1) = domain.bounds
+        sheet = f"which reaches from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m"
+        problem = f"electrode {number} at {positions[number]} m lies outside the sheet, {sheet}"
         if table.has("positions"):
-            raise table.error("positions", problem)
+            raise table.error("positions", f"{problem}; give places in m, on the sheet")
         hint = "give pitch and origin in m, or list positions = [[x, y], ...] where the sheet is no rectangle"
         raise table.error("grid", f"{problem}; {hint}")
     return positions

@@ -378,6 +378,19 @@ def test_a_grid_of_presses_keeps_what_an_l_shaped_sheet_holds(tmp_path):
         load_bench(str(tmp_path / "scene.toml"))
 
 
+def test_a_skin_without_pads_makes_no_session(skin, tmp_path):
+    scene = je.Scene(replace(skin, pads=()), effects=())
+    bare = calib.Bench(scene, sites=np.array([[0.1, 0.1]]), forces=np.array([5.0]))
+    with pytest.raises(calib.bench.BenchError, match=r"the skin 'testbed' has no pads for a session to hold; add"):
+        calib.simulate(bare, tmp_path / "s.h5")
+
+
+def test_the_ending_of_a_scene_file_is_missed(tmp_path):
+    (tmp_path / "mine.toml").touch()
+    with pytest.raises(calib.bench.BenchError, match=r"mine: no such scene file .*; did you mean .*mine\.toml\?"):
+        calib.load_bench(tmp_path / "mine")
+
+
 def test_an_unknown_preset_is_named():
     with pytest.raises(ValueError, match=r"papr_bench: no such scene file or preset; presets: .*paper_bench"):
         load_bench("papr_bench")

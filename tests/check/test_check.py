@@ -396,10 +396,28 @@ def test_low_signal_is_a_warning(parts, look):
     assert "It can be used; a calibration needs the force too." in render(look(parts))
 
 
+def test_what_a_calibration_lacks_is_said(parts, look):
+    del parts.streams["force"]
+    assert "Nothing wrong was found. A calibration needs the force too." in render(look(parts))
+
+
+def test_places_of_the_presses_are_missed(parts, look):
+    parts.presses = None  # and there is no stream of the stage
+    said = " ".join(render(look(parts)).split())
+    assert "needs the places of the presses (a stream named stage, or a table of presses) too" in said
+
+
+def test_presses_are_missed(parts, look):
+    parts.presses = None
+    parts.change("force", np.zeros_like(parts.values("force")))
+    said = " ".join(render(look(parts)).split())
+    assert "It can be used; a calibration needs presses and the places of the presses" in said
+
+
 # --- skin and protocol ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", ["[0.2, 2.0]", "[200.0, 0.2]"])
+@pytest.mark.parametrize("size", ["[0.2, 2.0]", "[20.0, 0.2]"])
 def test_a_sheet_that_reaches_far_beyond_its_electrodes_is_named(size, parts, look):
     """The readings alone follow such a sheet nearly as well."""
     parts.toml = parts.toml.replace("size = [0.2, 0.2]", f"size = {size}")

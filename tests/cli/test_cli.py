@@ -167,8 +167,11 @@ def test_no_command_prints_the_commands_as_an_error(capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["ideal"], "give either -o SESSION.h5 to simulate, or --explain"),
-        (["ideal", "--explain", "-o", "s.h5"], "give either -o SESSION.h5 to simulate, or --explain"),
+        (["ideal"], "give either -o SESSION.h5 to simulate, also with --serve, or"),
+        (
+            ["ideal", "--explain", "-o", "s.h5"],
+            "give either -o SESSION.h5 to simulate, also with --serve, or",
+        ),
         (["ideel", "--explain"], "ideel: no such scene file or preset; presets: broken_electrode"),
         (["testbed", "--data-set", "3", "--serve", "-o", "s.h5"], "--serve are for scenes"),
     ],

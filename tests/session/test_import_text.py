@@ -89,6 +89,13 @@ def test_a_name_that_holds_a_comma_is_told_as_it_is_to_be_written(tmp_path, caps
     assert """column 'p': not there; header names: t, "p, left", f;""" in told
 
 
+def test_numbered_columns_are_told_as_a_range(tmp_path, capsys):
+    names = [f"U{k} [mV]" for k in range(1, 41)]
+    path = written(tmp_path, ",".join(["Time [ms]", *names, "Fz [N]"]) + "\n" + "1," * 41 + "1\n")
+    told = refusal(capsys, path, "--time", "time:ms", "--stream", "force=load:N")
+    assert "header names: Time [ms], U1 [mV]-U40 [mV], Fz [N]; use one of them" in told
+
+
 def test_the_nearest_name_is_told_and_units_of_another_quantity_are_refused(tmp_path, capsys):
     path = written(tmp_path, "t,force_z,p\n0,1,2\n1,4,5\n")
     told = refusal(capsys, path, "--time", "t:s", "--stream", "force=forcez:N")
@@ -339,7 +346,9 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
         ("time (ms),force", "--time time: read in s, but the header says ms ('time (ms)')"),
         ("time,force (mN)", "--stream force: read in N, but the header says mN ('force (mN)')"),
         ("time (s),force [N]", None),
-        ("time,force_m", None),  # not a unit of force
+        ("time,force [mm]", "--stream force: read in N, but the header says mm ('force [mm]')"),
+        ("time,force (counts)", None),
+        ("time,force_m", None),  # may be the name of a channel
     ],
 )
 def test_a_header_that_contradicts_the_command_is_named(header, said, tmp_path, capsys):

@@ -169,7 +169,7 @@ def test_a_skin_file_with_rings_is_simulated():
         ),
         ("inner_radius = 0.003", "", "inner_radius: missing; give the radius of the hole in m, above zero"),
         ("inner_radius = 0.003", "inner = 0.003", "inner_radius: missing"),
-        ("[0.15, 0.05]", "[0.25, 0.05]", "positions: electrode 1 at .* m lies outside the sheet"),
+        ("[0.15, 0.05]", "[0.25, 0.05]", "electrode 1 at .* outside the sheet, which .* to .0.2, 0.2. m; give"),
         ('kind = "ring"', 'kind = "rings"', "kind: no electrode 'rings'; did you mean 'ring'"),
         ('kind = "ring"', 'kind = "mine:Ring"', "kind: electrode 'mine:Ring' is code outside jaxeit"),
         ('kind = "ring"', "", r'kind: missing; give one of .*"ring"'),

@@ -71,7 +71,7 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate, explain, or serve a scene."""
     if bool(args.output) == args.explain:
-        raise ValueError("give either -o SESSION.h5 to simulate, or --explain")
+        raise ValueError("give either -o SESSION.h5 to simulate, also with --serve, or --explain")
     _refuse_lone_options(args)
     from ...runtime import set_up
 
@@ -109,7 +109,7 @@ def _saturation(path: str) -> str:
     with open_session(path) as session:
         flags = {name: stream.status() for name, stream in session.streams.items()}
     shares = {n: 100 * np.mean(found & Status.saturated > 0) for n, found in flags.items() if found is not None}
-    parts = [f"{share:.2g} % of {name}" for name, share in shares.items() if share]
+    parts = [f"{share:{'.0f' if share > 1 else '.2g'}} % of {name}" for name, share in shares.items() if share]
     return f"; beyond the range of their converters: {', '.join(parts)}" if parts else ""
 
 

@@ -149,11 +149,17 @@ def column_indices(path: Path, column: str, header: Sequence[str], columns: int)
 
 
 def _listed(header: Sequence[str]) -> str:
-    """Names in the header as a user writes them: the columns of one array as a range, a name with a comma in quotes."""
+    """Names in the header as a user writes them: numbered columns as a range, a name with a comma in quotes."""
     written = [f'"{head}"' if "," in head else head for head in header]
-    groups = itertools.groupby(written, key=lambda head: re.sub(r"\[\d+\]$", "[]", head))
+    groups = itertools.groupby(written, key=_unnumbered)
     ends = [(names[0], names[-1]) for names in (list(group) for _, group in groups)]
     return ", ".join(first if first == last else f"{first}-{last}" for first, last in ends)
+
+
+def _unnumbered(head: str) -> str:
+    """What the names of numbered columns have in common: ``U# [mV]`` of ``U7 [mV]``; other names as they are."""
+    found = _NUMBERED.fullmatch(head)
+    return f"{found[1]}#{found[3]}" if found else head
 
 
 def _named(path: Path, column: str, header: Sequence[str]) -> int | None:

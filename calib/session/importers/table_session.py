@@ -175,11 +175,13 @@ def _clock_unit(file: AbstractTableFile, spec: FileSpec, wanted: Sequence[int], 
 
 
 def _contradictions(path: Path, where: str, unit: str, indices: Sequence[int], header: Sequence[str]) -> Iterator[str]:
-    """A note if a header states a unit that measures the same in another size, such as mN where N was given."""
+    """A note if a header states another unit: mN where N was given, or, in brackets, that of another quantity."""
     for head in (header[i] for i in indices if i < len(header)):
         said = name_and_unit(head)[1]
         known, given = UNITS.get(said), UNITS[unit]
-        if known and known.si == given.si and (known.factor, known.offset) != (given.factor, given.offset):
+        if known is None or "1" in (known.si, given.si) or known == given:
+            continue
+        if known.si == given.si or head.rstrip().endswith((")", "]")):  # x_m may be the name of a channel
             yield f"{printable(path.name)}: {where}: read in {unit}, but the header says {said} ({printable(head)!r})"
             return
 
@@ -227,7 +229,8 @@ def _described(files: Sequence[FileSpec], skin: "je.Skin | None") -> dict[str, A
     if skin is None:
         return {"skin_name": "", "skin_toml": ""}
     if not any(s.name == "eit" for f in files for s in f.streams):
-        raise SessionError("--skin: no stream is called eit; name the readings' columns, as --stream eit=1-550:V")
+        columns = f"1-{skin.protocol.readings}"
+        raise SessionError(f"--skin: no stream is called eit; name the readings' columns, as --stream eit={columns}:V")
     protocol = skin.protocol
     scan = {
         "pattern": protocol.pattern,
