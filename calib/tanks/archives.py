@@ -21,8 +21,11 @@ def archive_tank(skin: je.Skin, frames: np.ndarray) -> Tank:
 
 
 def read_archive(path: Path) -> dict[str, Any]:
-    """The arrays of an .npz by name."""
+    """The arrays of an .npz by name; that of an .npy is ``frames``."""
     try:
+        if path.suffix.lower() == ".npy":
+            with open_regular(path) as file:
+                return {"frames": np.load(file, allow_pickle=False)}
         with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:

@@ -1,4 +1,4 @@
-"""Frames alone, of a NumPy archive or a MATLAB file, as readings of a tank that a skin describes."""
+"""Frames alone, of NumPy, a table of text or a MATLAB file, as readings of a tank that a skin describes."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -13,6 +13,7 @@ import jaxeit as je
 from .archives import archive_tank, read_archive
 from .matlab import columns_of, forward_models, is_ktc, named_frames, read_matlab, stimulation_protocol
 from .recording import Tank, TankError
+from .texts import read_table
 
 LISTED = 8
 """Variables that an error names."""
@@ -21,9 +22,11 @@ LISTED = 8
 def described_tank(path: Path, skin: je.Skin) -> Tank:
     """The frames of a file without a tank.
 
-    Of a MATLAB file, each array with a column a frame, or a data structure with one, whose readings are those of the
-    protocol; the protocol is that of a ``stimulation`` in the file, and of the skin where there is none. A column of
-    all pairs of neighbours for every drive of neighbours, as EIDORS fills one, is read by the protocol's rows.
+    Of NumPy, each array of one or two axes, one of which has as many readings as the protocol; of a table, its rows or
+    its columns. Of a MATLAB file, each array with a column a frame, or a data structure with one, whose readings are
+    those of the protocol; the protocol is that of a ``stimulation`` in the file, and of the skin where there is none. A
+    column of all pairs of neighbours for every drive of neighbours, as EIDORS fills one, is read by the rows of the
+    protocol.
 
     Raises:
         TankError: if the file has a tank or a scan of its own, or no variable has the readings of the protocol.
@@ -31,13 +34,52 @@ def described_tank(path: Path, skin: je.Skin) -> Tank:
     kind = path.suffix.lower()
     if kind == ".mat":
         return _of_matlab(path, read_matlab(path), skin)
-    arrays = read_archive(path) if kind == ".npz" else {}
-    if set(arrays) != {"frames"}:
+    if kind in (".csv", ".txt"):
+        return _of_table(path, *read_table(path), skin)
+    arrays = read_archive(path) if kind in (".npz", ".npy") else {}
+    if not arrays or not {"pattern", "current"}.isdisjoint(arrays):
         raise TankError(
-            f"{path.name}: a file of frames that a skin's TOML describes is a .mat without a model, or an .npz with "
-            "frames (frames, readings) V and nothing else; other files have a scan of their own: leave the skin out"
+            f"{path.name}: a file of frames that a skin's TOML describes is an .npz, .npy, .csv or .mat of readings "
+            "alone; other files have a scan of their own: leave the skin out"
         )
-    return archive_tank(skin, arrays["frames"])
+    if set(arrays) == {"frames"}:
+        return archive_tank(skin, arrays["frames"])
+    frames = {name: found for name, array in arrays.items() if (found := _columns(array, skin)) is not None}
+    if not frames:
+        raise _without_readings(path, arrays, skin)
+    return named_frames(skin, frames)
+
+
+def _of_table(path: Path, names: tuple[str, ...], table: np.ndarray, skin: je.Skin) -> Tank:
+    """A table with a frame in each row, or in each column by its name."""
+    readings = skin.protocol.readings
+    if table.shape[1] != readings and len(table) == readings:
+        return named_frames(skin, dict(zip(names, np.hsplit(table, table.shape[1]), strict=True)))
+    if table.shape[1] != readings:
+        raise _without_readings(path, {"a table": table}, skin)
+    return archive_tank(skin, table)
+
+
+def _columns(array: np.ndarray, skin: je.Skin) -> np.ndarray | None:
+    """An array as (readings, frames); None if no axis has the readings of the protocol."""
+    if array.dtype.kind not in "fiuc" or array.ndim not in (1, 2):
+        return None
+    if array.shape[-1] == skin.protocol.readings:
+        return np.atleast_2d(array).T
+    return array if array.ndim == 2 and len(array) == skin.protocol.readings else None
+
+
+def _without_readings(
+    path: Path, arrays: Mapping[str, np.ndarray], skin: je.Skin, whose: str = "the skin"
+) -> TankError:
+    """What a file holds, where nothing in it has the readings of the protocol."""
+    sizes = [f"{name} {' x '.join(map(str, found.shape))}" for name, found in arrays.items()]
+    held = ", ".join(sizes[:LISTED]) + (", ..." if len(sizes) > LISTED else "") or "no numbers"
+    return TankError(
+        f"{path.name}: holds {held}; the protocol of {whose} has {skin.protocol.readings} readings of "
+        f"{len(skin.electrodes)} electrodes: give the protocol of these readings, or save them as columns of as many "
+        "rows"
+    )
 
 
 def _of_matlab(path: Path, variables: Mapping[str, Any], skin: je.Skin) -> Tank:
@@ -54,12 +96,7 @@ def _of_matlab(path: Path, variables: Mapping[str, Any], skin: je.Skin) -> Tank:
         if (chosen := _readings_of(found, skin.protocol, electrodes)) is not None
     }
     if not frames:
-        sizes = [f"{name} {' x '.join(map(str, found.shape))}" for name, found in columns.items()]
-        held = ", ".join(sizes[:LISTED]) + (", ..." if len(sizes) > LISTED else "") or "no numbers"
-        raise TankError(
-            f"{path.name}: holds {held}; the protocol of {whose} has {skin.protocol.readings} readings of {electrodes} "
-            "electrodes: give the protocol of these readings, or save them as columns of as many rows"
-        )
+        raise _without_readings(path, columns, skin, whose)
     return named_frames(skin, frames)
 
 

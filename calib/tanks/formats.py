@@ -27,8 +27,9 @@ def load_tank(
             (GOE-MF II, Draeger), .npz, or a folder of .eit files of Sciospec.
         domain: shape of the tank, where the file has none (all but .mat), such as ``je.Disc(0.03)``.
         rim: its electrodes; default: `je.skin.rim_electrodes`, electrode 0 at +x, counter-clockwise.
-        skin: shape, electrodes and scan of the tank, for an .npz of ``frames`` alone and for a .mat without a model,
-            whose arrays of as many rows as the scan has readings are the frames; in place of ``domain`` and ``rim``.
+        skin: shape, electrodes and scan of the tank, for readings alone: an .npz or .npy of arrays (frames, readings),
+            a table .csv with a frame in each row or column, and a .mat without a model, whose arrays of as many rows
+            as the scan has readings are the frames; in place of ``domain`` and ``rim``.
 
     Raises:
         TankError, OSError: naming the file and what is wrong with it.

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 from jaxeit.imaging import (
+    AbstractHyperparameter,
     AbstractIterativeMethod,
     AbstractLinearMethod,
     IterativeReconstructor,
@@ -55,7 +56,7 @@ def difference_image(
     prior: je.AbstractPrior | None = None,
     method: AbstractLinearMethod | AbstractIterativeMethod | None = None,
     basis: AbstractBasis | None = None,
-    hyperparameter: float = 0.3,
+    hyperparameter: float | AbstractHyperparameter = 0.3,
     fidelity: je.Fidelity | None = None,
     fit: ReferenceSettings | None = None,
 ) -> TankImage:
@@ -67,7 +68,8 @@ def difference_image(
     Args:
         frame, reference: numbers of the frames.
         prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x. The default
-            hyperparameter suits tanks whose geometry is known to a few percent (docs/tanks.md).
+            hyperparameter suits tanks whose geometry is known to a few percent (docs/tanks.md). A way to choose one
+            looks at the difference of the two frames, unless it has frames of its own.
         fidelity: default: draft, with quadratic elements if ``fit`` is given, as linear ones add a contact resistance
             to each electrode: 10 % of that of the tank in tests/imaging/test_reference.py.
         fit: fit conductivity and contacts to the reference by `je.imaging.fit_reference`, for the image;
@@ -79,8 +81,10 @@ def difference_image(
     """
     scaled = _scaled(tank, frame, reference, fidelity, fit)
     model = scaled.model
-    recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=hyperparameter)
-    change = recon(jnp.asarray(scaled.after - scaled.before, model.dtype)) / model.background[0]
+    dv = jnp.asarray(scaled.after - scaled.before, model.dtype)
+    weight = hyperparameter.on(dv) if isinstance(hyperparameter, AbstractHyperparameter) else hyperparameter
+    recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=weight)
+    change = recon(dv) / model.background[0]
     return TankImage(change, recon, scaled.gain * float(model.background[0]), scaled.correlation, scaled.fit)
 
 

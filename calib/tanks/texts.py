@@ -1,4 +1,4 @@
-"""Text files of tanks: CSV of PyEIDORS, and the .eit files that the software of Sciospec writes."""
+"""Text files of tanks: tables, CSV of PyEIDORS, and the .eit files that the software of Sciospec writes."""
 
 import re
 from collections.abc import Sequence
@@ -30,6 +30,20 @@ def _numbers(where: str, line: str) -> list[float]:
         return [float(word) for word in line.replace(",", " ").split()]
     except ValueError:
         raise TankError(f"{where}: {line.strip()[:60]!r} has a word that is no number") from None
+
+
+def read_table(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """The names of the columns and the numbers (rows, columns) of a table; "frame 0", ... where no line names them."""
+    lines = [line for line in text_of(path).replace(";", ",").splitlines() if line.strip()]
+    names: tuple[str, ...] = ()
+    if lines and re.search(r"[A-DF-Za-df-z]", lines[0].replace("nan", "")):
+        names = tuple(name.strip(' "#') for name in lines.pop(0).split(","))
+    rows = [_numbers(f"{path.name}: row {k + 1}", line) for k, line in enumerate(lines)]
+    widths = sorted({len(row) for row in rows})
+    if len(widths) != 1 or (names and len(names) != widths[0]):
+        heads = f", and {len(names)} names" if names else ""
+        raise TankError(f"{path.name}: rows have {widths} numbers{heads}; give a table, with a frame a row or a column")
+    return names or tuple(f"frame {k}" for k in range(widths[0])), np.array(rows)
 
 
 def pyeidors_tank(path: Path, domain: Domain | None, rim: Sequence[AbstractElectrode] | None) -> Tank:

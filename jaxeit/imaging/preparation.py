@@ -234,9 +234,15 @@ def require_choices(prior: Any, method: Any, basis: Any, weight: Any) -> None:
     ):
         if not isinstance(choice, kinds):
             stated = type(choice).__name__ if not isinstance(choice, type) else f"the class {choice.__name__}"
-            raise InverseError(f"{stated} is not a {name}; give {name} by its name, such as {example}")
+            stated = repr(choice) if isinstance(choice, str) else stated
+            raise InverseError(f"{stated} is not a {name}; give an object, such as {example}")
+    if prior.follows_image and not method.follows_prior:
+        raise InverseError(
+            f"the prior {type(prior).__name__} changes with the image, and the method {type(method).__name__} takes it "
+            "only once; choose the method Reweighted, or another prior"
+        )
     if not (isinstance(weight, AbstractHyperparameter) or is_traced(weight) or _is_number(weight)):
-        ways = "a number, such as 0.1, or a way to choose one, such as je.imaging.LCurve()"
+        ways = "a number, such as 0.1, or a way to choose one, such as je.imaging.LCurve(dv)"
         raise InverseError(f"the hyperparameter is {weight!r}; give {ways}")
 
 

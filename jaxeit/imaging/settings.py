@@ -48,11 +48,6 @@ class Imaging:
         weight = self.hyperparameter
         if isinstance(weight, int | float) and not 0 < weight < float("inf"):
             raise InverseError(f"the hyperparameter is {weight}; give a number above zero, such as 0.1")
-        if self.prior.follows_image and not self.method.follows_prior:
-            raise InverseError(
-                f"the prior {type(self.prior).__name__} changes with the image, and the method "
-                f"{type(self.method).__name__} takes it only once; choose the method Reweighted, or another prior"
-            )
 
     def __str__(self) -> str:
         """The choices by their names, such as "pixels, one-step, noser at 0.1"."""

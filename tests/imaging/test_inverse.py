@@ -193,10 +193,12 @@ def test_settings_that_cannot_be_are_refused(model, pixels, settings, message):
 @pytest.mark.parametrize(
     ("choices", "message"),
     [
-        ((je.OneStep(), je.Noser()), r"OneStep is not a prior; give prior by its name, such as prior=Noser\(\)"),
-        ((None, je.Noser()), "Noser is not a method; give method by its name"),
+        ((je.OneStep(), je.Noser()), r"OneStep is not a prior; give an object, such as prior=Noser\(\)"),
+        (("noser",), r"'noser' is not a prior; give an object, such as prior=Noser\(\)"),
+        ((je.TotalVariation(),), "TotalVariation changes with the image, .* OneStep takes it only once"),
+        ((None, je.Noser()), "Noser is not a method; give an object, such as method="),
         ((je.Noser, None), "the class Noser is not a prior"),
-        ((None, None, 20), "int is not a basis; give basis by its name"),
+        ((None, None, 20), "int is not a basis; give an object, such as basis="),
     ],
 )
 def test_a_choice_in_the_place_of_another_is_refused(model, choices, message):

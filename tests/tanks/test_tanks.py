@@ -159,6 +159,50 @@ def test_a_tank_whose_scan_is_named(bench, tmp_path, root, capsys):
         load_tank(path, skin=skin)
 
 
+def test_readings_alone_are_read_as_numpy_and_tables_hold_them(bench, tmp_path, capsys):
+    """Arrays by their names, the reference first; a table with a frame in each row, or in each named column."""
+    text = TANK_TOML.replace("eidors-adjacent", "adjacent")
+    (tmp_path / "tank.toml").write_text(text)
+    skin, (vh, vi) = je.load_skin(tmp_path / "tank.toml"), bench.frames[:2]
+    np.savez(tmp_path / "named.npz", vi=vi, vh=vh, angle=np.ones(3))
+    np.save(tmp_path / "plain.npy", bench.frames)
+    np.savetxt(tmp_path / "rows.csv", bench.frames, "%.17g", ",")
+    np.savetxt(tmp_path / "columns.csv", np.stack([vi, vh], 1), "%.17g", ";", header="vi;vh", comments="")
+    named = {"named.npz": ("vh", "vi"), "columns.csv": ("vh", "vi"), "plain.npy": None, "rows.csv": None}
+    for name, names in named.items():
+        tank = load_tank(tmp_path / name, skin=skin)
+        assert tank.names == (names or tuple(f"frame {k}" for k in range(len(bench.frames))))
+        np.testing.assert_array_equal(tank.frames[:2], [vh, vi])
+    words = [
+        "image",
+        str(tmp_path / "columns.csv"),
+        "--skin",
+        str(tmp_path / "tank.toml"),
+        "-o",
+        str(tmp_path / "a.png"),
+    ]
+    assert main([*words, "--hyperparameter", "l-curve"]) == 0
+    assert re.search(r"\nhyperparameter [\d.e-]+\n", capsys.readouterr().out)
+    assert main([*words, "--hyperparameter", "lcurve"]) == 2
+    assert "--hyperparameter: no hyperparameter 'lcurve'; did you mean 'l-curve'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,2\n3,4\n", "a.csv: holds a table 2 x 2; the protocol of the skin has 208 readings"),
+        ("1,2\n3\n", r"a.csv: rows have \[1, 2\] numbers; give a table"),
+        ("vh\n1,2\n", r"a.csv: rows have \[2\] numbers, and 1 names; give a table"),
+        ("vh,vi\n1,two\n", "a.csv: row 1: '1,two' has a word that is no number"),
+        ("", r"a.csv: rows have \[\] numbers; give a table"),
+    ],
+)
+def test_tables_that_do_not_fit_their_skin(text, message, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(TankError, match=message):
+        load_tank(tmp_path / "a.csv", skin=je.skin.parse_skin(TANK_TOML))
+
+
 TANK_TOML = f"""
 format = "jaxeit-skin"
 version = 1

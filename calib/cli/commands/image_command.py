@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A file of a tank, its geometry where the file has none, and the picture to write."""
     text = (
         "MATLAB file of EIDORS or the Kuopio challenge, CSV of PyEIDORS, .eit of Sciospec or a folder of them, .eit or "
-        ".get of Draeger, CareFusion or GOE-MF II, or NPZ"
+        ".get of Draeger, CareFusion or GOE-MF II, or NPZ; with --skin also readings alone: CSV, NPY, NPZ or MAT"
     )
     parser.add_argument("tank", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", required=True, metavar="PICTURE.png", help="PNG, PDF or SVG by its name")
@@ -31,10 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=int, default=0, metavar="N", help="frame it is compared with; default: 0")
     text = "radius in m of a round tank; needed where the file does not describe its tank (all but .mat)"
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
-    text = (
-        "shape, electrodes and scan of the tank, for an .npz of frames alone or a .mat without a model: a TOML file, "
-        "or a shipped skin's name"
-    )
+    text = "shape, electrodes and scan of the tank, for a file of readings alone: a TOML file, or a shipped skin's name"
     parser.add_argument("--skin", metavar="TANK.toml", help=text)
     parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
@@ -44,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--classes", action="store_true", help=text)
     parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
     parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
-    parser.add_argument("--hyperparameter", type=above_zero, default=0.3, metavar="L", help="weight of the prior; 0.3")
+    text = "weight of the prior, or a method to choose it, such as l-curve; 0.3"
+    parser.add_argument("--hyperparameter", default="0.3", metavar="L", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -87,16 +85,22 @@ def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", meth
     """Draw the difference image; what is printed of it."""
     import jaxeit as je
 
+    from ...calibration.recipe_text import hyperparameter_choice
     from ...tanks import difference_image
 
-    choices = {"prior": prior, "method": method, "hyperparameter": args.hyperparameter, "fit": _fit(args)}
+    try:
+        weight = hyperparameter_choice(args.hyperparameter, allow_import=True)
+    except ValueError as error:
+        raise ValueError(f"--hyperparameter: {error}") from None
+    choices = {"prior": prior, "method": method, "hyperparameter": weight, "fit": _fit(args)}
     found = difference_image(tank, args.frame, args.reference, **choices)
     je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
     low, high = float(found.change.min()), float(found.change.max())
     of_reference = f"{found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}"
     fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
     of_image = f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity"
-    return [f"reference: {of_reference}", *fitted, of_image]
+    chosen = [] if isinstance(weight, float) else [f"hyperparameter {found.recon.provenance['hyperparameter']}"]
+    return [f"reference: {of_reference}", *fitted, *chosen, of_image]
 
 
 def _classes(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:
