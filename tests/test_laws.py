@@ -255,3 +255,17 @@ def test_float32_runs_without_x64():
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False, env=quiet, cwd=ROOT
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("LCurve", "jaxeit has no LCurve; it is jaxeit.imaging.LCurve"),
+        ("Nosser", "jaxeit has no Nosser; did you mean Noser?"),
+        ("inv_solve", "jaxeit has no inv_solve"),
+    ],
+)
+def test_a_name_of_a_room_is_told_where_it_is_missed(name, said):
+    with pytest.raises(AttributeError) as caught:
+        getattr(je, name)
+    assert str(caught.value) == said

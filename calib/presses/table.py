@@ -148,12 +148,9 @@ def require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) ->
     if session.pattern is None:
         raise _error(session, "/device", "has no eit_protocol", "record the pattern of the scan")
     if not same_scan(session, skin.protocol):
-        raise _error(
-            session,
-            "/device/eit_protocol/pattern",
-            f"is not that of the skin {skin.name!r}",
-            "calibrate with the skin that was recorded (--skin FILE)",
-        )
+        recorded = f"the skin that was recorded, {session.skin_name!r}" if session.skin_name else "the recorded skin"
+        todo = f"take a calibration of {recorded}, or calibrate with it (--skin FILE)"
+        raise _error(session, "/device/eit_protocol/pattern", f"is not that of the skin {skin.name!r}", todo)
     pads = streams["pressure"].channels
     if pads != len(skin.pads):
         raise _error(

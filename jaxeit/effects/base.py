@@ -355,8 +355,25 @@ def fold(effects: Iterable[AbstractEffect], family: type, state: Any, *context: 
     """
     for effect in chosen(effects, family):
         with jax.named_scope(type(effect).__name__):
-            state = effect(state, *context)
+            before, state = state, effect(state, *context)
+            _require_same_kind(type(effect).__name__, before, state)
     return state
+
+
+def _require_same_kind(name: str, before: Any, after: Any) -> None:
+    """Refuse what an effect returns in the place of its argument: another type, or arrays of other shapes."""
+    if isinstance(before, tuple):
+        kind = type(before).__name__
+        if not isinstance(after, type(before)):
+            given = "an array" if hasattr(after, "shape") else type(after).__name__
+            raise EffectError(f"{name} returns {given}; return the {kind} that it is given, changed by _replace")
+        fields = getattr(before, "_fields", range(len(before)))
+        pairs = [(f"{kind}.{field}", *both) for field, *both in zip(fields, before, after, strict=True)]
+    else:
+        pairs = [("an array", before, after)]
+    for what, old, new in pairs:
+        if hasattr(old, "shape") and getattr(new, "shape", None) != old.shape:
+            raise EffectError(f"{name} returns {what} of shape {getattr(new, 'shape', new)}; it must stay {old.shape}")
 
 
 def keys(effects: Iterable[AbstractEffect], key: Key[Array, ""]) -> list[Key[Array, ""]]:

@@ -159,7 +159,12 @@ class Reconstructor(AbstractReconstructor):
     | variance left to each coefficient by readings and prior; infinite where not known | (basis,)  | S^2  |
     | the rest: `AbstractReconstructor`                                                |            |      |
 
+    A call is compiled already. As a step of a compiled function of your own it stands in that function, as below:
+    ``jax.jit(recon)`` itself has no arrays that JAX could compare.
+
     Example:
+        strongest = jax.jit(lambda dv: jnp.max(recon(dv)))
+        print(strongest(dv))  # S
         quick = recon.on_host("float32")  # NumPy to NumPy: for one frame after the other
         images = recon(quiet)  # (frames, pixels) S
         broken = recon.without(jnp.arange(len(v0)) == 7)  # reading 7 has died; nothing else changes

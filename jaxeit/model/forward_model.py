@@ -209,9 +209,12 @@ def coefficients(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | 
 
 def _checked_values(model: Model, name: str, values: Float[Array, " elements"]) -> Float[Array, " elements"]:
     if values.shape != model.background.shape or values.dtype != model.dtype:
+        batch = values.ndim > 1 and values.shape[-1:] == model.background.shape
+        cast = values.shape == model.background.shape
+        hint = "; use jax.vmap for a batch" if batch else "; use .astype(model.dtype)" if cast else ""
         raise ValueError(
             f"{name} is {values.dtype}{list(values.shape)}; this model needs "
-            f"{model.dtype}{list(model.background.shape)}, one value per element"
+            f"{model.dtype}{list(model.background.shape)}, one value per element{hint}"
         )
     # With small negative values the matrix remains positive definite, and the voltages would look valid.
     return jnp.where(values < 0, jnp.nan, values)

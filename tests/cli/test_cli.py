@@ -143,6 +143,20 @@ def test_arguments_that_are_not_known_end_in_one_line(line, message, capsys):
     assert error.count("\n") == 1
 
 
+def test_check_of_a_skin_file(tmp_path, skin, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text(skin.toml)
+    assert main(["check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert f"{path}: skin testbed, 200 x 200 mm" in said
+    assert "25 electrodes; pads: lower left, lower right, upper left, upper right\n550 readings in 5.5 ms; " in said
+    assert main(["check", str(path), "--json"]) == 2
+    assert "leave out --json" in capsys.readouterr().err
+    path.write_text(skin.toml.replace("radius = 0.003", "radius = 0.03", 1))
+    assert main(["check", str(path)]) == 2
+    assert f"{path}: electrode 0 (disc at (20.00, 20.00) mm) of radius 30.00 mm is" in capsys.readouterr().err
+
+
 def test_check_of_the_bundled_sessions(bundled, capsys):
     assert main(["check", *map(str, bundled)]) == 0
     assert "SIMULATED" in capsys.readouterr().out

@@ -327,3 +327,24 @@ def test_effects_of_many_numbers_in_a_scene_file():
     table = {"type": "TpuRelaxation", "shares": [0.2], "times": [3.0]}
     (effect,) = je.model.read_effects(je.toml.TomlTable({"effects": [table]}, "scene.toml"))
     assert effect.shares.shape == effect.times.shape == (1,)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda sheet: sheet.sigma, "Wrong returns an array; return the Sheet that it is given, changed by _replace"),
+        (lambda sheet: None, "Wrong returns NoneType; return the Sheet"),
+        (
+            lambda sheet: sheet._replace(sigma=sheet.sigma[:3]),
+            r"Wrong returns Sheet.sigma of shape \(3,\); it must stay",
+        ),
+    ],
+)
+def test_an_effect_returns_what_it_is_given(model, change, message):
+    class Wrong(fx.AbstractSheetEffect):
+        def __call__(self, sheet):
+            return change(sheet)
+
+    wrong = dataclasses.replace(model, effects=(Wrong(),))
+    with pytest.raises(fx.EffectError, match=message):
+        je.conductivity(wrong, jnp.ones_like(model.background))

@@ -93,3 +93,15 @@ def test_bumps_are_what_a_round_contact_does(model):
 def test_bumps_that_cannot_be_are_refused(settings):
     with pytest.raises(ValueError, match="give "):
         je.Bumps(**settings)
+
+
+@pytest.mark.parametrize(("wrong", "given"), [(lambda n: jnp.ones(n), "an array"), (lambda n: None, "NoneType")])
+def test_a_prior_returns_a_precision(model, wrong, given):
+    class Mine(je.AbstractPrior):
+        def precision(self, jacobian, picture, at=None):
+            return wrong(jacobian.shape[1])
+
+    with pytest.raises(
+        je.imaging.InverseError, match=rf"Mine\.precision returns {given}; return jaxeit\.imaging\.Diag"
+    ):
+        je.prepare(model, Mine(), basis=je.Pixels(5))

@@ -257,8 +257,10 @@ def test_float32_follows_float64():
 def test_wrong_sigma_is_refused(model):
     with pytest.raises(ValueError, match="one value per element"):
         je.forward(model, jnp.ones(3))
-    with pytest.raises(ValueError, match="float32"):
+    with pytest.raises(ValueError, match=r"float32.*; use \.astype\(model\.dtype\)"):
         je.forward(model, model.background.astype(jnp.float32))
+    with pytest.raises(ValueError, match=r"; use jax\.vmap for a batch"):
+        je.forward(model, jnp.stack([model.background] * 2))
 
 
 def test_float64_without_x64_is_refused(skin):

@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Sessions, and how to print what is found."""
-    parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
+    """Sessions or skins, and how to print what is found."""
+    text = "a session, or a skin's TOML file, of which it is said what it describes and what is wrong with it"
+    parser.add_argument("sessions", nargs="+", metavar="SESSION.h5", help=text)
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
     text = "also print how far the session is off this calibration, and whether to recalibrate"
     parser.add_argument("--calibration", metavar="CALIBRATION.h5", help=text)
@@ -36,6 +37,11 @@ def run(args: argparse.Namespace) -> int:
     skin, worst = skin_of(args.skin), 0
     health = _health_by(args.calibration)
     for path in args.sessions:
+        if path.endswith(".toml"):
+            if args.json:
+                raise ValueError(f"{path}: is a skin, of which there is no report as JSON; leave out --json")
+            print(_described(path))
+            continue
         try:
             with open_session(path) as session:
                 bar = progress_bar(session.name)
@@ -49,6 +55,28 @@ def run(args: argparse.Namespace) -> int:
         print(to_json(report) if args.json else render(report, verbose=args.all))
         worst = worst if report.ok else 2
     return worst
+
+
+def _described(path: str) -> str:
+    """What a skin's file describes, and what its model reads without contact, in words."""
+    import jaxeit as je
+
+    skin = je.load_skin(path)
+    try:
+        model = je.discretise(je.Scene(skin, effects=()), je.Fidelity.draft())
+    except ValueError as error:
+        raise ValueError(f"{path}: {one_line(error)}") from None
+    readings = 1e3 * abs(je.forward(model))  # mV
+    low, high = skin.domain.bounds
+    width, height = (1e3 * (end - start) for start, end in zip(low, high, strict=True))
+    pads = ", ".join(pad.name for pad in skin.pads) or "none"
+    return (
+        f"{path}: skin {skin.name}, {width:.4g} x {height:.4g} mm\n"
+        f"{len(skin.electrodes)} electrodes; pads: {pads}\n"
+        f"{len(readings)} readings in {1e3 * skin.protocol.frame_time:.3g} ms; without contact "
+        f"{readings.min():.3g} to {readings.max():.3g} mV\n"
+        "Nothing wrong was found."
+    )
 
 
 def _health_by(path: str | None) -> "Callable[[Session], str] | None":

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ...model.bases import Picture
 from ...registry import AbstractChoice
+from ..noise import InverseError
 from ..priors import AbstractPrecision, AbstractPrior
 
 
@@ -31,7 +32,12 @@ class Problem(eqx.Module):
 
     def precision(self, at: Float[Array, " basis"] | None = None) -> AbstractPrecision:
         """R; see `AbstractPrior.precision`."""
-        return self.prior.precision(self.jacobian, self.picture, at)
+        found = self.prior.precision(self.jacobian, self.picture, at)
+        if not isinstance(found, AbstractPrecision):
+            given = "an array" if hasattr(found, "shape") else type(found).__name__
+            wanted = "jaxeit.imaging.Diagonal(values), or Precision(matrix)"
+            raise InverseError(f"{type(self.prior).__name__}.precision returns {given}; return {wanted}")
+        return found
 
     def strength(self, gained: Float[Array, "basis k"]) -> Float[Array, ""]:
         """``l^2``, given ``R^-1 J^T``."""
