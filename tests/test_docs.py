@@ -122,6 +122,13 @@ def run(page, names):
     return names
 
 
+def test_the_page_of_scenes_lists_every_effect(root):
+    head, *_ = (root / "docs" / "scenes.md").read_text(encoding="utf-8").split("```toml")
+    listed = re.findall(r"`(\w+)`", "".join(line for line in head.splitlines() if line.startswith("| ")))
+    ours = (name for name, kind in je.effects.EFFECTS.items() if kind.__module__.startswith("jaxeit"))
+    assert sorted(listed) == sorted(ours)
+
+
 def test_programs_about_curves(root):
     names = run(root / "docs" / "fitting.md", {"calib": calib, "np": np})
     np.testing.assert_allclose(names["force"], 2e-3 * names["pressure"] ** 1.1, rtol=1e-5)

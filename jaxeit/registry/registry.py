@@ -157,7 +157,11 @@ class Registry(Mapping[str, type[T]], Generic[T]):
 
     def _checked(self, thing: Any, name: str) -> type[T]:
         if not self._is_choice(thing):
-            raise RegistryError(f"{self.kind} {name!r} is not a concrete class derived from {self.base.__name__}")
+            lacks = ", ".join(sorted(getattr(thing, "__abstractmethods__", ())))
+            what = f"is not a concrete class derived from {self.base.__name__}" + (
+                f": it lacks {lacks}" if lacks else ""
+            )
+            raise RegistryError(f"{self.kind} {name!r} {what}")
         checked: type[T] = thing
         return checked
 

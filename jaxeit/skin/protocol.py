@@ -64,8 +64,8 @@ class Protocol:
             )
         if np.ndim(self.current) != 0:
             raise ProtocolError(f"the current has shape {np.shape(self.current)}; give one number, A, for all readings")
-        if not (np.isfinite(self.current) and self.current > 0):
-            raise ProtocolError(f"the current is {self.current} A; give a positive number")
+        if isinstance(self.current, str) or not (np.isfinite(self.current) and self.current > 0):
+            raise ProtocolError(f"the current is {self.current}; give a positive number, A")
         if not (isinstance(self.sense_channels, int | np.integer) and self.sense_channels >= 1):
             raise ProtocolError(f"sense_channels is {self.sense_channels}; give how many readings are taken at once")
         if self.mixing is not None and self.sense_channels > 1:

@@ -162,7 +162,7 @@ def test_text_of_a_data_file_imports_nothing(own):
         ("OWN:Thrice", "cannot be imported .module 'OWN' has no attribute 'Thrice'"),
         ("OWN:number", "is not a concrete class derived from AbstractEffect"),
         ("OWN:Straight", "is not a concrete class derived from AbstractEffect"),
-        ("OWN:AbstractThing", "is not a concrete class derived from AbstractEffect"),
+        ("OWN:AbstractThing", "is not a concrete class derived from AbstractEffect: it lacks __call__"),
     ],
 )
 def test_import_paths_of_no_use_are_named(own, path, message):

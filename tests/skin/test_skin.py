@@ -272,6 +272,12 @@ def test_trigonometric_currents_are_orthogonal(electrodes):
     assert np.linalg.matrix_rank(current) == electrodes - 1
 
 
+@pytest.mark.parametrize("current", ["1 mA", 0.0, float("nan")])
+def test_a_current_that_is_no_positive_number_is_refused(current):
+    with pytest.raises(je.skin.ProtocolError, match=r"the current is .*; give a positive number, A"):
+        je.Protocol(ROWS, current)
+
+
 @pytest.mark.parametrize("current", [np.full(8, 1e-3), [1e-3]])
 def test_a_current_for_each_reading_is_refused(current):
     with pytest.raises(je.skin.ProtocolError, match=r"the current has shape .*; give one number, A, for all readings"):
