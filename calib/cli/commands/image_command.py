@@ -99,7 +99,8 @@ def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", meth
     of_reference = f"{found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}"
     fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
     of_image = f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity"
-    chosen = [] if isinstance(weight, float) else [f"hyperparameter {found.recon.provenance['hyperparameter']}"]
+    used = float(found.recon.provenance["hyperparameter"])
+    chosen = [] if isinstance(weight, float) else [f"hyperparameter {used:.3g}"]
     return [f"reference: {of_reference}", *fitted, *chosen, of_image]
 
 
