@@ -18,6 +18,9 @@ from .belief.programs import Programs
 from .events import Events, Hypothesis
 from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Trial
 
+# A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
+# of the belief changes by much more than it may.
+UNEXPECTED, SURPRISING = 4.0, 25.0
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
 FAINT, FAINT_FRAMES = 4.0, 2
 # Signal of a contact that begins beside others, at least: in standard deviations of the noise, and over that of all.
@@ -49,6 +52,16 @@ def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
     return replace(backlog, waiting=(*waiting, seen))
 
 
+def caught_up(now: Tracking, backlog: Backlog, seen: Seen) -> tuple[Tracking, Seen]:
+    """Where one frame waits and none is looked into, the frame that has come stands for both.
+
+    Else one would wait for ever where a piece is done after each frame.
+    """
+    if backlog.look is not None or len(backlog.waiting) > 1:
+        return now, seen
+    return backlog.before, seen._replace(seconds=seen.seconds + sum(one.seconds for one in backlog.waiting))
+
+
 def is_given_up(backlog: Backlog) -> bool:
     """Whether so many frames wait that no spare time can be hoped for, as on a machine that is too slow or too busy."""
     return sum(seen.seconds for seen in backlog.waiting) > LONGEST_WAIT
@@ -71,7 +84,10 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
     if not look.best.ended:
         return replace(look, best=_further(look.best, look.seen, programs))
     if look.trials is None:
-        return replace(look, trials=_trials(look, programs, events))
+        careful = _concluded(look, look.best, programs)
+        if is_expected(careful, programs.size):
+            return replace(look, after=_uneventful(look, careful))
+        return replace(look, trials=_trials(look, careful, programs, events))
     best = max(trial.probability for trial in [look.best, *_possible(look)])
     for k, trial in enumerate(look.trials):
         if not (trial.ended or trial.is_hopeless(best)):
@@ -84,10 +100,19 @@ def _further(trial: Trial, seen: Seen, programs: Programs) -> Trial:
     return trial._replace(attempt=programs.attempted(trial.event.belief, seen.dv, seen.pads, trial.attempt))
 
 
-def _trials(look: Look, programs: Programs, events: Events) -> tuple[Trial, ...]:
+def is_far(update: Update, size: int) -> bool:
+    """Whether more is left of a frame of so many whitened readings than noise and errors of the model leave."""
+    return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
+
+
+def is_expected(update: Update, size: int) -> bool:
+    """Whether the contacts before a frame explain it, without an event."""
+    return is_finite(update) and float(update.surprise) < SURPRISING and not is_far(update, size)
+
+
+def _trials(look: Look, careful: Update, programs: Programs, events: Events) -> tuple[Trial, ...]:
     """What may have happened."""
-    best = _concluded(look, look.best, programs)
-    place = programs.unexplained_place(best.belief, look.seen.dv, look.seen.pads)
+    place = programs.unexplained_place(careful.belief, look.seen.dv, look.seen.pads)
     possible = events.possible(_as_is(look.before), look.before.begun, place, look.seen.seconds)
     return tuple(map(Trial, possible))
 
@@ -110,7 +135,7 @@ def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing more has happened."""
     best = _most_probable(look)
     if best is look.best or best.attempt is None:
-        after = _carefully(look, programs) if look.unfinished else look.otherwise
+        after = _uneventful(look, _concluded(look, look.best, programs))
         return replace(look, after=calmer(after) if look.events == EVENTS else after)
     event = best.event
     update = _concluded(look, best, programs)
@@ -121,16 +146,15 @@ def _judged(look: Look, programs: Programs) -> Look:
     return look if left else replace(look, after=after)
 
 
-def _carefully(look: Look, programs: Programs) -> Tracking:
-    """Contacts to which nothing has happened, after a frame that was beyond an ordinary update.
+def _uneventful(look: Look, careful: Update) -> Tracking:
+    """Contacts to which nothing more has happened; by the careful update, where a frame was beyond an ordinary one.
 
     Where a force grows severalfold between two frames, the few evaluations of an ordinary update end before the force
     is found, and the gain explains the rest of the frame.
     """
-    update = _concluded(look, look.best, programs)
-    if not float(update.misfit) < look.otherwise.misfit:
+    if not look.unfinished or not float(careful.misfit) < look.otherwise.misfit:
         return look.otherwise
-    return settled(replace(look.before, since=0, misfit=float(update.misfit)), update)
+    return settled(replace(look.before, since=0, misfit=float(careful.misfit)), careful)
 
 
 def calmer(after: Tracking) -> Tracking:

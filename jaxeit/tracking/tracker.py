@@ -22,14 +22,23 @@ from .belief.filter import SEEN, SIZE, TOLD, Belief, ContactFilter, Pads, Update
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
-from .looks import begun, calmer, is_finite, is_given_up, looked, meanwhile, settled, without_contacts
+from .looks import (
+    SURPRISING,
+    begun,
+    calmer,
+    caught_up,
+    is_far,
+    is_finite,
+    is_given_up,
+    looked,
+    meanwhile,
+    settled,
+    without_contacts,
+)
 from .preparation import prepare_filter
 from .settings import TrackerSettings
 from .tracks import Backlog, Look, Seen, Track, Tracking
 
-# A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
-# of the belief changes by much more than it may.
-UNEXPECTED, SURPRISING = 4.0, 25.0
 # Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
@@ -178,7 +187,7 @@ class Tracker:
         found: list[Update] = []
         for place in self.programs.explaining_places(self.programs.unexplained(before, frame, pads)):
             found.append(self._updated(self.events.with_contact(before, place), frame, pads))
-            if is_finite(found[-1]) and bool(found[-1].converged) and not self._is_far(found[-1]):
+            if is_finite(found[-1]) and bool(found[-1].converged) and not is_far(found[-1], self.programs.size):
                 break
         return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
 
@@ -193,9 +202,11 @@ class Tracker:
         if now.backlog is not None and is_given_up(now.backlog):
             now = self._given_up(now, seen)
         if now.backlog is not None:
+            now, seen = caught_up(now, now.backlog, seen)
+        if now.backlog is not None:
             moved, update = self.programs.followed(now.belief, *seen)
             # What the contacts do not explain would bend them: until it is explained they move on as they did.
-            after = replace(now, belief=moved) if self._is_far(update) else settled(now, update)
+            after = replace(now, belief=moved) if is_far(update, self.programs.size) else settled(now, update)
             return replace(after, backlog=meanwhile(now.backlog, seen))
         after, look = self._followed(now, seen)
         if look is None:
@@ -209,7 +220,7 @@ class Tracker:
         """Without the frames that wait, and without contacts that have moved on unseen and do not explain the frame."""
         _, update = self.programs.followed(now.belief, *seen)
         signal = float(np.sum(np.square(np.asarray(update.loudness))))
-        if is_finite(update) and float(update.misfit) - len(self.filter.compress) < UNSEEN * signal:
+        if is_finite(update) and float(update.misfit) - self.programs.size < UNSEEN * signal:
             return replace(calmer(now), backlog=None, since=0, misfit=float(update.misfit))
         return replace(without_contacts(now), backlog=None)
 
@@ -283,11 +294,9 @@ class Tracker:
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:
             return True
-        return self._is_far(update) and (now.since >= now.patience or float(update.misfit) > WORSE * now.misfit)
-
-    def _is_far(self, update: Update) -> bool:
-        size = len(self.filter.compress)
-        return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
+        return is_far(update, self.programs.size) and (
+            now.since >= now.patience or float(update.misfit) > WORSE * now.misfit
+        )
 
 
 def bounded(now: Tracking) -> Tracking:

@@ -186,3 +186,18 @@ def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_o
     (track,) = now.tracks
     assert track.force == pytest.approx(force, rel=0.1)
     assert np.linalg.norm(track.position - place) < 2e-3
+
+
+def test_with_a_piece_a_frame_no_frame_is_left_waiting(tracker, frame_of):
+    """A growing force is no event: the look ends with its careful update, and the frames since then are caught up."""
+    now, waited, asked = tracker.start(), [], []
+    for force in [0.5] * 30 + [1.3, 4.0] + [12.0] * 28:
+        now = tracker.step(now, frame_of([load(0.137, 0.022, force)]), SECONDS, whole=False)
+        now = tracker.look(now)
+        waited.append(0 if now.backlog is None else len(now.backlog.waiting))
+        asked.append(now.backlog is not None and now.backlog.look is not None and now.backlog.look.trials is not None)
+    assert now.numbers == (1,)
+    assert max(waited[30:]) > 0
+    assert not any(asked[30:]), asked[30:]
+    assert waited[29] == waited[-1] == 0
+    assert now.backlog is None

@@ -15,9 +15,13 @@ STARTS, APART = 4, 0.01
 
 
 class Programs:
-    """What a `ContactFilter` computes, with its arrays packed; each number of contacts is compiled once."""
+    """What a `ContactFilter` computes, with its arrays packed; each number of contacts is compiled once.
+
+    `size`: number of whitened readings of a frame.
+    """
 
     def __init__(self, tracker: ContactFilter):
+        self.size = len(tracker.compress)
         self._followed: Callable[..., tuple[Belief, Update]] = bind(followed, tracker)
         self._predicted: Callable[..., Belief] = bind(predicted, tracker)
         self._attempted: Callable[..., Attempt] = bind(attempted, tracker)
