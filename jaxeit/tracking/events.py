@@ -62,6 +62,10 @@ class Events:
         self._usual = np.log([loads.width, loads.force])
         self._spread = np.array([loads.width_spread, loads.force_spread])
 
+    def rare(self, seconds: float) -> float:
+        """Log of the prior probability of an event within some seconds."""
+        return float(np.log(self._settings.birth_rate * seconds))
+
     def possible(
         self, now: Hypothesis, begun: int, place: Float[np.ndarray, "2"], seconds: float
     ) -> Iterator[Hypothesis]:
@@ -71,7 +75,7 @@ class Events:
             begun: number of contacts so far.
             place: where a contact would explain most of what the contacts leave of the frame, m.
         """
-        rare, count = float(np.log(self._settings.birth_rate * seconds)), len(now.numbers)
+        rare, count = self.rare(seconds), len(now.numbers)
         if count < self._settings.most:
             # The prior of a place is even over the skin, that of the fit is normal about where it begins.
             even = float(np.log(2 * np.pi * PLACE**2 / self._area))

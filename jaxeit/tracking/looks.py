@@ -18,9 +18,6 @@ from .belief.programs import Programs
 from .events import Events, Hypothesis
 from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Trial
 
-# A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
-# of the belief changes by much more than it may.
-UNEXPECTED, SURPRISING = 4.0, 25.0
 # A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
 FAINT, FAINT_FRAMES = 4.0, 2
 # Signal of a contact that begins beside others, at least: in standard deviations of the noise, and over that of all.
@@ -85,7 +82,7 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
         return replace(look, best=_further(look.best, look.seen, programs))
     if look.trials is None:
         careful = _concluded(look, look.best, programs)
-        if is_expected(careful, programs.size):
+        if _is_explained(careful, programs.size, events.rare(look.seen.seconds)):
             return replace(look, after=_uneventful(look, careful))
         return replace(look, trials=_trials(look, careful, programs, events))
     best = max(trial.probability for trial in [look.best, *_possible(look)])
@@ -100,14 +97,15 @@ def _further(trial: Trial, seen: Seen, programs: Programs) -> Trial:
     return trial._replace(attempt=programs.attempted(trial.event.belief, seen.dv, seen.pads, trial.attempt))
 
 
-def is_far(update: Update, size: int) -> bool:
-    """Whether more is left of a frame of so many whitened readings than noise and errors of the model leave."""
-    return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
+def _is_explained(careful: Update, size: int, rare: float) -> bool:
+    """Whether no event is more probable than none, even one that would leave only noise of a frame.
 
-
-def is_expected(update: Update, size: int) -> bool:
-    """Whether the contacts before a frame explain it, without an event."""
-    return is_finite(update) and float(update.surprise) < SURPRISING and not is_far(update, size)
+    Args:
+        size: number of whitened readings.
+        rare: log of the prior probability of an event.
+    """
+    gained = 0.5 * (float(careful.misfit) - size + float(careful.surprise))
+    return is_finite(careful) and gained + rare < 0
 
 
 def _trials(look: Look, careful: Update, programs: Programs, events: Events) -> tuple[Trial, ...]:

@@ -23,11 +23,9 @@ from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
 from .looks import (
-    SURPRISING,
     begun,
     calmer,
     caught_up,
-    is_far,
     is_finite,
     is_given_up,
     looked,
@@ -39,6 +37,9 @@ from .preparation import prepare_filter
 from .settings import TrackerSettings
 from .tracks import Backlog, Look, Seen, Track, Tracking
 
+# A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
+# of the belief changes by much more than it may.
+UNEXPECTED, SURPRISING = 4.0, 25.0
 # Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
@@ -187,7 +188,7 @@ class Tracker:
         found: list[Update] = []
         for place in self.programs.explaining_places(self.programs.unexplained(before, frame, pads)):
             found.append(self._updated(self.events.with_contact(before, place), frame, pads))
-            if is_finite(found[-1]) and bool(found[-1].converged) and not is_far(found[-1], self.programs.size):
+            if is_finite(found[-1]) and bool(found[-1].converged) and not self._is_far(found[-1]):
                 break
         return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
 
@@ -206,7 +207,7 @@ class Tracker:
         if now.backlog is not None:
             moved, update = self.programs.followed(now.belief, *seen)
             # What the contacts do not explain would bend them: until it is explained they move on as they did.
-            after = replace(now, belief=moved) if is_far(update, self.programs.size) else settled(now, update)
+            after = replace(now, belief=moved) if self._is_far(update) else settled(now, update)
             return replace(after, backlog=meanwhile(now.backlog, seen))
         after, look = self._followed(now, seen)
         if look is None:
@@ -294,9 +295,11 @@ class Tracker:
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:
             return True
-        return is_far(update, self.programs.size) and (
-            now.since >= now.patience or float(update.misfit) > WORSE * now.misfit
-        )
+        return self._is_far(update) and (now.since >= now.patience or float(update.misfit) > WORSE * now.misfit)
+
+    def _is_far(self, update: Update) -> bool:
+        size = self.programs.size
+        return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
 
 
 def bounded(now: Tracking) -> Tracking:

@@ -8,7 +8,7 @@ import pytest
 
 from jaxeit.tracking.belief.filter import PIECE, STEPS, Pads
 from jaxeit.tracking.belief.programs import Programs
-from jaxeit.tracking.looks import KEPT, LONGEST_WAIT, meanwhile
+from jaxeit.tracking.looks import KEPT, LONGEST_WAIT, begun, looked, meanwhile, settled
 from jaxeit.tracking.tracks import MOST_PATIENCE, PATIENCE, Seen
 
 from .conftest import SECONDS, load
@@ -189,15 +189,30 @@ def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_o
 
 
 def test_with_a_piece_a_frame_no_frame_is_left_waiting(tracker, frame_of):
-    """A growing force is no event: the look ends with its careful update, and the frames since then are caught up."""
-    now, waited, asked = tracker.start(), [], []
-    for force in [0.5] * 30 + [1.3, 4.0] + [12.0] * 28:
+    """Each piece follows one frame; the last that waits and the new one are followed as one."""
+    now, waited = tracker.start(), []
+    for force in [0.5] * 40 + [1.3, 4.0] + [12.0] * 40:
         now = tracker.step(now, frame_of([load(0.137, 0.022, force)]), SECONDS, whole=False)
         now = tracker.look(now)
         waited.append(0 if now.backlog is None else len(now.backlog.waiting))
-        asked.append(now.backlog is not None and now.backlog.look is not None and now.backlog.look.trials is not None)
     assert now.numbers == (1,)
-    assert max(waited[30:]) > 0
-    assert not any(asked[30:]), asked[30:]
-    assert waited[29] == waited[-1] == 0
+    assert max(waited[40:]) > 0
+    assert waited[39] == waited[-1] == 0
     assert now.backlog is None
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_events_are_asked_about_only_where_contacts_leave_something(tracker, frame_of, second):
+    """The contact before the frame explains it within noise, or there is a second one."""
+    loads = [load(0.05, 0.05, 10.0)]
+    before = tracker.step(tracker.start(), frame_of(loads), SECONDS)
+    frame = frame_of([load(0.05, 0.05, 10.5), *[load(0.15, 0.15, 5.0)] * second])
+    seen = Seen(tracker.frame(frame), tracker.pads(None, None), SECONDS)
+    moved, update = tracker.programs.followed(before.belief, *seen)
+    look = begun(replace(before, belief=moved), settled(before, update), seen)
+    asked = False
+    while look.after is None:
+        look = looked(look, tracker.programs, tracker.events)
+        asked = asked or look.trials is not None
+    assert asked == second
+    assert len(look.after.numbers) == 1 + second
