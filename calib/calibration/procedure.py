@@ -13,6 +13,7 @@ import jaxeit as je
 from ..check.acceptance import accept
 from ..check.placement import placement_note
 from ..fitting.fields import single_places
+from ..fitting.neighbourhoods import with_error_scale
 from ..fitting.pads import PadModel
 from ..fitting.response import (
     HeldOutForces,
@@ -127,7 +128,7 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
 
 def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
     presses, imager, response = found.presses, found.imager, found.response
-    choice, model = response.choice, response.model
+    choice, model = response.choice, with_error_scale(response.model, found.held_out.error_scale)
     return Calibration(
         skin=found.skin,
         recon=imager.recon,

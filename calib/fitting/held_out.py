@@ -100,14 +100,18 @@ class HeldOut(NamedTuple):
         force, error = (part[use] for part in self.hold)
         return fit_noise(data.force[use] - force.sum(1), force, (error**2).sum(1), data.place[use])
 
-    def half_widths(self, data: PressData) -> np.ndarray:
-        """Half the 90 % interval of the total force over each hold, (presses,) N, by the residuals of other folds."""
-        force, error = self.hold
+    def half_widths(self, data: PressData, variance: np.ndarray) -> np.ndarray:
+        """Half the 90 % interval of the total force over each hold, (presses,) N, by the residuals of other folds.
+
+        Args:
+            variance: of the total force by the model, (presses,) N^2.
+        """
+        force = self.hold.force
         half = np.full(len(force), np.nan)
         for k in np.unique(self.fold):
             held = self.fold == k
             if not held.all():
-                half[held] = self.hold_noise(data, ~held).half_widths(force[held], error[held])
+                half[held] = self.hold_noise(data, ~held).half_widths(force[held], variance[held])
         return half
 
 

@@ -48,10 +48,11 @@ class NoiseLaw(eqx.Module):
         found: Float[Array, "*n pads"] = _variances(self, force)
         return found
 
-    def half_widths(self, force: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """Half the 90 % interval of the total of predicted forces (n, pads) N with these standard errors, (n,) N."""
-        variance = (np.asarray(self.variance(jnp.asarray(force))) + error**2).sum(1)
-        return np.asarray(float(self.multiple) * np.sqrt(variance))
+    def half_widths(self, force: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """Half the 90 % interval of the total of predicted forces (n, pads) N, (n,) N; `variance` of that total by
+        the model, (n,) N^2."""
+        noise = np.asarray(self.variance(jnp.asarray(force))).sum(1)
+        return np.asarray(float(self.multiple) * np.sqrt(noise + variance))
 
 
 @je.verb

@@ -175,7 +175,7 @@ class PadModel(eqx.Module):
         """Force on each pad (n, pads) N, and half the 90 % interval of their total (n,) N, of means over holds.
 
         The interval is narrower than that of a reading, because a mean holds less noise than the readings in it.
-        Errors of different pads count as independent.
+        See `total_variance` for errors of different pads.
 
         Args:
             pressures: means over the holds of presses, (n, pads) Pa.
@@ -184,7 +184,16 @@ class PadModel(eqx.Module):
         found = forces(self, jnp.asarray(pressures, self.dtype), places)
         force, error = np.asarray(found.force), np.asarray(found.standard_error)
         noise = self._noise if self.hold_noise is None else self.hold_noise
-        return force, noise.half_widths(force, error)
+        return force, noise.half_widths(force, self.total_variance(error))
+
+    def total_variance(self, error: Float[np.ndarray, "n pads"]) -> Float[np.ndarray, " n"]:
+        """Variance (n,) N^2 of the total force, from the standard errors of the pads (n, pads) N.
+
+        Pads that share a field err together: the errors of a press across their wall add up. Others are independent.
+        """
+        if self.field is not None and self.field.field.shared:
+            return np.asarray(error.sum(1) ** 2)
+        return np.asarray((error**2).sum(1))
 
     @property
     def multiple(self) -> float:

@@ -15,26 +15,27 @@ from .curves.fitted import FittedCurve
 from .fields.base import AbstractField
 from .fields.geometry import geometry_of
 from .fields.places import Places, single_places
-from .held_out import Folds, HeldOut, Split, folds_by_place, hold_out_image, leave_out
+from .held_out import Folds, Split, folds_by_place, hold_out_image, leave_out
 from .intervals import NoiseLaw
 from .losses import AbstractLoss
+from .neighbourhoods import error_scale, hold_out_scaled
 from .pads import LocatedPresses, PadModel
 from .results import FitError, FitResult
-from .selection import Choice, choose, hold_out_choice
+from .selection import Choice, choose, chosen_without
 
 
 @dataclass(frozen=True, eq=False)
 class PadResponse:
     """The curve and field that were chosen, fitted to all presses.
 
-    ``held`` holds the forces of all presses by fits, and by choices, that did not use their fold.
+    ``without`` holds, by the number of each fold, the fit that did not use the fold, nor did the choice.
     ``baseline`` holds the curves of the paper's recipe beside them: `Linear`, without a field.
     """
 
     choice: Choice
     model: PadModel
     baseline: FittedCurve
-    held: HeldOut
+    without: Mapping[int, PadModel]
 
 
 class HeldOutForces(NamedTuple):
@@ -46,6 +47,7 @@ class HeldOutForces(NamedTuple):
     | half_width: half the 90 % interval of the total, by other places     | (presses,)      | N    |
     | noise: deviation of new readings about the response                  |                 |      |
     | hold_noise: deviation of means over holds about the response         |                 |      |
+    | error_scale: factor of the standard errors of the field              |                 |      |
     | others: total force by each method of comparison, by name            | (presses,) each | N    |
     | splits: errors when a whole pad, indenter or session is left out     |                 |      |
     """
@@ -54,6 +56,7 @@ class HeldOutForces(NamedTuple):
     half_width: np.ndarray
     noise: NoiseLaw
     hold_noise: NoiseLaw
+    error_scale: float
     others: dict[str, np.ndarray]
     splits: tuple[Split, ...]
 
@@ -75,8 +78,8 @@ def fit_response(
     choice = choose(curves, fields, folds)
     model = folds.fit(choice.curve, choice.field, frozenset())
     _require_fits(skin, model)
-    held = hold_out_choice(curves, fields, folds) if choice.tried else folds.hold_out(choice.curve, choice.field)
-    return PadResponse(choice, model, folds.fit(*_baseline(choice), frozenset()).curves, held)
+    without = chosen_without(curves, fields, folds)
+    return PadResponse(choice, model, folds.fit(*_baseline(choice), frozenset()).curves, without)
 
 
 def require_every_pad_pressed(skin: je.Skin, data: PressData) -> None:
@@ -133,12 +136,16 @@ def hold_out_response(
     if field is not None and true_position is not None:
         true = presses._replace(places=single_places(true_position, presses.geometry.pads))
         others["true_place"] = Folds(true, folds.loss, folds.fold).hold_out(curve, field).hold.force.sum(1)
-    held = response.held
+    held = hold_out_scaled(folds, response.without, 1.0)
+    hold_noise = held.hold_noise(data)
+    scale = error_scale(folds, curve, response.model, hold_noise)
+    wider = hold_out_scaled(folds, response.without, scale)
     return HeldOutForces(
         held.hold.force,
-        held.half_widths(data),
+        held.half_widths(data, response.model.total_variance(wider.hold.standard_error)),
         held.noise(data),
-        held.hold_noise(data),
+        hold_noise,
+        scale,
         others,
         leave_out(curve, field, presses, folds.loss, groups),
     )

@@ -14,7 +14,8 @@ import numpy as np
 
 from .curves import CURVES, AbstractCurve
 from .fields import FIELDS, AbstractField
-from .held_out import Folds, HeldOut, joined
+from .held_out import Folds
+from .pads import PadModel
 
 MAX_SAID = 12  # candidates that the reason in words names; the table of the report has all
 NOTHING_HELD: frozenset[int] = frozenset()
@@ -153,10 +154,12 @@ def choose(
     return Choice(curve, field, why, table)
 
 
-def hold_out_choice(curves: Sequence[AbstractCurve], fields: Sequence[AbstractField | None], folds: Folds) -> HeldOut:
-    """Forces held out of fits and choice alike: for each fold, curve and field are chosen without it (nested)."""
-    parts = []
+def chosen_without(
+    curves: Sequence[AbstractCurve], fields: Sequence[AbstractField | None], folds: Folds
+) -> dict[int, PadModel]:
+    """The fit without each fold, by its number; curve and field are chosen without the fold as well (nested)."""
+    found = {}
     for k in folds.numbers:
         choice = choose(curves, fields, folds, frozenset({k}))
-        parts.append(folds.predicted(folds.fit(choice.curve, choice.field, frozenset({k})), frozenset({k})))
-    return joined(parts, folds)
+        found[k] = folds.fit(choice.curve, choice.field, frozenset({k}))
+    return found

@@ -223,7 +223,7 @@ def gain_field(field, skin, rng):
         covariance=jnp.zeros((size, size)),
         reach=jnp.asarray(np.stack([low + 0.012, high - 0.007], 1)),
         centre=jnp.asarray(rng.normal(0, 0.3, (4, size))),
-        **dict.fromkeys(("noise", "spread", "evidence", "effective", "n"), zero),
+        **dict.fromkeys(("noise", "spread", "evidence", "effective", "n", "error_scale"), zero),
         result=jnp.zeros((), int),
     )
 

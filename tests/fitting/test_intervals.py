@@ -1,16 +1,22 @@
 """The noise law of held-out residuals: what it recovers, and what its intervals cover on new places."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from calib.fitting.curves import Linear
-from calib.fitting.fields import geometry_of
+from calib.fitting.fields import PadEdge, geometry_of, single_places
 from calib.fitting.held_out import Folds, folds_by_place
 from calib.fitting.intervals import fit_noise
 from calib.fitting.losses import SoftL1
+from calib.fitting.neighbourhoods import error_scale, with_error_scale
 from calib.fitting.pads import LocatedPresses, PadModel, fit_pads
-from calib.presses.pooled import PressData
+from calib.fitting.response import fit_response, fold_presses, hold_out_response
+from calib.presses.pooled import MIN_SHARE, PressData
+from jaxeit.geometry.shapes import Polygon
 
 PADS, PLACES, SAMPLES = 3, 60, 30
 
@@ -105,3 +111,74 @@ def test_means_over_holds_have_intervals_of_their_own(skin):
         sampled = np.abs(everything.sum(1) - new.sample_force) <= wide
         covered.append([*(inside[k::3].mean() for k in range(3)), sampled.mean()])
     np.testing.assert_allclose(np.mean(covered, 0), 0.9, atol=0.05)
+
+
+def pressed(skin, sites, rng, dip, width, spread):
+    """Presses of 3 to 20 N on pads that are stiff near their walls and lose the part of a load beside them."""
+    force = rng.uniform(3, 20, len(sites))
+    felt = []
+    for pad in skin.pads:
+        (low, high), outline = (pad.outline.min(0), pad.outline.max(0)), Polygon(pad.outline)
+        borne = np.prod(ndtr((high - sites) / spread) - ndtr((low - sites) / spread), axis=1)
+        away = np.where(outline.contains(sites), outline.boundary_distance(sites), 0)
+        felt.append(100 * borne * (1 - dip * np.exp(-away / width)))
+    pressure = np.array(felt).T * force[:, None] * np.exp(0.005 * rng.normal(size=(len(sites), len(skin.pads))))
+    press, load = np.arange(len(sites)).repeat(3), np.tile([0.4, 0.7, 1.0], len(sites))
+    share = pressure / pressure.sum(1, keepdims=True)
+    return PressData(
+        sample_pressure=(pressure[press] * load[:, None]).T,
+        sample_force=force[press] * load,
+        sample_press=press,
+        mask=(share[press] >= MIN_SHARE).T,
+        pressure=pressure,
+        force=force,
+        place=np.arange(len(sites)),
+        reach=np.stack([sites.min(0), sites.max(0)]),
+    )
+
+
+@pytest.mark.slow
+def test_intervals_hold_between_the_places_of_a_grid_that_is_aligned_with_the_walls(skin):
+    """Presses of the grid have few distances to walls, so that those of one distance predict each other well."""
+    lines = np.linspace(0.01, 0.19, 12)
+    grid = np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    by_places, covered, widened = [], [], []
+    for seed in range(8):
+        rng = np.random.default_rng([13, seed])
+        pads = rng.uniform(0.3, 0.5), rng.uniform(0.007, 0.013), rng.uniform(0.005, 0.01)
+        data, sites = pressed(skin, grid, rng, *pads), rng.uniform(0.01, 0.19, (300, 2))
+        new, known = pressed(skin, sites, rng, *pads), single_places(grid, 4)
+        folds = fold_presses(skin, data, known, SoftL1(), 5)
+        response = fit_response(folds, skin, (Linear(),), (PadEdge(),))
+        found = hold_out_response(folds, response, {}, data.force)
+        narrow = replace(response.model, noise=found.noise, hold_noise=found.hold_noise)
+        wide = with_error_scale(narrow, found.error_scale)
+        widths = [_covered(model, new, sites, result) for model, result in ((narrow, by_places), (wide, covered))]
+        widened.append(widths[1] / widths[0])
+    assert np.mean(by_places) < 0.87  # what held-out places alone tell
+    assert (np.mean(covered, 0) > 0.87).all()
+    assert (np.mean(covered, 0) < 0.97).all()  # whole neighbourhoods are farther away than the places between them
+    assert np.mean(widened) < 2
+
+
+def _covered(model, new, sites, result):
+    """Mean half width of the intervals; what they cover in each third of force is appended to the result."""
+    force, half = model.hold_forces(new.pressure, single_places(sites, 4))
+    inside = np.abs(force.sum(1) - new.force) <= half
+    third = np.minimum(3 * new.force / 20, 2).astype(int)
+    result.append([inside[third == k].mean() for k in range(3)])
+    return half.mean()
+
+
+def test_a_scale_moves_no_force_and_ends_at_the_errors_of_an_unknown_place(skin):
+    rng = np.random.default_rng(5)
+    sites = rng.uniform(0.01, 0.19, (60, 2))
+    folds = fold_presses(skin, pressed(skin, sites, rng, 0.4, 0.01, 0.008), single_places(sites, 4), SoftL1(), 5)
+    model = fit_response(folds, skin, (Linear(),), (None,)).model
+    assert error_scale(folds, Linear(), model, fit_noise(*_with_variance(residuals(rng)))) == 1
+    assert with_error_scale(model, 3.0) is model
+    field = fit_pads(Linear(), PadEdge(), folds.presses, SoftL1())
+    near, far = (with_error_scale(field, scale).field.log_gain(single_places(sites, 4)) for scale in (1.0, 1e6))
+    np.testing.assert_array_equal(near.mean, far.mean)
+    most = np.maximum(near.variance, max(field.field.spread**2 - field.field.noise**2, 0))
+    np.testing.assert_allclose(far.variance, most)  # never less known than at an unknown place

@@ -206,6 +206,7 @@ _FIELD_FIELDS = {
     "effective": ("1", "coefficients that the presses determine"),
     "n": ("1", "places fitted"),
     "result": ("1", "0: success"),
+    "error_scale": ("1", "factor of standard errors, by held-out neighbourhoods of presses"),
 }
 
 _CURVE_FIELDS = {
@@ -303,7 +304,8 @@ def field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> F
     if missing:
         raise KeyError(f"location/choice-{min(missing)}")
     geometry = {f.name: jnp.asarray(arrays[f"location/geometry-{f.name}"]) for f in fields(Geometry)}
-    given = {"location/effective": np.asarray(np.nan), **arrays}  # early versions did not store it
+    # early versions did not store these
+    given = {"location/effective": np.asarray(np.nan), "location/error_scale": np.ones(()), **arrays}
     numbers = {name: jnp.asarray(given[f"location/{name}"]) for name in _FIELD_FIELDS}
     return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
 
@@ -370,6 +372,7 @@ _NOT_NEGATIVE = (
     "baseline/scale",
     "location/noise",
     "location/spread",
+    "location/error_scale",
 )
 _RANGES = ("pads/pressure_range", "baseline/pressure_range")
 _COVARIANCES = (

@@ -169,4 +169,5 @@ def fit_field(
         effective=jnp.where(good, found.effective, 0),
         n=n,
         result=result,
+        error_scale=jnp.ones_like(found.variance),
     )

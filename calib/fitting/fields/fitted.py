@@ -38,6 +38,7 @@ class FittedField(eqx.Module):
     | effective    | number of coefficients that the presses determine                  | ()           |      |
     | n            | presses used; all presses at one place count as one                | ()           |      |
     | result       | a `FitResult`; if not 0, there is no correction                    | ()           |      |
+    | error_scale  | factor of standard errors, by held-out neighbourhoods of presses   | ()           | 1    |
     """
 
     field: AbstractField
@@ -52,17 +53,20 @@ class FittedField(eqx.Module):
     effective: Float[Array, ""]
     n: Float[Array, ""]
     result: Int[Array, ""]
+    error_scale: Float[Array, ""]
 
     def log_gain(self, places: Places) -> LogGain:
         """The field at places; that of a pad is the mean over the contacts that load the pad.
 
         Outside the box of the presses (`reach`) the field keeps its value at the border. The variance there is that of
-        the extrapolated field, plus the square of the difference between the two.
+        the extrapolated field, plus the square of the difference between the two. `error_scale` widens the errors up to
+        those at an unknown place.
         """
         held, there = (self._centred(places, reach) for reach in (self.reach, None))
         between = (there - held) @ self.coefficients
         variance = jnp.einsum("npi,ij,npj->np", there, self.covariance, there) + between**2
         unknown = jnp.maximum(self.spread**2 - self.noise**2, 0)
+        variance = jnp.maximum(variance, jnp.minimum(self.error_scale**2 * variance, unknown))
         return LogGain(held @ self.coefficients, jnp.where(places.known, variance, unknown))
 
     def _centred(self, places: Places, reach: Float[Array, "pads 2 2"] | None) -> Float[Array, "n pads m"]:
