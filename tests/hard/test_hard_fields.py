@@ -54,8 +54,8 @@ def test_a_contact_that_is_not_known_has_an_uncertainty_and_no_gain(geometry):
     """Of presses that scatter about the field more than about nothing, too."""
     none, size = jnp.zeros(()), len(PadEdge().shapes()[0])
     box = jnp.broadcast_to(jnp.array([[0.0, 0.0], [0.2, 0.2]]), (4, 2, 2))
-    # Noise, spread, evidence, effective coefficients, n, result.
-    rest = (none + 2, none + 1, none, none, none, jnp.zeros((), jnp.int32))
+    # Noise, spread, evidence, effective coefficients, n, result, scale of errors.
+    rest = (none + 2, none + 1, none, none, none, jnp.zeros((), jnp.int32), none + 1)
     fitted = FittedField(PadEdge(), geometry, jnp.ones(size), jnp.eye(size), box, jnp.zeros((4, size)), *rest)
     gain = log_gain(fitted, single_places(np.full((1, 2), np.nan), 4))
     assert not np.asarray(gain.mean).any()
@@ -80,8 +80,8 @@ def test_what_a_field_would_go_on_to_is_part_of_its_uncertainty_beyond_what_was_
     """The square of what lies between level and going on; nothing else where the coefficients are known exactly."""
     size, zero = len(PadEdge().shapes()[0]), jnp.zeros(())
     box = jnp.broadcast_to(jnp.array([[0.03, 0.03], [0.06, 0.06]]), (4, 2, 2))
-    # Noise, spread, evidence, effective coefficients, n, result.
-    rest = (zero, zero + 1, zero, zero, zero, jnp.zeros((), jnp.int32))
+    # Noise, spread, evidence, effective coefficients, n, result, scale of errors.
+    rest = (zero, zero + 1, zero, zero, zero, jnp.zeros((), jnp.int32), zero + 1)
     known = FittedField(
         PadEdge(), geometry, jnp.arange(1.0, size + 1), jnp.zeros((size, size)), box, jnp.zeros((4, size)), *rest
     )

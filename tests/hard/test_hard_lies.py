@@ -278,10 +278,10 @@ def test_nodes_are_foretold(skin, level):
 
 MESHES = {
     "an edge of a tenth of a millimetre": (lambda: je.Fidelity(edge_length=2e-4), TESTBED, "mesh nodes, the limit"),
-    "a strip of 200 m by a micrometre": (
+    "a strip of 20 m by a micrometre": (
         je.Fidelity.standard,
-        edited(("size = [0.2, 0.2]", "size = [200, 1e-6]"), ("columns = 5", "columns = 25"), ("rows = 5", "rows = 1"),
-               ("pitch = 0.04", "pitch = 1.0"), ("origin = [0.02, 0.02]", "origin = [1, 5e-7]"),
+        edited(("size = [0.2, 0.2]", "size = [20, 1e-6]"), ("columns = 5", "columns = 25"), ("rows = 5", "rows = 1"),
+               ("pitch = 0.04", "pitch = 0.5"), ("origin = [0.02, 0.02]", "origin = [1, 5e-7]"),
                ("radius = 0.003", "radius = 1e-7")),
         "mesh nodes, the limit",
     ),

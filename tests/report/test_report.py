@@ -131,6 +131,7 @@ def located(calibration):
         effective=jnp.array(5.0),
         n=jnp.array(16.0),
         result=jnp.array(0),
+        error_scale=jnp.array(1.0),
     )
     provenance = calibration.provenance | {"location": "edge", "choice": "edge, the simplest; none 3.02, edge 0.91"}
     return replace(calibration, evaluation=evaluation, field=fitted, provenance=provenance)
