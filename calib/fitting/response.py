@@ -139,7 +139,7 @@ def hold_out_response(
     held = hold_out_scaled(folds, response.without, 1.0)
     hold_noise = held.hold_noise(data)
     scale = error_scale(folds, curve, response.model, hold_noise)
-    wider = hold_out_scaled(folds, response.without, scale)
+    wider = hold_out_scaled(folds, response.without, scale) if scale > 1 else held
     return HeldOutForces(
         held.hold.force,
         held.half_widths(data, response.model.total_variance(wider.hold.standard_error)),

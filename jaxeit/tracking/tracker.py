@@ -202,7 +202,7 @@ class Tracker:
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
             now = self._given_up(now, seen)
-        if now.backlog is not None:
+        elif now.backlog is not None:
             now, seen = caught_up(now, now.backlog, seen)
         if now.backlog is not None:
             moved, update = self.programs.followed(now.belief, *seen)
