@@ -67,6 +67,17 @@ def test_a_tall_sheet_is_drawn_narrower_not_taller():
     assert (high - low)[1] / (high - low)[0] == pytest.approx(10, rel=1e-6)
 
 
+@pytest.mark.parametrize("largest", [1.5, 150.0])
+def test_labels_lie_inside_of_their_panel(largest):
+    """Ticks below zero are the widest; the letters of the axis stand left of them."""
+    figure, axes = chart_axes(simulated=True)
+    axes.plot([0, 20], [-0.8 * largest, largest])
+    axes.set(xlabel="true force, N", ylabel="estimated − true, N")
+    box = figure.get_tightbbox()
+    assert min(box.x0, box.y0) >= 0
+    assert (box.x1, box.y1) <= tuple(figure.get_size_inches())
+
+
 def test_ellipses_are_those_of_the_covariance():
     """Against the singular values of a root of the covariance, which no eigenvectors enter."""
     root = np.random.default_rng(0).normal(size=(2, 2)) * 1e-3

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 WIDTH = 3.5  # inches, at which letters of 10 points are as large as those of the page
 WIDER = 5.0  # inches, of panels of which the page has few
 HEIGHT = 2.6  # inches, of a panel that shows no sheet
-LEFT, RIGHT, BAR, BOTTOM, TOP, MARK = 0.6, 0.12, 0.95, 0.5, 0.1, 0.2  # margins, inches: MARK is that of SIMULATED
+LEFT, RIGHT, BAR, BOTTOM, TOP, MARK = 0.72, 0.12, 0.95, 0.5, 0.1, 0.2  # margins, inches: MARK is that of SIMULATED
 SHEET_MARGIN = 0.03  # about the sheet, of its longer side
 TALLEST = 1.6  # height of a sheet over its width, beyond which it is drawn narrower
 RASTER_DPI = 100  # of maps of many cells
