@@ -27,17 +27,19 @@ def _image(axes: Any, image: Any, recon: Any, **marks: Any) -> None:
     values = np.asarray(image).reshape(recon.shape)
     top = np.abs(values).max()
     extent = MM * np.array(recon.extent)
-    axes.imshow(values, origin="lower", extent=extent, cmap="RdBu_r", vmin=-top, vmax=top)
+    drawn = axes.imshow(values, origin="lower", extent=extent, cmap="RdBu_r", vmin=-top, vmax=top)
+    axes.figure.colorbar(drawn, ax=axes, label="change of conductivity, S")
     for place, colour in zip(marks.values(), ("black", ORANGE), strict=False):
         axes.plot(*(MM * np.asarray(place)), "x", color=colour, markersize=8)
     axes.set(xlabel="x, mm", ylabel="y, mm")
 
 
-def _sheet(axes: Any, model: Any, sigma: Any, label: str = "") -> None:
+def _sheet(axes: Any, model: Any, sigma: Any, label: str) -> None:
     """The conductivity of each triangle, or its change."""
     mesh = Triangulation(*(MM * np.asarray(model.chart).T), np.asarray(model.triangles))
-    axes.tripcolor(mesh, np.asarray(sigma), cmap="viridis")
-    axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title=label)
+    drawn = axes.tripcolor(mesh, np.asarray(sigma), cmap="viridis")
+    axes.figure.colorbar(drawn, ax=axes, label=label)
+    axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
 
 
 def _bars(axes: Any, values: Mapping[str, float], label: str) -> None:
@@ -55,7 +57,7 @@ def _line(axes: Any, x: Any, y: Any, xlabel: str, ylabel: str, look: str = "-") 
 
 
 def where_is_the_contact(axes: Any, names: Names) -> None:
-    _sheet(axes, names["model"], names["touched"])
+    _sheet(axes, names["model"], MM * names["touched"], "conductivity, mS")
     axes.plot(*(MM * np.asarray(names["found"][:2])), "x", color="red", markersize=9)
 
 
@@ -68,13 +70,13 @@ def two_fingers(axes: Any, names: Names) -> None:
 
 def one_two_or_an_edge(axes: Any, names: Names) -> None:
     """Probabilities of each kind, a group of bars for each touch."""
-    for row, (touch, stated) in enumerate(names["probabilities"].items()):
+    for row, stated in enumerate(names["probabilities"].values()):
         left = 0.0
         for (kind, share), colour in zip(stated.items(), ("white", BLUE, ORANGE, GREY, "lightgrey"), strict=True):
             axes.barh(row, share, left=left, color=colour, label=kind if row == 0 else None)
             left += share
-        axes.text(0.02, row, touch, va="center", fontsize=8)
-    axes.set(xlabel="probability", yticks=[], xlim=(0, 1))
+    touches = list(names["probabilities"])
+    axes.set(xlabel="probability", yticks=range(len(touches)), yticklabels=touches, xlim=(0, 1))
     axes.invert_yaxis()
     axes.legend(fontsize=6, ncols=5, loc="upper center", bbox_to_anchor=(0.5, 1.18))
 
@@ -100,8 +102,9 @@ def pressure_to_force(axes: Any, names: Names) -> None:
 
 def image_and_forces(axes: Any, names: Names) -> None:
     image = np.asarray(names["fmap"].pressure).reshape(names["recon"].shape) / MM
-    axes.imshow(image, origin="lower", extent=MM * np.array(names["recon"].extent), cmap="viridis")
-    axes.set(xlabel="x, mm", ylabel="y, mm", title="kPa")
+    drawn = axes.imshow(image, origin="lower", extent=MM * np.array(names["recon"].extent), cmap="viridis")
+    axes.figure.colorbar(drawn, ax=axes, label="force per area, kPa")
+    axes.set(xlabel="x, mm", ylabel="y, mm")
 
 
 def mujoco_ball_on_chest(axes: Any, names: Names) -> None:
@@ -117,7 +120,7 @@ def mujoco_ball_on_chest(axes: Any, names: Names) -> None:
 
 def write_a_session(axes: Any, names: Names) -> None:
     axes.plot(np.arange(1000) / 100, names["pressures"], color=BLUE)
-    axes.set(xlabel="s", ylabel="Pa")
+    axes.set(xlabel="time, s", ylabel="pressure, Pa")
 
 
 def forces_of_a_session(axes: Any, names: Names) -> None:
@@ -202,7 +205,7 @@ DRAWN: Mapping[str, Callable[[Any, Names], None]] = {
     "tank": lambda axes, n: _image(axes, n["recon"](n["dv"]), n["recon"], true=n["middle"]),
     "train_on_random_scenes": train_on_random_scenes,
     "two_fingers": two_fingers,
-    "uneven_coating": lambda axes, n: _sheet(axes, n["model"], n["coating"]),
+    "uneven_coating": lambda axes, n: _sheet(axes, n["model"], MM * n["coating"], "conductivity, mS"),
     "where_is_the_contact": where_is_the_contact,
     "which_readings": lambda axes, n: _line(
         axes, range(1, 81), n["chosen"].gain, "readings taken", "told by the next, nats"

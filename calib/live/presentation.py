@@ -57,7 +57,9 @@ def present(
         tell: called with messages for the operator, such as the address of the page.
 
     Raises:
-        LiveError, PriorityError: as `run_live`. RecordError: as `session_journal`. OSError: if a port is in use.
+        LiveError, PriorityError: as `run_live`.
+        RecordError: as `session_journal`.
+        OSError: if a port is in use.
 
     Example:
         from calib.live import Presentation, present

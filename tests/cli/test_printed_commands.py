@@ -54,10 +54,11 @@ def test_commands_named_in_messages_know_their_options(root):
     assert found >= 10
 
 
-def fenced_commands(text):
-    """Lines `jaxeit ...` of the fenced blocks of a page, without what explains them, continued lines joined."""
-    for block in re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
-        for line in block.replace("\\\n", " ").splitlines():
+def commands_of(text):
+    """Lines `jaxeit ...` of fenced blocks and of the first column of tables, without what explains them."""
+    rows = "\n".join(re.findall(r"^\| `(jaxeit .*?)` \|", text, re.MULTILINE))
+    for block in [*re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL), rows]:
+        for line in re.sub(r"\\\n *", "", block).splitlines():
             words = re.split(r"(?<=\S) {3,}(?=\S)|  #", line.removeprefix("$ ").strip())[0]
             if words.startswith("jaxeit ") and not re.search(r"\[|\.\.\.|…", words):
                 yield words
@@ -77,7 +78,7 @@ def is_parsed(words):
 
 
 def test_commands_of_the_pages_are_parsed(root):
-    lines = [(page.name, line) for page in pages(root) for line in fenced_commands(page.read_text())]
+    lines = [(page.name, line) for page in pages(root) for line in commands_of(page.read_text())]
     refused = [(page, line) for page, line in lines if not is_parsed(shlex.split(re.sub(r"\s#.*", "", line))[1:])]
     assert refused == []
     assert len(lines) >= 10
@@ -115,7 +116,7 @@ def test_the_record_line_of_a_served_scene_records(served, tmp_path, monkeypatch
 def test_the_record_line_of_the_readme_records(served, root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     urls = re.findall(r"tcp://\S+", served)
-    (line,) = (x for x in fenced_commands((root / "README.md").read_text()) if x.startswith("jaxeit record"))
+    (line,) = (x for x in commands_of((root / "README.md").read_text()) if x.startswith("jaxeit record"))
     for url in urls[: line.count("URL")]:
         line = line.replace("URL", url, 1)
     assert main([*shlex.split(line)[1:], "--seconds", "0.5"]) == 0
