@@ -35,6 +35,8 @@ from typing import Any
 
 import lazy_loader
 
+from ._other_words import translation
+
 _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
@@ -53,7 +55,7 @@ def _whereabouts(name: str) -> str:
         if re.search(rf'^    "{re.escape(name)}",$', room.read_text(encoding="utf-8"), re.MULTILINE):
             return f"; it is jaxeit.{room.parent.name}.{name}"
     near = difflib.get_close_matches(name, __all__, 1)
-    return f"; did you mean {near[0]}?" if near else ""
+    return translation(name) or (f"; did you mean {near[0]}?" if near else "")
 
 
 __version__ = metadata.version("jaxeit")

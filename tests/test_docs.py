@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tomllib
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import calib
 import jaxeit as je
 from calib.cli import _parser, main
 from calib.cli.recipe_options import recipe_of
+from jaxeit._other_words import WORDS
 
 FENCE = re.compile(r"^( *)```(\w*)(?: title=\"(.+?)\")?\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 SHELL = ("sed ", "python ")
@@ -127,6 +128,29 @@ def test_the_page_of_scenes_lists_every_effect(root):
     listed = re.findall(r"`(\w+)`", "".join(line for line in head.splitlines() if line.startswith("| ")))
     ours = (name for name, kind in je.effects.EFFECTS.items() if kind.__module__.startswith("jaxeit"))
     assert sorted(listed) == sorted(ours)
+
+
+def rows_of(page):
+    """Both cells of each row of the first table of a page."""
+    table = re.search(r"(?:^\|.*\n)+", page.read_text(encoding="utf-8"), re.MULTILINE)[0]
+    return [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+
+
+@pytest.mark.parametrize(("package", "page"), WORDS)
+def test_words_of_other_packages_are_those_of_their_page(root, model, package, page):
+    """Each function of the first column is known, with what stands beside it; what it names exists."""
+    rows, words = rows_of(root / page), WORDS[package, page]
+    for word, answer in words.items():
+        assert any(
+            re.search(rf"`[^`]*\b{word}\b", left) and re.search(rf"`[^`]*{re.escape(answer)}`", right)
+            for left, right in rows
+        ), word
+        named = re.findall(r"\w+", answer.split("(")[0])[1:]
+        assert reduce(getattr, named, je if answer.startswith("je.") else model) is not None
+        with pytest.raises(AttributeError, match=rf"jaxeit has no {word}; for {word} of {package} write .*{page}"):
+            getattr(je, word)
+    functions = {name for left, _ in rows for name in re.findall(r"(?<![\w.])(\w+)(?:\.\w+)?\(", left)}
+    assert functions - {"fmdl", "eit"} <= words.keys()  # objects of a user
 
 
 def test_programs_about_curves(root):

@@ -1,7 +1,9 @@
 """Text files of tanks: tables, CSV of PyEIDORS, and the .eit files that the software of Sciospec writes."""
 
+import csv
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,10 @@ from jaxeit.files import open_regular
 from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
 
+from ..session import SessionError
+from ..session.importers.formats.text_files import lines_of
+from ..session.importers.formats.text_layout import FIRST_LINES, Dialect, layout_of
+from ..session.importers.limits import MAX_LINE
 from .recording import Tank, TankError, tank_of
 
 CURRENT_IN_NAME = re.compile(r"_([\d.]+)(uA|mA)(?:_([\d.]+)Hz)?")
@@ -33,17 +39,50 @@ def _numbers(where: str, line: str) -> list[float]:
 
 
 def read_table(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """The names of the columns and the numbers (rows, columns) of a table; "frame 0", ... where no line names them."""
-    lines = [line for line in text_of(path).replace(";", ",").splitlines() if line.strip()]
-    names: tuple[str, ...] = ()
-    if lines and re.search(r"[A-DF-Za-df-z]", lines[0].replace("nan", "")):
-        names = tuple(name.strip(' "#') for name in lines.pop(0).split(","))
-    rows = [_numbers(f"{path.name}: row {k + 1}", line) for k, line in enumerate(lines)]
+    """The names of the columns and the numbers (rows, columns) of a table; "frame 0", ... where no line names them.
+
+    Delimiter, decimal sign, quotes and header are found as by `jaxeit import csv`. A word that is no number is an
+    error, since a tank has no reading to spare; "nan" and an empty cell are missing readings.
+
+    Raises:
+        TankError: if the file is no table of numbers.
+    """
+    require("array_bytes", path.stat().st_size, path.name, TankError)
+    try:
+        lines = list(lines_of(path))
+        layout = layout_of(path, [text for _, text in lines[:FIRST_LINES]])
+        cells = [(lines[n - 1][0], row) for n, row in layout.rows(text for _, text in lines) if n > layout.header_lines]
+    except (SessionError, csv.Error) as error:
+        raise TankError(str(error)) from error
+    rows = [[_number(path, line, layout, cell) for cell in row] for line, row in _without_last(cells)]
     widths = sorted({len(row) for row in rows})
-    if len(widths) != 1 or (names and len(names) != widths[0]):
-        heads = f", and {len(names)} names" if names else ""
-        raise TankError(f"{path.name}: rows have {widths} numbers{heads}; give a table, with a frame a row or a column")
-    return names or tuple(f"frame {k}" for k in range(widths[0])), np.array(rows)
+    names = layout.header or _names_of_comment(path, layout)
+    names = names[:-1] if names and not names[-1] else names
+    if len(widths) != 1 or (layout.header and len(names) != widths[0]):
+        raise TankError(f"{path.name}: rows have {widths} numbers; give a table, with a frame a row or a column")
+    return names if len(names) == widths[0] else tuple(f"frame {k}" for k in range(widths[0])), np.array(rows)
+
+
+def _without_last(cells: Sequence[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    """The rows; without their last cells where all of these are empty, since each line ends in a delimiter."""
+    ended = all(not row[-1] for _, row in cells)
+    for line, row in cells:
+        yield line, row[:-1] if ended else row
+
+
+def _number(path: Path, line: int, layout: Dialect, cell: str) -> float:
+    value = layout.number(cell)
+    if math.isnan(value) and cell.strip().lower() not in ("", "nan"):
+        raise TankError(f"{path.name}: line {line}: {cell[:60]!r} is no number; correct it, or leave the cell empty")
+    return value
+
+
+def _names_of_comment(path: Path, layout: Dialect) -> tuple[str, ...]:
+    """The names that `numpy.savetxt` writes: the first line, behind a "#"."""
+    with open_regular(path) as file:
+        first = file.readline(MAX_LINE).decode("utf-8", "replace").strip()
+    names = next(layout.rows([first.removeprefix("#")]), (0, []))[1] if first.startswith("#") else []
+    return tuple(name.strip(' "') for name in names)
 
 
 def pyeidors_tank(path: Path, domain: Domain | None, rim: Sequence[AbstractElectrode] | None) -> Tank:
@@ -51,19 +90,17 @@ def pyeidors_tank(path: Path, domain: Domain | None, rim: Sequence[AbstractElect
 
     Adjacent drive and measurement in rotating order; current and frequency are in the name of the file.
     """
-    lines = [line for line in text_of(path).splitlines() if line.strip()]
-    rows = [_numbers(f"{path.name}: line {k + 1}", line) for k, line in enumerate(lines)]
+    _, rows = read_table(path)
     electrodes = (3 + np.sqrt(9 + 4 * len(rows))) / 2
-    if not rows or electrodes != int(electrodes) or electrodes < 4:
+    if electrodes != int(electrodes) or electrodes < 4:
         raise TankError(f"{path.name}: has {len(rows)} lines, which is no n (n - 3) for n electrodes of adjacent pairs")
-    widths = {len(row) for row in rows}
-    if len(widths) != 1 or widths.pop() % 2:
-        raise TankError(f"{path.name}: lines have {sorted({len(row) for row in rows})} columns; two are needed a frame")
+    if rows.shape[1] % 2:
+        raise TankError(f"{path.name}: lines have {rows.shape[1]} columns; two are needed a frame")
     named = CURRENT_IN_NAME.search(path.name)
     current = float(named[1]) * AMPERE[named[2]] if named else 1e-3
     frequency = float(named[3]) if named and named[3] else 0.0
     protocol = je.Protocol(je.skin.adjacent(int(electrodes)), current, frequency)
-    table = -np.array(rows).T
+    table = -rows.T
     names = tuple(f"frame {k}" for k in range(len(table) // 2))
     skin = tank_of(path.stem, protocol, int(electrodes), domain, rim)
     return Tank(skin, table[::2], names, table[1::2])
