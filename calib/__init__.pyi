@@ -41,7 +41,12 @@ from .calibration import (
     recalibrate as recalibrate,
 )
 from .check import check_session as check_session
-from .export import export_c as export_c, export_lerobot as export_lerobot, export_mcap as export_mcap
+from .export import (
+    export_c as export_c,
+    export_csv as export_csv,
+    export_lerobot as export_lerobot,
+    export_mcap as export_mcap,
+)
 from .fitting import (
     Affine as Affine,
     Linear as Linear,

@@ -36,6 +36,12 @@ def _add_bag(bag: argparse.ArgumentParser) -> None:
     bag.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
 
 
+def _add_forces(forces: argparse.ArgumentParser) -> None:
+    forces.add_argument("source", metavar="FORCEMAP.h5", help="a force map of jaxeit apply, or the forces of a log")
+    text = "contacts are written to a second table beside it, FORCES-contacts.csv"
+    forces.add_argument("-o", "--output", required=True, metavar="FORCES.csv", help=text)
+
+
 def _add_dataset(dataset: argparse.ArgumentParser) -> None:
     dataset.add_argument("sources", nargs="+", metavar="FORCEMAP.h5", help="force maps of jaxeit apply")
     dataset.add_argument("-o", "--output", required=True, metavar="DATASET", help="a new folder")
@@ -71,6 +77,13 @@ def _write_header(args: argparse.Namespace) -> object:
     return export_c(calibration, args.output, **options, tell=say)
 
 
+def _write_forces(args: argparse.Namespace) -> object:
+    from ...export import export_csv
+
+    prepare_results(args, "output")
+    return export_csv(args.source, args.output, progress=progress_bar("blocks"))
+
+
 def _write_bag(args: argparse.Namespace) -> object:
     from ...export import export_mcap
 
@@ -97,6 +110,11 @@ _FORMATS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None], Callab
         "one C99 header without allocation: a frame to image, force map and pad forces in float32",
         _add_header,
         _write_header,
+    ),
+    "csv": (
+        "forces of jaxeit apply as a table, a row a frame, and contacts as a second table, for spreadsheets and pandas",
+        _add_forces,
+        _write_forces,
     ),
     "mcap": (
         "a force map or a session as a bag of ROS 2 (MCAP) for ros2 bag play and Foxglove, with jaxeit[tables]",
