@@ -167,6 +167,7 @@ class AbstractEffect(eqx.Module):
 
     ``rank`` orders effects within their family.  A scene lists at most one effect of each ``alternative``.  An effect
     ``of_pairs`` acts on the pair that drives and the pair that senses, which readings of a protocol of matrices lack.
+    A scene file must give the parameters ``to_be_set``, whose defaults of 1 are no usual value.
 
     Raises:
         EffectError: for a parameter below its least value, such as a negative standard deviation.
@@ -176,6 +177,7 @@ class AbstractEffect(eqx.Module):
     rank: ClassVar[int] = 0
     alternative: ClassVar[str] = ""
     of_pairs: ClassVar[bool] = False
+    to_be_set: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self) -> None:
         require_limits(self, EffectError)

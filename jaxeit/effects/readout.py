@@ -196,6 +196,8 @@ class Noise(AbstractReadoutEffect):
     | std                                   | 1       | that of the stream   | set it          |
     """
 
+    to_be_set: ClassVar[tuple[str, ...]] = ("std",)
+
     std: Float[Array, ""] = parameter(1.0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
@@ -214,6 +216,8 @@ class PinkNoise(AbstractReadoutEffect):
     |------------------------------------------|---------|--------------------|--------|
     | amplitude: root of the density at 1 Hz   | 1       | that of the stream | set it |
     """
+
+    to_be_set: ClassVar[tuple[str, ...]] = ("amplitude",)
 
     amplitude: Float[Array, ""] = parameter(1.0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
@@ -243,6 +247,7 @@ class Quantisation(AbstractReadoutEffect):
     """
 
     rank: ClassVar[int] = 1  # after all effects that add to the signal
+    to_be_set: ClassVar[tuple[str, ...]] = ("step",)
 
     step: Float[Array, ""] = parameter(1.0)
     lowest: Float[Array, ""] = parameter(-jnp.inf, least=-jnp.inf)

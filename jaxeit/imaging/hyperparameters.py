@@ -131,7 +131,7 @@ class GeneralisedCrossValidation(AbstractFrameChoice):
         residual = _residuals(spectrum, filters, self.whitened(whiten))
         m = len(spectrum.squares)
         freedom = m - jnp.sum(spectrum.squares * filters, 1)
-        return float(tried[int(jnp.argmin(m * residual / freedom**2))])
+        return _within("cross-validation", tried, int(jnp.argmin(m * residual / freedom**2)))
 
 
 class LCurve(AbstractFrameChoice):
@@ -147,7 +147,18 @@ class LCurve(AbstractFrameChoice):
         (x1, z1), (x2, z2) = _slopes(x, z), _slopes(*_slopes(x, z))
         curvature = (x1 * z2 - x2 * z1) / np.maximum(x1**2 + z1**2, 1e-30) ** 1.5
         inner = slice(4, -4)  # the ends of the range have one-sided slopes
-        return float(tried[inner][int(np.argmax(curvature[inner]))])
+        return _within("L-curve", tried[inner], int(np.argmax(curvature[inner])))
+
+
+def _within(name: str, tried: np.ndarray, best: int) -> float:
+    """The best hyperparameter; refuses an end of the range, beyond which a better one may lie."""
+    if 0 < best < len(tried) - 1:
+        return float(tried[best])
+    why = "show no touch above their noise" if best else "hold no noise that the model does not explain"
+    raise HyperparameterError(
+        f"{name}: the best hyperparameter is the end of the range, {tried[best]:.2g}: the frames to choose by {why}; "
+        "give other frames, or a number such as 0.1"
+    )
 
 
 def _slopes(*curves: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -69,4 +69,14 @@ def read_effects(table: TomlTable) -> tuple[AbstractEffect, ...]:
         text = '[[effects]]\\ntype = "LoadSpreading"\\nwidth = 0.01'
         print(je.toml.parse_toml(text, "scene", je.model.read_effects))
     """
-    return tuple(map(EFFECTS.read, table.tables("effects")))
+    return tuple(map(_read_effect, table.tables("effects")))
+
+
+def _read_effect(table: TomlTable) -> AbstractEffect:
+    effect = EFFECTS.read(table)
+    for name in type(effect).to_be_set:
+        if not table.has(name):
+            raise table.error(
+                name, f"{type(effect).__name__} has no usual value of it; set it in the unit of its stream"
+            )
+    return effect

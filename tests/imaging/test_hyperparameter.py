@@ -7,6 +7,7 @@ import pytest
 import jaxeit as je
 from jaxeit.imaging.hyperparameters import Spectrum
 from jaxeit.imaging.methods import Problem
+from jaxeit.imaging.noise import noise_weight
 
 STD = 2e-6
 
@@ -119,6 +120,29 @@ def test_where_the_l_curve_stands_still_it_does_not_bend(coarse):
     problem = Problem(jacobian, jnp.array(2.0), jnp.array(1.0), je.Noser(), coarse.picture)
     spectrum = Spectrum(squares, jnp.eye(2, dtype=jnp.float32), jacobian.T, problem)
     assert je.imaging.LCurve(y).choose(spectrum, lambda y: y) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("choice", "squares", "y", "said"),
+    [
+        (je.imaging.GeneralisedCrossValidation, [1.0, 0.0], [0.0, 1.0], r"end of the range, 1e\+02: .* show no touch"),
+        (je.imaging.GeneralisedCrossValidation, [1.0, 0.0], [1.0, 0.0], r"end of the range, 0\.0001: .* hold no noise"),
+        (je.imaging.LCurve, [1.0, 0.0], [1.0, 1e-9], "L-curve: the best hyperparameter is the end of the range"),
+    ],
+)
+def test_an_end_of_the_range_is_no_choice(coarse, choice, squares, y, said):
+    """Readings that no image explains ask for ever more of the prior, those without noise for ever less."""
+    jacobian = jnp.zeros((2, coarse.size))
+    problem = Problem(jacobian, jnp.array(2.0), jnp.array(1.0), je.Noser(), coarse.picture)
+    spectrum = Spectrum(jnp.array(squares), jnp.eye(2), jacobian.T, problem)
+    with pytest.raises(je.imaging.HyperparameterError, match=said):
+        choice(jnp.array([y])).choose(spectrum, lambda y: y)
+
+
+@pytest.mark.parametrize("noise", [je.imaging.MeasuredNoise(), je.imaging.EqualNoise, je.effects.Noise()])
+def test_a_choice_of_noise_is_no_noise(noise):
+    with pytest.raises(je.imaging.InverseError, match=r"noise is .*; give the standard deviation of each reading, V"):
+        noise_weight(noise, 3, np.ones(3, bool))
 
 
 @pytest.mark.parametrize("choice", [je.imaging.GeneralisedCrossValidation, je.imaging.LCurve, je.imaging.Discrepancy])
