@@ -339,8 +339,8 @@ def noise_weight(noise: Any, readings: int, channels: np.ndarray) -> Any:
         return channels.astype(float)
     if isinstance(noise, type | eqx.Module):
         raise InverseError(
-            f"noise is {noise!r:.60}; give the standard deviation of each reading, V, or a choice such as MeasuredNoise() "
-            "to je.Imaging(noise=...), whose prepare(model, quiet=frames) measures it"
+            f"noise is {noise!r:.60}; give the standard deviation of each reading, V, or give a choice such as "
+            "MeasuredNoise() to je.Imaging(noise=...), whose prepare(model, quiet=frames) measures it"
         )
     library, known = (JAX, False) if is_traced(noise) else (NUMPY, True)
     noise = jnp.asarray(noise) if not known else np.asarray(noise, float)
