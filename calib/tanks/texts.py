@@ -94,8 +94,8 @@ def pyeidors_tank(path: Path, domain: Domain | None, rim: Sequence[AbstractElect
     electrodes = (3 + np.sqrt(9 + 4 * len(rows))) / 2
     if electrodes != int(electrodes) or electrodes < 4:
         raise TankError(
-            f"{path.name}: has {len(rows)} lines, which is no n (n - 3) for n electrodes of adjacent pairs; describe another "
-            "tank and its scan in a TOML file, and give that: --skin TANK.toml, in Python skin= (docs/tanks.md)"
+            f"{path.name}: has {len(rows)} lines, which is no n (n - 3) for n electrodes of adjacent pairs; describe "
+            "another tank and its scan in a TOML file, and give that: --skin TANK.toml, in Python skin= (docs/tanks.md)"
         )
     if rows.shape[1] % 2:
         raise TankError(f"{path.name}: lines have {rows.shape[1]} columns; two are needed a frame")
