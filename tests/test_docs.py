@@ -153,6 +153,19 @@ def test_words_of_other_packages_are_those_of_their_page(root, model, package, p
     assert functions - {"fmdl", "eit"} <= words.keys()  # objects of a user
 
 
+def test_programs_about_places_of_electrodes(root):
+    names = run(root / "docs" / "electrodes.md", {})
+    by_slope = 1e-3 * np.asarray(names["slopes"][:, 7, 0])
+    np.testing.assert_allclose(names["change"], by_slope, atol=0.1 * np.abs(by_slope).max())
+    assert names["wider"].nodes.shape == names["model"].nodes.shape
+
+
+def test_programs_about_proposals(root):
+    found = run(root / "docs" / "proposal.md", {})["found"]
+    assert found.kind is je.contacts.LoadKind.NONE
+    assert np.sum(found.probability) == pytest.approx(1)
+
+
 def test_programs_about_curves(root):
     names = run(root / "docs" / "fitting.md", {"calib": calib, "np": np})
     np.testing.assert_allclose(names["force"], 2e-3 * names["pressure"] ** 1.1, rtol=1e-5)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import calib
 from calib.session import SessionFacts, SessionWriter, StreamFacts
 
 from .record.test_recorder import both, journal
@@ -133,6 +134,30 @@ def test_programs_import_from_rooms_that_have_a_page(site):
     }
     assert imported > {"calib", "jaxeit"}
     assert imported <= {*CONTENTS, "calib.simulators.mujoco"}  # which needs MuJoCo
+
+
+def follow(page, names):
+    """The programs of a page, which go on from what is given."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    for program in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        exec(compile(program, page, "exec"), names)
+    return names
+
+
+@pytest.mark.slow
+def test_programs_of_pages_that_go_on_from_a_calibration(calibrated, tmp_path, monkeypatch):
+    calibration = calib.load_calibration("calibration.h5")
+    with calib.open_session("other.h5") as session:
+        moved = follow("a-week-later.md", {"calib": calib, "calibration": calibration, "session": session})["moved"]
+    assert np.isfinite(moved.recalibration.log_gain).all()
+    with calib.open_session("log.h5") as log, calib.open_session("later.h5") as later:
+        fitted, signal = calib.calibration.calibrate_logs([log]), later.streams["pressure"]
+        time, values = signal.time, signal.read()
+    monkeypatch.chdir(tmp_path)
+    fitted.save("calibration.h5")
+    found = follow("logs.md", {"calib": calib, "time": time, "values": values})["found"]
+    assert found.force.shape == found.valid.shape == time.shape
+    assert 9 < np.nanmax(found.force) < 12
 
 
 @pytest.mark.slow
