@@ -102,8 +102,9 @@ def sessions(tmp_path_factory):
 @pytest.fixture(scope="module")
 def calibrated(sessions):
     """The folder, with the calibrations of both sessions, from the command line."""
+    quick = ["--pixels", "20", "--fidelity", "draft"]
     for scan in SCANS:
-        assert main(["calibrate", str(sessions / f"{scan}.h5"), "-o", str(sessions / f"cal-{scan}.h5")]) == 0
+        assert main(["calibrate", str(sessions / f"{scan}.h5"), "-o", str(sessions / f"cal-{scan}.h5"), *quick]) == 0
     return sessions
 
 
