@@ -85,9 +85,11 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(scene, tmp_path_factory):
-    """Frames by the command, with two processes."""
-    path = tmp_path_factory.mktemp("frames") / "two"
-    assert main(["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(path), *WORDS, "--jobs", "2"]) == 0
+    """Frames by the command, in this process: others would import and compile everything anew."""
+    path = tmp_path_factory.mktemp("frames") / "here"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(random_frames, "spawned_pool", lambda jobs: Here())
+        assert main(["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(path), *WORDS]) == 0
     return path
 
 
@@ -101,10 +103,12 @@ def _bytes(folder):
 
 
 @pytest.mark.slow
-def test_one_process_after_an_interruption_gives_the_same_bytes(scene, folder, tmp_path, monkeypatch, capsys):
-    """After one of the first frames, and after one of frames that were to be added."""
-    out = tmp_path / "one"
+def test_one_process_after_an_interruption_gives_the_same_bytes(scene, tmp_path, monkeypatch, capsys):
+    """As two processes without; after one of the first frames, and after one of frames that were to be added."""
+    out, two = tmp_path / "one", tmp_path / "two"
     words = ["simulate", str(scene), "--random-scenes", str(FRAMES), "-o", str(out), *WORDS]
+    assert main([*words[:4], "-o", str(two), *WORDS, "--jobs", "2"]) == 0
+    capsys.readouterr()
     few = [*words[:3], "128", *words[4:]]
     pool = random_frames.spawned_pool
     monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here(ends_at=0))
@@ -122,14 +126,14 @@ def test_one_process_after_an_interruption_gives_the_same_bytes(scene, folder, t
         calib.open_training_frames(out)["contacts"]
     assert main(few) == 2
     assert "holds 129 frames; give as many or more" in capsys.readouterr().err
-    (out / "shard-000000.h5").write_bytes((folder / "shard-000000.h5").read_bytes()[:-1])  # not whole
+    (out / "shard-000000.h5").write_bytes((two / "shard-000000.h5").read_bytes()[:-1])  # not whole
     monkeypatch.setattr(random_frames, "spawned_pool", pool)
     assert main(words) == 0
     told = capsys.readouterr()
     assert f"{FRAMES:,} of them now" in told.out
     bound = float(re.search(r"at most ([\d.]+) MB", told.err)[1])
     assert 0.2 * bound < sum(path.stat().st_size for path in out.glob("*.h5")) / 1e6 < bound
-    assert _bytes(out) == _bytes(folder)
+    assert _bytes(out) == _bytes(two)
     assert main(words) == 0
     assert "all of them there before" in capsys.readouterr().out
 

@@ -14,7 +14,7 @@ from calib.cli.recipe_options import add_recipe_arguments, recipe_of
 from calib.fitting import CURVES, FIELDS, LOSSES
 from jaxeit.toml import TomlError
 
-from .test_calibration import QUICK, folder, grid  # noqa: F401  fixtures
+from .quick_bench import QUICK
 
 RECIPES = {
     "default": calib.Recipe(),
@@ -192,7 +192,7 @@ ITERATIVE = {
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "sparse Bayes")) for name in ITERATIVE]
 )
-def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, folder):  # noqa: F811
+def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, folder):
     imaging = ITERATIVE[name]
     with calib.open_session(grid) as session:
         made = calib.calibrate([session], recipe=replace(QUICK, imaging=imaging))
@@ -215,7 +215,7 @@ def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, 
 
 
 @pytest.mark.parametrize("noise", [je.imaging.MeasuredNoise(), je.imaging.CorrelatedNoise()], ids=["std", "cov"])
-def test_noise_is_measured_before_the_presses(noise, grid, folder):  # noqa: F811
+def test_noise_is_measured_before_the_presses(noise, grid, folder):
     """Of 1 uV, white, and steps of 1 uV."""
     imaging = je.Imaging(
         je.Pixels(14), noise=noise, hyperparameter=je.imaging.Discrepancy(factor=100.0)
@@ -234,7 +234,7 @@ def test_noise_is_measured_before_the_presses(noise, grid, folder):  # noqa: F81
     assert loaded.recipe.imaging == recipe.imaging
 
 
-def test_what_was_cut_one_way_is_evaluated_that_way(grid, folder):  # noqa: F811
+def test_what_was_cut_one_way_is_evaluated_that_way(grid, folder):
     processing = calib.presses.Processing(corrections=(calib.presses.LowPass(2.0),), baseline=calib.presses.PreOnly())
     with calib.open_session(grid) as session:
         made = calib.calibrate([session], recipe=replace(QUICK, processing=processing))

@@ -99,12 +99,25 @@ def sessions(tmp_path_factory):
     return folder
 
 
+def calibrate(sessions, name, *options):
+    """Calibrate both sessions from the command line, and return their folder."""
+    for scan in SCANS:
+        assert (
+            main(["calibrate", str(sessions / f"{scan}.h5"), "-o", str(sessions / f"{name}-{scan}.h5"), *options]) == 0
+        )
+    return sessions
+
+
 @pytest.fixture(scope="module")
 def calibrated(sessions):
-    """The folder, with the calibrations of both sessions, from the command line."""
-    for scan in SCANS:
-        assert main(["calibrate", str(sessions / f"{scan}.h5"), "-o", str(sessions / f"cal-{scan}.h5")]) == 0
-    return sessions
+    """The folder, with calibrations ``cal`` on coarse images."""
+    return calibrate(sessions, "cal", "--pixels", "20", "--fidelity", "draft")
+
+
+@pytest.fixture(scope="module")
+def finely_calibrated(sessions):
+    """The folder, with calibrations ``fine`` by the default recipe."""
+    return calibrate(sessions, "fine")
 
 
 def test_a_session_holds_the_scan(sessions):
@@ -190,17 +203,17 @@ def test_errors_of_forces_hold_the_noise_of_single_readings(calibrated):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [61, 62, 63])
 @pytest.mark.parametrize("scan", SCANS)
-def test_each_press_is_one_contact(calibrated, tmp_path, scan, seed):
+def test_each_press_is_one_contact(finely_calibrated, tmp_path, scan, seed):
     """Ten frames a second: between two frames of its onset the force of a press grows severalfold."""
     few = {"seed = 3": f"seed = {seed}", "columns = 6": "columns = 4", "rows = 6": "rows = 4", "[6.0, 12.0]": "[12.0]"}
-    text = SCENE.replace("SCAN.toml", str(calibrated / f"{scan}.toml"))
+    text = SCENE.replace("SCAN.toml", str(finely_calibrated / f"{scan}.toml"))
     for old, new in few.items():
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "scene.toml").write_text(text)
     session, output = tmp_path / "session.h5", tmp_path / "map.h5"
     assert main(["simulate", str(tmp_path / "scene.toml"), "-o", str(session)]) == 0
-    assert main(["apply", str(calibrated / f"cal-{scan}.h5"), str(session), "-o", str(output), "--track"]) == 0
+    assert main(["apply", str(finely_calibrated / f"fine-{scan}.h5"), str(session), "-o", str(output), "--track"]) == 0
     found = read_archive(output, "skin-forcemap").arrays
     with calib.open_session(session) as recorded:
         begin, end = recorded.presses.t_press, recorded.presses.t_release

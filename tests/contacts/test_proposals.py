@@ -16,7 +16,7 @@ from jaxeit.contacts.loads.proposal import KINDS, PARAMETERS, PROPOSALS, WEIGHTS
 from jaxeit.imaging import InverseError
 from jaxeit.skin import parse_skin, skin_hash
 
-from .test_loads import TOUCHES, ready  # noqa: F401  a fixture
+from .touches import TOUCHES
 
 READINGS, DIRECTIONS, PADS = 30, 6, 4
 
@@ -160,7 +160,7 @@ def proposed(kind, rows, distance=0.2):
 
 
 @pytest.mark.slow
-def test_a_fit_from_a_proposal_ends_where_a_search_does(ready):  # noqa: F811
+def test_a_fit_from_a_proposal_ends_where_a_search_does(ready):
     fitter, finder, frames, _ = ready
     _, (places, forces) = TOUCHES["two at 30 mm"]
     number = list(TOUCHES).index("two at 30 mm")
@@ -175,7 +175,7 @@ def test_a_fit_from_a_proposal_ends_where_a_search_does(ready):  # noqa: F811
     assert found.two.misfit == pytest.approx(float(searched.two.misfit), abs=0.02)
 
 
-def test_a_proposal_that_leads_astray_is_not_followed(ready, monkeypatch):  # noqa: F811
+def test_a_proposal_that_leads_astray_is_not_followed(ready, monkeypatch):
     """Neither outside of its scenes, nor where what it proposes explains nothing."""
     fitter, finder, frames, _ = ready
     contacts, search, calls = finder(frames[0]), Comparison.searched, []
@@ -193,7 +193,7 @@ def test_a_proposal_that_leads_astray_is_not_followed(ready, monkeypatch):  # no
     assert float(found.one.misfit) <= float(searched.one.misfit) + 1e-6
 
 
-def test_frames_without_a_search_and_without_contact(ready):  # noqa: F811
+def test_frames_without_a_search_and_without_contact(ready):
     """Outside of its scenes a frame is searched from all over the sheet, and noise is nothing."""
     fitter, _, frames, noise = ready
     far = proposed(LoadKind.ONE, [(np.array([0.1, 0.1]), 10.0)], distance=1.5)

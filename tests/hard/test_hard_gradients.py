@@ -7,7 +7,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from inspect import isclass
 from types import ModuleType, SimpleNamespace
 from typing import NamedTuple
@@ -504,14 +504,24 @@ def _marked(slow, names=tuple(CASES)):
     return [pytest.param(name, marks=pytest.mark.slow) if name in slow else name for name in names]
 
 
+@pytest.fixture(scope="module")
+def programs(tiny):
+    """The case of a name and its compiled program, which two tests call: each is traced once."""
+
+    def made(name):
+        case = CASES[name](tiny)
+        return case, jax.jit(_program(case))
+
+    return cache(made)
+
+
 # What methods have in common is tried with one of them.
 OTHERS = {name for name in CASES if name.startswith("prepare") and name.endswith(tuple(LINEAR))}
 
 
 @pytest.mark.parametrize("name", _marked(SLOW))
-def test_derivatives_are_right_and_finite(hard, tiny, name):
-    case = CASES[name](tiny)
-    program = jax.jit(_program(case))
+def test_derivatives_are_right_and_finite(hard, programs, name):
+    case, program = programs(name)
     worst = 0.0
     for x in case.smooth:
         along = jnp.where(x == 0, 1, jnp.abs(x) * jnp.asarray(np.random.default_rng(1).normal(size=x.size)))
@@ -534,13 +544,12 @@ def test_derivatives_are_right_and_finite(hard, tiny, name):
 @pytest.mark.parametrize(
     "name", _marked(set(CASES) - {"fuse", "Peak", "coefficient_of_variation"}, [n for n in CASES if n not in OTHERS])
 )
-def test_jit_vmap_and_plain_python_agree(tiny, name):
-    case = CASES[name](tiny)
+def test_jit_vmap_and_plain_python_agree(programs, name):
+    case, compiled = programs(name)
     points = [*case.smooth, *case.kinks]
     along = jnp.ones_like(points[0])
     program = _program(case)
     batch = jax.jit(jax.vmap(program, (0, None)))(jnp.stack(points), along)
-    compiled = jax.jit(program)
     for k, x in enumerate(points):
         alone = compiled(x, along)
         for found, expected in zip(batch, alone, strict=True):
