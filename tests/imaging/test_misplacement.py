@@ -21,18 +21,18 @@ def test_the_evidence_and_the_shifts_are_those_of_the_gaussian():
     rng = np.random.default_rng(3)
     coat, slopes, true = rng.normal(size=(40, 6)), rng.normal(size=(40, 4)) * 300, rng.normal(size=4) * 2e-3
     y = slopes @ true + 0.1 * coat @ rng.normal(size=6) + 0.2 * rng.normal(size=40)
-    surprise = []
+    gain = 30 * rng.normal(size=40)
+    strengths, along = np.linalg.eigh(coat @ coat.T)
+    seen, surprise = along.T @ np.column_stack([y, slopes, gain]), []
     for ratio in (0.1, 0.3):
-        still = np.eye(40) + ratio**2 * coat @ coat.T
-        root = np.linalg.cholesky(still)
-        white = np.linalg.solve(root, y), np.linalg.solve(root, slopes)
-        for belief in _beliefs(ratio, *white, float(np.log(np.diag(root)).sum())):
+        still = np.eye(40) + ratio**2 * coat @ coat.T + np.outer(gain, gain)
+        for belief in _beliefs(ratio, strengths, seen):
             whole = belief.error**2 * still + belief.size**2 * slopes @ slopes.T
             usual = 0.5 * (np.log(ratio * belief.error / USUAL_COAT) / COAT_SPREAD) ** 2
             surprise.append(belief.surprise - usual + multivariate_normal.logpdf(y, np.zeros(40), whole))
-            gain = belief.size**2 * slopes.T @ np.linalg.inv(whole)
-            np.testing.assert_allclose(belief.shift, gain @ y, atol=1e-12)
-            left = belief.size**2 * np.eye(4) - belief.size**2 * gain @ slopes
+            told = belief.size**2 * slopes.T @ np.linalg.inv(whole)
+            np.testing.assert_allclose(belief.shift, told @ y, atol=1e-12)
+            left = belief.size**2 * np.eye(4) - belief.size**2 * told @ slopes
             np.testing.assert_allclose(belief.variance, np.diag(left), atol=1e-15)
         assert 1e-3 < belief.size < 4e-3
         np.testing.assert_allclose(belief.shift, true, atol=3e-4)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.linalg import cholesky, solve_triangular, svd
+from scipy.linalg import eigh
 
 from ..._compile import require_known, verb
 from ...model.bases import Pixels
@@ -129,13 +129,14 @@ def _compared(
     by_shift: Float[np.ndarray, "n both"],
     by_gain: Float[np.ndarray, " n"],
 ) -> Misplacement:
-    """The more probable beliefs about readings y (n,) and their derivatives, all in errors of a good model."""
-    of_coat, of_gain = by_coat @ by_coat.T, np.outer(by_gain, by_gain)
-    beliefs: list[_Belief] = []
-    for ratio in COATS:
-        root = cholesky(np.eye(len(y)) + ratio**2 * of_coat + of_gain, lower=True)
-        white, slopes = (solve_triangular(root, part, lower=True) for part in (y, by_shift))
-        beliefs += _beliefs(ratio, white, slopes, float(np.log(np.diag(root)).sum()))
+    """The more probable beliefs about readings y (n,) and their derivatives, all in errors of a good model.
+
+    In the directions along which the coat moves the readings, its part of K is diagonal for every ratio c / e.
+    """
+    strengths, along = eigh(by_coat @ by_coat.T)
+    of_coat = np.maximum(strengths, 0)
+    seen = along.T @ np.column_stack([y, by_shift, by_gain])
+    beliefs = [belief for ratio in COATS for belief in _beliefs(ratio, of_coat, seen)]
     unshifted, shifted = (min(beliefs[k::2], key=lambda belief: belief.surprise) for k in (0, 1))
     parts = (
         shifted.size,
@@ -158,26 +159,44 @@ class _Belief(NamedTuple):
     variance: np.ndarray
 
 
+def _whitened(
+    ratio: float, of_coat: Float[np.ndarray, " n"], seen: Float[np.ndarray, "n both_and_2"]
+) -> tuple[np.ndarray, float]:
+    """Readings and slopes of shifts with the covariance one, and half of the log determinant that makes them so."""
+    variance = 1 + ratio**2 * of_coat
+    white = seen / np.sqrt(variance)[:, None]
+    others, gain = white[:, :-1], white[:, -1]
+    square = gain @ gain
+    lost = (1 - 1 / np.sqrt(1 + square)) / square  # (I + g g')^(-1/2) = I - lost g g'
+    return others - np.outer(gain, lost * (gain @ others)), 0.5 * float(np.log(variance).sum() + np.log1p(square))
+
+
 def _beliefs(
-    ratio: float, y: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n both"], root: float
+    ratio: float, of_coat: Float[np.ndarray, " n"], seen: Float[np.ndarray, "n both_and_2"]
 ) -> tuple[_Belief, _Belief]:
     """The belief without shifts, and that with the most probable size of shifts, for one ratio of coat to errors.
 
-    The singular values of the whitened slopes serve all sizes; that of the errors is known in closed form.
+    The principal axes of the whitened slopes serve all sizes; the size of the errors is known in closed form.
+
+    Args:
+        of_coat: variance of the readings by a coat of deviation one, in errors.
+        seen: readings, their derivatives by shifts, and what the common gain moves, a column each.
     """
-    left, values, right = svd(slopes, full_matrices=False)
-    along = left.T @ y
-    seen = (SHIFTS[:, None] * values) ** 2
-    square = y @ y - (seen / (1 + seen)) @ along**2
+    white, root = _whitened(ratio, of_coat, seen)
+    y, slopes = white[:, 0], white[:, 1:]
+    squares, axes = eigh(slopes.T @ slopes)
+    squares, towards = np.maximum(squares, 0), axes.T @ (slopes.T @ y)
+    told = SHIFTS[:, None] ** 2 * squares
+    square = y @ y - (SHIFTS[:, None] ** 2 / (1 + told)) @ towards**2
     error = np.sqrt(np.maximum(square / len(y), LEAST_ERROR**2))
-    surprise = len(y) * np.log(error) + 0.5 * (square / error**2 + np.log1p(seen).sum(1)) + root
+    surprise = len(y) * np.log(error) + 0.5 * (square / error**2 + np.log1p(told).sum(1)) + root
     surprise += 0.5 * (np.log(ratio * error / USUAL_COAT) / COAT_SPREAD) ** 2
     size = SHIFTS * error
     surprise = np.where((ratio * error > MOST_COAT) | (size > MOST_SHIFT), np.inf, surprise)
 
     def belief(k: int) -> _Belief:
-        part = seen[k] / (1 + seen[k])
-        shift = right.T @ (part / values * along)
-        return _Belief(surprise[k], size[k], error[k], shift, size[k] ** 2 * (1 - part @ right**2))
+        left = 1 / (1 + told[k])
+        shift = axes @ (SHIFTS[k] ** 2 * left * towards)
+        return _Belief(surprise[k], size[k], error[k], shift, size[k] ** 2 * (axes**2 @ left))
 
     return belief(0), belief(int(np.argmin(surprise)))
