@@ -11,7 +11,7 @@ import numpy as np
 import jaxeit as je
 
 from ..check.acceptance import accept
-from ..check.placement import placement_note
+from ..check.placement import FIDELITY, placement_note
 from ..fitting.fields import single_places
 from ..fitting.neighbourhoods import with_error_scale
 from ..fitting.pads import PadModel
@@ -137,7 +137,7 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         evaluation=_held_out_evaluation(found),
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=(*ignored, *_notes(found)),
+        notes=(*ignored, *_notes(found, recipe.fidelity)),
         field=model.field,
         crosstalk=presses.crosstalk,
         noise=found.held_out.noise,
@@ -155,13 +155,14 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
     )
 
 
-def _notes(found: _Found) -> tuple[str, ...]:
-    """What the operator should know of the stages."""
+def _notes(found: _Found, fidelity: je.Fidelity) -> tuple[str, ...]:
+    """What the operator should know of the stages; their model has this fidelity."""
     presses, choice = found.presses, found.response.choice
+    model = found.imager.model if fidelity == FIDELITY else None
     return (
         *presses.notes,
         *([found.placed.note] if found.placed else []),
-        *filter(None, [placement_note(found.skin, presses.untouched, presses.channels)]),
+        *filter(None, [placement_note(found.skin, presses.untouched, presses.channels, model)]),
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
         *found.imager.notes,

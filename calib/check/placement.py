@@ -36,16 +36,20 @@ REMEDY = (
 
 
 def placement_finding(
-    skin: je.Skin, untouched: Float[np.ndarray, " readings"], used: Bool[np.ndarray, " readings"]
+    skin: je.Skin,
+    untouched: Float[np.ndarray, " readings"],
+    used: Bool[np.ndarray, " readings"],
+    model: je.Model | None = None,
 ) -> Finding | None:
     """What is to be said of the places of the electrodes; None: nothing, or they cannot be told.
 
     Args:
         untouched: mean frame without contact, V.
         used: which of its readings are used.
+        model: of the skin at `FIDELITY`, where there is one already.
     """
     try:
-        model = je.discretise(je.Scene(skin), FIDELITY)
+        model = je.discretise(je.Scene(skin), FIDELITY) if model is None else model
         found = find_misplacement(model, np.where(used, untouched, np.nan))
     except (InverseError, MotionError):
         return None
@@ -61,10 +65,13 @@ def placement_finding(
 
 
 def placement_note(
-    skin: je.Skin, untouched: Float[np.ndarray, " readings"], used: Bool[np.ndarray, " readings"]
+    skin: je.Skin,
+    untouched: Float[np.ndarray, " readings"],
+    used: Bool[np.ndarray, " readings"],
+    model: je.Model | None = None,
 ) -> str:
     """`placement_finding` in one line; empty for nothing."""
-    found = placement_finding(skin, untouched, used)
+    found = placement_finding(skin, untouched, used, model)
     return "" if found is None else f"{NOTE}{found.what}: {found.remedy}"
 
 

@@ -42,12 +42,14 @@ class Imager:
     | masks: which pad carries which pixel                                 |
     | locator: estimator of places; None: no place is needed               |
     | notes: remarks for the reader of the results                         |
+    | model: from which it was prepared; None: loaded from a calibration   |
     """
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
     masks: je.PadMasks
     locator: AbstractLocator | None = None
     notes: tuple[str, ...] = ()
+    model: je.Model | None = None
 
     def presses(self, dv: np.ndarray) -> PressImages:
         """Images of presses (presses, readings) V, each of which holds one contact."""
@@ -79,7 +81,7 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
     )
     masks = je.pad_masks(skin, recon)
     locator = recipe.locator.prepare(model, presses.noise, presses.channels, sigma) if recipe.locates else None
-    return Imager(recon, masks, locator, notes)
+    return Imager(recon, masks, locator, notes, model)
 
 
 def fit_untouched_sheet(
