@@ -3,14 +3,25 @@
 import argparse
 import difflib
 import re
+import textwrap
 from collections.abc import Iterator, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
+
+
+class _WholeNames(argparse.HelpFormatter):
+    """Lines that end between words: names of options and choices hold hyphens, and are to be copied."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
 
 
 class CommandParser(argparse.ArgumentParser):
     """The parser of one command. ``words`` is the command line, for a command whose arguments depend on it."""
 
     words: Sequence[str] = ()
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**{"formatter_class": _WholeNames, **settings})
 
     def error(self, message: str) -> NoReturn:
         """End with exit status 2, and one line in place of the usage, which may be longer than the screen."""
