@@ -1,6 +1,7 @@
 """Fields of gain over the place pressed: geometry, closed forms, recovery, honesty, and the fit beside the curves."""
 
 from dataclasses import fields, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from calib.fitting.fields import (
     GaussianProcess,
     PadEdge,
     PadEdgeSize,
+    PadEdgeSpline,
     Places,
     RadialBasis,
     fit_field,
@@ -72,23 +74,35 @@ def dip(skin, place):
 # --- geometry --------------------------------------------------------------------------------------------------------
 
 
-def test_edge_features_are_distances_to_sides_and_rim(skin, geometry):
+@pytest.mark.parametrize("field", [PadEdge(), PadEdgeSpline(), PadEdgeSpline(bumps=7, steps=3, order=2)])
+def test_edge_features_are_distances_to_sides_and_rim(skin, geometry, field):
     place = grid(7)
     inside = np.eye(4, dtype=bool)[owner(place)]
-    features = np.asarray(features_of(PadEdge(), geometry, single_places(place, 4)))[inside]
+    features = np.asarray(features_of(field, geometry, single_places(place, 4)))[inside]
     x, y = place.T
-    sides = sum(near(d, 8e-3, 4) for d in (x % 0.1, 0.1 - x % 0.1, y % 0.1, 0.1 - y % 0.1))
-    rim = near(skin.domain.boundary_distance(place), 8e-3, 4)
-    corner = (rim * near(np.sort([x, 0.2 - x, y, 0.2 - y], 0)[1], 8e-3, 4))[:, :3]
-    np.testing.assert_allclose(features, np.concatenate([sides, rim, corner], 1), rtol=1e-9, atol=1e-12)
-    early = np.asarray(features_of(PadEdge(corners=False), geometry, single_places(place, 4)))[inside]
-    np.testing.assert_array_equal(early, features[:, :8])
+    one = partial(near, field=field)
+    sides = sum(map(one, (x % 0.1, 0.1 - x % 0.1, y % 0.1, 0.1 - y % 0.1)))
+    rim = one(skin.domain.boundary_distance(place))
+    corner = (rim * one(np.sort([x, 0.2 - x, y, 0.2 - y], 0)[1]))[:, :-1]
+    expected = np.concatenate([summed(part, field.order) for part in (sides, rim, corner)], 1)
+    np.testing.assert_allclose(features, expected, rtol=1e-9, atol=1e-12)
+    few = np.asarray(features_of(replace(field, corners=False), geometry, single_places(place, 4)))[inside]
+    np.testing.assert_array_equal(few, features[:, : 2 * field.bumps])
 
 
-def near(distance, width, bumps):
-    """Cubic B-splines by SciPy, (n, bumps), one octave of distance apart."""
+def near(distance, field):
+    """Cubic B-splines by SciPy, (n, bumps), at steps of octaves of distance."""
     bump = BSpline.basis_element(np.arange(-2.0, 3), extrapolate=False)
-    return np.nan_to_num(bump(np.log2(1 + distance / width)[:, None] - np.arange(bumps)))
+    place = field.steps * np.log2(1 + distance / float(field.width)) + (field.order > 0)
+    return np.nan_to_num(bump(place[:, None] - np.arange(field.bumps)))
+
+
+def summed(parts, order):
+    """Functions of coefficients that are sums of sums of independent steps, of mean variance one at the bumps."""
+    each = np.eye(parts.shape[1])
+    for _ in range(order):
+        each = each[::-1].cumsum(0)[::-1]
+    return parts @ each / np.sqrt((each**2).sum(1).mean())
 
 
 def test_a_place_beside_a_pad_counts_as_its_nearest_edge(geometry):
@@ -102,11 +116,12 @@ def test_pads_with_fewer_corners_and_round_sheets(skin):
     round_sheet = je.Disc(0.1)
     odd = je.Skin("odd", round_sheet, 1.0, skin.electrodes, skin.protocol, (skin.pads[3], triangle))
     point = np.array([[0.05, 0.04]])
-    features = np.asarray(features_of(PadEdge(0.01, bumps=1), geometry_of(odd), single_places(point, 2)))[0, 1]
+    field = PadEdge(0.01, bumps=1)
+    features = np.asarray(features_of(field, geometry_of(odd), single_places(point, 2)))[0, 1]
     sides = np.roll(triangle.outline, -1, 0) - triangle.outline
     normal = np.stack([-sides[:, 1], sides[:, 0]], 1) / np.linalg.norm(sides, axis=1)[:, None]
-    assert features[0] == pytest.approx(near(((point - triangle.outline) * normal).sum(1), 0.01, 1).sum(), rel=1e-9)
-    assert features[1] == pytest.approx(near(round_sheet.boundary_distance(point), 0.01, 1)[0, 0], rel=2e-2)
+    assert features[0] == pytest.approx(near(((point - triangle.outline) * normal).sum(1), field).sum(), rel=1e-9)
+    assert features[1] == pytest.approx(near(round_sheet.boundary_distance(point), field)[0, 0], rel=2e-2)
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -162,6 +177,22 @@ def test_a_known_field_is_found_whatever_the_levels_of_the_pads(skin, fitted):
     assert np.sqrt(np.mean((own - dip(skin, place)) ** 2)) < 0.04 < 0.5 * dip(skin, place).std() + 0.005
     np.testing.assert_allclose([own[owner(place) == p].mean() for p in range(4)], 0, atol=1e-12)
     assert 0.02 < float(found.noise) < 0.5 * float(found.spread)  # corners are not quite sums of their sides
+
+
+def test_a_spline_of_distance_follows_a_dip_more_closely(skin, geometry):
+    """Between the places of the presses, by three sets of 100."""
+    new, errors = jittered(200, 9), []
+    for seed in (21, 22, 23):
+        place = jittered(100, seed)
+        log_ratio = dip(skin, place) + np.random.default_rng(seed).normal(0, 0.01, len(place))
+        rows = press_rows(place, log_ratio)
+        fits = [fit(field, geometry, single_places(place, 4), *rows) for field in (PadEdge(), PadEdgeSpline())]
+        found = np.array([np.asarray(log_gain(one, single_places(new, 4)).mean) for one in fits])
+        left = found[:, np.arange(len(new)), owner(new)] - dip(skin, new)
+        left -= [[left[k][owner(new) == pad].mean() for pad in owner(new)] for k in range(2)]  # levels are the curves'
+        errors.append(np.sqrt((left**2).mean(1)))
+    edge, spline = np.mean(errors, 0)
+    assert spline < 0.9 * edge
 
 
 def test_coefficients_are_those_of_every_prior_weighed_by_its_evidence(geometry):
@@ -308,19 +339,20 @@ def test_many_fits_mapped_wait_for_no_thread(geometry, field):
     assert not spread_stacks(jax.jit(jax.vmap(one)).lower(many).as_text())
 
 
-def test_pulls_and_intervals_over_many_simulated_fits(skin, geometry):
+@pytest.mark.parametrize("field", [PadEdge(), PadEdgeSpline()], ids=lambda f: f.name)
+def test_pulls_and_intervals_over_many_simulated_fits(skin, geometry, field):
     """1,000 sessions in one compiled call: pulls of mean 0 and deviation 1, and 90 % intervals that cover 90 %."""
     trials, place = 1000, jittered(64, 2)
-    truth = np.random.default_rng(3).normal(0, 0.3, (trials, PadEdge().size(4)))
-    features = np.asarray(features_of(PadEdge(), geometry, single_places(place, 4)))
+    truth = np.random.default_rng(3).normal(0, 0.3, (trials, field.size(4)))
+    features = np.asarray(features_of(field, geometry, single_places(place, 4)))
     own = np.arange(len(place)), owner(place)
     new = jittered(8, 4)
-    at = np.asarray(features_of(PadEdge(), geometry, single_places(new, 4)))[np.arange(8), owner(new)]
+    at = np.asarray(features_of(field, geometry, single_places(new, 4)))[np.arange(8), owner(new)]
     noise = np.random.default_rng(5).normal(0, 0.03, (trials, len(place)))
     rows = press_rows(place, truth @ features[own].T + noise)
 
     def one(log_ratio):
-        found = fit_field(PadEdge(), geometry, single_places(place, 4), log_ratio, *rows[1:])
+        found = fit_field(field, geometry, single_places(place, 4), log_ratio, *rows[1:])
         mean, variance = found.log_gain(single_places(new, 4))
         return mean[np.arange(8), owner(new)], variance[np.arange(8), owner(new)], found.centre, found.result
 

@@ -80,7 +80,7 @@ def location_in_c(calibration: Calibration) -> LocationInC:
         raise ExportError(
             "location: this calibration places contacts by fits, which are not exported; add --place half, which takes "
             "the place from the image and says what that changes, or calibrate with --locator image-centroid first, "
-            "whose forces are then more accurate (docs/firmware.md)"
+            "whose forces are then more accurate, or export with --without-location (docs/firmware.md)"
         )
     name = FIELDS.name_of(fitted.field)
     if name not in FORMULAS:
@@ -129,39 +129,39 @@ def _constant(fitted: FittedField) -> FieldInC:
 def _edge(fitted: FittedField) -> FieldInC:
     """Without the size of `edge-size`: an image does not tell the width, and such a feature counts as its mean."""
     edge = cast(PadEdge, fitted.field)
-    bumps, pairs = edge.bumps, edge.bumps - 1 if edge.corners else 0
-    formula = (
-        f"B-splines of the distance to the sides of the pad and to the rim, over octaves of {float(edge.width):g} m"
-    )
+    bumps, pairs, width = edge.bumps, edge.pairs, float(edge.width)
+    formula = f"B-splines of the distance to the sides of the pad and to the rim, over octaves of {width:g} m"
     operations = (15 + 8 * bumps) * fitted.geometry.start.shape[1] + 15 * len(fitted.geometry.rim) + 24 * bumps
-    last = 2 * bumps + pairs
-    return FieldInC(formula, _by_pad(fitted, last), _edge_body(bumps, pairs, _literal(float(edge.width))), operations)
+    *independent, level = np.split(_by_pad(fitted, 2 * bumps + pairs), [bumps, 2 * bumps, 2 * bumps + pairs], 1)
+    rows = [part @ edge.smooth(part.shape[1]).T for part in independent]
+    return FieldInC(formula, np.hstack([*rows, level]), _edge_body(edge), operations)
 
 
-def _edge_body(bumps: int, pairs: int, scale: str) -> tuple[str, ...]:
-    """The log of the gain in C, of so many bumps over octaves of a distance, and pairs of them at corners."""
-    last = 2 * bumps + pairs
+def _edge_body(edge: PadEdge) -> tuple[str, ...]:
+    """The log of the gain in C: of bumps over octaves of a distance, and pairs of them at corners."""
+    bumps, pairs, first = edge.bumps, edge.pairs, f" + {_literal(-edge.first)}" if edge.first else ""
+    place = f"{_literal(edge.steps)} * log2f(1.0f + sqrtf({{}}) / {_literal(float(edge.width))}){first}"
     corners = (
         f"for (uint32_t k = 0; k < {pairs}; k++)",
         f"    log_gain += b[{2 * bumps} + k] * skin_bspline(nearest - (float)k) * skin_bspline(second - (float)k);",
     )
     return (
-        f"float log_gain = -b[{last}], nearest = INFINITY, second = INFINITY;",
+        f"float log_gain = -b[{2 * bumps + pairs}], nearest = INFINITY, second = INFINITY;",
         "for (uint32_t s = 0; s < SKIN_SIDES; s++) {",
         "    const float *side = skin_side[pad][s];",
-        f"    const float octave = log2f(1.0f + sqrtf(skin_square(side, x, y, 0)) / {scale});",
+        f"    const float place = {place.format('skin_square(side, x, y, 0)')};",
         "    if (side[0] == side[2] && side[1] == side[3])",
         "        continue;",
         f"    for (uint32_t k = 0; k < {bumps}; k++)",
-        "        log_gain += b[k] * skin_bspline(octave - (float)k);",
+        "        log_gain += b[k] * skin_bspline(place - (float)k);",
         "}",
         "for (uint32_t s = 0; s < SKIN_RIM; s++) {",
         "    const float square = skin_square(skin_rim[s], x, y, 0);",
         "    second = fminf(second, fmaxf(nearest, square));",
         "    nearest = fminf(nearest, square);",
         "}",
-        f"nearest = log2f(1.0f + sqrtf(nearest) / {scale});",
-        f"second = log2f(1.0f + sqrtf(second) / {scale});",
+        f"nearest = {place.format('nearest')};",
+        f"second = {place.format('second')};",
         f"for (uint32_t k = 0; k < {bumps}; k++)",
         f"    log_gain += b[{bumps} + k] * skin_bspline(nearest - (float)k);",
         *(corners if pairs else ()),
@@ -215,6 +215,7 @@ FORMULAS: dict[str, Callable[[FittedField], FieldInC]] = {
     "constant": _constant,
     "edge": _edge,
     "edge-size": _edge,
+    "edge-spline": _edge,
     "bilinear": _product("nodes over the pad, bilinear", "fmaxf(1.0f - fabsf(z), 0.0f)", _nodes(0)),
     "rbf": _product("Gaussian bumps over the pad", "expf(-0.5f * z * z)", _nodes(0)),
     "spline": _product("cubic B-splines over the pad", "skin_bspline(z)", _nodes(1)),

@@ -11,7 +11,7 @@ from .constant import Constant
 from .fit import fit_field
 from .fitted import FittedField, log_gain
 from .geometry import Geometry, geometry_of
-from .pad_edge import PadEdge, PadEdgeSize
+from .pad_edge import PadEdge, PadEdgeSize, PadEdgeSpline
 from .places import Places, single_places
 from .tensor_products import Bilinear, GaussianProcess, RadialBasis, TensorSpline
 
@@ -31,6 +31,7 @@ __all__ = [
     "Geometry",
     "PadEdge",
     "PadEdgeSize",
+    "PadEdgeSpline",
     "Places",
     "RadialBasis",
     "TensorSpline",
