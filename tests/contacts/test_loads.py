@@ -198,8 +198,8 @@ def test_a_gain_that_is_known_places_loads_where_they_are(ready):
                 [np.linalg.norm(each.of(kind).position[:, None] - places, axis=-1).min(0).max() for each in found]
             )
     before, after = np.array(away).T
-    assert after.max() < 0.8e-3
-    assert after.mean() < 0.6 * before.mean()
+    assert after.max() < 0.9e-3  # 0.79 or 0.80 mm, as processors round
+    assert after.mean() < min(0.55e-3, 0.6 * before.mean())
 
 
 def test_fields_that_are_not_known_have_their_size_and_length():

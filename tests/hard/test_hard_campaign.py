@@ -32,7 +32,7 @@ def judged(found, count):
 
 
 def test_some_lies(root):
-    judged(campaign(20, 1, root, 100), 20)
+    judged(campaign(20, 1, root, 600), 20)
 
 
 @pytest.mark.slow
