@@ -23,6 +23,7 @@ from ..fitting.response import (
     hold_out_response,
     require_every_pad_pressed,
 )
+from ..fitting.unpressed_walls import unpressed_note
 from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
@@ -98,7 +99,10 @@ def _one_skin(sessions: Sequence[Session]) -> je.Skin:
 
 
 class _Found(NamedTuple):
-    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`."""
+    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`.
+
+    ``unpressed``: a remark on distances to walls without presses, or nothing.
+    """
 
     skin: je.Skin
     placed: PlacedElectrodes | None
@@ -107,6 +111,7 @@ class _Found(NamedTuple):
     images: PressImages
     response: PadResponse
     held_out: HeldOutForces
+    unpressed: str
 
 
 def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Callable[[str], object]) -> _Found:
@@ -123,7 +128,8 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
     progress("holding out")
     true_position = presses.position if presses.true_place else None
     held_out = hold_out_response(folds, response, presses.groups, images.integral, true_position)
-    return _Found(skin, placed, presses, imager, images, response, held_out)
+    unpressed = unpressed_note(response.model.field, folds.presses)
+    return _Found(skin, placed, presses, imager, images, response, held_out, unpressed)
 
 
 def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
@@ -165,6 +171,7 @@ def _notes(found: _Found, fidelity: je.Fidelity) -> tuple[str, ...]:
         *filter(None, [placement_note(found.skin, presses.untouched, presses.channels, model)]),
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
+        *filter(None, [found.unpressed]),
         *found.imager.notes,
     )
 

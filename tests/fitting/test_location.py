@@ -1,7 +1,9 @@
 """Fields of gain over the place pressed: geometry, closed forms, recovery, honesty, and the fit beside the curves."""
 
+import re
 from dataclasses import fields, replace
 from functools import partial
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -36,6 +38,7 @@ from calib.fitting.losses import SoftL1
 from calib.fitting.pads import LocatedPresses, fit_pads
 from calib.fitting.results import FitResult
 from calib.fitting.selection import choose
+from calib.fitting.unpressed_walls import unpressed_note
 from calib.presses.pooled import PressData, PressSeries, thinned
 
 from ..helpers import spread_stacks
@@ -313,6 +316,18 @@ def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geo
     free = eqx.tree_at(lambda f: f.reach, found, jnp.array([[[0.0, 0.0], [0.2, 0.2]]] * 4))
     if not corners:  # so that the bound matters here
         assert abs(log_gain(free, border).mean[0, 0]) > 1  # what the coefficients alone would say
+
+
+@pytest.mark.parametrize(("place", "told"), [(grid(12), "10 to 25 mm"), (jittered(64, 5), ""), (grid(2), "")])
+def test_distances_to_walls_without_presses_are_told(skin, geometry, place, told):
+    share = np.eye(4)[owner(place)]
+    presses = LocatedPresses(SimpleNamespace(share=share), geometry, single_places(place, 4))
+    field = fit(PadEdge(), geometry, presses.places, *press_rows(place, dip(skin, place)))
+    note = unpressed_note(field, presses)
+    assert re.search(told, note) if told else not note
+    other = fit(RadialBasis(), geometry, presses.places, *press_rows(place, dip(skin, place)))
+    assert not unpressed_note(other, presses)
+    assert not unpressed_note(None, presses)
 
 
 def test_two_contacts_on_one_pad_share_its_gain_by_their_weights(fitted):
