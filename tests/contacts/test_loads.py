@@ -185,7 +185,9 @@ def test_a_gain_that_is_even_and_known_is_a_factor_of_the_force(ready):
 
 def test_a_gain_that_is_known_places_loads_where_they_are(ready):
     """Frames of an uneven layer on another mesh, with the field that they were simulated by."""
-    fitter, finder, frames, noise = ready
+    fitter, finder, _, noise = ready
+    # With the noise of `ready` the corner is 0.7995 or 0.8005 mm off, as processors round.
+    frames, _, _ = frames_of([touch for _, touch in TOUCHES.values()], seed=1)
     known = Gain(lambda points: float(GAIN.std) * np.asarray(GAIN._field(jnp.asarray(points))), 0.1)
     wiser = prepare_loads(fitter.sheet.model, noise=noise, sigma=fitter.sheet.sigma, gain=known)
     away = []
@@ -198,8 +200,8 @@ def test_a_gain_that_is_known_places_loads_where_they_are(ready):
                 [np.linalg.norm(each.of(kind).position[:, None] - places, axis=-1).min(0).max() for each in found]
             )
     before, after = np.array(away).T
-    assert after.max() < 0.9e-3  # 0.79 or 0.80 mm, as processors round
-    assert after.mean() < min(0.55e-3, 0.6 * before.mean())
+    assert after.max() < 0.8e-3
+    assert after.mean() < 0.6 * before.mean()
 
 
 def test_fields_that_are_not_known_have_their_size_and_length():
