@@ -78,9 +78,9 @@ def location_in_c(calibration: Calibration) -> LocationInC:
     assert fitted is not None
     if not isinstance(locator, CentroidLocator):
         raise ExportError(
-            "location: this calibration places contacts by fits, which are not exported; add --place half, which takes "
-            "the place from the image and says what that changes, or calibrate with --locator image-centroid first, "
-            "whose forces are then more accurate, or export with --without-location (docs/firmware.md)"
+            "location: contacts are fitted to each frame, which is not exported; calibrate with --locator "
+            "image-centroid, or add --place half, which takes the place from the image and says what that changes, or "
+            "--without-location (docs/firmware.md)"
         )
     name = FIELDS.name_of(fitted.field)
     if name not in FORMULAS:
