@@ -99,10 +99,7 @@ def _one_skin(sessions: Sequence[Session]) -> je.Skin:
 
 
 class _Found(NamedTuple):
-    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`.
-
-    ``unpressed``: a remark on distances to walls without presses, or nothing.
-    """
+    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`."""
 
     skin: je.Skin
     placed: PlacedElectrodes | None
@@ -111,7 +108,6 @@ class _Found(NamedTuple):
     images: PressImages
     response: PadResponse
     held_out: HeldOutForces
-    unpressed: str
 
 
 def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Callable[[str], object]) -> _Found:
@@ -128,8 +124,7 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
     progress("holding out")
     true_position = presses.position if presses.true_place else None
     held_out = hold_out_response(folds, response, presses.groups, images.integral, true_position)
-    unpressed = unpressed_note(response.model.field, folds.presses)
-    return _Found(skin, placed, presses, imager, images, response, held_out, unpressed)
+    return _Found(skin, placed, presses, imager, images, response, held_out)
 
 
 def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
@@ -164,6 +159,7 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
 def _notes(found: _Found, fidelity: je.Fidelity) -> tuple[str, ...]:
     """What the operator should know of the stages; their model has this fidelity."""
     presses, choice = found.presses, found.response.choice
+    unpressed = unpressed_note(found.response.model.field, found.images.places, presses.data.share)
     model = found.imager.model if fidelity == FIDELITY else None
     return (
         *presses.notes,
@@ -171,7 +167,7 @@ def _notes(found: _Found, fidelity: je.Fidelity) -> tuple[str, ...]:
         *filter(None, [placement_note(found.skin, presses.untouched, presses.channels, model)]),
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
-        *filter(None, [found.unpressed]),
+        *filter(None, [unpressed]),
         *found.imager.notes,
     )
 

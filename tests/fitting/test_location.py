@@ -3,7 +3,6 @@
 import re
 from dataclasses import fields, replace
 from functools import partial
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -320,14 +319,12 @@ def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geo
 
 @pytest.mark.parametrize(("place", "told"), [(grid(12), "10 to 25 mm"), (jittered(64, 5), ""), (grid(2), "")])
 def test_distances_to_walls_without_presses_are_told(skin, geometry, place, told):
-    share = np.eye(4)[owner(place)]
-    presses = LocatedPresses(SimpleNamespace(share=share), geometry, single_places(place, 4))
-    field = fit(PadEdge(), geometry, presses.places, *press_rows(place, dip(skin, place)))
-    note = unpressed_note(field, presses)
+    share, places = np.eye(4)[owner(place)], single_places(place, 4)
+    note = unpressed_note(fit(PadEdge(), geometry, places, *press_rows(place, dip(skin, place))), places, share)
     assert re.search(told, note) if told else not note
-    other = fit(RadialBasis(), geometry, presses.places, *press_rows(place, dip(skin, place)))
-    assert not unpressed_note(other, presses)
-    assert not unpressed_note(None, presses)
+    other = fit(RadialBasis(), geometry, places, *press_rows(place, dip(skin, place)))
+    assert not unpressed_note(other, places, share)
+    assert not unpressed_note(None, places, share)
 
 
 def test_two_contacts_on_one_pad_share_its_gain_by_their_weights(fitted):

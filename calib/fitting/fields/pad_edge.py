@@ -19,8 +19,8 @@ class PadEdge(AbstractField):
     """Distance to the walls: a pad is stiff at its sides, and the part of a load beyond the rim of the sheet is lost.
 
     The field is a sum of functions of distance: to each side of the pad, and to the nearest side of the rim; and, with
-    `corners`, a sum of products of bumps of the distances to the two nearest sides of the rim, all but
-    the farthest, because a load at a corner of the sheet is lost beyond two sides, which counts neither once nor twice.
+    `corners`, a sum of products of bumps of the distances to the two nearest sides of the rim, all but the farthest,
+    because a load at a corner of the sheet is lost beyond two sides, which counts neither once nor twice.
     Functions are sums of cubic B-splines over octaves of distance, the n-th centred where the distance is
     (2^(n / `steps`) - 1) `width` (m). Walls are alike, so that all pads share the coefficients, and a few dozen presses
     suffice. A coefficient without presses at its distance keeps its prior. With ``order=0`` coefficients are
@@ -65,7 +65,8 @@ class PadEdge(AbstractField):
     def smooth(self, bumps: int) -> Float[np.ndarray, "bumps bumps"]:
         """Coefficients of so many bumps for each independent one, with prior variances of one on average."""
         summed = np.linalg.matrix_power(np.triu(np.ones((bumps, bumps))), self.order)
-        return summed / np.sqrt(np.sum(summed**2) / max(bumps, 1)) if bumps else summed
+        found: np.ndarray = summed / np.sqrt(np.sum(summed**2) / max(bumps, 1))
+        return found
 
     def _bumps(self, metres: Float[Array, "..."]) -> Float[Array, "... bumps"]:
         octaves = jnp.log2(1 + metres / self.width.astype(metres.dtype))
