@@ -17,7 +17,7 @@ from jax.core import Tracer, eval_context
 from jax.custom_batching import custom_vmap
 from jax.extend.backend import backends
 from jax.extend.core import get_opaque_trace_state
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 from threadpoolctl import threadpool_limits
 
 from .program_cache import changes_of_folder, keep, programs_folder
@@ -274,6 +274,28 @@ def by_platform(*args: Any, cpu: Callable[..., T], default: Callable[..., T]) ->
         return cpu(*args)
     chosen: T = jax.lax.platform_dependent(*args, cpu=cpu, default=default)
     return chosen
+
+
+@custom_vmap
+def _in_every_sample(holds: Bool[Array, ""]) -> Bool[Array, ""]:
+    return holds
+
+
+@_in_every_sample.def_vmap
+def _(size: int, batched: Sequence[bool], holds: Bool[Array, " batch"]) -> tuple[Bool[Array, ""], bool]:
+    return _in_every_sample(jnp.all(holds)), False
+
+
+def usually(holds: Bool[Array, ""], usual: Callable[..., T], unusual: Callable[..., T], *args: Any) -> T:
+    """`jax.lax.cond` for a condition that holds nearly always.
+
+    `jax.vmap` of a condition computes both branches for all samples. Of this one it computes the usual branch alone
+    where the condition holds in all samples of the batch. Otherwise a CPU takes one sample after the other, each with
+    its own branch, unless derivatives are taken. Arguments and results are pytrees of arrays.
+    """
+    each = sequential_on_cpu(lambda holds, *args: jax.lax.cond(holds, usual, unusual, *args))
+    found: T = jax.lax.cond(_in_every_sample(holds), lambda _, *args: usual(*args), each, holds, *args)
+    return found
 
 
 def sequential_on_cpu(function: Callable[..., T]) -> Callable[..., T]:

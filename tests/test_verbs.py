@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from collections import Counter
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -167,6 +169,40 @@ def test_each_takes_only_its_own_way():
     own_way = (4 + 3 + 1, 3) if jax.devices()[0].platform == "cpu" else (6 * 4, 6)  # a GPU takes all at once
     assert (ours.count("halved"), ours.count("sine")) == own_way
     assert (theirs.count("halved"), theirs.count("sine")) == (6 * 4, 6)
+
+
+def _squared(seen):
+    """scale x^2, or scale x where x is negative; both ways tell when they are gone."""
+
+    def told(name, x):
+        jax.debug.callback(lambda _: seen.append(name), jax.lax.stop_gradient(x))
+        return x
+
+    def usual(scale, x):
+        return scale * told("usual", x) ** 2
+
+    def unusual(scale, x):
+        return scale * told("unusual", x)
+
+    return lambda scale, x: verbs.usually(x > 0, usual, unusual, scale, x)
+
+
+@pytest.mark.parametrize(
+    ("first", "ways"), [(4.0, {"usual": 4}), (-1.0, {"usual": 3, "unusual": 1})], ids=["all as usual", "one is not"]
+)
+def test_a_batch_takes_the_usual_way_alone_where_all_do(first, ways):
+    seen, x = [], jnp.array([[first, 9.0], [1.0, 16.0]])
+    squared = partial(_squared(seen), jnp.array(3.0))
+    found = jax.jit(jax.vmap(jax.vmap(squared)))(x)
+    jax.effects_barrier()
+    np.testing.assert_allclose(found, 3 * jnp.where(x > 0, x**2, x), rtol=1e-12)
+    if first > 0 or jax.devices()[0].platform == "cpu":  # a GPU goes both ways at once where one sample is not as usual
+        assert Counter(seen) == ways
+    for slopes in (
+        jax.vmap(jax.vmap(jax.grad(squared))),
+        jax.grad(lambda x: jnp.sum(jax.vmap(jax.vmap(squared))(x))),
+    ):
+        np.testing.assert_allclose(jax.jit(slopes)(x), jnp.where(x > 0, 6 * x, 3.0), rtol=1e-12)
 
 
 def test_what_is_done_one_by_one_has_derivatives():

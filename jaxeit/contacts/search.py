@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import sequential_on_cpu, verb
+from .._compile import sequential_on_cpu, usually, verb
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
@@ -150,7 +150,7 @@ class ContactFinder(eqx.Module):
         """A frame, (readings,) V, as it is searched, and whether no reading that is used is missing (NaN)."""
         channels = self.whitening.channels
         whole = jnp.all((jnp.isfinite(dv) & channels) == channels)
-        seen = jax.lax.cond(whole, lambda dv: self._complete_frame(dv), lambda dv: self._incomplete_frame(dv), dv)
+        seen = usually(whole, ContactFinder._complete_frame, ContactFinder._incomplete_frame, self, dv)
         return seen, whole
 
     def _complete_frame(self, dv: Float[Array, " readings"]) -> Frame:

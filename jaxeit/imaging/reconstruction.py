@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import compiler_options, full_precision, is_traced, require_known
+from .._compile import compiler_options, full_precision, is_traced, require_known, usually
 from ..linalg.array_libraries import JAX
 from ..model.bases import AbstractPictured, Picture
 from ..notebook import card, picture
@@ -82,22 +82,10 @@ class AbstractReconstructor(AbstractPictured):
 
     def _sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
         sums = self.whitening.sums(dv)
-
-        def each() -> Float[Array, "... k"]:
-            frames = prod(sums.shape[:-1])
-            each_frame = dv.reshape(frames, self.readings), sums.reshape(frames, sums.shape[-1])
-            completed: Array = jax.lax.map(self._complete, each_frame)
-            return completed.reshape(sums.shape)
-
-        whole: Array = jax.lax.cond(jnp.isfinite(jnp.sum(sums)), lambda: sums, each)
-        return whole
-
-    def _complete(self, of_a_frame: tuple[Float[Array, " readings"], Float[Array, " k"]]) -> Float[Array, " k"]:
-        dv, sums = of_a_frame
-        completed: Array = jax.lax.cond(
-            jnp.isfinite(jnp.sum(sums)), lambda: sums, lambda: mended_sums(self.whitening, self.predict, dv)
+        whole: Array = usually(
+            jnp.isfinite(jnp.sum(sums)), _as_they_are, _completed, self.whitening, self.predict, dv, sums
         )
-        return completed
+        return whole
 
     @abstractmethod
     def on_host(
@@ -138,6 +126,29 @@ class AbstractReconstructor(AbstractPictured):
     def channels(self) -> Bool[Array, " readings"]:
         """Whether each reading is used, (readings,)."""
         return self.whitening.channels
+
+
+def _as_they_are(
+    whitening: Whitening, predict: Float[Array, "k k"], dv: Float[Array, "... readings"], sums: Float[Array, "... k"]
+) -> Float[Array, "... k"]:
+    return sums
+
+
+def _completed(
+    whitening: Whitening, predict: Float[Array, "k k"], dv: Float[Array, "... readings"], sums: Float[Array, "... k"]
+) -> Float[Array, "... k"]:
+    """Sums of frames; those that lack readings are completed."""
+
+    def complete(frame: tuple[Float[Array, " readings"], Float[Array, " k"]]) -> Float[Array, " k"]:
+        dv, sums = frame
+        there = jnp.isfinite(jnp.sum(sums))
+        found: Array = jax.lax.cond(there, lambda: sums, lambda: mended_sums(whitening, predict, dv))
+        return found
+
+    frames = prod(sums.shape[:-1])
+    each_frame = dv.reshape(frames, dv.shape[-1]), sums.reshape(frames, sums.shape[-1])
+    completed: Array = jax.lax.map(complete, each_frame)
+    return completed.reshape(sums.shape)
 
 
 @partial(jax.jit, static_argnames="whole")

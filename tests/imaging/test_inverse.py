@@ -103,6 +103,28 @@ def test_numpy_gives_the_same_image(recon):
         recon.on_host()(np.zeros(3))
 
 
+def test_a_vmap_over_whole_frames_solves_nothing(recon):
+    """Readings are completed behind a condition of the whole batch, where one lacks some."""
+    dv = jnp.asarray(np.random.default_rng(1).normal(size=(3, 550)))
+    np.testing.assert_allclose(jax.vmap(recon)(dv), dv @ recon.matrix.T, rtol=1e-9, atol=1e-12)
+    broken = dv.at[1, 5].set(jnp.nan)
+    np.testing.assert_allclose(jax.vmap(recon)(broken), recon(broken), rtol=1e-9)
+    asked = _unconditional(jax.make_jaxpr(jax.vmap(recon))(dv).jaxpr)
+    assert "dot_general" in asked
+    assert asked.isdisjoint({"lu", "cholesky", "triangular_solve", "while", "scan"})
+
+
+def _unconditional(jaxpr):
+    """Names of the operations that run whatever the numbers are."""
+    names = set()
+    for equation in jaxpr.eqns:
+        names.add(equation.primitive.name)
+        if equation.primitive.name != "cond":
+            for value in equation.params.values():
+                names |= _unconditional(getattr(value, "jaxpr", value)) if hasattr(value, "jaxpr") else set()
+    return names
+
+
 @pytest.fixture(scope="module")
 def correlated(model, pixels):
     """The noise of neighbours goes together."""

@@ -1,11 +1,9 @@
 """Linear reconstruction with a quadratic prior, in one regularised Gauss-Newton step."""
 
-from functools import partial
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..._compile import usually
 from ...linalg.lapack import cho_factor, cho_solve, qr, solve_triangular
 from ..priors import AbstractPrecision
 from .base import AbstractLinearMethod, Problem
@@ -49,8 +47,8 @@ def damped_solution(b: Float[Array, "k n"], level: Float[Array, ""], y: Float[Ar
     which takes four times as long and whose errors grow as one over level.
     """
     least = jnp.finfo(b.dtype).eps ** 0.25 * jnp.max(jnp.sum(b**2, 0))
-    found: tuple[Array, Array] = jax.lax.cond(
-        level**2 > least, partial(_by_normal_equations, least), _by_orthogonal_factor, b, level, y
+    found: tuple[Array, Array] = usually(
+        level**2 > least, _by_normal_equations, lambda _, *of: _by_orthogonal_factor(*of), least, b, level, y
     )
     return found
 

@@ -20,7 +20,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._compile import verb
+from ..._compile import usually, verb
 from ...contacts.search import ContactFinder, Frame
 from ...least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations
 from ...linalg import lapack
@@ -248,11 +248,14 @@ def _seen(tracker: ContactFilter, dv: Float[Array, " readings"]) -> tuple[Frame,
     dv = jnp.asarray(dv, tracker.compress.dtype)
     y = tracker.compress @ dv  # of channels that are not used the matrix is zero, but not its product with NaN
     whole = jnp.all(jnp.isfinite(y))
-    none = jnp.zeros((), y.dtype)
-    quick = Frame(y, none, none, tracker.finder.root)
-    frame = jax.lax.cond(whole, lambda dv: quick, lambda dv: tracker.finder.compressed(dv)[0], dv)
+    frame = usually(whole, _complete, lambda finder, _, dv: finder.compressed(dv)[0], tracker.finder, y, dv)
     whole = whole | jnp.all(jnp.isfinite(dv) | ~tracker.finder.whitening.channels)
     return frame, whole, tracker.error_share * (frame.y @ frame.y) / len(frame.y)
+
+
+def _complete(finder: ContactFinder, y: Float[Array, " r"], dv: Float[Array, " readings"]) -> Frame:
+    none = jnp.zeros((), y.dtype)
+    return Frame(y, none, none, finder.root)
 
 
 def _problem(
