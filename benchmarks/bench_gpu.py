@@ -1,9 +1,10 @@
-"""A GPU at forward solves, Jacobians, gradients, training and the ladder, in both precisions, alone and in batches.
+"""A GPU at forward solves, Jacobians, gradients, images, contacts, training and the ladder, in both precisions.
 
 Conductivities lie on the device before a call, and results stay there. Before a clock is read, voltages are compared
-with those of SuperLU in float64 on the host; Jacobians and gradients with ours in float64 on the CPU. Beside ours stand
-cuDSS, NVIDIA's direct solver for sparse matrices, which factors a batch of one pattern (where it is installed:
-``pip install nvidia-cudss-cu13``), and dense matrices factored by the libraries that JAX calls (cuSOLVER, cuBLAS).
+with those of SuperLU in float64 on the host; Jacobians and gradients with ours in float64 on the CPU; images and
+contacts with ours there. Beside ours stand cuDSS, NVIDIA's direct solver for sparse matrices, which factors a batch of
+one pattern (where it is installed: ``pip install nvidia-cudss-cu13``), and dense matrices factored by the libraries
+that JAX calls (cuSOLVER, cuBLAS).
 
 Without a GPU it says so. With ``--smoke`` it runs on a CPU as well.
 """
@@ -205,6 +206,62 @@ def by_cudss(cells: int, dtype: str, batch: int) -> Row:
     return found | {"prepare_s": prepare_s}
 
 
+def frames(run: Run) -> Iterator[Row]:
+    """Images and contacts of the frames of the testbed, with an instance of each that was prepared on the host."""
+    yield {"frames": []}
+    batches = run.sizes((1, 1024), (1, 4))
+    for dtype in LOOSE:
+        with jax.default_device(jax.devices("cpu")[0]):
+            dv, noise, model = touched(max(batches), dtype)
+            prepared = {"image": je.prepare(model), "contacts": je.prepare_contacts(model, noise=noise)}
+            right = {what: [np.asarray(shown(made(dv[k]))) for k in range(CHECKED)] for what, made in prepared.items()}
+        for what, made in prepared.items():
+            made = jax.device_put(made, jax.devices()[0])
+            for batch in batches:
+                yield {"frames": [of_frames(what, made, jax.device_put(dv[:batch], jax.devices()[0]), right[what])]}
+
+
+def touched(count: int, dtype: str) -> tuple[jax.Array, jax.Array, je.Model]:
+    """(count, readings) differences of frames with one contact each, V, the noise of each reading, V, and the model."""
+    model = je.discretise(je.Scene(je.load_skin("testbed")), je.Fidelity.draft(dtype=dtype))
+    places = jnp.asarray(np.random.default_rng(0).uniform(0.04, 0.16, (count, 2)), dtype)
+    v0 = je.forward(model)
+    noise = jnp.full(len(v0), 1e-4 * jnp.abs(v0).max())
+
+    def frame(key: jax.Array, place: jax.Array) -> jax.Array:
+        bump = jnp.exp(-jnp.sum((model.centroids - place) ** 2, 1) / (2 * 0.01**2))
+        return (
+            je.forward(model, model.background * (1 + 0.4 * bump))
+            - v0
+            + noise * jax.random.normal(key, v0.shape, dtype)
+        )
+
+    keys = jax.random.split(jax.random.key(1), count)
+    return jax.lax.map(lambda one: frame(*one), (keys, places)), noise, model
+
+
+def shown(found: jax.Array | je.contacts.Contacts) -> jax.Array:
+    """What is compared of a result: the image, or the place of the strongest contact."""
+    return found if isinstance(found, jax.Array) else je.contacts.strongest(found)
+
+
+def of_frames(what: str, made: Callable, dv: jax.Array, right: list[np.ndarray]) -> Row:
+    batch = len(dv)
+
+    def several(made: Callable, dv: jax.Array) -> Any:
+        return jax.tree.map(lambda a: a[None], made(dv[0])) if batch == 1 else jax.vmap(made)(dv)
+
+    found = program(several, (made, dv))
+    first = [shown(jax.tree.map(lambda a, k=k: a[k], found.call())) for k in range(min(batch, CHECKED))]
+    off = max(difference(np.asarray(one, float), right[k].astype(float)) for k, one in enumerate(first))
+    dtype = str(dv.dtype)
+    if not off <= LOOSE[dtype]:
+        raise SystemExit(f"{what}, {dtype}: off by {off:.1e} of the largest value: nothing is timed")
+    ms = median_ms(found.call, 10, 2.0)
+    about: Row = {"what": what, "dtype": dtype, "batch": batch, "difference": off}
+    return about | {"median_ms": ms, "per_s": 1e3 * batch / ms} | cost(found)
+
+
 def learning(run: Run) -> Iterator[Row]:
     """Steps of training a proposal (`jaxeit train`) on random numbers, an epoch each."""
     count = training.BATCH * (200 if not run.smoke else 2)
@@ -243,6 +300,7 @@ PARTS = {
     "batches": batches,
     "gradients": gradients,
     "peers": peers,
+    "frames": frames,
     "training": learning,
     "ladder": ladder,
 }

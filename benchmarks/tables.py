@@ -115,6 +115,19 @@ def _gpu_verbs(results: Row) -> Iterator[Row]:
         }
 
 
+def _gpu_frames(larger: Row) -> Iterator[Row]:
+    """Images and contacts of the testbed's frames: single calls, then batches and what they take."""
+    names = {"image": ("one image", "images"), "contacts": ("contacts of one frame", "frames searched for contacts")}
+    for row in larger["frames"]:
+        one, many = names[row["what"]]
+        if row["batch"] == 1:
+            yield row | {"line": f"{one}, ms", "shown": f"{row['median_ms']:.2f}"}
+        else:
+            yield row | {"line": f"{many} a second, batches of {row['batch']:,}", "shown": f"{row['per_s']:,.0f}"}
+            yield row | {"line": f"memory of the batch of {many}, GB", "shown": f"{1e-3 * row['memory_mb']:.1f}"}
+            yield row | {"line": f"compilation for {many}, s", "shown": f"{row['compile_s']:.0f}"}
+
+
 def _gpu_training(results: Row) -> str:
     (row,) = results["training"]
     return (
@@ -320,6 +333,7 @@ ROWS: dict[str, Callable] = {
     "onto": _onto,
     "gpu_batches": _gpu_batches,
     "gpu_verbs": _gpu_verbs,
+    "gpu_frames": _gpu_frames,
     "gpu_training": _gpu_training,
     "repeat": _repeat,
     "images": _images,

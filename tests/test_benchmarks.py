@@ -281,7 +281,9 @@ def test_frames_follow_one_another_or_other_work():
 def test_smoke_of_a_gpu_without_one(capsys):
     """Its parts on a CPU; in earnest they ask for a GPU."""
     data = bench_gpu.main(["--smoke"])
-    assert all(row["per_s"] > 0 for part in ("singles", "batches", "gradients", "peers") for row in data[part])
+    assert all(
+        row["per_s"] > 0 for part in ("singles", "batches", "gradients", "peers", "frames") for row in data[part]
+    )
     with pytest.raises(SystemExit, match=r"jax\[cuda13\]"):
         bench_gpu.main([])
 

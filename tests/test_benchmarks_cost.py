@@ -445,7 +445,11 @@ def test_tables_of_the_pages(root):
         "training": [{"steps_per_s": 100.0, "frames_per_s": 25600.0, "first_epoch_s": 4.5}],
         "ladder": [{"label": "standard", "forward": {"median": 0.8e-3}, "jacobian": {"median": 1.25e-3}}],
     }
-    results["gpu_h200"] = {"batches": [one | {"per_s": 600e3}]}
+    searched = one | {"what": "contacts", "per_s": 17e3, "memory_mb": 16.7e3, "compile_s": 55.0}
+    results["gpu_h200"] = {
+        "batches": [one | {"per_s": 600e3}],
+        "frames": [one | {"what": "image", "batch": 1, "median_ms": 0.22}, searched],
+    }
     pages = [(root / "docs" / name).read_text() for name in ("costs.md", "live.md")]
     marks = re.findall(r"<!-- end of ([\w-]+) -->", "".join(pages))
     assert set(marks) <= set(tables.FORMATS)
@@ -464,6 +468,8 @@ def test_tables_of_the_pages(root):
     ):
         assert f"| {line} |" in text["gpu-batches"]
     assert "| forward, one call, ms | 2.00 |" in text["gpu-verbs"]
+    for line in ("one image, ms | 0.22", "frames searched for contacts a second, batches of 1,024 | 17,000"):
+        assert f"| {line} |" in text["gpu-frames"]
     assert "100 steps a second there, of 256 random frames" in text["gpu-training"]
     assert "| bundled | no | later | 0.12 | 0.12 | 0.12 | 0.12 | 0.12 |" in text["calibration-seconds"]
     assert "| **standard** |" in text["ladder-chest"]
