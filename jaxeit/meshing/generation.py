@@ -18,11 +18,12 @@ from ..budget import require
 from ..geometry.shapes import Domain, Rectangle
 from .footprints import AbstractFootprint, Feature, cycle, neighbours, require_placed
 from .sizes import SizeField, divide_rim, fill, narrow_places, thin
-from .smoothing import Problem, missing_edges, relax
-from .triangles import CROWDED, Mesh, MeshError, place
+from .smoothing import Problem, missing_edges, quality, relax
+from .triangles import CROWDED, MIN_ANGLE, Mesh, MeshError, place
 
-START_SPACING = 0.72
-"""Least distance between the initial nodes, over the wanted edge length."""
+START_SPACINGS = (0.72, 0.69, 0.75, 0.66, 0.78)
+"""Least distance between the initial nodes, over the wanted edge length; the next is tried where one leads to a mesh
+that `Mesh.check` refuses."""
 
 RIM_SPACING = 0.45
 """Least distance of free nodes from the rim, over the wanted edge length."""
@@ -66,9 +67,20 @@ def triangulate(
     problem = _problem(domain, footprints, rim, size)
     free = fill(domain, size)
     free = free[problem.open_to(free)]
-    points, triangles = relax(problem, thin(free, problem.fixed, START_SPACING * size(free)))
+    points, triangles = _relaxed(problem, free)
     _require_followed(problem, triangles)
     return Mesh(points, triangles).check(advice=CROWDED)
+
+
+def _relaxed(problem: Problem, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first triangulation that is good enough, or the best one; free: places for nodes, (n, 2) m."""
+    wanted, found = problem.size(free), []
+    for spacing in START_SPACINGS:
+        points, triangles = relax(problem, thin(free, problem.fixed, spacing * wanted))
+        found.append((quality(problem, points, triangles), points, triangles))
+        if found[-1][0] >= MIN_ANGLE:
+            break
+    return max(found, key=lambda one: one[0])[1:]
 
 
 def expected_nodes(

@@ -12,6 +12,9 @@ from scipy.spatial import cKDTree
 
 from .smoothing import corner_angles, directed_edges, doubled_areas, edge_keys
 
+MIN_ANGLE = 20.0
+"""Smallest angle of a triangle, degrees, that is accepted unless told otherwise."""
+
 OWN_MESH = "move its nodes apart, or accept such triangles with min_angle=, an argument of discretise and of Mesh.check"
 
 CROWDED = "use a shorter edge_length or more segments there, or move what is crowded apart"
@@ -84,7 +87,7 @@ class Mesh:
         """Smallest angle of each triangle on the surface, (m,) degrees."""
         return np.asarray(corner_angles(self.nodes[self.triangles]).min(1))
 
-    def check(self, min_angle: float = 20.0, advice: str = OWN_MESH) -> "Mesh":
+    def check(self, min_angle: float = MIN_ANGLE, advice: str = OWN_MESH) -> "Mesh":
         """This mesh; raises MeshError with its worst fault, the place of the fault, and what to do.
 
         Tests for values that are not finite, indices out of range, nodes that coincide or belong

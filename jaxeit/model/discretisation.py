@@ -21,7 +21,7 @@ from ..linalg.base import on_device
 from ..meshing.elements import Space, function_space
 from ..meshing.footprints import AbstractFootprint
 from ..meshing.generation import expected_nodes, triangulate
-from ..meshing.triangles import CROWDED, Mesh
+from ..meshing.triangles import CROWDED, MIN_ANGLE, Mesh
 from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
 from ..skin.electrodes import touched
@@ -115,7 +115,7 @@ def discretise(
     *,
     mesh: Mesh | None = None,
     ground: int | None = None,
-    min_angle: float = 20.0,
+    min_angle: float = MIN_ANGLE,
 ) -> Model:
     """Build the model of ``scene`` at ``fidelity`` (default: `Fidelity.standard`).
 

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxeit as je
 from jaxeit.geometry.shapes import Disc, Polygon, Rectangle
+from jaxeit.meshing import generation
 from jaxeit.meshing.foreign import flat_mesh, read_mesh, write_mesh
 from jaxeit.meshing.generation import Mesh, MeshError, TrianglePattern, structured, triangulate
 from jaxeit.meshing.outlines import ArcFootprint, DiscFootprint, PointFootprint, polygon_radius
@@ -298,6 +299,15 @@ def test_anything_apart_can_be_meshed(x, y, radius, segments, start, length, edg
 
 
 @pytest.mark.slow
+def test_where_one_start_ends_in_flat_triangles_another_is_tried(monkeypatch):
+    moved = np.array([d.position for d in bolts(0.02)]) + np.random.default_rng(3).normal(0, 0.003, (25, 2))
+    footprints = [DiscFootprint(tuple(place), 0.003, segments=8) for place in moved.tolist()]
+    assert triangulate(SQUARE, footprints, 0.012, growth=1.6).min_angles.min() > 20
+    monkeypatch.setattr(generation, "START_SPACINGS", generation.START_SPACINGS[:1])
+    with pytest.raises(MeshError, match=r"an angle of 18\.4 degrees"):
+        triangulate(SQUARE, footprints, 0.012, growth=1.6)
+
+
 def test_fine_testbed_mesh():
     mesh = triangulate(*CASES["bolts"], 0.0015)
     assert len(mesh.nodes) > 15_000
