@@ -40,7 +40,7 @@ from calib.fitting.selection import choose
 from calib.fitting.unpressed_walls import unpressed_note
 from calib.presses.pooled import PressData, PressSeries, thinned
 
-from ..helpers import spread_stacks
+from ..helpers import require_identical, spread_stacks
 
 features_of = eqx.filter_jit(pad_features)
 REACH = jnp.array([[0.01, 0.01], [0.19, 0.19]])
@@ -89,7 +89,7 @@ def test_edge_features_are_distances_to_sides_and_rim(skin, geometry, field):
     expected = np.concatenate([summed(part, field.order) for part in (sides, rim, corner)], 1)
     np.testing.assert_allclose(features, expected, rtol=1e-9, atol=1e-12)
     few = np.asarray(features_of(replace(field, corners=False), geometry, single_places(place, 4)))[inside]
-    np.testing.assert_array_equal(few, features[:, : 2 * field.bumps])
+    require_identical(few, features[:, : 2 * field.bumps])
 
 
 def near(distance, field):
