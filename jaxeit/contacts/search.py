@@ -6,6 +6,7 @@ after the other.
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import prod
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compile import sequential_on_cpu, usually, verb
+from .._compile import by_platform, sequential_on_cpu, usually, verb
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
@@ -29,6 +30,8 @@ MIN_RELATIVE_STRENGTH = 0.1
 # A further start is given up if this many more steps, each with the fall that its last step promised, would not make it
 # good enough.
 OUTLOOK = 16
+# Frames of a batch that are searched together where a batch is not done frame by frame; each takes some 30 MB.
+SIDE_BY_SIDE = 256
 # Standard deviations above its mean that chi-square may have in a fit that leaves nothing to explain.
 MAX_DEVIATIONS = 4
 
@@ -111,8 +114,9 @@ class ContactFinder(eqx.Module):
         A reading that is not finite is left out of its frame exactly, as if it had never been measured
         (`imaging.missing`).
 
-        A batch is done frame by frame, each of which stops as soon as it can. So does ``jax.vmap`` of a finder on a
-        processor; elsewhere it does them side by side.
+        On a CPU a batch is done frame by frame, each of which stops as soon as it can, and so is ``jax.vmap`` of a
+        finder. Other devices search `SIDE_BY_SIDE` frames at a time, and ``jax.vmap`` all of them, each of which takes
+        some 30 MB.
         """
         frames = jnp.asarray(dv, self.compress.dtype)
         require_frames(frames, self.readings)
@@ -343,6 +347,11 @@ def _find(finder: ContactFinder, frames: Float[Array, "... readings"]) -> Contac
         return one
     batch = frames.shape[:-1]
     each_frame = frames.reshape(prod(batch), frames.shape[-1])
-    found: Contacts = jax.lax.map(lambda frame: _single_frame(finder, frame), each_frame)
+    each: Callable[[Array], Contacts] = partial(_single_frame, finder)
+    found: Contacts = by_platform(
+        each_frame,
+        cpu=lambda frames: jax.lax.map(each, frames),
+        default=lambda frames: jax.lax.map(each, frames, batch_size=SIDE_BY_SIDE),
+    )
     found = jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
     return found

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 import jaxeit as je
-from jaxeit.contacts import ContactResult, ContactSettings, prepare_contacts, refine_contacts, strongest
+from jaxeit.contacts import ContactResult, ContactSettings, prepare_contacts, refine_contacts, search, strongest
 from jaxeit.imaging.noise import InverseError
 
 from ..helpers import spread_stacks
@@ -162,6 +162,16 @@ def test_many_frames_mapped_wait_for_no_thread(single):
     """See `jaxeit.linalg.lapack`: without that this program stood still for ever in most runs on two cores."""
     frames = jax.ShapeDtypeStruct((1000, 550), single.compress.dtype)
     assert not spread_stacks(jax.jit(jax.vmap(single)).lower(frames).as_text())
+
+
+def test_other_devices_search_so_many_frames_side_by_side(single, linear, monkeypatch):
+    frames = np.stack([0.02 * linear((0.05 + 0.02 * k, 0.08), 0.01) for k in range(5)]) + _noise(5)
+    alone = single(frames)
+    monkeypatch.setattr(search, "SIDE_BY_SIDE", 2)
+    monkeypatch.setattr(search, "by_platform", lambda *args, cpu, default: default(*args))
+    together = single(frames[None])  # of another shape, for which nothing is compiled yet
+    assert together.position.shape == (1, 5, 1, 2)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[0], rtol=1e-6, atol=1e-9), alone, together)
 
 
 @pytest.mark.slow
