@@ -1,6 +1,7 @@
 """The documentation site shows every public name once, and asks nothing of the network."""
 
 import ast
+import dataclasses
 import os
 import re
 import subprocess
@@ -106,6 +107,41 @@ def test_every_public_name_has_a_docstring(names):
     ours = [module for path, module in sys.modules.items() if path.partition(".")[0] in ("jaxeit", "calib")]
     values = {(name, id(vars(module).get(name))) for module in ours for name in _described_values(module)}
     assert [missing for name, thing in public.items() for missing in _undescribed(name, thing, values)] == []
+
+
+def test_every_field_of_a_public_class_is_explained(names):
+    """In the docstring of the class or of one that it derives from."""
+    missing = []
+    for name, thing in ((n, t) for listed in names.public_names().values() for n, t in listed.items() if isclass(t)):
+        fields = [field.name for field in dataclasses.fields(thing)] if dataclasses.is_dataclass(thing) else []
+        family = [base for base in thing.__mro__ if base.__module__.partition(".")[0] in ("jaxeit", "calib")]
+        words = set(re.findall(r"\w+", " ".join(base.__doc__ or "" for base in family)))
+        given = [field for field in [*fields, *getattr(thing, "_fields", ())] if not field.startswith("_")]
+        missing += [f"{name}.{field}" for field in given if field not in words]
+    assert missing == []
+
+
+def test_summaries_of_values_are_their_own_docstrings(pages):
+    assert "[`calib.fitting.logs.MIN_PLACES`][calib.fitting.logs.MIN_PLACES]: Places of" in pages["calib.fitting.logs"]
+    assert ": Finer than that of a calibration" in pages["calib.bench"]
+
+
+def test_a_class_of_another_package_with_the_name_of_a_public_one_is_not_taken_for_it(names, pages):
+    """Such as the path of a file for the path of a stage."""
+    (entry,) = [part for part in pages["jaxeit.effects"].split("::: ") if part.startswith("jaxeit.effects.Path\n")]
+    assert "[`je.effects.StageError`]" in entry
+    assert "load_skin" not in entry
+    assert names.public_path("jaxeit.skin.description.Skin") == "jaxeit.skin.Skin"
+    assert names.public_path("pathlib.Path") is None
+
+
+def test_names_in_docstrings_become_links(names):
+    said = names.linked("see `Noser`, `je.Noser(0.5)`, `prior` and [`Noser`](x)", "jaxeit.imaging.preparation")
+    assert said == (
+        "see [`Noser`][jaxeit.imaging.Noser], [`je.Noser(0.5)`][jaxeit.imaging.Noser], `prior` and [`Noser`](x)"
+    )
+    assert names.linked("`Noser`, `je.Noser`") == "`Noser`, [`je.Noser`][jaxeit.imaging.Noser]"
+    assert names.linked("see `Bumps`", "jaxeit.contacts.fit") == "see `Bumps`"  # another class of that name
 
 
 def test_programs_are_found_by_what_they_import(names):

@@ -30,7 +30,16 @@ RATE_TOLERANCE = 0.01  # by which frames may follow one another more quickly tha
 
 @dataclass(frozen=True)
 class Timing:
-    """Timing of one press in seconds. The paper states 2 s of hold; the other times are assumed."""
+    """Timing of one press in seconds. The paper states 2 s of hold; the other times are assumed.
+
+    | field    | meaning                                      |
+    |----------|----------------------------------------------|
+    | rest     | time without contact before the press        |
+    | ramp     | time in which the force rises                |
+    | hold     | time of constant force                       |
+    | release  | time in which the force falls                |
+    | recovery | time without contact after the press         |
+    """
 
     rest: float = 1.0
     ramp: float = 1.0
@@ -65,6 +74,7 @@ class Bench:
 
     | field                                | meaning                                       | shape      | unit      |
     |--------------------------------------|-----------------------------------------------|------------|-----------|
+    | scene                                | skin and effects                              |            |           |
     | sites                                | centres of the tip                            | (sites, 2) | m         |
     | forces                               | target forces, repeated over the sites        | (any,)     | N         |
     | tip_diameter                         | of all tips                                   | ()         | m         |
@@ -75,7 +85,9 @@ class Bench:
     | eit_step, pressure_step, force_step  | SI value of one stored count; eit_step None:  | ()         | V, Pa, N  |
     |                                      | twice the largest reading at rest is stored   |            |           |
     | temperature_rate, barometer_rate     | change of the surrounding air                 | ()         | K/s, Pa/s |
+    | timing                               | of each press                                 |            |           |
     | seed                                 | of all random numbers                         |            |           |
+    | title, epoch                         | of the session; when its clock reads zero     |            |           |
     | toml                                 | the scene file as text                        |            |           |
 
     Raises:

@@ -23,11 +23,11 @@ STRENGTHS = ("std", "fraction", "width")
 class Footprint(IntEnum):
     """How the tips of one contact are arranged."""
 
-    ABSENT = 0
-    TIP = 1
-    DISC = 2
-    RING = 3
-    EDGE = 4
+    ABSENT = 0  # there is no contact
+    TIP = 1  # one tip
+    DISC = 2  # tips all over a disc
+    RING = 3  # tips along a circle
+    EDGE = 4  # tips along a line
 
 
 @dataclass(frozen=True)

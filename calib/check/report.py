@@ -24,7 +24,7 @@ class Severity(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One statement about a recording: where in it, what is the case, and what to do."""
+    """One statement about a recording: ``severity``, ``where`` it applies, ``what`` is the case, and ``remedy``."""
 
     severity: Severity
     where: str
@@ -155,7 +155,19 @@ class PressSummary:
 class CheckReport:
     """Result of `check_session`. ``ok`` is False if any finding is an error.
 
-    ``electrodes`` is empty unless their places were asked for and could be checked.
+    | field              | meaning                                                                          |
+    |--------------------|----------------------------------------------------------------------------------|
+    | name, title        | of the session                                                                   |
+    | skin               | name of the skin that the session was checked against                            |
+    | simulated          | whether the session was simulated                                                |
+    | complete           | whether the recording ended as planned                                           |
+    | findings           | all statements, in the order of the checks                                       |
+    | streams, pads      | a row for each stream and for each pad                                           |
+    | channels           | readings of the untouched skin; None: there is no stream of EIT                  |
+    | order              | whether the readings have the order of the skin; None: not checked               |
+    | presses            | how many presses can be used                                                     |
+    | onsets             | delay of each stream behind the force, by its name                               |
+    | electrodes         | places of the electrodes; empty unless they were asked for and could be checked  |
     """
 
     name: str

@@ -17,13 +17,13 @@ class FitError(ValueError):
 class FitResult(enum.IntEnum):
     """Outcome of a fit. Use its numbers only after SUCCESS; otherwise `message` says what to do."""
 
-    SUCCESS = 0
-    NOT_FINITE = 1
-    TOO_FEW = 2
-    MAX_STEPS = 3
-    NO_RESPONSE = 4
-    SINGULAR = 5
-    AT_BOUND = 6
+    SUCCESS = 0  # fitted
+    NOT_FINITE = 1  # no finite samples, or the fit diverged
+    TOO_FEW = 2  # too few samples or presses for this curve
+    MAX_STEPS = 3  # the solver ran out of steps
+    NO_RESPONSE = 4  # the force does not rise with the pressure
+    SINGULAR = 5  # the samples do not determine all parameters
+    AT_BOUND = 6  # somewhere the force does not rise, and this curve must
 
     @property
     def message(self) -> str:

@@ -50,8 +50,11 @@ T = TypeVar("T")
 class ReceivedFrame(NamedTuple):
     """A frame of the stream that sets the pace, the mean of the other stream since the frame before, and arrival (ns).
 
-    Of a skin: voltages (readings,) V and pressures (pads,) Pa. Of a sensor without EIT: its channels and, if the
-    calibration needs it, the place of the stage (3,) m; otherwise nothing (0,).
+    | field  | of a skin            | of a sensor without EIT                                                       |
+    |--------|----------------------|-------------------------------------------------------------------------------|
+    | values | voltages (readings,) V | its channels                                                                |
+    | beside | pressures (pads,) Pa | place of the stage (3,) m, if the calibration needs it; otherwise empty (0,) |
+    | host   | time of arrival, ns  | time of arrival, ns                                                           |
     """
 
     values: np.ndarray

@@ -114,16 +114,28 @@ def _ignore(line: str) -> None:
 
 @dataclass
 class LiveControl:
-    """Controls of a running live view (stop, measure rest levels again), and its state for viewers."""
+    """Controls of a running live view (stop, measure rest levels again), and its state for viewers.
+
+    | field     | meaning                                                                                  |
+    |-----------|------------------------------------------------------------------------------------------|
+    | stop      | event that ends the view                                                                 |
+    | tare      | event that has the rest levels measured again                                            |
+    | state     | what the view does now, in words                                                         |
+    | lost      | number of frames that were sent and did not arrive                                       |
+    | health    | of the calibration, in words, while it is being recalibrated or its places are doubtful  |
+    | doubt     | about places of contacts, in words                                                       |
+    | simulated | whether a device reports that its values are simulated                                   |
+    | warn      | called with what the operator should know                                                |
+    """
 
     stop: threading.Event = field(default_factory=threading.Event)
     tare: threading.Event = field(default_factory=threading.Event)
     state: str = "waiting for the devices"
-    lost: int = 0  # frames that were sent and did not arrive
-    health: str = ""  # of the calibration, while it is being recalibrated or its places are doubtful
-    doubt: str = ""  # about places of contacts, as told to the operator
-    simulated: bool = False  # whether a device reports that its values are simulated
-    warn: Callable[[str], object] = _ignore  # called with what the operator should know
+    lost: int = 0
+    health: str = ""
+    doubt: str = ""
+    simulated: bool = False
+    warn: Callable[[str], object] = _ignore
 
 
 Publish = Callable[[Result], object]

@@ -88,7 +88,8 @@ class LowPass(AbstractCorrection):
 
     With `causal=False` (offline) the filter runs forwards and backwards: no delay, half the amplitude (-6 dB) at the
     cutoff. With `causal=True` (online) it has -3 dB at the cutoff and a delay; it starts at rest at the first sample.
-    The default of 50 Hz is that of the paper which this bench reproduces.
+    The default of 50 Hz is that of the paper which this bench reproduces. ``order`` is that of the filter in one
+    direction.
 
     Raises:
         CorrectionError: if the cutoff is not below half the sample rate. At 50 Hz this refuses a stream of 100 Hz,

@@ -61,12 +61,12 @@ class PressData:
 
     | field           | meaning                                                      | shape           | unit |
     |-----------------|--------------------------------------------------------------|-----------------|------|
-    | sample_pressure | along the presses                                            | (pads, n)       | Pa   |
-    | sample_force    |                                                              | (n,)            | N    |
+    | sample_pressure | of pads, along presses                                       | (pads, n)       | Pa   |
+    | sample_force    | force of the load cell along the presses                     | (n,)            | N    |
     | sample_press    | row of the sample's press                                    | (n,)            |      |
     | mask            | samples from which a pad's curve is fitted                   | (pads, n)       |      |
-    | pressure        | over the hold                                                | (presses, pads) | Pa   |
-    | force           |                                                              | (presses,)      | N    |
+    | pressure        | of the pads over the hold                                    | (presses, pads) | Pa   |
+    | force           | force of the load cell over the hold                         | (presses,)      | N    |
     | place           | number of the place pressed                                  | (presses,)      |      |
     | reach           | lowest and highest corner of the box of places               | (2, 2)          | m    |
     """

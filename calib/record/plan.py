@@ -123,7 +123,9 @@ class RecordingPlan:
 
     ``pattern`` (rows, 4), ``mixing`` (reading, row and share of each term; None: each row is one reading), ``current``
     (A), ``frequency`` (Hz) and ``offset`` (readings,) s describe the EIT protocol, or are None. ``epoch`` is an ISO
-    time with zone, at which the monotonic clock showed ``host_epoch`` ns.
+    time with zone, at which the monotonic clock showed ``host_epoch`` ns. The session file gets ``session_id``,
+    ``title``, ``license`` and ``creator`` as they are, name and text of the skin file as ``skin_name`` and
+    ``skin_toml``, and of a simulated device (``simulated``) its ``scene`` as TOML and its ``seed``.
     """
 
     streams: tuple[StreamPlan, ...]

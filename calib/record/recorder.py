@@ -113,11 +113,14 @@ def _receiver_status(receiver: StreamReceiver) -> str:
 
 @dataclass
 class StopRequest:
-    """Lets another thread, or a signal handler, stop a recording."""
+    """Lets another thread, or a signal handler, stop a recording.
+
+    ``stop`` is the event, ``why`` what cut the recording short, and ``status`` the exit status of the program.
+    """
 
     stop: threading.Event = field(default_factory=threading.Event)
     why: str = ""
-    status: int = 0  # exit status of the program
+    status: int = 0
 
     def stop_recording(self, why: str = "", status: int = 0) -> None:
         """Stop the recording; ``why`` says what cut it short, if it did not end as planned."""

@@ -243,14 +243,24 @@ def _sequence_numbers(stream: Stream) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Source:
-    """A stream and its origin."""
+    """A stream and its origin.
+
+    | field  | meaning                                                                 | unit  |
+    |--------|-------------------------------------------------------------------------|-------|
+    | plan   | of the stream                                                           |       |
+    | url    | address of the device or of the file                                    |       |
+    | format | of what is sent: "binary" or "csv"                                      |       |
+    | baud   | rate of a serial line                                                   | bit/s |
+    | speed  | of a replay, over that of the recording                                 | 1     |
+    | ping   | time between two pings; 0: the device does not answer pings             | s     |
+    """
 
     plan: StreamPlan
     url: str
     format: str = "binary"
     baud: int = 115200
     speed: float = 1.0
-    ping: float = 0.0  # s between pings; 0 for a device that does not answer pings
+    ping: float = 0.0
 
     def link(self) -> Link:
         """A connection, not yet open."""

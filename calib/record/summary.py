@@ -14,6 +14,7 @@ class StreamSummary:
 
     | field       | meaning                                                           | unit |
     |-------------|-------------------------------------------------------------------|------|
+    | name        | of the stream                                                     |      |
     | frames      | number of frames in the session                                   |      |
     | lost        | number of missing frames, by sequence numbers                     |      |
     | steps       | number of times that the device's clock was set or restarted      |      |
@@ -50,7 +51,8 @@ class RecordingSummary:
     """Summary of a recording and the session made of it.
 
     ``complete`` is true if the recording ended as planned, every device sent until its end, and no record is missing;
-    otherwise ``reasons`` says why not.
+    otherwise ``reasons`` says why not. ``path`` is that of the session, ``streams`` has a summary of each stream;
+    ``records_lost`` and ``bytes_damaged`` count what the journal lacks.
     """
 
     path: Path

@@ -23,13 +23,13 @@ CLOCK_ATTRIBUTES = ("tick_s", "offset_ns", "drift_ppm", "residual_p95_ns", "vali
 class Status(enum.IntFlag):
     """Known faults of one sample, as CF flag masks; 0 is a good sample."""
 
-    gap_before = 1
-    crc_resync = 2
-    saturated = 4
-    clock_step = 8
-    disconnected = 16
-    nonfinite = 32
-    unchecked = 64
+    gap_before = 1  # samples were lost before this one
+    crc_resync = 2  # the first sample after a damaged frame
+    saturated = 4  # out of range, clipped
+    clock_step = 8  # the clock was set
+    disconnected = 16  # the device was not there
+    nonfinite = 32  # missing
+    unchecked = 64  # came over a link without checksum
 
 
 @dataclass(frozen=True)

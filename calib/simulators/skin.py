@@ -36,8 +36,10 @@ class SkinState(NamedTuple):
 
     | meaning                                                        |
     |----------------------------------------------------------------|
-    | key of all chance, and number of the next step                 |
-    | states of the effects: material, pads, both recorded streams   |
+    | key of all chance                                              |
+    | number of the next step                                        |
+    | material, pads: states of the effects on sheet and pads        |
+    | eit, pressure: states of the effects on both recorded streams  |
     """
 
     key: Key[Array, "*environments"]

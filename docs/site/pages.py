@@ -5,32 +5,20 @@ the text become links to the pages of their rooms.
 """
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from public_names import identifiers, public_names, room_page
+from public_names import linked, public_names, public_path, room_page
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "*/README.md", "data/schema/README.md")
 FILES = ("docs/**/*.png", "docs/site/*.css", "docs/site/*.js", "jaxeit/skin/skins/*.toml", "calib/bench/scenes/*.toml",
          "data/sessions/*.toml", "examples/notebooks/*.ipynb")  # fmt: skip
-CODE = re.compile(r"^( *)```.*?^\1```|`[^`\n]+`(?!\])", re.DOTALL | re.MULTILINE)
-NAME = re.compile(r"`(?:je|jaxeit|calib)\.([\w.]+)(?:\(.*\))?`", re.DOTALL)
 EXAMPLE = re.compile(r"\]\((\w+)\.py\)")
-
-
-def _linked(text: str, paths: Mapping[str, str]) -> str:
-    """The text with names in code linked. Programs and links stay as they are."""
-
-    def link(found: re.Match[str]) -> str:
-        dotted = NAME.fullmatch(found[0])
-        known = [part for part in dotted[1].split(".") if part in paths] if dotted else []
-        return f"[{found[0]}][{paths[known[0]]}]" if known else found[0]
-
-    return CODE.sub(link, text)
+RAISED = re.compile(r"(field-body\">\s*)<code>(\w+)</code>")
+REFERENCE = re.compile(r"(<autoref\b[^>]*\bidentifier=\")([\w.]+)(?=\")")
 
 
 def _with_programs(text: str) -> str:
@@ -54,4 +42,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     if page.file.src_uri == "examples/README.md":
         return _with_programs(markdown)
-    return markdown if page.file.src_uri.startswith("api/") else _linked(markdown, identifiers())
+    return markdown if page.file.src_uri.startswith("api/") else linked(markdown)
+
+
+def on_page_content(html: str, **_: object) -> str:
+    """Let references lead to the page of a name, whichever module has it, and the errors of a list to theirs."""
+
+    def error(found: re.Match[str]) -> str:
+        return f'{found[1]}<autoref identifier="{found[2]}" optional><code>{found[2]}</code></autoref>'
+
+    return REFERENCE.sub(lambda found: found[1] + (public_path(found[2]) or found[2]), RAISED.sub(error, html))

@@ -7,7 +7,7 @@ from inspect import getdoc, isclass, isroutine, signature
 from pathlib import Path
 from textwrap import dedent
 from types import FunctionType
-from typing import NamedTuple
+from typing import NamedTuple, get_args, get_origin
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"je": "jaxeit", "jaxeit": "jaxeit", "calib": "calib"}
@@ -99,9 +99,13 @@ def written_programs() -> Iterator[Program]:
         yield Program(f"[{title}](../{path.relative_to(ROOT)})", "\n".join(blocks))
 
 
-def _annotated(annotation: object, known: set[str]) -> set[str]:
-    text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "") + " " + str(annotation)
-    return known & set(re.findall(r"\w+", text))
+def _annotated(annotation: object, known: Mapping[str, type]) -> set[str]:
+    """Names of the known classes in an annotation. What is a text stands for the classes of its words."""
+    text = annotation if isinstance(annotation, str) else getattr(annotation, "__forward_arg__", "")
+    parts = annotation if isinstance(annotation, list | tuple) else (get_origin(annotation), *get_args(annotation))
+    inside = (_annotated(part, known) for part in parts if part is not None)
+    own = {name for name, kind in known.items() if kind is annotation}
+    return own.union(known.keys() & set(re.findall(r"\w+", text)), *inside)
 
 
 def _functions(name: str, thing: object) -> Iterator[tuple[str, FunctionType]]:
@@ -138,7 +142,7 @@ class Relations(NamedTuple):
 
 def relations(public: Mapping[str, object]) -> Relations:
     """What returns or takes a class, what raises an error, which classes a base has, and which hold another."""
-    classes = {name for name, thing in public.items() if isclass(thing)}
+    classes = {name: thing for name, thing in public.items() if isclass(thing)}
     found = Relations({}, {}, {}, {}, {})
     for name, thing in public.items():
         for path, function in _functions(name, thing):

@@ -1,9 +1,14 @@
 """Public names by room, and the pages that show them. What several rooms list is shown with the first of them."""
 
+import ast
 import importlib
+import re
+import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from inspect import getdoc, isclass, isroutine
+from itertools import pairwise
+from pathlib import Path
 from types import ModuleType
 
 from programs import Program, Relations, examples, relations, used_in, with_fences, written_programs
@@ -13,8 +18,10 @@ GROUPS = ("Functions", "Classes", "Values", "Errors")
 SUBROOMS = ("calib.fitting.logs", "calib.session.importers")
 """Rooms inside of rooms, whose names no other room lists."""
 
-
 MOST_LINKS = 4
+CODE = re.compile(r"^( *)```.*?^\1```|(?<![`\[])`[^`\n]+`(?![`\]])", re.DOTALL | re.MULTILINE)
+NAME = re.compile(r"`(?:(?:je|jaxeit|calib)\.)?([A-Za-z][\w.]*)(?:\(.*\))?`")
+PAGE = re.compile(r"``((?:docs|data)/[\w/-]+)\.md``")
 
 
 @cache
@@ -44,6 +51,45 @@ def identifiers() -> dict[str, str]:
     return {name: f"{path}.{name}" for path, names in public_names().items() for name in names}
 
 
+def public_path(identifier: str) -> str | None:
+    """Path under which a name is shown, from where it is defined or imported; None for what is not public."""
+    module, _, name = identifier.rpartition(".")
+    path = identifiers().get(name)
+    if path is None or not module:
+        return path
+    public = public_names()[path.rpartition(".")[0]][name]
+    return path if getattr(sys.modules.get(module), name, None) is public else None
+
+
+def linked(text: str, module: str | None = None) -> str:
+    """The text with names in code linked, and pages; programs and links stay as they are.
+
+    Args:
+        module: module whose docstring the text is, where a name alone is a name too; in others only `je.prepare` is.
+    """
+
+    def link(found: re.Match[str]) -> str:
+        named = NAME.fullmatch(found[0])
+        alone = named and not found[0].startswith(("`je.", "`jaxeit.", "`calib."))
+        if not named or (alone and (module is None or "(" in found[0])):
+            return found[0]
+        if alone and not _is_public(named[1].partition(".")[0], module):
+            return found[0]
+        known = [part for part in named[1].split(".") if part in identifiers()]
+        return f"[{found[0]}][{identifiers()[known[0]]}]" if known else found[0]
+
+    return CODE.sub(link, text)
+
+
+def _is_public(name: str, module: str | None) -> bool:
+    """Whether a name in a docstring of a module is the public one, and not another that the module has."""
+    path = identifiers().get(name)
+    if path is None:
+        return False
+    public = public_names()[path.rpartition(".")[0]][name]
+    return getattr(sys.modules.get(module or ""), name, public) is public
+
+
 def shown(path: str, name: str) -> str:
     """A name as users type it: by its package, if that has it, or else by its room."""
     package, _, room = path.partition(".")
@@ -57,11 +103,27 @@ def _group(thing: object) -> str:
     return "Functions" if isroutine(thing) else "Values"
 
 
-def _summary(thing: object) -> str:
-    """The first line of a docstring; of a table of names, the names."""
+@cache
+def _described_values() -> dict[tuple[str, int], str]:
+    """The docstring below each value of a module, by the name of the value and its identity."""
+    found = {}
+    for path, module in list(sys.modules.items()):
+        if path.partition(".")[0] in SHORT and getattr(module, "__file__", None):
+            lines = ast.parse(Path(module.__file__).read_text(encoding="utf-8")).body
+            for line, after in pairwise(lines):
+                names = line.targets if isinstance(line, ast.Assign) else [getattr(line, "target", None)]
+                text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and after.value.value
+                if text and isinstance(names[0], ast.Name):
+                    found[names[0].id, id(vars(module).get(names[0].id))] = str(text)
+    return found
+
+
+def _summary(name: str, thing: object) -> str:
+    """The first paragraph of a docstring; of a table of names, the names."""
     if isinstance(thing, Mapping):
         return ", ".join(f"`{key}`" for key in thing)
-    return " ".join((getdoc(thing) or "").split("\n\n")[0].removesuffix("::").split())
+    text = _described_values()[name, id(thing)] if _group(thing) == "Values" else getdoc(thing) or ""
+    return " ".join(text.split("\n\n")[0].removesuffix(":").removesuffix(":").split())
 
 
 def _programs(thing: object) -> list[str]:
@@ -165,7 +227,7 @@ def _introduction(path: str, names: Mapping[str, object]) -> str:
     """The docstring of a room with its program."""
     text = with_fences(getdoc(rooms()[path]) or "")
     goes_on = "```python" in text and any(_programs(thing) for thing in names.values())
-    return text + (f"\n{GO_ON}" if goes_on else "")
+    return linked(text, path) + (f"\n{GO_ON}" if goes_on else "")
 
 
 def room_page(path: str, names: Mapping[str, object]) -> str:
@@ -173,8 +235,9 @@ def room_page(path: str, names: Mapping[str, object]) -> str:
     package, _, room = path.partition(".")
     lines = [f"# {SHORT[package]}{room and '.'}{room}", "", _introduction(path, names), ""]
     groups = {group: [n for n in names if _group(names[n]) == group] for group in GROUPS}
-    lines += [f"- {_link(path, n)}: {_summary(names[n])}" for inside in groups.values() for n in inside]
+    summaries = {n: linked(_summary(n, names[n]), path) for inside in groups.values() for n in inside}
+    lines += [f"- {_link(path, n)}: {summary}" for n, summary in summaries.items()]
     for group, inside in groups.items():
         entries = [entry for name in inside for entry in _entry(path, name)]
         lines += ["", f"## {group}", "", *entries] if entries else []
-    return "\n".join(lines) + "\n"
+    return PAGE.sub(r"[`\1.md`](../\1.md)", "\n".join(lines) + "\n")

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 class ContactResult(IntEnum):
     """Outcome of the fit of one slot of `Contacts`."""
 
-    CONVERGED = 0
+    CONVERGED = 0  # the contact and its covariance hold
     AT_BOUND = 1  # the width or the position ended on its bound: the covariance is a guess
     OBLONG = 2  # longer than wide: the centre is good, the width a mean over directions, the covariance a guess
     NOT_CONVERGED = 3  # do not trust it

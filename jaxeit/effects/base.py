@@ -302,7 +302,10 @@ class AbstractScanEffect(AbstractEffect):
 
 
 class AbstractReadoutEffect(AbstractHistoryEffect):
-    """Readout: the deviation of a recorded series from the quantity it records."""
+    """Readout: the deviation of a recorded series from the quantity it records.
+
+    ``stream`` is the recorded stream that the effect acts on.
+    """
 
     stage: ClassVar[str] = "readout"
     stream: eqx.AbstractVar[StreamKind]

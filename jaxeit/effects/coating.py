@@ -14,8 +14,8 @@ class ContinuousCoating(AbstractCoatEffect):
     Sheet and metal, with potentials u and m, exchange current under pressure
     (`jaxeit.model.metal_sheet`):
 
-        ``-div(sigma grad u) + g (u - m) = 0``,  ``-div(grad m) / R_m + g (m - u) = 0``,
-        ``g = f / rho``,  ``rho = rho_r (p / p_r)^-n``.
+        -div(sigma grad u) + g (u - m) = 0,  -div(grad m) / R_m + g (m - u) = 0,
+        g = f / rho,  rho = rho_r (p / p_r)^-n.
 
     It replaces `ContactPiezoresistance` and `HomogenisedIslands`, which are local: list one of the
     three.  The metal touches no electrode.

@@ -76,12 +76,12 @@ class ContactGain(AbstractSheetEffect):
 class ContactPiezoresistance(AbstractSheetEffect):
     """Sheet and metal in contact conduct in parallel: a Hill law of local pressure.
 
-    ``sigma <- sigma (1 + A x / (1 + x))``, ``x = (p / p_half)^n``
+    ``sigma <- sigma (1 + A x / (1 + x))``, ``x = (p / p_half)^n`` with p the pressure
 
     | meaning                             | default | range      | unit | source                    |
     |-------------------------------------|---------|------------|------|---------------------------|
     | amplitude A, the largest change     | 1       | 0 to 1     | 1    | the paper's 100 % cap     |
-    | p_half, pressure of half the change | 20      | 1 to 200   | kPa  | assumption                |
+    | half_pressure p_half, of half of it | 20      | 1 to 200   | kPa  | assumption                |
     | exponent n                          | 1       | 0.6 to 1.2 | 1    | assumption: many contacts |
     """
 
@@ -107,7 +107,7 @@ class HomogenisedIslands(AbstractSheetEffect):
     resistance ``rho = rho_r (p / p_r)^-n``.  The dipole of one, from the modified Bessel equation
     under it, inserted into Maxwell's mixture formula (1873):
 
-        ``sigma <- sigma (1 + f b) / (1 - f b)``,  ``b = I2(k) / I0(k)``,  ``k = a sqrt(R_s / rho)``,
+        sigma <- sigma (1 + f b) / (1 - f b),  b = I2(k) / I0(k),  k = a sqrt(R_s / rho),
 
     whose limit at high pressure is ``(1 + f) / (1 - f)``, or 2 for f = 1/3.  The ratio is within 0.006 of
     that of a resolved square lattice up to f = 1/3.
@@ -142,7 +142,7 @@ class ProtrusionGrid(AbstractSheetEffect):
     ``p <- p / f`` on a share of each element, ``f = (side / pitch)^2``.  The share is that of the
     protrusions in a square of the element's area around its centroid, in closed form: 0 or 1 where
     elements resolve the grid, and f where elements are larger than the pitch.  The next law is not
-    linear in pressure: it acts on the share and mixes the result (`_mixture`).
+    linear in pressure: it acts on the share, and the result is mixed by the formula of `HomogenisedIslands`.
 
     The spread of a load within a protrusion and the elements on its border are not resolved; the
     load is conserved on the average over cells.
@@ -223,7 +223,7 @@ class Hysteresis(AbstractMemoryEffect):
     The play operators act on the logarithm of the load, so that the loop is a share of the load and
     closes at zero load.  Each has an excess e over the rising branch,
 
-        ``e_i <- clip(e_i + ln(load before / load), 0, r_i)``,  ``felt = load exp(w sum of e_i)``,
+        e_i <- clip(e_i + ln(load before / load), 0, r_i),  felt = load exp(w sum of e_i),
 
     with evenly spaced ``r_i`` up to ``ln(reach)`` and w such that the operators together open the loop
     by ``loop``.  A rising load has its nominal effect.

@@ -68,8 +68,8 @@ class IndentationSpreading(AbstractLoadEffect):
     A load Q at a point gives ``3 Q z^3 / (2 pi R^5)`` at depth z and distance R (Boussinesq 1885).
     For an even load on a disc of radius a, the divergence theorem gives an integral over the rim alone,
 
-        ``p / load = 1 / (pi a^2) mean of a (a - r cos t) (R^2 + R z + z^2) / (R^3 (R + z))``,
-        ``R^2 = z^2 + a^2 + r^2 - 2 a r cos t``, the mean over directions t,
+        p / load = 1 / (pi a^2) mean of a (a - r cos t) (R^2 + R z + z^2) / (R^3 (R + z)),
+        R^2 = z^2 + a^2 + r^2 - 2 a r cos t, the mean over directions t,
 
     which is ``(1 - (1 + (a/z)^2)^-1.5) / (pi a^2)`` on the axis and an even pressure at depth 0.  A
     Gaussian fits it with width 7.1, 7.4, 8.5, 10.2 mm at depth 2, 5, 10, 15 mm under a 20 mm tip.

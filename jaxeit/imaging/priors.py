@@ -78,7 +78,7 @@ class Diagonal(AbstractPrecision):
 
 
 class Precision(AbstractPrecision):
-    """R as a matrix, (basis, basis)."""
+    """R as the matrix ``values``, (basis, basis)."""
 
     values: Float[Array, "basis basis"]
 
@@ -106,7 +106,7 @@ class Precision(AbstractPrecision):
 
 
 class Covariance(AbstractPrecision):
-    """R as its inverse, the covariance of the image, (basis, basis)."""
+    """R as its inverse ``values``, the covariance of the image, (basis, basis)."""
 
     values: Float[Array, "basis basis"]
 
@@ -242,7 +242,7 @@ class TotalVariation(AbstractPrior):
 
     Minimised by iteratively reweighted least squares, with ``R = D^T diag(length / sqrt((D x)^2 + beta^2)) D`` at an
     image x (Vogel and Oman 1996).  ``beta``, as a fraction of the largest value of the image, keeps the penalty smooth
-    where x is flat.
+    where x is flat.  ``floor`` of the mean diagonal is added so that R stays definite.
     """
 
     follows_image: ClassVar[bool] = True

@@ -252,7 +252,7 @@ def half_height_classes(
         weakest: sum of the image over the weakest region, over that of the strongest.
 
     Returns:
-        (rows, columns): 0 unchanged, 1 below zero, 2 above zero.
+        0 unchanged, 1 below zero, 2 above zero, (rows, columns).
 
     Example:
         picture = je.imaging.on_grid(image, recon.picture, (64, 64))  # S, on a grid of its own

@@ -58,7 +58,8 @@ def quadratic_at(fn: Callable[..., Any], y: Parameters, args: Any, options: Mapp
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Parameters, Any, Any, LeastSquaresState]):
     """Bounded least squares for parameters (k,) of order one, one few or some hundreds; use `ImplicitStep` as adjoint.
 
-    Ends with a step of full length that changes no parameter by more than ``atol + rtol`` of itself, or that promises a
+    ``descent`` proposes each step, and ``search`` its damping. The fit ends with a step of full length that changes no
+    parameter (by ``norm``, the largest) by more than ``atol + rtol`` of itself, or that promises a
     fall of the objective, half the sum of squares, by no more than ``fall_atol + fall_rtol`` of itself.  That step is
     taken.  A solution that has not converged has another `optimistix.Solution.result`.
 

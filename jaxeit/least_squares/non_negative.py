@@ -98,7 +98,10 @@ class DiagonalProblem(eqx.Module):
 
 
 class DenseProblem(eqx.Module):
-    """``argmin over x >= 0 of x^T H x / 2 - b x``, H positive definite, (k, k)."""
+    """``argmin over x >= 0 of x^T H x / 2 - b x``, with H the ``hessian``, (k, k), and b the ``linear`` term, (k,).
+
+    H must be positive definite.
+    """
 
     hessian: Matrix
     linear: Parameters
@@ -130,7 +133,8 @@ class DualNewton(optx.AbstractMinimiser[Data, Any, DualState]):
     """Newton's method for `DiagonalProblem.dual`, in as many unknowns as there are data.
 
     The objective is a parabola while the set of positive parameters stays the same, so that the method ends exactly: a
-    whole step to the same set is the last one. The ``args`` of `optimistix.minimise` are the problem.
+    whole step to the same set is the last one. The ``args`` of `optimistix.minimise` are the problem. ``rtol``,
+    ``atol`` and ``norm``, which optimistix expects of a minimiser, have no influence.
 
     Example:
         J = jax.random.normal(jax.random.key(0), (15, 24))
@@ -177,7 +181,8 @@ class InteriorPoint(optx.AbstractMinimiser[Parameters, Any, Parameters]):
 
     Solves ``H x - b = z``, ``x z = 0`` with x, z > 0. Each step divides the duality gap, the mean of x z, by about ten
     whatever the condition of H. Ends where the gap is ``atol``, for a problem of order one, which is the ``args`` of
-    `optimistix.minimise`. The state is the multiplier z.
+    `optimistix.minimise`. The state is the multiplier z. ``rtol`` and ``norm``, which optimistix expects of a
+    minimiser, have no influence.
 
     Example:
         dense = problem.dense().of_order_one()

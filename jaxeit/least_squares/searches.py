@@ -131,7 +131,7 @@ class BoundedDescent(optx.AbstractDescent[Parameters, Quadratic, _AtPoint]):
     """Marquardt's damped step inside a box; the damping is one over the step size, as in optimistix.
 
     A parameter that is pushed against its bound rests there. One that the step would take out of the box goes to its
-    bound, and the others take the step that is best then.
+    bound, and the others take the step that is best then. ``lower`` and ``upper`` are the bounds, (k,); None: no bound.
 
     Example:
         solver = ls.LevenbergMarquardt(1e-8, 1e-8, descent=ls.BoundedDescent(lower=jnp.zeros(2)))
@@ -179,8 +179,8 @@ class DampingSearch(optx.AbstractSearch[Parameters, Quadratic, Quadratic, Scalar
     | meaning                                                    | default |
     |------------------------------------------------------------|---------|
     | first damping, of the diagonal of the normal matrix        | 1e-3    |
-    | factor of the damping after a step that leads down         | 0.1     |
-    | factor of the damping after a step that leads up           | 10      |
+    | after_descent: factor after a step that leads down         | 0.1     |
+    | after_ascent: factor after a step that leads up            | 10      |
     | least damping                                              | 1e-9    |
     """
 

@@ -121,11 +121,15 @@ class Space:
 
     | meaning                                            | shape             | unit |
     |----------------------------------------------------|-------------------|------|
+    | mesh: the triangles                                |                   |      |
+    | element of each triangle                           |                   |      |
     | points: where the degrees of freedom sit           | (dofs, 2 or 3)    | m    |
     | chart: the same in the sheet's flat coordinates    | (dofs, 2)         | m    |
     | dofs of each triangle                              | (elements, k)     |      |
     | boundary_dofs of each boundary edge                | (boundary, e)     |      |
-    | slopes of each triangle, weighted (see above)      | (elements, k, r)  | 1    |
+    | slopes of each triangle, weighted                  | (elements, k, r)  | 1    |
+
+    The weighted slopes S of a triangle give its stiffness at unit conductivity, ``S S^T``.
     """
 
     mesh: Mesh
@@ -184,7 +188,7 @@ def _edge_index(edges: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 def element_slopes(
     corners: Float[np.ndarray | Array, "elements 3 d"], areas: Float[np.ndarray | Array, " elements"], element: Lagrange
 ) -> Float[np.ndarray | Array, "elements k r"]:
-    """Weighted slopes (see above) of triangles with these corners, m, and areas, m^2; in NumPy or in JAX."""
+    """Weighted slopes (see `Space`) of triangles with these corners, m, and areas, m^2; in NumPy or in JAX."""
     xp: Any = corners.__array_namespace__()
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length, along, twice = xp.sqrt(xp.sum(first**2, -1)), xp.sum(first * second, -1), 2 * areas

@@ -90,6 +90,7 @@ class BasisMap(AbstractPictured):
     | coefficient of each line                              | (lines,)    |      |
     | stiffness of each line                                |             |      |
     | picture: where the coefficients lie                   |             |      |
+    | elements: number of elements of the model             |             |      |
     | single: whether each coefficient has one line         |             |      |
 
     Example:

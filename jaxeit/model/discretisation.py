@@ -53,6 +53,8 @@ class Model(eqx.Module):
     | mixing: readings as sums of rows; None: each is one |                 |                   |
     | current                                             | ()              | A                 |
     | effects of the scene                                |                 |                   |
+    | system: where each coefficient of the matrix is     |                 |                   |
+    | solver of the linear systems                        |                 |                   |
     | coat: the second sheet, if an effect asks for one   |                 |                   |
 
     Example:

@@ -42,7 +42,7 @@ def jacobian(
 ) -> Float[Array, "readings basis"]:
     """Derivative of `forward` at ``sigma`` with respect to the coefficients of ``basis``, V/S.
 
-    One factorisation and one substitution for the L fields; the rest is products (see above).
+    One factorisation and one substitution for the L fields; the rest is products.
 
     Args:
         sigma: (elements,) S; default: the untouched sheet.

@@ -79,7 +79,7 @@ def _points_in_box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PressureSensor:
-    """The span of a pad's gage pressure sensor and its stated accuracy, in Pa."""
+    """The span of a pad's gage pressure sensor, ``minimum`` to ``maximum``, and its stated ``accuracy``, in Pa."""
 
     minimum: float = 0.0
     maximum: float = 34474.0
@@ -92,12 +92,14 @@ class Skin:
 
     | meaning                                   | unit           |
     |-------------------------------------------|----------------|
+    | name of the skin                          |                |
     | domain: the sheet's flat shape            | m              |
     | sheet_resistance                          | ohm per square |
     | electrodes, in the order of their numbers |                |
     | protocol: one scan                        |                |
     | pads, in the order of pressure channels   |                |
-    | surface: its shape in space; None: flat   |                |
+    | pressure_sensor of each pad               | Pa             |
+    | surface: shape in space; None: flat       |                |
     | toml: the text of the skin file           |                |
 
     Raises:

@@ -76,7 +76,7 @@ def named_pattern(name: str, electrodes: int) -> np.ndarray:
     """The pattern of a name: "adjacent", "eidors-adjacent", "opposite", or "skip-n" with a whole number n.
 
     Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
+        Electrodes drive+, drive-, sense+ and sense- of each reading, (readings, 4) int32.
 
     Raises:
         ProtocolError: for another name, or too few electrodes.
@@ -112,7 +112,7 @@ def adjacent(electrodes: int) -> np.ndarray:
     shares an electrode with its drive: ``electrodes * (electrodes - 3)`` rows (550 for 25).
 
     Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
+        Electrodes drive+, drive-, sense+ and sense- of each reading, (readings, 4) int32.
 
     Raises:
         ProtocolError: for fewer than four electrodes.
@@ -128,7 +128,7 @@ def eidors_adjacent(electrodes: int) -> np.ndarray:
     of an even disc are above zero.
 
     Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
+        Electrodes drive+, drive-, sense+ and sense- of each reading, (readings, 4) int32.
 
     Raises:
         ProtocolError: for fewer than four electrodes.
@@ -143,7 +143,7 @@ def skip(electrodes: int, skipped: int) -> np.ndarray:
     It has as many rows as `adjacent`: ``electrodes * (electrodes - 3)``.
 
     Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
+        Electrodes drive+, drive-, sense+ and sense- of each reading, (readings, 4) int32.
 
     Raises:
         ProtocolError: for fewer than four electrodes, or if a pair reaches half way round or farther.
@@ -173,7 +173,7 @@ def opposite(electrodes: int) -> np.ndarray:
     (``electrodes`` drives for an odd number).
 
     Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
+        Electrodes drive+, drive-, sense+ and sense- of each reading, (readings, 4) int32.
 
     Raises:
         ProtocolError: for fewer than six electrodes, where no pair of neighbours is left to sense.
@@ -197,7 +197,7 @@ def all_pairs(electrodes: int) -> np.ndarray:
     negative, so that ``3 C(electrodes, 4)`` are left (37,950 for 25).
 
     Returns:
-        (readings, 4) int32: drive+, drive-, sense+, sense-.
+        Electrodes drive+, drive-, sense+ and sense- of each reading, (readings, 4) int32.
 
     Raises:
         ProtocolError: for fewer than four electrodes.

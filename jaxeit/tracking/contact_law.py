@@ -36,6 +36,9 @@ USUAL = np.log([LoadSettings().force, LoadSettings().width])
 class ContactLaw(NamedTuple):
     """What contacts have told of the force by which readings err.
 
+    With f and w the force and the width that readings alone tell, F the true force, F0 and w0 usual ones,
+    ``log f = log F + a + b log(F / F0) + c log(w / w0) + e`` with a normal error e.
+
     | meaning                                                                     | shape  | unit |
     |-----------------------------------------------------------------------------|--------|------|
     | mean of a, b and c                                                          | (3,)   | 1    |
@@ -81,7 +84,7 @@ class ContactLaw(NamedTuple):
 
     @property
     def slope(self) -> float:
-        """Of the log force that readings alone tell in the log of the true force."""
+        """Slope 1 + b of the log force that readings alone tell, over the log of the true force."""
         return max(1 + float(self.mean[1]), LEAST_SLOPE)
 
     @property

@@ -86,7 +86,7 @@ def _one_back(state: State, step: Transition, after: State, told: State) -> Stat
 
 
 class TimedTracks(NamedTuple):
-    """Tracks at a time (ns)."""
+    """The contacts ``tracks`` at a ``time`` (ns)."""
 
     time: int
     tracks: tuple[Track, ...]

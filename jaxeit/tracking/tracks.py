@@ -25,7 +25,8 @@ class Track(NamedTuple):
     | position in the sheet's flat coordinates; of an edge, its middle    | (2,)   | m     |
     | covariance of the position                                          | (2, 2) | m^2   |
     | width: standard deviation of the load, across an edge               |        | m     |
-    | force, and the standard deviation of its logarithm                  |        | N, 1  |
+    | force                                                               |        | N     |
+    | log_force_error: standard deviation of the logarithm of the force   |        | 1     |
     | half: from the middle of an edge to its end; zero for other contacts | (2,)  | m     |
     | velocity                                                            | (2,)   | m/s   |
     """

@@ -149,7 +149,8 @@ class PlaySpline(AbstractCurve):
 
     y = w_0 P + sum of w_i play(P; r_i) is in pascal: its slope of first loading is ratio i beyond the i-th width, and 1
     beyond the last, so that S alone carries the unit of force. A generalised Prandtl-Ishlinskii operator (Al Janaideh
-    et al. 2011, IEEE Trans. Mechatronics 16); its inverse is the inverse of S, then that of the play operators.
+    et al. 2011, IEEE Trans. Mechatronics 16); its inverse is the inverse of S, then that of the play operators. The
+    ``widths`` r_i and ``top`` are settings in Pa; by default the fit takes them from the samples.
 
     | parameter     | meaning                                                    | shape | unit | bound |
     |---------------|------------------------------------------------------------|-------|------|-------|

@@ -117,7 +117,7 @@ def fit_field(
     weight: Float[Array, " n"],
     reach: Float[Array, "2 2"],
 ) -> FittedField:
-    """The pure fit: fixed shapes, works under jit and vmap, never raises.
+    """Fit a field of gain to presses: fixed shapes, works under jit and vmap, never raises.
 
     Args:
       places: of the presses, from their images.

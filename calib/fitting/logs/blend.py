@@ -81,6 +81,8 @@ class BlendChannels:
 class WithPlace:
     """Make one signal in N of all channels and of the two coordinates of the place, which are the last columns.
 
+    ``way`` combines the columns, such as `BlendChannels`.
+
     Example:
         # the last two columns of the channels are the place
         with_place = logs.WithPlace(logs.BlendChannels())

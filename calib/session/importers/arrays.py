@@ -23,7 +23,7 @@ from .tables import AbstractTableFile, Progress, Table
 
 
 class ArrayShape(NamedTuple):
-    """Rows and columns of an array as a table; ``unit`` is known of clocks: "s" of times since 1970."""
+    """``rows`` and ``columns`` of an array as a table; ``unit`` is known of clocks: "s" of times since 1970."""
 
     rows: int
     columns: int

@@ -8,7 +8,18 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class StreamReport:
-    """Report of one stream: numbers of values, over all its channels and files."""
+    """Report of one stream, over all its channels and files.
+
+    | field                  | meaning                                                           |
+    |------------------------|-------------------------------------------------------------------|
+    | name, variable, unit   | of the stream and of its quantity                                 |
+    | rows, channels         | number of samples, and of values of each                          |
+    | rate_hz                | rate of the samples, Hz                                           |
+    | declared_missing       | number of values that were declared to stand for a missing one    |
+    | not_numbers            | number of cells that are no numbers                               |
+    | first_not_number       | line or row of the first of these; None: there is none            |
+    | warnings               | what the user should act on                                       |
+    """
 
     name: str
     variable: str
@@ -27,6 +38,16 @@ class FileReport:
     """Report of one file; ``first_*`` are numbers of lines or, in a binary file, of rows, as ``counted`` says.
 
     Streams that several files continue are in the report of the last of these files.
+
+    | field                               | meaning                                                      |
+    |-------------------------------------|--------------------------------------------------------------|
+    | path                                | of the file                                                  |
+    | rows_read                           | number of rows                                               |
+    | rows_without_time                   | number of rows left out because their time is missing        |
+    | equal_times                         | number of rows left out because they have the time of another |
+    | first_without_time, first_equal_time | where the first of these is; None: there is none            |
+    | rows_sorted                         | number of rows that went back in time and were sorted        |
+    | streams                             | a report of each                                             |
     """
 
     path: Path
@@ -43,6 +64,9 @@ class FileReport:
 @dataclass(frozen=True)
 class ImportReport:
     """What an import read, left out and found suspicious.
+
+    ``output`` is the path of the session, ``epoch`` when its clock read zero (1970 unless ``epoch_known``), ``files`` a
+    report of each file and ``notes`` what holds for all.
 
     Example:
         for file in report.files:

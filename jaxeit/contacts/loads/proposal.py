@@ -83,9 +83,11 @@ class Proposal:
     | meaning                                                                     | shape                | unit |
     |-----------------------------------------------------------------------------|----------------------|------|
     | noise of a reading in the training                                          | ()                   | V    |
-    | basis U, orthonormal, and the standard deviations s in units of the noise   | (readings, r), (r,)  | 1    |
+    | basis: orthonormal directions U of the whitened frame                       | (readings, r)        | 1    |
+    | spread: standard deviations s along the directions, in units of the noise   | (r,)                 | 1    |
     | mean, deviation of ``z / |z|`` and ``log |z|``                              | (r + 1,)             | 1    |
-    | weight0, bias0 to weight2, bias2: of the layers, between which stands max(x, 0) | (outputs, inputs) | 1    |
+    | weight0, weight1, weight2: of the layers, between which stands max(x, 0)    | (outputs, inputs)    | 1    |
+    | bias0, bias1, bias2: of the layers                                          | (outputs,)           | 1    |
     | temperature: by which the first outputs are divided for probabilities       | ()                   | 1    |
     | offset, scale: from the other outputs to the parameters of loads            | (30,)                | m, 1 |
     | unexplained: part of the signal that no direction has, in the training      | ()                   | 1    |

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 class LoadKind(IntEnum):
     """What touches the sheet."""
 
-    NONE = 0
-    ONE = 1
-    TWO = 2
-    EDGE = 3
+    NONE = 0  # nothing
+    ONE = 1  # one load
+    TWO = 2  # two loads
+    EDGE = 3  # one load along a line
     MORE = 4  # three loads explain the frame better than all else
 
 

@@ -126,7 +126,7 @@ class LearnedLayer(NamedTuple):
 
     @property
     def probabilities(self) -> Float[np.ndarray, " v"]:
-        """Of `PRESS_VARIANCES`."""
+        """Probability of each variance of the effect of a press (`PRESS_VARIANCES`)."""
         return np.asarray(softmax(self.evidence))
 
     @property
