@@ -37,6 +37,7 @@ from .scan_control import ScanDirector, prepare_director
 MAX_WAIT = 10_000_000  # ns
 MAX_QUEUED_FRAMES = 16
 PERIOD_SMOOTHING = 0.1  # weight of a new interval in the mean interval between frames
+COMPILING = "compiling the programs of this calibration, before the devices are asked: up to a minute the first time"
 
 
 class LiveError(ValueError):
@@ -130,7 +131,7 @@ class LiveControl:
 
     stop: threading.Event = field(default_factory=threading.Event)
     tare: threading.Event = field(default_factory=threading.Event)
-    state: str = "waiting for the devices"
+    state: str = COMPILING
     lost: int = 0
     health: str = ""
     doubt: str = ""
@@ -199,6 +200,7 @@ def run_live(
         PriorityError: if real-time scheduling is refused.
     """
     settings = settings or LiveSettings()
+    control.state = COMPILING
     engine, recalibrator = _engine(calibration, sources, control, settings)
     queue = FrameQueue(*(source.plan for source in sources))
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
@@ -206,6 +208,7 @@ def run_live(
     if settings.event_driven:
         control.state = "choosing the readings for each place of the skin"
         director = prepare_director(cast(Calibration, calibration), sources[0].plan.number, recorder.receivers[0].send)
+    control.state = f"waiting for the first frame of {' and '.join(source.plan.name for source in sources)}"
     with real_time(settings.realtime), recorder:
         begun()
         count = _process_frames(engine, queue, recorder, viewers, control, settings.wait, director)

@@ -557,6 +557,26 @@ def test_results_come_as_frames_arrive(calibration):
     assert show.state == "running"
 
 
+def test_before_the_first_frame_viewers_are_told_what_is_waited_for(calibration, monkeypatch):
+    """While programs are compiled, too, which no device has a part in."""
+    show, told = LiveControl(), []
+    make = Engine.__init__
+
+    def compiling(engine, *args, **options):
+        told.append(show.state)
+        make(engine, *args, **options)
+
+    def tell():
+        told.append(show.state)
+        show.stop.set()
+
+    monkeypatch.setattr(Engine, "__init__", compiling)
+    with small_device() as device:
+        plan, sources = sources_of(device, calibration)
+        run_live(calibration, plan, sources, [], show, LiveSettings(rest=0.1), begun=tell)
+    assert told == [live_module.COMPILING, "waiting for the first frame of eit and pressure"]
+
+
 def policies():
     return [os.sched_getscheduler(int(task)) for task in os.listdir("/proc/self/task")]
 

@@ -174,6 +174,14 @@ def page(calibration):
         yield found
 
 
+def test_before_the_first_result_the_page_says_what_is_waited_for(browser, calibration):
+    control = LiveControl()
+    with Page(calibration, control) as waiting, browser.open(waiting.url, 1280) as tab:
+        tab.wait_for("$('state').textContent.startsWith('compiling the programs of this calibration')")
+        control.state = "waiting for the first frame of eit and pressure"
+        tab.wait_for(f"$('state').textContent === '{control.state}'")
+
+
 @pytest.fixture
 def tab(browser, page):
     with browser.open(page.url, 1280) as found:
