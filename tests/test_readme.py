@@ -27,6 +27,7 @@ def test_commands_and_links(root):
     described = (root / "docs" / "commands.md").read_text()
     assert set(re.findall(r"^\| `jaxeit (\w+)", text, re.MULTILINE)) == set(COMMANDS)
     assert set(re.findall(r"^`jaxeit (\w+)", described, re.MULTILINE)) == set(COMMANDS)
+    text += (root / "CONTRIBUTING.md").read_text()
     for target in re.findall(r"^make (\w+)", text, re.MULTILINE):
         assert f"\n{target}:" in (root / "Makefile").read_text()
 

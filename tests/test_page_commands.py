@@ -1,0 +1,231 @@
+"""The commands of the pages run as they are printed, on recordings of the kind that each page speaks of.
+
+Where a page names a device (``tcp://HOST:PORT``) or a number of frames that takes hours, the test gives another one.
+"""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+import calib
+import jaxeit as je
+from calib.cli import main
+from tests.record.test_recorder import both, journal
+from tests.test_docs import blocks, served
+from tests.test_programs import write_log
+
+ROOT = Path(__file__).parents[1]
+SESSIONS = ROOT / "data" / "sessions"
+SHORT = ["--port", "0", "--seconds", "20"]
+"""What lets the live show of a test end."""
+
+
+def commands(page):
+    """The commands in the blocks of a page, without what explains them; those with an ellipsis are left out."""
+    for language, _, text in blocks(ROOT / "docs" / page):
+        for line in re.sub(r"\\\n *", "", text).splitlines() if language in ("", "text") else ():
+            words = re.split(r"(?<=\S) {3,}(?=\S)| +#", line)[0]
+            if words.startswith("jaxeit ") and "..." not in words:
+                yield words
+
+
+def do(line, *more, **given):
+    """Run a command, with words of its own in place of some."""
+    words = shlex.split(line)[1:]
+    assert main([*(given.get(word, word) for word in words), *more]) == 0, line
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A folder with the bundled recordings and a calibration of one."""
+    folder = tmp_path_factory.mktemp("pages")
+    shutil.copy(SESSIONS / "testbed_grid.h5", folder / "session.h5")
+    shutil.copy(SESSIONS / "testbed_presses.h5", folder / "use.h5")
+    words = ["calibrate", str(folder / "session.h5"), "-o", str(folder / "calibration.h5"), "--fidelity", "draft"]
+    assert main(words) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(calibrated, tmp_path, monkeypatch):
+    """The same files in a folder of the test's own."""
+    for path in calibrated.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_table(name, header, rows=200):
+    """A table of text with a clock in its first column."""
+    values = np.random.default_rng(0).normal(1, 0.1, (rows, len(re.findall(r'"[^"]*"|[^,]+', header))))
+    values[:, 0] = np.arange(rows)
+    np.savetxt(name, values, "%.6g", ",", header=header, comments="")
+
+
+def write_bag(path):
+    """A bag of ROS 2 with a force and a sensor."""
+    rosbag2, stores = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
+    kinds = store.types
+    zero = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 1.0)
+    stamp = kinds["builtin_interfaces/msg/Time"](0, 0)
+    header = kinds["std_msgs/msg/Header"](stamp, "tool")
+    layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
+    messages = {
+        "/ft": kinds["geometry_msgs/msg/WrenchStamped"](header, kinds["geometry_msgs/msg/Wrench"](zero, zero)),
+        "/skin": kinds["std_msgs/msg/Float64MultiArray"](layout, np.ones(3)),
+    }
+    with rosbag2.Writer(path, version=9) as writer:
+        for topic, message in messages.items():
+            connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            for k in range(100):
+                writer.write(connection, k * 10**7, store.serialize_cdr(message, message.__msgtype__))
+
+
+@pytest.mark.slow
+def test_the_commands_about_import(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    seconds = {"t": np.arange(50) / 100, "f": np.ones(50), "p": np.ones(50)}
+    wide = ",".join(["t", *(f"v{k}" for k in range(550)), '"p, left"', '"p, right"'])
+    for name, header in (("day1", "t,load"), ("states", "a,b,c,d,e"), ("sensor", ",".join("abcdefghijklmnop"))):
+        write_table(f"{name}.csv", header)
+    (tmp_path / "day2.csv").write_text("t,load\n" + "".join(f"{300 + k},1\n" for k in range(50)))
+    for name in ("a", "b"):
+        np.savez(f"{name}.npz", f=np.arange(50.0))
+    savemat("run.mat", {"run": seconds})
+    write_bag(tmp_path / "bag")
+    tables = iter(["ms,1,2,3,4,p,f", wide])
+    lines = list(commands("import.md"))
+    assert len(lines) == 7
+    for line in lines:
+        if " log.csv " in line:
+            write_table("log.csv", next(tables))
+        do(line)
+        with calib.open_session("session.h5") as session:
+            assert all(np.isfinite(stream.read()).all() for stream in session.streams.values()), line
+
+
+@pytest.mark.slow
+def test_the_commands_about_logs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, gain in (("log", 400), ("other", 400), ("later", 410), ("a-week-later", 420)):
+        write_log(f"{name}.h5", gain)
+    with calib.open_session("log.h5") as session:
+        force, pressure = (session.streams[name] for name in ("force", "pressure"))
+        columns = [1e-6 * force.time, *np.zeros((4, len(force.time))), 1e-5 * pressure.read()[:, 0], force.read()[:, 0]]
+    np.savetxt("log.csv", np.stack(columns, 1), "%.9g", ",")
+    Path("log.h5").unlink()
+    first, *rest, live = commands("logs.md")
+    do(first)
+    for line in rest:
+        do(line)
+    do(live, *SHORT, **{"tcp://HOST:PORT": "replay://later.h5"})
+    assert int(re.findall(r"(\d+) frames$", capsys.readouterr().err, re.MULTILINE)[-1]) > 0
+    assert calib.load_calibration("new.h5").shift is not None
+    assert {path.name for path in tmp_path.glob("*")} >= {"report.html", "forces.h5", "calibration.h5"}
+
+
+@pytest.mark.slow
+def test_the_commands_about_ros(folder, capsys):
+    assert main(["apply", "calibration.h5", "use.h5", "-o", "forcemap.h5"]) == 0
+    *export, ros, foxglove, again, back = commands("ros.md")
+    for line in export:
+        do(line)
+    assert (folder / "bag" / "metadata.yaml").exists()
+    shutil.rmtree("recording")
+    do(again)
+    do(back)
+    with calib.open_session("again.h5") as found, calib.open_session("session.h5") as given:
+        wanted = given.streams["eit"].read()
+        np.testing.assert_allclose(found.streams["eit"].read(), wanted, atol=1e-6 * np.abs(wanted).max())
+    assert "--ros2" in ros  # which needs ROS; tests/live/test_bridges.py gives the node messages
+    pytest.importorskip("foxglove")
+    replay = "replay://use.h5"
+    do(foxglove.replace("URL", replay).replace("--foxglove", "--foxglove 0"), *SHORT)
+    assert int(re.findall(r"(\d+) frames$", capsys.readouterr().err, re.MULTILINE)[-1]) > 0
+
+
+def do_served(line, *more):
+    """Run a command with the addresses of a served recording in place of those of its devices."""
+    with served(["simulate", "ideal", "-o", "use.h5", "--serve"]) as urls:
+        words = shlex.split(line)[1:]
+        given = [urls.get(before, word) for before, word in zip(["", *words], words, strict=False)]
+        assert main([*given, *more]) == 0, line
+
+
+@pytest.mark.slow
+def test_the_commands_about_recording(folder, capsys):
+    record, recover, live, serve = commands("live.md")
+    do_served(record, "-o", "recorded.h5", "--seconds", "1")
+    journal("session.h5.part", both(), end=False)
+    (folder / "session.h5").unlink()
+    do(recover)
+    do_served(live, *SHORT)
+    assert int(re.findall(r"(\d+) frames$", capsys.readouterr().err, re.MULTILINE)[-1]) > 0
+    assert shlex.split(serve)[-1] == "--serve"  # as `served` does, of a recording that is there
+    (checklist,) = commands("checklist.md")
+    Path("my_skin.toml").write_text(je.load_skin("testbed").toml)
+    stage = "--stage tcp://HOST:PORT "
+    assert stage in checklist  # the recording has none
+    do_served(checklist.replace(stage, ""), "-o", "again.h5", "--seconds", "1")
+    with calib.open_session("again.h5") as session:
+        assert session.streams.keys() == {"eit", "pressure", "force"}
+
+
+@pytest.mark.slow
+def test_the_commands_a_week_later(folder):
+    with_force, without = commands("a-week-later.md")
+    do(with_force, **{"later.h5": "session.h5"})
+    do(without, "--from", "use", "--force", **{"use.h5": "session.h5"})
+    assert calib.load_calibration("new.h5").recalibration is not None
+
+
+@pytest.mark.slow
+def test_the_commands_about_training_frames(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for line in commands("training-frames.md"):
+        do(line, **{"1000000": "40", "8": "1"})
+    assert (tmp_path / "frames" / "card.json").exists()
+    assert list((tmp_path / "tables").glob("*.parquet"))
+
+
+def test_the_recipe_of_the_page_on_commands_is_read():
+    (text,) = [text for language, _, text in blocks(ROOT / "docs" / "commands.md") if language == "toml"]
+    recipe = calib.Recipe.from_toml(text)
+    assert isinstance(recipe.imaging.hyperparameter, je.imaging.LCurve)
+    assert isinstance(recipe.location, calib.PadEdge)
+
+
+def fragments(page):
+    """The programs of a page that go on from objects of the reader."""
+    return [text for language, _, text in blocks(ROOT / "docs" / page) if language == "py"]
+
+
+@pytest.mark.slow
+def test_programs_that_go_on_from_objects_of_the_reader(folder):
+    calibration, names = calib.load_calibration("calibration.h5"), {"calib": calib, "je": je}
+    model = je.discretise(je.Scene(calibration.skin), je.Fidelity.draft())
+    v0 = je.forward(model)
+    noise, places = jnp.full(len(v0), 1e-4 * float(jnp.abs(v0).max())), jnp.array([[0.05, 0.13], [0.14, 0.06]])
+    bumps = jnp.exp(-jnp.sum((model.centroids - places[:, None]) ** 2, -1) / (2 * 0.01**2))
+    dv = jnp.stack([je.forward(model, model.background * (1 + 0.4 * bump)) - v0 for bump in bumps])
+    tracker = je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=model.background)
+    now = tracker.step(tracker.start(), dv[0], 0.01)
+    given = {"calibration": calibration, "points": np.asarray(places), "tracker": tracker, "now": now, "model": model}
+    with calib.open_session("use.h5") as session, calib.open_session("session.h5") as grid:
+        names |= given | {"session": session, "sessions": [grid], "noise": noise, "v0": v0, "pad_errors": None}
+        names |= {"skin": calibration.skin, "dv": dv, "places": places}
+        learned, law = fragments("methods.md")
+        exec(compile(learned, "methods.md", "exec"), names)
+        exec(compile(law, "methods.md", "exec"), names)
+        (electrodes,) = fragments("electrodes.md")
+        exec(compile(electrodes, "electrodes.md", "exec"), names)
+    assert np.isfinite(names["mean"]).all()
+    assert len(names["tracks"]) == len(now.tracks)
+    assert float(jnp.abs(names["fit"].shift).max()) < 1e-3
