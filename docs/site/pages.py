@@ -17,7 +17,7 @@ PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "*/README.
 FILES = ("docs/**/*.png", "docs/site/*.css", "docs/site/*.js", "jaxeit/skin/skins/*.toml", "calib/bench/scenes/*.toml",
          "data/sessions/*.toml", "examples/notebooks/*.ipynb")  # fmt: skip
 EXAMPLE = re.compile(r"\]\((\w+)\.py\)")
-RAISED = re.compile(r"(field-body\">\s*)<code>(\w+)</code>")
+RAISED = re.compile(r"(field-body\">\s*<code>)(\(?\w+(?:, \w+)*\)?)(?=</code>)")
 REFERENCE = re.compile(r"(<autoref\b[^>]*\bidentifier=\")([\w.]+)(?=\")")
 
 
@@ -49,6 +49,6 @@ def on_page_content(html: str, **_: object) -> str:
     """Let references lead to the page of a name, whichever module has it, and the errors of a list to theirs."""
 
     def error(found: re.Match[str]) -> str:
-        return f'{found[1]}<autoref identifier="{found[2]}" optional><code>{found[2]}</code></autoref>'
+        return found[1] + re.sub(r"\w+", r'<autoref identifier="\g<0>" optional>\g<0></autoref>', found[2])
 
     return REFERENCE.sub(lambda found: found[1] + (public_path(found[2]) or found[2]), RAISED.sub(error, html))
