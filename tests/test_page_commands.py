@@ -17,7 +17,10 @@ import calib
 import jaxeit as je
 from calib.cli import main
 from tests.record.test_recorder import both, journal
-from tests.test_docs import blocks, served
+from tests.tanks.instrument_files import goe_get
+from tests.tanks.rods import tank_with_rod
+from tests.tanks.tank_files import write_csv, write_ktc
+from tests.test_docs import blocks, served, write_files
 from tests.test_programs import write_log
 
 ROOT = Path(__file__).parents[1]
@@ -200,6 +203,33 @@ def test_the_recipe_of_the_page_on_commands_is_read():
     recipe = calib.Recipe.from_toml(text)
     assert isinstance(recipe.imaging.hyperparameter, je.imaging.LCurve)
     assert isinstance(recipe.location, calib.PadEdge)
+
+
+def write_tanks(folder):
+    """The files that the page on tanks names: of PyEIDORS, an instrument, the Kuopio challenge and readings alone."""
+    rod = tank_with_rod()
+    write_csv(folder / "tank_55uA_1000Hz.csv", rod.frames)
+    (folder / "recording.get").write_bytes(goe_get(np.resize(rod.frames, (121, rod.frames.shape[1]))))
+    write_ktc(folder)
+    write_files(ROOT / "docs" / "tanks.md", folder)
+    model = je.discretise(je.Scene(je.load_skin(folder / "tank.toml")), je.Fidelity.draft())
+    touched = jnp.linalg.norm(model.centroids - jnp.array([0.05, 0.03]), axis=1) < 0.02
+    frames = np.stack([je.forward(model), je.forward(model, jnp.where(touched, 2, 1) * model.background)])
+    savemat(folder / "frames.mat", dict(zip(("vh", "vi"), frames[:, :, None], strict=True)))
+    np.savez(folder / "frames.npz", frames=frames)
+
+
+@pytest.mark.slow
+def test_the_commands_about_tanks(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_tanks(tmp_path)
+    lines = list(commands("tanks.md"))
+    assert len(lines) == 6
+    for line in lines:
+        do(line)
+        picture = Path(shlex.split(line)[-1])
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        picture.unlink()
 
 
 def fragments(page):
