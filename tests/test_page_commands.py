@@ -209,8 +209,8 @@ def write_tanks(folder):
     """The files that the page on tanks names: of PyEIDORS, an instrument, the Kuopio challenge and readings alone."""
     rod = tank_with_rod()
     write_csv(folder / "tank_55uA_1000Hz.csv", rod.frames)
-    (folder / "recording.get").write_bytes(goe_get(np.resize(rod.frames, (121, rod.frames.shape[1]))))
-    write_ktc(folder)
+    (folder / "recording.get").write_bytes(goe_get(-np.resize(rod.frames, (121, rod.frames.shape[1]))))
+    write_ktc(folder, je.Fidelity.draft(order=2, edge_length=0.03))
     write_files(ROOT / "docs" / "tanks.md", folder)
     model = je.discretise(je.Scene(je.load_skin(folder / "tank.toml")), je.Fidelity.draft())
     touched = jnp.linalg.norm(model.centroids - jnp.array([0.05, 0.03]), axis=1) < 0.02

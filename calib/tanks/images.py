@@ -76,7 +76,7 @@ def difference_image(
             default: contacts as the tank has them.
 
     Raises:
-        TankError: if there is one frame, or the reference does not look like the model.
+        TankError: if there is one frame, the reference does not look like the model, or its fit does not converge.
         InverseError: if ``fit`` is given, and no even content explains the reference.
     """
     scaled = _scaled(tank, frame, reference, fidelity, fit)
@@ -141,8 +141,19 @@ def _scaled(
             "check the order and the polarity of readings, and the place and direction of electrodes"
             + ("; it seems to be the polarity: save the readings with the other sign" if correlation < OPPOSITE else "")
         )
-    found = None if fit is None else fit_reference(model, np.where(used, before, np.nan), fit)
+    found = None if fit is None else _fitted(tank, model, np.where(used, before, np.nan), first, fit)
     model = model if found is None else found.model
     even = np.asarray(je.forward(model))
     scale = float(even[used] @ before[used] / (before[used] @ before[used]))
     return _Scaled(model, scale * before, scale * after, scale, correlation, found)
+
+
+def _fitted(tank: Tank, model: je.Model, frame: np.ndarray, number: int, fit: ReferenceSettings) -> ReferenceFit:
+    """The conductivity and contacts of a frame; refuses what the fit does not find."""
+    found = fit_reference(model, frame, fit)
+    if not np.isfinite(found.value.level):
+        raise TankError(
+            f"{tank.skin.name}: the fit of conductivity and contacts to frame {number} does not converge, as where "
+            "contacts are better than the mesh resolves; leave out --fit-contacts (fit=None)"
+        )
+    return found

@@ -74,14 +74,14 @@ def write_sciospec(folder, bench):
         (folder / name).write_text("\n".join(lines) + "\n")
 
 
-def write_ktc(folder):
+def write_ktc(folder, fidelity=None):
     """Each drive has its own current, in mA; the reference lies beside the frame. Returns the readings."""
     disc = je.Disc(0.115)
     rim = je.skin.rim_electrodes(disc, COUNT, contact=1e-4, start=np.pi / 2)
     current = RING[:, ::2] * np.linspace(1.4, 1.6, 8)
     protocol = je.Protocol.from_matrices(1e-3 * current, RING[:, :15])
     tank = je.Skin("", disc, 1.0, rim, protocol)
-    readings = np.asarray(je.forward(je.discretise(je.Scene(tank), je.Fidelity.draft())))
+    readings = np.asarray(je.forward(je.discretise(je.Scene(tank), fidelity or je.Fidelity.draft())))
     savemat(folder / "ref.mat", {"Injref": current, "Mpat": RING[:, :15], "Uelref": readings[:, None]})
     savemat(folder / "data1.mat", {"Inj": current, "Mpat": RING[:, :15], "Uel": 1.1 * readings[:, None]})
     return readings

@@ -401,3 +401,13 @@ def test_matrices_of_the_kuopio_challenge_explain_its_water():
     water = tank.frames[0]
     assert tank.skin.protocol.readings == len(water) == 2356
     assert np.corrcoef(np.asarray(je.forward(tank.model())), water)[0, 1] > 0.99
+
+
+@pytest.mark.slow
+def test_a_fit_of_the_reference_that_does_not_converge_is_refused(tmp_path, capsys):
+    """Linear elements add a contact resistance, so that quadratic ones would need one below zero."""
+    write_ktc(tmp_path)
+    assert main(["image", str(tmp_path / "data1.mat"), "--fit-contacts", "one", "-o", str(tmp_path / "p.png")]) == 2
+    assert "does not converge" in (told := capsys.readouterr().err)
+    assert "leave out --fit-contacts" in told
+    assert not (tmp_path / "p.png").exists()

@@ -82,7 +82,7 @@ def find_misplacement(
         drilled = places + np.random.default_rng(0).normal(0, 1e-3, places.shape)  # m
         real = je.discretise(je.Scene(je.skin.with_positions(skin, drilled)), je.Fidelity.draft())
         doubt = je.imaging.find_misplacement(model, je.forward(real))
-        print(f"bolts sit {1e3 * doubt.size:.1f} mm aside, with a log evidence of {0.5 * doubt.evidence:.0f}")
+        print(f"bolts sit {1e3 * doubt.size:.1f} mm aside; log evidence {0.5 * doubt.evidence:.0f}")
     """
     require_known("find_misplacement", InverseError, model.nodes, v0, noise)
     frame = jnp.asarray(v0, model.dtype)
