@@ -20,7 +20,7 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "_other_words", "budget", "files", "notebook", "program_cache", "_compile", "toml",
+    "_other_words", "budget", "files", "array_files", "notebook", "program_cache", "_compile", "toml",
     "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "plot", "__main__",
 ]  # fmt: skip
@@ -67,6 +67,16 @@ def test_imports_run_down_the_list(package, order):
         for used in _imports(path, package):
             if used and used != room:
                 assert order.index(used) < order.index(room), f"{path} imports {used}"
+
+
+@pytest.mark.parametrize(("package", "order"), [("jaxeit", ORDER), ("calib", BENCH)])
+def test_imports_are_at_most_eight_rooms_deep(package, order):
+    depth = dict.fromkeys(order, 1)
+    for room in order:  # each room imports earlier ones only
+        for path in [*(ROOT / package / room).rglob("*.py"), *(ROOT / package).glob(f"{room}.py")]:
+            below = [depth[used] for used in _imports(path, package) if used and used != room]
+            depth[room] = max(depth[room], 1 + max(below, default=0))
+    assert max(depth.values()) <= 8, depth
 
 
 def test_files_are_read_and_recorded_without_jax():

@@ -11,7 +11,7 @@ import pytest
 import calib
 import jaxeit as je
 
-HELPERS = {"budget", "registry", "toml", "files", "_compile"}
+HELPERS = {"budget", "registry", "toml", "files", "array_files", "_compile"}
 """Rooms that serve every step, such as the memory budget; they are no steps of a job."""
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compile import require_known
-from ..files import DAMAGE, read_arrays, write_arrays
+from ..array_files import DAMAGE, read_arrays, write_arrays
 from ..linalg import is_covariance
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem

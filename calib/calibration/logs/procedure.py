@@ -17,7 +17,6 @@ import jaxeit as je
 from jaxeit.budget import current_budget
 
 from ...check.acceptance import accept
-from ...fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ...fitting.curves import CURVES, AbstractCurve
 from ...fitting.fields import FIELDS, AbstractField, PadEdge
 from ...fitting.logs import (
@@ -33,6 +32,7 @@ from ...fitting.logs import (
     ways_of,
 )
 from ...fitting.results import FitError
+from ...presses.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
 from ..fitted_sessions import FITTED, is_fitted, require_each_once

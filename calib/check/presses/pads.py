@@ -6,7 +6,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ...fitting.channel_faults import MIN_ARRAY_CHANNELS, faults
+from ...presses.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ...presses.streams import resample
 from ...session import Stream
 from ..report import Finding, PadRow, Severity, listed

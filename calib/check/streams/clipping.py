@@ -6,7 +6,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ...fitting.channel_faults import MIN_ARRAY_CHANNELS
+from ...presses.channel_faults import MIN_ARRAY_CHANNELS
 from ...presses.streams import true_runs
 from ..report import Finding, Severity, counted
 from .statistics import MIN_FRAME_CHANNELS, StreamStatistics, full_scale

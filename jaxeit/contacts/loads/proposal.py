@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from ...files import read_arrays, write_arrays
+from ...array_files import read_arrays, write_arrays
 from ...imaging.noise import InverseError
 from ...skin import Skin, skin_hash
 from .result import LoadKind

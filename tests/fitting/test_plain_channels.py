@@ -9,12 +9,12 @@ from scipy import ndimage
 import calib
 from benchmarks import bench_real
 from calib.fitting import AffinePlay, PlaySpline
-from calib.fitting.channel_faults import faults
 from calib.fitting.curves import Affine, fit_curves
 from calib.fitting.curves.fitted import predict_pads
 from calib.fitting.logs import SmoothChannels, fit_log
 from calib.fitting.logs.combination import lagged
 from calib.fitting.results import FitResult
+from calib.presses.channel_faults import faults
 
 from ..helpers import REAL_DATA
 

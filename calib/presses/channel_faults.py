@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage, stats
 
-from ..presses.corrections import bridge
+from .corrections import bridge
 
 MIN_ARRAY_CHANNELS = 8  # with fewer channels, a user inspects each one by itself
 STUCK_FRACTION = 0.99  # of the samples at one value
