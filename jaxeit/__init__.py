@@ -27,15 +27,10 @@ Example:
     print(f"{fmap.force.sum():.1f} N in all, at most {fmap.pressure.max() / 1e3:.0f} kPa")
 """
 
-import difflib
-import re
-from importlib import metadata
-from pathlib import Path
+from importlib import import_module, metadata
 from typing import Any
 
 import lazy_loader
-
-from ._other_words import translation
 
 _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
@@ -46,16 +41,8 @@ def __getattr__(name: str) -> Any:
     except AttributeError:
         if name.startswith("_"):
             raise
-        raise AttributeError(f"jaxeit has no {name}{_whereabouts(name)}", name=name) from None
-
-
-def _whereabouts(name: str) -> str:
-    """Where a name is that is not here, by the lists of the rooms: looking it up imports none of them."""
-    for room in sorted(Path(__file__).parent.glob("*/__init__.py")):
-        if re.search(rf'^    "{re.escape(name)}",$', room.read_text(encoding="utf-8"), re.MULTILINE):
-            return f"; it is jaxeit.{room.parent.name}.{name}"
-    near = difflib.get_close_matches(name, __all__, 1)
-    return translation(name) or (f"; did you mean {near[0]}?" if near else "")
+        hints = import_module("._missing_names", __name__)  # on an error only
+        raise AttributeError(hints.message(name, __all__), name=name) from None
 
 
 __version__ = metadata.version("jaxeit")

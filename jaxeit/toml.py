@@ -23,7 +23,6 @@ Example:
 """
 
 import codecs
-import difflib
 import math
 import os
 import re
@@ -37,6 +36,7 @@ import numpy as np
 
 from .budget import current_budget, require
 from .files import open_regular
+from .spelling import did_you_mean, nearest
 
 __all__ = [
     "TomlError",
@@ -164,8 +164,8 @@ class TomlTable:
         """
         if not self.has(key):
             if default is ...:
-                near = difflib.get_close_matches(key, self._values.keys() - self._asked, 1, cutoff=0.75)
-                hint = f"; is {SHORT_REPR.repr(near[0])} a misspelling of it?" if near else ""
+                near = nearest(key, self._values.keys() - self._asked, least=0.75)
+                hint = f"; is {SHORT_REPR.repr(near)} a misspelling of it?" if near else ""
                 raise self.error(key, f"missing; give {meaning}{hint}")
             return default
         value = self._values[key]
@@ -236,12 +236,8 @@ class TomlTable:
         """Raise a `TomlError` for the first key that was not read, naming the nearest known key."""
         for key in self._values:
             if key not in self._asked:
-                near = difflib.get_close_matches(key, self._asked, 1)
-                hint = f"did you mean {near[0]!r}?" if near else "known: " + self._known()
+                hint = did_you_mean(key, self._asked, "known: " + ", ".join(sorted(self._asked)))
                 raise self.error(SHORT_REPR.repr(key)[1:-1], f"unknown key; {hint}")
-
-    def _known(self) -> str:
-        return ", ".join(sorted(self._asked))
 
 
 MAX_COUNT = 1_000_000

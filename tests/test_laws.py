@@ -20,8 +20,8 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "_other_words", "budget", "files", "array_files", "notebook", "program_cache", "_compile", "toml",
-    "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
+    "spelling", "_missing_names", "budget", "files", "array_files", "notebook", "program_cache", "_compile",
+    "toml", "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "plot", "__main__",
 ]  # fmt: skip
 BENCH = [
@@ -232,6 +232,19 @@ def test_libraries_of_other_projects_are_imported_when_they_are_asked_for():
     assert done.returncode == 0, done.stderr
 
 
+def test_what_only_an_error_needs_is_imported_by_the_error():
+    code = (
+        "import sys, jaxeit\n"
+        "late = {'jaxeit._missing_names', 'jaxeit.spelling', 'difflib'}\n"
+        "early = late & set(sys.modules)\n"
+        "try: jaxeit.Nosser\n"
+        "except AttributeError: pass\n"
+        "sys.exit(f'imported {early} of {late & set(sys.modules)}' if early or late - set(sys.modules) else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; from calib.cli import main\n"
@@ -271,7 +284,7 @@ def test_float32_runs_without_x64():
     ("name", "said"),
     [
         ("LCurve", "jaxeit has no LCurve; it is jaxeit.imaging.LCurve"),
-        ("Nosser", "jaxeit has no Nosser; did you mean Noser?"),
+        ("Nosser", "jaxeit has no Nosser; did you mean 'Noser'?"),
         ("eidors_obj", "jaxeit has no eidors_obj"),
     ],
 )

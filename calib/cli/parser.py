@@ -1,7 +1,6 @@
 """The parser of the command line: bad arguments end in one line, with the nearest name that is known."""
 
 import argparse
-import difflib
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -30,8 +29,10 @@ class CommandParser(argparse.ArgumentParser):
     def refuse(self, others: Sequence[str]) -> NoReturn:
         """End with the first of the arguments that no parser took, and the nearest option."""
         word = next((word for word in others if word.startswith("-")), others[0]).partition("=")[0]
-        near = difflib.get_close_matches(word, [*_options(self)], 1)
-        self.error(f"{word}: not known" + (f"; did you mean {near[0]}?" if near else ""))
+        from jaxeit.spelling import did_you_mean  # on an error only: help answers at once
+
+        near = did_you_mean(word, _options(self))
+        self.error(f"{word}: not known" + (f"; {near}" if near else ""))
 
 
 def _nearest_choice(message: str) -> str:
@@ -39,9 +40,11 @@ def _nearest_choice(message: str) -> str:
     found = re.fullmatch(r"(argument .*): invalid choice: '(.*)' \(choose from (.*)\)", message)
     if not found:
         return message
+    from jaxeit.spelling import did_you_mean  # on an error only
+
     name, word, choices = found.groups()
-    near = difflib.get_close_matches(word, [choice.strip("'") for choice in choices.split(", ")], 1)
-    return f"{name}: no {word!r}; " + (f"did you mean {near[0]!r}?" if near else f"choose from {choices}")
+    known = (choice.strip("'") for choice in choices.split(", "))
+    return f"{name}: no {word!r}; " + did_you_mean(word, known, f"choose from {choices}")
 
 
 def _options(parser: argparse.ArgumentParser) -> Iterator[str]:

@@ -15,9 +15,8 @@ from jaxeit.geometry import Domain
 from jaxeit.skin import AbstractElectrode
 
 from ..session import SessionError
-from ..session.importers.formats.text_files import lines_of
+from ..session.importers.formats.text_files import every_line, is_data
 from ..session.importers.formats.text_layout import FIRST_LINES, Dialect, layout_of
-from ..session.importers.limits import MAX_LINE
 from .recording import Tank, TankError, tank_of
 
 CURRENT_IN_NAME = re.compile(r"_([\d.]+)(uA|mA)(?:_([\d.]+)Hz)?")
@@ -49,14 +48,15 @@ def read_table(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     """
     require("array_bytes", path.stat().st_size, path.name, TankError)
     try:
-        lines = list(lines_of(path))
+        every = list(every_line(path))
+        lines = [numbered for numbered in every if is_data(*numbered)]
         layout = layout_of(path, [text for _, text in lines[:FIRST_LINES]])
         cells = [(lines[n - 1][0], row) for n, row in layout.rows(text for _, text in lines) if n > layout.header_lines]
     except (SessionError, csv.Error) as error:
         raise TankError(str(error)) from error
     rows = [[_number(path, line, layout, cell) for cell in row] for line, row in _without_last(cells)]
     widths = sorted({len(row) for row in rows})
-    names = layout.header or _names_of_comment(path, layout)
+    names = layout.header or _names_of_comment(every[0][1], layout)
     names = names[:-1] if names and not names[-1] else names
     if len(widths) != 1 or (layout.header and len(names) != widths[0]):
         raise TankError(f"{path.name}: rows have {widths} numbers; give a table, with a frame a row or a column")
@@ -77,10 +77,8 @@ def _number(path: Path, line: int, layout: Dialect, cell: str) -> float:
     return value
 
 
-def _names_of_comment(path: Path, layout: Dialect) -> tuple[str, ...]:
-    """The names that `numpy.savetxt` writes: the first line, behind a "#"."""
-    with open_regular(path) as file:
-        first = file.readline(MAX_LINE).decode("utf-8", "replace").strip()
+def _names_of_comment(first: str, layout: Dialect) -> tuple[str, ...]:
+    """The names that `numpy.savetxt` writes into the first line, behind a "#"."""
     names = next(layout.rows([first.removeprefix("#")]), (0, []))[1] if first.startswith("#") else []
     return tuple(name.strip(' "') for name in names)
 

@@ -6,7 +6,6 @@ its import path, ``my_package.my_module:MyEffect``.  One reader serves TOML tabl
 and words of the command line (``greit:width=0.01,radius=0.02``).
 """
 
-import difflib
 import functools
 import importlib
 import re
@@ -17,6 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from inspect import isabstract, isclass
 from typing import Any, Generic, TypeVar, cast
 
+from ..spelling import did_you_mean
 from ..toml import TomlError, TomlTable, parse_values
 from .settings import Part, settings_of, word
 
@@ -115,13 +115,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
 
     def _hint(self, name: str) -> str:
         """What may be meant by an unknown name."""
-        near = difflib.get_close_matches(name, self.names, 1)
-        if near:
-            return f"did you mean {near[0]!r}?"
         module, dot, own = name.rpartition(".")
-        if dot:
-            return f"write a class of your own as {module + ':' + own!r}"
-        return "give one of " + ", ".join(f'"{known}"' for known in self.names)
+        known = ", ".join(f'"{known}"' for known in self.names)
+        path = f"write a class of your own as {module + ':' + own!r}"
+        return did_you_mean(name, self.names, path if dot else f"give one of {known}")
 
     def name_of(self, thing: T | type[T]) -> str:
         """The name of a class or of an object's class; its import path if it is neither shipped nor installed."""

@@ -83,7 +83,7 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
     if look.trials is None:
         careful = _concluded(look, look.best, programs)
         if _is_explained(careful, programs.size, events.rare(look.seen.seconds)):
-            return replace(look, after=_uneventful(look, careful) if look.unfinished else look.otherwise)
+            return replace(look, after=_uneventful(look, programs))
         return replace(look, trials=_trials(look, careful, programs, events))
     best = max(trial.probability for trial in [look.best, *_possible(look)])
     for k, trial in enumerate(look.trials):
@@ -133,7 +133,7 @@ def _judged(look: Look, programs: Programs) -> Look:
     """The look after the most probable event; the end of it if this is that nothing more has happened."""
     best = _most_probable(look)
     if best is look.best or best.attempt is None:
-        after = _uneventful(look, _concluded(look, look.best, programs)) if look.unfinished else look.otherwise
+        after = _uneventful(look, programs)
         return replace(look, after=calmer(after) if look.events == EVENTS else after)
     event = best.event
     update = _concluded(look, best, programs)
@@ -144,12 +144,15 @@ def _judged(look: Look, programs: Programs) -> Look:
     return look if left else replace(look, after=after)
 
 
-def _uneventful(look: Look, careful: Update) -> Tracking:
-    """Contacts to which nothing more has happened, after a frame that was beyond an ordinary update.
+def _uneventful(look: Look, programs: Programs) -> Tracking:
+    """Contacts to which nothing more has happened: by the careful update, if the ordinary one ended before it was best.
 
     Where a force grows severalfold between two frames, the few evaluations of an ordinary update end before the force
     is found, and the gain explains the rest of the frame.
     """
+    if not look.unfinished:
+        return look.otherwise
+    careful = _concluded(look, look.best, programs)
     if not float(careful.misfit) < look.otherwise.misfit:
         return look.otherwise
     return settled(replace(look.before, since=0, misfit=float(careful.misfit)), careful)

@@ -118,8 +118,6 @@ def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pad
     """
     programs, before = tracker.programs, tracker.start().belief
     left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
-    belief, attempt = tracker.events.with_contact(before, programs.explaining_place(left)), None
-    while attempt is None or not attempt.ended:
-        attempt = programs.attempted(belief, frame, pads, attempt)
+    belief = tracker.events.with_contact(before, programs.explaining_place(left))
     share = 1 - float(tracker.filter.error_share) * float(left @ left) / len(left)  # 1 / s^2
-    return float(attempt.evidence) + 0.5 * len(left) * float(np.log(share))
+    return float(programs.completed(belief, frame, pads).evidence) + 0.5 * len(left) * float(np.log(share))

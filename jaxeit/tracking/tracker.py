@@ -194,9 +194,7 @@ class Tracker:
 
     def _updated(self, belief: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
         """A careful update, as of a contact that begins."""
-        attempt = self.programs.attempted(belief, frame, pads, None)
-        while attempt.state is not None and not attempt.state.converged and attempt.state.steps < PRESS_STEPS:
-            attempt = self.programs.attempted(belief, frame, pads, attempt)
+        attempt = self.programs.completed(belief, frame, pads, PRESS_STEPS)
         return self.programs.concluded(belief, frame, pads, attempt)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:

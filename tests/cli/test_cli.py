@@ -128,7 +128,7 @@ def test_a_low_pass_beyond_the_frame_rate(grid_file, tmp_path, capsys):
     ("line", "message"),
     [
         ("simulat scene.toml", "argument COMMAND: no 'simulat'; did you mean 'simulate'? (jaxeit --help)"),
-        ("calibrate s.h5 -o c.h5 --recipie=r.toml", "--recipie: not known; did you mean --recipe? (jaxeit calibrate"),
+        ("calibrate s.h5 -o c.h5 --recipie=r.toml", "--recipie: not known; did you mean '--recipe'? (jaxeit calibrate"),
         ("export mcapp c.h5", "argument FORMAT: no 'mcapp'; did you mean 'mcap'? (jaxeit export --help)"),
         ("calibrate s.h5", "the following arguments are required: -o/--output (jaxeit calibrate --help)"),
         ("doctor thoroughly", "thoroughly: not known (jaxeit doctor --help)"),

@@ -188,7 +188,7 @@ def test_readings_alone_are_read_as_numpy_and_tables_hold_them(bench, tmp_path, 
 
 
 def test_tables_of_spreadsheets_are_read(bench, tmp_path):
-    """Semicolons and decimal commas, quotes, a delimiter at the end, names behind "#"; an empty cell is missing."""
+    """Semicolons and decimal commas, quotes, a delimiter at the end, names behind "#" (UTF-16), an empty cell."""
     skin, (vh, vi) = je.skin.parse_skin(TANK_TOML.replace("eidors-adjacent", "adjacent")), bench.frames[:2]
     points = [(f"{b:.17g}", f"{a:.17g}") for a, b in zip(vh, vi, strict=True)]
     commas = [tuple(cell.replace(".", ",") for cell in row) for row in points]
@@ -199,7 +199,7 @@ def test_tables_of_spreadsheets_are_read(bench, tmp_path):
         "savetxt.csv": ["# vi vh", *map(" ".join, points)],
     }
     for name, lines in tables.items():
-        (tmp_path / name).write_text("\n".join(lines) + "\n")
+        (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-16" if name == "savetxt.csv" else "utf-8")
         tank = load_tank(tmp_path / name, skin=skin)
         assert tank.names == ("vh", "vi"), name
         np.testing.assert_array_equal(tank.frames, [vh, vi], name)

@@ -1,12 +1,13 @@
 """Texts that assign the columns of a table to clock and streams: ``0:ms``, ``force=4:N``, ``signal=s0-s3:V``."""
 
 import csv
-import difflib
 import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from jaxeit.spelling import did_you_mean
 
 from ..errors import SessionError, printable, problem
 from ..units import KNOWN_UNITS, UNITS
@@ -142,8 +143,8 @@ def column_indices(path: Path, column: str, header: Sequence[str], columns: int)
     names = _range_of_names(path, column, header)
     if names is not None:
         return names
-    if near := difflib.get_close_matches(column, header, 1):
-        raise problem(path, f"column {column!r}", "not there", f"did you mean {near[0]!r}?")
+    if near := did_you_mean(column, header):
+        raise problem(path, f"column {column!r}", "not there", near)
     what = f"not there; header names: {_listed(header) or 'none, it has no header'}"
     raise problem(path, f"column {column!r}", what, "use one of them, or count from zero")
 

@@ -8,7 +8,19 @@ from jaxtyping import Array, Float
 
 from ..._compile import bind
 from .consider import consider_covariance
-from .filter import Attempt, Belief, ContactFilter, Pads, Update, attempted, concluded, followed, predicted, unexplained
+from .filter import (
+    MANY_STEPS,
+    Attempt,
+    Belief,
+    ContactFilter,
+    Pads,
+    Update,
+    attempted,
+    concluded,
+    followed,
+    predicted,
+    unexplained,
+)
 
 # Places where the fit of a contact begins, and their least distance, m.
 STARTS, APART = 4, 0.01
@@ -46,6 +58,15 @@ class Programs:
     ) -> Attempt:
         """See `filter.attempted`."""
         return self._attempted(_free(belief), dv, pads, attempt)
+
+    def completed(
+        self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, most: int = MANY_STEPS
+    ) -> Attempt:
+        """What is `attempted`, until it has converged or taken ``most`` steps."""
+        attempt = self.attempted(belief, dv, pads, None)
+        while attempt.state is not None and not attempt.state.converged and attempt.state.steps < most:
+            attempt = self.attempted(belief, dv, pads, attempt)
+        return attempt
 
     def concluded(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt) -> Update:
         """See `filter.concluded`."""

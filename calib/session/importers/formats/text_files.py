@@ -45,16 +45,25 @@ def count_lines(path: Path) -> int:
 
 
 def lines_of(path: Path) -> Iterator[tuple[int, str]]:
-    """Line numbers from 1 and lines that are neither blank nor comments; a line ``sep=;`` is for Excel alone."""
+    """Line numbers from 1, and the lines that hold data (`is_data`)."""
+    return (numbered for numbered in every_line(path) if is_data(*numbered))
+
+
+def is_data(number: int, line: str) -> bool:
+    """Whether a line is neither blank nor a comment; a first line ``sep=;`` is for Excel alone."""
+    skipped = line.startswith("#") or (number == 1 and _SEPARATOR_LINE.fullmatch(line))
+    return bool(line.strip()) and not skipped
+
+
+def every_line(path: Path) -> Iterator[tuple[int, str]]:
+    """Line numbers from 1, and lines without their ends."""
     utf16 = first_bytes(path).startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     encoding = "utf-16" if utf16 else "utf-8-sig"
     number = 0
     with _open_bytes(path) as raw, TextIOWrapper(raw, encoding, errors="replace") as stream:
         while line := _next_line(path, stream, number + 1):
             number += 1
-            skipped = line.startswith("#") or (number == 1 and _SEPARATOR_LINE.fullmatch(line))
-            if line.strip() and not skipped:
-                yield number, line.rstrip("\r\n")
+            yield number, line.rstrip("\r\n")
 
 
 def _next_line(path: Path, stream: TextIOWrapper, number: int) -> str:

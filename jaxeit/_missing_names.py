@@ -1,7 +1,13 @@
-"""Words of other packages, and the words of jaxeit for them: the tables of docs/from-eidors.md and docs/from-pyeit.md.
+"""Names that `jaxeit` does not have: the room that has them, the word of jaxeit for them, or the nearest name.
 
-A reader of those packages types them first; the error then names the word of jaxeit and the page.
+The words of other packages are the tables of docs/from-eidors.md and docs/from-pyeit.md.
 """
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from .spelling import did_you_mean
 
 PREPARE = "je.prepare(model, prior, method, basis, ...)"
 MAKE = "je.discretise(je.Scene(skin), fidelity)"
@@ -45,9 +51,23 @@ WORDS = {
 """Package and page -> word of the package -> what the page says for it."""
 
 
-def translation(name: str) -> str:
-    """What to write for a word of another package, as the end of a message; empty for another name."""
+def message(name: str, known: Sequence[str]) -> str:
+    """The message of the error for a name that `jaxeit` does not have; ``known`` are those that it has."""
+    hint = _room_of(name) or _translation(name) or did_you_mean(name, known)
+    return f"jaxeit has no {name}" + (f"; {hint}" if hint else "")
+
+
+def _room_of(name: str) -> str:
+    """Where the name is, by the lists of the rooms: none of them is imported."""
+    for room in sorted(Path(__file__).parent.glob("*/__init__.py")):
+        if re.search(rf'^    "{re.escape(name)}",$', room.read_text(encoding="utf-8"), re.MULTILINE):
+            return f"it is jaxeit.{room.parent.name}.{name}"
+    return ""
+
+
+def _translation(name: str) -> str:
+    """What to write for a word of another package; empty for another name."""
     for (package, page), words in WORDS.items():
         if name in words:
-            return f"; for {name} of {package} write {words[name]} ({page})"
+            return f"for {name} of {package} write {words[name]} ({page})"
     return ""
