@@ -42,9 +42,8 @@ HEIGHTS = (0.5, 4.5)  # ends of the logarithm of a conductivity over the water's
 def compared(model: je.Model, image: je.model.BasisMap, missed: np.ndarray, data: Data, place: int) -> Row:
     """Scores and objectives of fits from the image and from the truth; log odds of the truth over what is found."""
     frame, truth = data.frames[place], data.truth[place]
-    settings: Row = {"missed": missed, "pixels": GRID}
-    fits = {"image": je.imaging.segment(model, data.reference, frame, image, **settings)}
-    fits["truth"] = je.imaging.segment(model, data.reference, frame, image, start=truth[::-1], **settings)
+    fits = {"image": je.imaging.segment(model, data.reference, frame, image, missed=missed)}
+    fits["truth"] = je.imaging.segment(model, data.reference, frame, image, start=truth[::-1], missed=missed)
     row: Row = {}
     for start, fit in fits.items():
         classes = np.where(INSIDE, fit.classes[::-1], WATER)

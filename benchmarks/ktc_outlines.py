@@ -34,8 +34,8 @@ FITS = 25  # evaluations, at most
 def outlined(model: je.Model, image: je.model.BasisMap, missed: np.ndarray, data: Data, place: int) -> Row:
     """Score of the outline that is fitted from the regions of the image; log odds of the truth over it; what readings
     tell of its harmonics."""
-    frame, truth, settings = data.frames[place], data.truth[place], {"missed": missed, "pixels": GRID}
-    found = je.imaging.segment(model, data.reference, frame, image, borders=None, **settings)
+    frame, truth = data.frames[place], data.truth[place]
+    found = je.imaging.segment(model, data.reference, frame, image, borders=None, missed=missed)
     seen = Seen(model, data, frame, np.asarray(found.errors))
     sigma = np.mean(model.background) * jnp.exp(image.expand(found.image))
     outline = fitted_outline(seen, found.classes, sigma)

@@ -7,6 +7,7 @@ and a code c for each of its skins; the scatter of these codes is the belief abo
 updated by recursive least squares, linearised anew at each press.
 """
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,9 +75,9 @@ class Examples(NamedTuple):
 def drawn(skin: je.Skin, folder: Path, skins: int) -> TrainingFrames:
     """Frames of the scenes that `jaxeit train` draws, with force maps."""
     fidelity = je.Fidelity.draft(dtype="float32")
-    scenes = scenes_for(skin, fidelity)
-    options = {"seed": 1, "scenes": scenes, "fidelity": fidelity, "pixels": PIXELS}
-    calib.write_training_frames(training_bench(skin), folder, skins * SHARD_FRAMES, **options)
+    bench = replace(training_bench(skin), seed=1)
+    frame_set = calib.bench.FrameSet(bench, skins * SHARD_FRAMES, fidelity, PIXELS, scenes_for(skin, fidelity))
+    calib.write_training_frames(frame_set, folder)
     return calib.open_training_frames(folder)
 
 

@@ -14,7 +14,8 @@ import jaxeit as je
 bench, draft, pixels = calib.load_bench("paper_bench"), je.Fidelity.draft(dtype="float32"), je.Pixels(20)
 names, optimiser = ("frames", "pad_forces", "force_map"), optax.adam(optax.cosine_decay_schedule(1e-3, 3000))
 with tempfile.TemporaryDirectory() as folder:
-    calib.write_training_frames(bench, folder, 8192, fidelity=draft, pixels=pixels, executor=ThreadPoolExecutor(1))
+    frame_set = calib.bench.FrameSet(bench, 8192, fidelity=draft, pixels=pixels)
+    calib.write_training_frames(frame_set, folder, executor=ThreadPoolExecutor(1))
     parts = [calib.open_training_frames(folder).part(*skins) for skins in ((0, 0.875), (0.875, 1))]  # the last skin
     (dv, _, maps), (unseen, pads, truth) = [[jnp.asarray(p[n][p["contacts"] > 0]) for n in names] for p in parts]
 

@@ -13,8 +13,8 @@ import jaxeit as je
 bench, draft = calib.load_bench("paper_bench"), je.Fidelity.draft(dtype="float32")
 with tempfile.TemporaryDirectory() as folder:
     # On the command line: jaxeit simulate paper_bench --random-scenes 5120 -o FOLDER --fidelity draft --pixels 20
-    options = {"fidelity": draft, "pixels": je.Pixels(20), "executor": ThreadPoolExecutor(1)}
-    calib.write_training_frames(bench, folder, 5 * 1024, **options)
+    frame_set = calib.bench.FrameSet(bench, 5 * 1024, fidelity=draft, pixels=je.Pixels(20))
+    calib.write_training_frames(frame_set, folder, executor=ThreadPoolExecutor(1))
     frames = calib.open_training_frames(folder)  # each 1,024 frames are another skin
     known, unseen = (
         {name: part[name][part["contacts"] > 0] for name in ("frames", "pad_forces", "force_map", "contacts")}

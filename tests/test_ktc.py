@@ -71,14 +71,14 @@ def test_a_tank_in_classes():
     reference, frame = np.array(je.forward(fine)), np.array(je.forward(fine, jnp.asarray(sigma)))
     frame[5] = np.nan
     water = je.imaging.fit_reference(coarse, reference).model
-    found = je.imaging.segment(water, reference, frame, je.Pixels(24), pixels=100)
+    found = je.imaging.segment(water, reference, frame, je.Pixels(24), regions=je.imaging.RegionSettings(pixels=100))
     line = (np.arange(100) + 0.5) / 50 - 1
     x, y = np.meshgrid(line, line)
     for kind, place in ((ktc.CONDUCTIVE, (0.5, 0.0)), (ktc.RESISTIVE, (-0.4, 0.3))):
         truth, seen = np.hypot(x - place[0], y - place[1]) < 0.25, found.classes == kind
         assert (truth & seen).sum() > 0.6 * (truth | seen).sum()
-    with pytest.raises(je.imaging.InverseError, match=r"floor is 0\.0"):
-        je.imaging.segment(water, reference, frame, floor=0.0)
+    with pytest.raises(je.imaging.InverseError, match=r"regions\.floor is 0\.0"):
+        je.imaging.segment(water, reference, frame, regions=je.imaging.RegionSettings(floor=0.0))
     with pytest.raises(je.imaging.InverseError, match=r"width is 0\.0"):
         je.imaging.segment(water, reference, frame, je.Pixels(24), borders=je.imaging.LevelSet(widths=(0.5, 0.0)))
     with pytest.raises(je.imaging.InverseError, match=r"start is no array \(256, 256\)"):

@@ -37,7 +37,7 @@ def export_training_frames(
     The output holds ``card.json``, ``shard-000000.parquet`` and so on, with a row for each frame, and
     ``skins.parquet``, with a row for each shard: the readings and pressures of its skin without contact. Units and
     meanings are in the metadata of the columns. `calib.open_training_frames` reads the output, too. After an
-    interruption the same call goes on. ``file_format="parquet"`` of `calib.write_training_frames` writes the same
+    interruption the same call goes on. ``file_format="parquet"`` of `calib.bench.FrameSet` makes the same
     files at once.
 
     Args:
@@ -54,7 +54,8 @@ def export_training_frames(
 
         bench, one = calib.load_bench("paper_bench"), ThreadPoolExecutor(1)  # default: a pool of processes
         fidelity, pixels = je.Fidelity.draft(dtype="float32"), je.Pixels(10)
-        calib.write_training_frames(bench, "frames", 1024, fidelity=fidelity, pixels=pixels, executor=one)
+        frame_set = calib.bench.FrameSet(bench, 1024, fidelity, pixels)
+        calib.write_training_frames(frame_set, "frames", executor=one)
         # for pandas, Polars, DuckDB and Hugging Face datasets
         print(calib.export_training_frames("frames", "parquet"))
     """

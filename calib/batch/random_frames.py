@@ -17,12 +17,10 @@ from typing import Any
 import jax
 import numpy as np
 
-import jaxeit as je
-
-from ..bench import Bench, BenchError, RandomScenes
+from ..bench import BenchError, FrameSet
 from ..bench.frame_shards import EXTRA, SHARDS, Shard
 from ..bench.scene_frames import SceneFrames
-from ..bench.training_frames import VERSION, FrameSet, card_of, claim_folder
+from ..bench.training_frames import VERSION, card_of, claim_folder
 from ..runtime import settings, take_over
 from ..session import file_hash, replacing
 from ..session.importers.child import library
@@ -62,15 +60,9 @@ class _Task:
 
 
 def write_training_frames(
-    bench: Bench,
+    frame_set: FrameSet,
     folder: str | Path,
-    frames: int,
     *,
-    seed: int | None = None,
-    scenes: RandomScenes | None = None,
-    fidelity: je.Fidelity | None = None,
-    pixels: je.Pixels | None = None,
-    file_format: str = "hdf5",
     executor: Executor | None = None,
     jobs: int = 1,
     begin: Callable[[int, int], object] = lambda frames, nbytes: None,
@@ -79,21 +71,13 @@ def write_training_frames(
     """Simulate frames of random contacts, with pressures, contacts and true force maps, and write them in shards.
 
     Each shard of 1,024 frames is another skin of the scene: the seeds of all effects are drawn. Effects that the scene
-    does not list are not simulated. `calib.open_training_frames` reads the folder; ``card.json`` describes it. The same
-    arguments give the same bytes on the same machine, whatever the number of processes, and go on after an
-    interruption. Call this function below ``if __name__ == "__main__":``, because spawned processes import the main
-    module.
+    does not list are not simulated. `calib.open_training_frames` reads the folder; ``card.json`` describes it. Equal
+    sets give equal bytes on the same machine, whatever the number of processes. After an interruption the same call
+    goes on. Call this function below ``if __name__ == "__main__":``, because spawned processes import the main module.
 
     Args:
-        bench: a scene with its tip and rates, such as ``calib.load_bench("paper_bench")``; its presses are not used.
-        folder: new, empty, or with shards of the same arguments.
-        frames: number of frames.
-        seed: of all that is drawn; default: that of the bench.
-        scenes: distributions that contacts are drawn from; default `calib.bench.RandomScenes()`.
-        fidelity: of the simulation; default `jaxeit.Fidelity.standard()`.
-        pixels: of the force maps; default `jaxeit.Pixels()`, as those of a calibration.
-        file_format: of the shards: ``hdf5``, or ``parquet`` for pandas, Polars, DuckDB and Hugging Face datasets, with
-            ``skins.parquet`` beside the shards, which needs the extra ``tables``.
+        frame_set: the scene, the number of frames, and how they are simulated and stored; `calib.bench.FrameSet`.
+        folder: new, empty, or with shards of the same set, of which there may be fewer.
         executor: default: a pool of spawned processes with one thread of computation each. Another example is
             `distributed.Client(address).get_executor(pure=False)`; its workers must see the same folder.
         jobs: number of processes of the default pool.
@@ -110,7 +94,8 @@ def write_training_frames(
 
         bench, one = calib.load_bench("paper_bench"), ThreadPoolExecutor(1)  # default: a pool of processes
         fidelity, pixels = je.Fidelity.draft(dtype="float32"), je.Pixels(10)
-        calib.write_training_frames(bench, "frames", 1024, fidelity=fidelity, pixels=pixels, executor=one)
+        frame_set = calib.bench.FrameSet(bench, 1024, fidelity, pixels)
+        calib.write_training_frames(frame_set, "frames", executor=one)
         for readings, maps in calib.open_training_frames("frames").batches(
             64, "frames", "force_map", seed=0
         ):
@@ -118,20 +103,17 @@ def write_training_frames(
     """
     if jobs < 1:
         raise BenchError(f"{jobs} jobs; give one or more")
-    seed, fidelity = bench.seed if seed is None else seed, fidelity or je.Fidelity.standard()
-    pixels = _with_rows(pixels or je.Pixels(), bench.scene.skin)
-    made = FrameSet(bench, frames, seed, fidelity, pixels, scenes or RandomScenes(), file_format)
-    folder, versions = Path(folder), _versions(file_format)
+    folder, versions = Path(folder), _versions(frame_set.file_format)
     # A folder may get more frames, so that the number of frames is no part of the mark.
-    mark = digest(describe(replace(made, frames=1)), str(VERSION), *versions.values())
-    claim_folder(folder, card_of(made, mark, versions))
-    files = SHARDS[file_format]
-    left = [n for n in range(made.shards) if not files.is_whole(files.path(folder, n), mark, made.rows(n))]
-    to_make = sum(map(made.rows, left))
-    _require_space(folder, made.nbytes(left))
-    begin(to_make, made.nbytes(left))
-    _run(executor, jobs, _tasks(folder, made, mark, left), lambda number: tell(made.rows(number)))
-    return WrittenFrames(folder, frames, to_make, _finish_folder(folder, made))
+    mark = digest(describe(replace(frame_set, frames=1)), str(VERSION), *versions.values())
+    claim_folder(folder, card_of(frame_set, mark, versions))
+    files, rows = SHARDS[frame_set.file_format], frame_set.rows
+    left = [n for n in range(frame_set.shards) if not files.is_whole(files.path(folder, n), mark, rows(n))]
+    to_make, nbytes = sum(map(rows, left)), frame_set.nbytes(left)
+    _require_space(folder, nbytes)
+    begin(to_make, nbytes)
+    _run(executor, jobs, _tasks(folder, frame_set, mark, left), lambda number: tell(rows(number)))
+    return WrittenFrames(folder, frame_set.frames, to_make, _finish_folder(folder, frame_set))
 
 
 def _versions(file_format: str) -> dict[str, str]:
@@ -144,12 +126,6 @@ def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> d
     """The tasks that make the shards of these numbers."""
     choices, chosen = pickle.dumps(made), settings()
     return {number: _Task(str(folder.absolute()), number, choices, mark, chosen) for number in numbers}
-
-
-def _with_rows(pixels: je.Pixels, skin: je.Skin) -> je.Pixels:
-    """Pixels whose number of rows does not depend on the mesh."""
-    (x0, y0), (x1, y1) = skin.domain.bounds
-    return je.Pixels(pixels.columns, pixels.rows or max(1, round(pixels.columns * (y1 - y0) / (x1 - x0))))
 
 
 def _require_space(folder: Path, nbytes: int) -> None:

@@ -33,7 +33,7 @@ from .costs import PartCost, measure_costs, render_costs
 from .dataset import grid, simulate_contacts, write_data_set
 from .random_scenes import Footprint, RandomScenes
 from .simulation import SIMULATION, simulate
-from .training_frames import TrainingFrames, open_training_frames
+from .training_frames import FrameSet, TrainingFrames, open_training_frames
 
 __all__ = [
     "SIMULATION",
@@ -41,6 +41,7 @@ __all__ = [
     "BenchError",
     "Companion",
     "Footprint",
+    "FrameSet",
     "PartCost",
     "RandomScenes",
     "Timing",

@@ -59,39 +59,52 @@ ARRAYS = {
 
 @dataclasses.dataclass(frozen=True)
 class FrameSet:
-    """Everything that the bytes of a set of frames depend on.
+    """A set of frames for training, by everything that its bytes depend on: to be written by `write_training_frames`.
 
-    | field                                                        |
-    |--------------------------------------------------------------|
-    | bench: scene, tip, rates and ranges of temperature           |
-    | frames: their number                                         |
-    | seed of all that is drawn                                    |
-    | fidelity of the simulation                                   |
-    | pixels of the force maps, with their number of rows          |
-    | scenes: what contacts are drawn from                         |
-    | file_format of the shards, of `frame_shards.SHARDS`          |
+    | field                                                          | default                      |
+    |----------------------------------------------------------------|------------------------------|
+    | bench: scene, tip, rates, temperature, and seed of all draws   |                              |
+    | frames: their number                                           |                              |
+    | fidelity of the simulation                                     | `jaxeit.Fidelity.standard()` |
+    | pixels of the force maps                                       | as those of a calibration    |
+    | scenes: distributions that contacts are drawn from             | `RandomScenes()`             |
+    | file_format of the shards, ``hdf5`` or ``parquet``             | ``hdf5``                     |
+
+    Presses of the bench are not used. Parquet is for pandas, Polars, DuckDB and Hugging Face datasets; it has
+    ``skins.parquet`` beside the shards, and needs the extra ``tables``.
 
     Raises:
         BenchError: for less than one frame, or a seed below 0 or beyond 2^63 - 1.
+
+    Example:
+        drawn, scenes = replace(bench, seed=7), calib.bench.RandomScenes(force=(1, 50))  # N
+        frame_set = calib.bench.FrameSet(drawn, 2048, fidelity=je.Fidelity.draft(), scenes=scenes)
+        print(frame_set.shards, frame_set.sizes)
     """
 
     bench: Bench
     frames: int
-    seed: int
-    fidelity: je.Fidelity
-    pixels: je.Pixels
-    scenes: RandomScenes
+    fidelity: je.Fidelity = dataclasses.field(default_factory=je.Fidelity.standard)
+    pixels: je.Pixels = dataclasses.field(default_factory=je.Pixels)
+    scenes: RandomScenes = dataclasses.field(default_factory=RandomScenes)
     file_format: str = "hdf5"
 
     def __post_init__(self) -> None:
+        if self.pixels.rows is None:  # their number must not depend on the mesh
+            (x0, y0), (x1, y1) = self.bench.scene.skin.domain.bounds
+            rows = max(1, round(self.pixels.columns * (y1 - y0) / (x1 - x0)))
+            object.__setattr__(self, "pixels", je.Pixels(self.pixels.columns, rows))
         if self.file_format not in SHARDS:
             raise BenchError(f"file format {self.file_format!r}: no such format; give {' or '.join(SHARDS)}")
         if self.frames < 1:
             raise BenchError(f"{self.frames} frames make no data set; give one or more")
         if not 0 <= self.seed < 2**63:
             raise BenchError(f"the seed is {self.seed}; give 0 to 2^63 - 1")
-        if self.pixels.rows is None:
-            raise BenchError("pixels without their number of rows; give Pixels(columns, rows)")
+
+    @property
+    def seed(self) -> int:
+        """Of all that is drawn."""
+        return self.bench.seed
 
     @property
     def shards(self) -> int:

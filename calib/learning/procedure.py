@@ -20,7 +20,7 @@ from jaxeit.skin import skin_hash
 
 from ..batch.digests import digest
 from ..batch.random_frames import write_training_frames
-from ..bench import BenchError, TrainingFrames, open_training_frames
+from ..bench import BenchError, FrameSet, TrainingFrames, open_training_frames
 from ..bench.scene_frames import SHARD_FRAMES
 from .inputs import Compression, Inputs, calibrated_forces, fit_compression, inputs_of, without_an_electrode
 from .quality import figures_of, fit_temperature
@@ -103,17 +103,9 @@ def _simulated(
         workers: as for `calib.write_training_frames`.
     """
     skins, made = -(-frames // SHARD_FRAMES), itertools.count(1)
-    write_training_frames(
-        training_bench(skin),
-        folder,
-        frames,
-        seed=seed,
-        scenes=scenes_for(skin, fidelity),
-        fidelity=fidelity,
-        pixels=PIXELS,
-        tell=lambda _: tell(next(made), skins),
-        **workers,
-    )
+    bench = replace(training_bench(skin), seed=seed)
+    frame_set = FrameSet(bench, frames, fidelity, PIXELS, scenes_for(skin, fidelity))
+    write_training_frames(frame_set, folder, tell=lambda _: tell(next(made), skins), **workers)
     return open_training_frames(folder)
 
 

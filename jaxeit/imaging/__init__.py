@@ -95,7 +95,7 @@ from .priors import (
     TotalVariation,
 )
 from .reconstruction import AbstractReconstructor, IterativeReconstructor, Provenance, Reconstructor
-from .segmentation import Segmentation, half_height_classes, on_grid, segment
+from .segmentation import ChangeErrors, RegionSettings, Segmentation, half_height_classes, on_grid, segment
 from .settings import Imaging
 from .storage import (
     NUMBERS,
@@ -123,6 +123,7 @@ __all__ = [
     "AbstractPrior",
     "AbstractReconstructor",
     "BackProjection",
+    "ChangeErrors",
     "CorrelatedNoise",
     "Covariance",
     "Diagonal",
@@ -157,6 +158,7 @@ __all__ = [
     "ReferenceFit",
     "ReferenceParameters",
     "ReferenceSettings",
+    "RegionSettings",
     "Reweighted",
     "Segmentation",
     "SparseBayes",

@@ -38,10 +38,47 @@ WEIGHT = 0.0064
 """Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
 COLUMNS = 30
 """Pixels along x where no basis is given."""
-BORDERS = LevelSet()
-"""How the borders of pieces are fitted."""
 MORE_FITS, BELIEVED_MISFIT = 3, 1.05
 """Fits with larger errors, of an image that leaves more of a frame than these; root mean square over the errors."""
+
+
+class ChangeErrors(eqx.Module):
+    """Errors of the changes that `segment` explains.
+
+    | meaning                                                                                              | default |
+    |------------------------------------------------------------------------------------------------------|---------|
+    | relative: of a change, over itself                                                                   | 0.03    |
+    | absolute: of a reading that does not change, over its size plus the root mean square of all          | 0.003   |
+
+    The absolute error grows where the image leaves more of the frame than that. Frames that repeat better than 0.3 %
+    allow a smaller one.
+
+    Example:
+        quiet = je.imaging.ChangeErrors(absolute=0.001)
+    """
+
+    relative: float = eqx.field(static=True, default=0.03)
+    absolute: float = eqx.field(static=True, default=0.003)
+
+
+class RegionSettings(eqx.Module):
+    """Regions of an image that `segment` takes for pieces.
+
+    | meaning                                                                            | default |
+    |------------------------------------------------------------------------------------|---------|
+    | floor: least height of a region, absolute logarithm of conductivity                | 0.5     |
+    | least: smallest region, over the area of the picture                               | 2.28e-3 |
+    | weakest: sum of the image over the weakest region, over that of the strongest      | 0.18    |
+    | pixels of the classes along each axis                                              | 256     |
+
+    Example:
+        faint = je.imaging.RegionSettings(floor=0.2, pixels=128)
+    """
+
+    floor: float = eqx.field(static=True, default=0.5)
+    least: float = eqx.field(static=True, default=2.28e-3)
+    weakest: float = eqx.field(static=True, default=0.18)
+    pixels: int = eqx.field(static=True, default=256)
 
 
 class Segmentation(eqx.Module):
@@ -67,6 +104,9 @@ class Segmentation(eqx.Module):
     objective: Float[Array, ""]
 
 
+ERRORS, REGIONS, BORDERS = ChangeErrors(), RegionSettings(), LevelSet()
+
+
 def segment(
     model: Model,
     reference: Float[ArrayLike, " readings"],
@@ -74,15 +114,11 @@ def segment(
     basis: AbstractBasis | BasisMap | None = None,
     *,
     penalty: AbstractPenalty | None = None,
+    errors: ChangeErrors = ERRORS,
+    regions: RegionSettings = REGIONS,
     borders: LevelSet | None = BORDERS,
     start: Int[ArrayLike, "rows columns"] | None = None,
     missed: Float[ArrayLike, " readings"] | None = None,
-    relative_error: float = 0.03,
-    absolute_error: float = 0.003,
-    floor: float = 0.5,
-    least: float = 2.28e-3,
-    weakest: float = 0.18,
-    pixels: int = 256,
 ) -> Segmentation:
     """Find what changed from a reference of even content, in three classes; on the host, seconds a frame.
 
@@ -96,41 +132,36 @@ def segment(
         reference, frame: V; readings that are not finite in either are left out.
         basis: default `Pixels`, 30 along x.
         penalty: default `IsotropicVariation` with a weight of 0.0064 for each reading that is used.
+        errors: of the changes.
+        regions: which regions of the image are pieces, and the pixels of the classes.
         borders: how borders are fitted to the readings, from those of the regions; None: left as the image shows them.
         start: classes, (pixels, pixels), from whose borders that fit starts; default: those of the image's regions.
         missed: of the reference by the model, V; default: the difference.
-        relative_error: of a change, over itself.
-        absolute_error: of a reading that does not change, over the sum of its size and the root mean square of all; it
-            grows where the image leaves more of the frame than that.
-        floor: least height of a region, logarithm of conductivity.
-        least: smallest region, over the area of the picture.
-        weakest: sum of the image over the weakest region, over that of the strongest.
-        pixels: of the classes along each axis.
 
     Raises:
         SceneError: if ``model`` is no model, such as a tank.
         InverseError: if a shape or a value is wrong.
 
     Example:
-        from jaxeit.imaging import LevelSet, segment
+        from jaxeit.imaging import LevelSet, RegionSettings, segment
 
         dark = model.background * jnp.where(near, 0.2, 1.0)  # S: an object that hardly conducts
-        found = segment(
-            model, v0, je.forward(model, dark), je.Pixels(16), borders=LevelSet(widths=(0.5,)), pixels=64
-        )
+        choices = {"borders": LevelSet(widths=(0.5,)), "regions": RegionSettings(pixels=64)}
+        found = segment(model, v0, je.forward(model, dark), je.Pixels(16), **choices)
         print(f"{(found.classes == 1).mean():.1%} of the picture is resistive")  # 2: conductive
     """
     require_model(model)
     require_known("segment", InverseError, model.background)
     seen = _seen(model, reference, frame, missed)
-    require_positive(relative_error=relative_error, absolute_error=absolute_error)
-    require_positive(floor=floor, least=least, weakest=weakest, pixels=pixels)
+    require_positive(**{f"errors.{name}": value for name, value in vars(errors).items()})
+    require_positive(**{f"regions.{name}": value for name, value in vars(regions).items()})
     image = _picture_basis(model, basis)
     if penalty is None:
         penalty = IsotropicVariation(weight=WEIGHT * seen.used(model.dtype))
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
-    found, std = _believed_image(physics, penalty, seen, relative_error, absolute_error)
-    classes = half_height_classes(on_grid(found, image.picture, (pixels, pixels)), floor, least, weakest)
+    found, std = _believed_image(physics, penalty, seen, errors)
+    grid = on_grid(found, image.picture, (regions.pixels, regions.pixels))
+    classes = half_height_classes(grid, regions.floor, regions.least, regions.weakest)
     classes = classes if start is None else _checked_start(start, classes.shape)
     unfitted = jnp.asarray(jnp.nan, model.dtype)
     before = Segmentation(found, image.picture, classes, found * unfitted, std, unfitted, unfitted)
@@ -171,11 +202,11 @@ class _Seen(NamedTuple):
         """Number of readings."""
         return jnp.sum(jnp.isfinite(self.change), dtype=dtype)
 
-    def errors(self, relative_error: float, absolute_error: float) -> Float[Array, " readings"]:
-        """Standard errors of the changes, V, as `segment` describes them."""
+    def std(self, errors: ChangeErrors, growth: float) -> Float[Array, " readings"]:
+        """Standard errors of the changes, V, as `segment` describes them; ``growth`` is that of the absolute ones."""
         share = jnp.sqrt(jnp.nansum(self.change**2) / jnp.nansum(self.before**2))
         size = jnp.abs(self.before) + jnp.sqrt(jnp.nanmean(self.before**2))
-        return relative_error * jnp.abs(self.change) + absolute_error * size + share * jnp.abs(self.left)
+        return errors.relative * jnp.abs(self.change) + growth * errors.absolute * size + share * jnp.abs(self.left)
 
 
 def _seen(
@@ -193,17 +224,18 @@ def _seen(
 
 
 def _believed_image(
-    physics: LogConductivity, penalty: AbstractPenalty, seen: _Seen, relative_error: float, absolute_error: float
+    physics: LogConductivity, penalty: AbstractPenalty, seen: _Seen, errors: ChangeErrors
 ) -> tuple[Float[Array, " basis"], Float[Array, " readings"]]:
     """The image, fitted anew with larger errors where it leaves more of the frame than they tell; and its errors, V."""
-    std = seen.errors(relative_error, absolute_error)
+    growth = 1.0
+    std = seen.std(errors, growth)
     found = gauss_newton(physics, penalty, seen.target, std)
     for _ in range(MORE_FITS):
         misfit = float(jnp.sqrt(jnp.nanmean(((seen.target - physics.voltages(found)) / std) ** 2)))
         if not misfit > BELIEVED_MISFIT:
             break
-        absolute_error *= misfit
-        std = seen.errors(relative_error, absolute_error)
+        growth *= misfit
+        std = seen.std(errors, growth)
         found = gauss_newton(physics, penalty, seen.target, std)
     return found, std
 

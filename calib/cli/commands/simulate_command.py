@@ -4,6 +4,7 @@ import argparse
 import shlex
 import time
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -216,25 +217,18 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
 
     from ...batch.cluster import dask_executor
     from ...batch.random_frames import write_training_frames
-    from ...bench import load_bench
+    from ...bench import FrameSet, load_bench
 
-    bench, start = load_bench(args.scene), time.monotonic()
+    start, bench = time.monotonic(), load_bench(args.scene)
+    bench = bench if args.seed is None else replace(bench, seed=args.seed)
+    fidelity, pixels = _fidelity_of(args) or je.Fidelity.standard(), je.Pixels(args.pixels or je.Pixels().columns)
+    frame_set = FrameSet(bench, args.random_scenes, fidelity, pixels, file_format=args.format or "hdf5")
     with ExitStack() as stack:
         executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
         begin, tell = stack.enter_context(_frame_bar())
         try:
             written = write_training_frames(
-                bench,
-                args.output,
-                args.random_scenes,
-                seed=args.seed,
-                fidelity=_fidelity_of(args),
-                pixels=None if args.pixels is None else je.Pixels(args.pixels),
-                file_format=args.format or "hdf5",
-                executor=executor,
-                jobs=args.jobs or 1,
-                begin=begin,
-                tell=tell,
+                frame_set, args.output, executor=executor, jobs=args.jobs or 1, begin=begin, tell=tell
             )
         except KeyboardInterrupt as interrupt:
             return say_interrupted(interrupt, f"the same command goes on from the shards in {args.output}")
