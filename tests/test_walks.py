@@ -1,15 +1,24 @@
 """The main jobs read as walks: the room that leads a job calls each other room once or twice, in one order."""
 
+import json
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 from types import FrameType
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import calib
 import jaxeit as je
+from calib.live.engine import Engine
+from calib.live.loop import FrameQueue, LiveControl
+from calib.live.page import Page
+from calib.record.plan import StreamPlan
+from calib.record.wire.messages import Frame
 
 HELPERS = {"budget", "registry", "toml", "files", "array_files", "_compile"}
 """Rooms that serve every step, such as the memory budget; they are no steps of a job."""
@@ -56,16 +65,55 @@ def test_a_scene_becomes_a_model_by_passing_each_room_at_most_twice():
     assert max(Counter(walk).values()) <= 2, walk
 
 
-@pytest.mark.slow  # without the check of annotations, which calls properties of its own
-def test_a_session_becomes_a_calibration_by_passing_each_room_at_most_three_times(root):
-    recipe = calib.Recipe(imaging=je.Imaging(je.Pixels(20)), fidelity=je.Fidelity.draft())
+@pytest.fixture(scope="module")
+def calibrated(root):
+    """A calibration of the bundled session, coarse, and the walk that made it."""
+    coarse = {"imaging": je.Imaging(je.Pixels(20)), "fidelity": je.Fidelity.draft()}
+    recipe, made = calib.Recipe(location=calib.PadEdge(), **coarse), []
 
     def job():
         with calib.open_session(root / "data" / "sessions" / "testbed_grid.h5") as session:
-            return calib.calibrate([session], recipe=recipe)
+            made.append(calib.calibrate([session], recipe=recipe))
 
     walk = rooms_called("calibration", job)
+    return made[-1], walk
+
+
+@pytest.mark.slow  # without the check of annotations, which calls properties of its own
+def test_a_session_becomes_a_calibration_by_passing_each_room_at_most_three_times(calibrated):
+    _, walk = calibrated
     steps = ["skin", "presses", "check", "model", "imaging", "fusion", "metrics"]
     assert sorted(steps, key=walk.index) == steps
     assert walk.index("metrics") < len(walk) - 1 - walk[::-1].index("fitting")
     assert max(Counter(walk).values()) <= 3, walk
+
+
+@pytest.mark.slow
+def test_a_frame_comes_to_the_page_by_passing_each_room_at_most_twice(calibrated, model):
+    """From what two devices send, in counts, to the text that is pushed to the browser; a contact is fitted between."""
+    calibration, _ = calibrated
+    readings, scale = calibration.recon.readings, 1e-9  # V
+    plans = StreamPlan("eit", readings, scale=scale), StreamPlan("pressure", len(calibration.skin.pads))
+    near = jnp.linalg.norm(model.centroids - jnp.array([0.06, 0.13]), axis=1) < 0.01
+    volts = [np.asarray(je.forward(model, model.background * jnp.where(near, more, 1.0))) for more in (1.0, 1.5)]
+    queue, engine, shown = FrameQueue(*plans), Engine(calibration, rest=0.0), []
+    with Page(calibration, LiveControl()) as page:
+
+        def job():
+            pressed = bool(shown)
+            for number, values in ((1, np.array([0.0, 0.0, 500.0 * pressed, 0.0])), (0, volts[pressed] / scale)):
+                queue.put(number, Frame(number, None, None, 32, values), time.monotonic_ns())
+            result = engine.step(queue.take(1.0))
+            engine.use_spare_time(60.0)
+            shown.append(None)
+            if result is not None:
+                page.show_result(result)
+                shown[-1] = json.loads(page.newest(result.number - 1).to_json(image=True))
+
+        job()  # the levels at rest
+        walk = rooms_called("live", job)
+        job()  # shows the contacts that were fitted after the frame before
+    assert shown[-1]["force"][2] > 1
+    assert len(shown[-1]["contacts"]) > 0
+    assert {"record", "imaging", "calibration"} <= set(walk)
+    assert max(Counter(walk).values()) <= 2, walk

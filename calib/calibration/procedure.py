@@ -11,7 +11,6 @@ import numpy as np
 import jaxeit as je
 
 from ..check.acceptance import accept
-from ..check.placement import FIDELITY, placement_note
 from ..fitting.fields import single_places
 from ..fitting.neighbourhoods import with_error_scale
 from ..fitting.pads import PadModel
@@ -135,10 +134,10 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         recon=imager.recon,
         masks=imager.masks,
         curves=model.curves,
+        notes=(*ignored, *_notes(found)),
         evaluation=_held_out_evaluation(found),
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=(*ignored, *_notes(found, recipe.fidelity)),
         field=model.field,
         crosstalk=presses.crosstalk,
         noise=found.held_out.noise,
@@ -156,19 +155,17 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
     )
 
 
-def _notes(found: _Found, fidelity: je.Fidelity) -> tuple[str, ...]:
-    """What the operator should know of the stages; their model has this fidelity."""
+def _notes(found: _Found) -> tuple[str, ...]:
+    """What the operator should know of the stages."""
     presses, choice = found.presses, found.response.choice
     unpressed = unpressed_note(found.response.model.field, found.images.places, presses.data.share)
-    model = found.imager.model if fidelity == FIDELITY else None
     return (
         *presses.notes,
         *([found.placed.note] if found.placed else []),
-        *filter(None, [placement_note(found.skin, presses.untouched, presses.channels, model)]),
+        *found.imager.notes,
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
         *filter(None, [unpressed]),
-        *found.imager.notes,
     )
 
 
@@ -195,11 +192,11 @@ def _held_out_evaluation(found: _Found) -> Evaluation:
         pad_force=held_out.pad_force,
         half_width=held_out.half_width,
         image_sum=found.images.integral,
-        centre=centre_of(found.skin),
+        recipe=found.response.choice.title,
         held_out_by="location",
         others=held_out.others,
-        recipe=found.response.choice.title,
         splits=held_out.splits,
+        centre=centre_of(found.skin),
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 import jaxeit as je
 
+from ...check.placement import FIDELITY, placement_note
 from ...fitting.fields import Places
 from ...presses.pooled import PooledPresses
 from ..recipe import Recipe
@@ -42,14 +43,12 @@ class Imager:
     | masks: which pad carries which pixel                                 |
     | locator: estimator of places; None: no place is needed               |
     | notes: remarks for the reader of the results                         |
-    | model: from which it was prepared; None: loaded from a calibration   |
     """
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
     masks: je.PadMasks
     locator: AbstractLocator | None = None
     notes: tuple[str, ...] = ()
-    model: je.Model | None = None
 
     def presses(self, dv: np.ndarray) -> PressImages:
         """Images of presses (presses, readings) V, each of which holds one contact."""
@@ -71,6 +70,8 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
         InverseError, HyperparameterError: if no image can be made with these choices.
     """
     imaging, model = recipe.imaging, je.discretise(je.Scene(skin), recipe.fidelity)
+    same = model if recipe.fidelity == FIDELITY else None
+    doubt = placement_note(skin, presses.untouched, presses.channels, same)
     sigma, notes = (None, ()) if recipe.even_sheet else fit_untouched_sheet(model, presses.untouched, presses.channels)
     recon = imaging.prepare(
         model,
@@ -81,7 +82,7 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
     )
     masks = je.pad_masks(skin, recon)
     locator = recipe.locator.prepare(model, presses.noise, presses.channels, sigma) if recipe.locates else None
-    return Imager(recon, masks, locator, notes, model)
+    return Imager(recon, masks, locator, (*filter(None, [doubt]), *notes))
 
 
 def fit_untouched_sheet(
