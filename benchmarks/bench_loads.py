@@ -232,12 +232,6 @@ def reliability(stated: np.ndarray, true: np.ndarray) -> list[Row]:
     return rows
 
 
-def calibration_error(rows: list[Row]) -> float:
-    """Mean distance of stated probabilities from shares of true kinds, over the counts of `reliability`."""
-    away = [abs(row["stated"] - row["true"]) for row in rows]
-    return float(np.average(away, weights=[row["count"] for row in rows]))
-
-
 def kinds(run: Run, skin: str = "testbed", seeds: int = 3) -> tuple[list[Row], list[Row]]:
     """Rows of all touches of a skin, and the reliability of their probabilities."""
     seeds, singles, others = run.sizes((seeds, 10, 3), (1, 1, 1))

@@ -37,7 +37,6 @@ NO_PADS, DEAD_PAD, NO_CODE = (
 )  # shares of the training's frames that lack all pads, each pad, the skin's code
 FORCE_ERROR = 0.15  # of the log force that counts as much as one nat of the pixels' shares
 TOUCHED = 0.1  # N; less is no contact
-TINY = 1e-6
 
 
 class Regressor(eqx.Module):
