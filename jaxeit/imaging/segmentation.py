@@ -54,7 +54,7 @@ class ChangeErrors(eqx.Module):
     allow a smaller one.
 
     Example:
-        quiet = je.imaging.ChangeErrors(absolute=0.001)
+        print(je.imaging.ChangeErrors(absolute=0.001))  # of frames that repeat well
     """
 
     relative: float = eqx.field(static=True, default=0.03)
@@ -72,7 +72,7 @@ class RegionSettings(eqx.Module):
     | pixels of the classes along each axis                                              | 256     |
 
     Example:
-        faint = je.imaging.RegionSettings(floor=0.2, pixels=128)
+        print(je.imaging.RegionSettings(floor=0.2, pixels=128))  # also faint regions
     """
 
     floor: float = eqx.field(static=True, default=0.5)
@@ -146,8 +146,8 @@ def segment(
         from jaxeit.imaging import LevelSet, RegionSettings, segment
 
         dark = model.background * jnp.where(near, 0.2, 1.0)  # S: an object that hardly conducts
-        choices = {"borders": LevelSet(widths=(0.5,)), "regions": RegionSettings(pixels=64)}
-        found = segment(model, v0, je.forward(model, dark), je.Pixels(16), **choices)
+        quick = {"borders": LevelSet(widths=(0.5,)), "regions": RegionSettings(pixels=64)}
+        found = segment(model, v0, je.forward(model, dark), je.Pixels(16), **quick)
         print(f"{(found.classes == 1).mean():.1%} of the picture is resistive")  # 2: conductive
     """
     require_model(model)
