@@ -11,11 +11,10 @@ import optax
 import calib
 import jaxeit as je
 
-bench, draft, pixels = calib.load_bench("paper_bench"), je.Fidelity.draft(dtype="float32"), je.Pixels(20)
+bench, draft, grid = calib.load_bench("paper_bench"), je.Fidelity.draft(dtype="float32"), je.Pixels(20)
 names, optimiser = ("frames", "pad_forces", "force_map"), optax.adam(optax.cosine_decay_schedule(1e-3, 3000))
 with tempfile.TemporaryDirectory() as folder:
-    frame_set = calib.bench.FrameSet(bench, 8192, fidelity=draft, pixels=pixels)
-    calib.write_training_frames(frame_set, folder, executor=ThreadPoolExecutor(1))
+    calib.write_training_frames(calib.bench.FrameSet(bench, 8192, draft, grid), folder, executor=ThreadPoolExecutor(1))
     parts = [calib.open_training_frames(folder).part(*skins) for skins in ((0, 0.875), (0.875, 1))]  # the last skin
     (dv, _, maps), (unseen, pads, truth) = [[jnp.asarray(p[n][p["contacts"] > 0]) for n in names] for p in parts]
 
@@ -54,7 +53,7 @@ for press in range(400):  # of ordinary use; recursive least squares, as the pad
     after[press + 1] = (force + features @ gain)[400:]
 errors = {presses: float(jnp.median(jnp.abs(after[presses] - true))) for presses in (0, 30, 120, 400)}
 print("error of the force without pads:", ", ".join(f"{e:.1%} after {n} presses" for n, e in errors.items()))
-recon = je.prepare(je.discretise(je.Scene(bench.scene.skin), draft), basis=pixels, hyperparameter=0.1)
+recon = je.prepare(je.discretise(je.Scene(bench.scene.skin), draft), basis=grid, hyperparameter=0.1)
 masks = je.pad_masks(bench.scene.skin, recon)
 fused = {"image": je.fuse(recon(unseen), masks, pads), "network": je.fuse(jnp.exp(shares), masks, pads)}
 wrong = {name: float(jnp.abs(m.force - truth).sum() / truth.sum() / 2) for name, m in fused.items()}
