@@ -182,6 +182,19 @@ def test_the_commands_about_recording(folder, capsys):
 
 
 @pytest.mark.slow
+def test_the_command_about_mujoco(tmp_path, monkeypatch):
+    """With the robot of the program on that page."""
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "mujoco.md").read_text(encoding="utf-8")
+    Path("robot.xml").write_text(re.search(r'from_xml_string\("""(.*?)"""', page, re.DOTALL)[1])
+    (line,) = commands("mujoco.md")
+    do(line, "--fidelity", "draft", **{"10": "0.5"})
+    with calib.open_session("rolling.h5") as session:
+        assert session.truth["load"].any()
+
+
+@pytest.mark.slow
 def test_the_commands_a_week_later(folder):
     with_force, without = commands("a-week-later.md")
     do(with_force, **{"later.h5": "session.h5"})
