@@ -131,7 +131,7 @@ def _gpu_frames(larger: Row) -> Iterator[Row]:
 def _gpu_training(results: Row) -> str:
     (row,) = results["training"]
     return (
-        f"Training of a proposal (`jaxeit train`) takes {row['steps_per_s']:,.0f} steps a second there, of "
+        f"Training of a proposal (`jaxeit train`) takes {row['steps_per_s']:,.0f} steps a second on the H100, of "
         f"{row['frames_per_s'] / row['steps_per_s']:.0f} random frames each; the first epoch,\nwith compilation, takes "
         f"{row['first_epoch_s']:.1f} s.\n"
     )

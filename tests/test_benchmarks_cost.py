@@ -470,7 +470,7 @@ def test_tables_of_the_pages(root):
     assert "| forward, one call, ms | 2.00 |" in text["gpu-verbs"]
     for line in ("one image, ms | 0.22", "frames searched for contacts a second, batches of 1,024 | 17,000"):
         assert f"| {line} |" in text["gpu-frames"]
-    assert "100 steps a second there, of 256 random frames" in text["gpu-training"]
+    assert "100 steps a second on the H100, of 256 random frames" in text["gpu-training"]
     assert "| bundled | no | later | 0.12 | 0.12 | 0.12 | 0.12 | 0.12 |" in text["calibration-seconds"]
     assert "| **standard** |" in text["ladder-chest"]
     assert "| at rest | 24 |  |  | 4,000 | 2,000 |" in text["event-scan"]
