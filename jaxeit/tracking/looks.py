@@ -83,7 +83,7 @@ def looked(look: Look, programs: Programs, events: Events) -> Look:
     if look.trials is None:
         careful = _concluded(look, look.best, programs)
         if _is_explained(careful, programs.size, events.rare(look.seen.seconds)):
-            return replace(look, after=_uneventful(look, programs))
+            return replace(look, after=_uneventful(look, programs, careful))
         return replace(look, trials=_trials(look, careful, programs, events))
     best = max(trial.probability for trial in [look.best, *_possible(look)])
     for k, trial in enumerate(look.trials):
@@ -144,7 +144,7 @@ def _judged(look: Look, programs: Programs) -> Look:
     return look if left else replace(look, after=after)
 
 
-def _uneventful(look: Look, programs: Programs) -> Tracking:
+def _uneventful(look: Look, programs: Programs, careful: Update | None = None) -> Tracking:
     """Contacts to which nothing more has happened: by the careful update, if the ordinary one ended before it was best.
 
     Where a force grows severalfold between two frames, the few evaluations of an ordinary update end before the force
@@ -152,7 +152,7 @@ def _uneventful(look: Look, programs: Programs) -> Tracking:
     """
     if not look.unfinished:
         return look.otherwise
-    careful = _concluded(look, look.best, programs)
+    careful = _concluded(look, look.best, programs) if careful is None else careful
     if not float(careful.misfit) < look.otherwise.misfit:
         return look.otherwise
     return settled(replace(look.before, since=0, misfit=float(careful.misfit)), careful)
