@@ -9,7 +9,7 @@ constraints of electrodes, `sizes` states the wanted edge lengths, and `smoothin
 
 from collections.abc import Sequence
 from enum import Enum
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +18,7 @@ from ..budget import require
 from ..geometry.shapes import Domain, Rectangle
 from .footprints import AbstractFootprint, Feature, cycle, neighbours, require_placed
 from .sizes import SizeField, divide_rim, fill, narrow_places, thin
-from .smoothing import Problem, missing_edges, quality, relax
+from .smoothing import Problem, Triangulation, better, missing_edges, relax
 from .triangles import CROWDED, MIN_ANGLE, Mesh, MeshError, place
 
 START_SPACINGS = (0.72, 0.69, 0.75, 0.66, 0.78)
@@ -67,20 +67,19 @@ def triangulate(
     problem = _problem(domain, footprints, rim, size)
     free = fill(domain, size)
     free = free[problem.open_to(free)]
-    points, triangles = _relaxed(problem, free)
+    _, points, triangles = _relaxed(problem, free)
     _require_followed(problem, triangles)
     return Mesh(points, triangles).check(advice=CROWDED)
 
 
-def _relaxed(problem: Problem, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _relaxed(problem: Problem, free: np.ndarray) -> Triangulation:
     """The first triangulation that is good enough, or the best one; free: places for nodes, (n, 2) m."""
-    wanted, found = problem.size(free), []
+    size, found = problem.size(free), []
     for spacing in START_SPACINGS:
-        points, triangles = relax(problem, thin(free, problem.fixed, spacing * wanted))
-        found.append((quality(problem, points, triangles), points, triangles))
-        if found[-1][0] >= MIN_ANGLE:
+        found.append(relax(problem, thin(free, problem.fixed, spacing * size)))
+        if found[-1].angle >= MIN_ANGLE:
             break
-    return max(found, key=lambda one: one[0])[1:]
+    return reduce(better, found)
 
 
 def expected_nodes(

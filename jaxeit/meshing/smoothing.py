@@ -8,6 +8,7 @@ Triangles are (m, 3) indices, counter-clockwise; points are (n, 2) m with the fi
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
@@ -49,25 +50,34 @@ class Problem:
     open_to: Callable[[np.ndarray], np.ndarray]
 
 
-def relax(problem: Problem, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of the best triangulation found, starting from the free nodes (n, 2) m."""
+class Triangulation(NamedTuple):
+    """Points (n, 2) m, triangles (m, 3), and their `quality`: the smallest angle, degrees."""
+
+    angle: float
+    points: np.ndarray
+    triangles: np.ndarray
+
+
+def relax(problem: Problem, free: np.ndarray) -> Triangulation:
+    """The best triangulation found, starting from the free nodes (n, 2) m."""
     points = np.concatenate([problem.fixed, free])
     triangles = delaunay(points, problem.domain)
-    best = (quality(problem, points, triangles), points, triangles)
+    best = Triangulation(quality(problem, points, triangles), points, triangles)
     for _ in range(ROUNDS):
         points = _adapt(problem, points, triangles)
         triangles = delaunay(points, problem.domain)
         for _ in range(SWEEPS):
             points = _sweep(problem, points, triangles)
             triangles = delaunay(points, problem.domain)
-            best = max(best, (quality(problem, points, triangles), points, triangles), key=_first)
-        if best[0] >= GOOD_ANGLE:
+            best = better(best, Triangulation(quality(problem, points, triangles), points, triangles))
+        if best.angle >= GOOD_ANGLE:
             break
     return _polish(problem, *best)
 
 
-def _first(entry: tuple[float, np.ndarray, np.ndarray]) -> float:
-    return entry[0]
+def better(one: Triangulation, other: Triangulation) -> Triangulation:
+    """That of larger angles, the first if they are alike."""
+    return other if other.angle > one.angle else one
 
 
 def quality(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> float:
@@ -227,7 +237,7 @@ def _misplaced(problem: Problem, points: np.ndarray) -> np.ndarray:
     return astray
 
 
-def _polish(problem: Problem, angle: float, points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _polish(problem: Problem, angle: float, points: np.ndarray, triangles: np.ndarray) -> Triangulation:
     """Raise the smallest angles by moving single nodes; the smallest angle never decreases."""
     for _ in range(POLISHES):
         if angle >= GOOD_ANGLE:
@@ -240,7 +250,7 @@ def _polish(problem: Problem, angle: float, points: np.ndarray, triangles: np.nd
         if trial <= angle:
             break
         angle, points, triangles = trial, moved, flipped
-    return points, triangles
+    return Triangulation(angle, points, triangles)
 
 
 def _improve_stars(points: np.ndarray, triangles: np.ndarray, fixed: int, reach: float) -> np.ndarray:

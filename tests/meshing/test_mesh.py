@@ -13,6 +13,7 @@ from jaxeit.meshing import generation
 from jaxeit.meshing.foreign import flat_mesh, read_mesh, write_mesh
 from jaxeit.meshing.generation import Mesh, MeshError, TrianglePattern, structured, triangulate
 from jaxeit.meshing.outlines import ArcFootprint, DiscFootprint, PointFootprint, polygon_radius
+from jaxeit.meshing.smoothing import Triangulation
 from jaxeit.meshing.triangles import CROWDED
 
 L_SHAPE = Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)))
@@ -369,7 +370,8 @@ def test_a_spike_ends_in_a_mesh_error():
 
 def test_an_outline_that_is_lost_is_not_passed_over(monkeypatch):
     coarse = structured(SQUARE, 1, 1)
-    monkeypatch.setattr("jaxeit.meshing.generation.relax", lambda problem, free: (coarse.nodes, coarse.triangles))
+    lost = Triangulation(-1.0, coarse.nodes, coarse.triangles)
+    monkeypatch.setattr("jaxeit.meshing.generation.relax", lambda problem, free: lost)
     with pytest.raises(MeshError, match=r"cannot follow the outline at \(.*\) mm; use a shorter"):
         triangulate(SQUARE, [], 0.02)
 
