@@ -74,13 +74,24 @@ def median_ms(call: Callable, repeats: int, budget: float) -> float:
     return 1e3 * float(np.median(in_turns({0: call}, repeats, budget)[0]))
 
 
-def row(call: Callable, dtype: str, cells: int, batch: int, off: float, repeats: int, budget: float = 2.0) -> Row:
+def row(call: Callable, what: str, dtype: str, batch: int, off: float, repeats: int, budget: float = 2.0) -> Row:
     """Times of a call for a batch, whose results are off by so much of the largest value."""
     if not off <= LOOSE[dtype]:
-        raise SystemExit(f"{dtype} is off by {off:.1e} of the largest value: nothing is timed")
-    ms, nodes = median_ms(call, repeats, budget), len(problem_of(cells).mesh.nodes)
-    about: Row = {"dtype": dtype, "nodes": nodes, "batch": batch, "difference": off}
+        raise SystemExit(f"{what}, {dtype}: off by {off:.1e} of the largest value; nothing is timed")
+    ms = median_ms(call, repeats, budget)
+    about: Row = {"what": what, "dtype": dtype, "batch": batch, "difference": off}
     return about | {"median_ms": ms, "per_s": 1e3 * batch / ms}
+
+
+def size(cells: int) -> Row:
+    return {"nodes": len(problem_of(cells).mesh.nodes)}
+
+
+def each(function: Callable, batch: jax.Array) -> Any:
+    """The results for a batch; of one, by the function itself."""
+    if len(batch) == 1:
+        return jax.tree.map(lambda a: a[None], function(batch[0]))
+    return jax.vmap(function)(batch)
 
 
 def cost(found: Program) -> Row:
@@ -121,14 +132,13 @@ def measured(what: str, cells: int, dtype: str, batch: int, repeats: int, dense:
     extra = (basis_of(model, True),) if what == "Jacobian" else ()
 
     def several(model: je.Model, sigma: jax.Array, *extra: Any) -> jax.Array:
-        one = lambda s: WHAT[what](model, s, *extra)  # noqa: E731
-        return one(sigma[0])[None] if batch == 1 else jax.vmap(one)(sigma)
+        return each(lambda one: WHAT[what](model, one, *extra), sigma)
 
     found = program(several, (model, sigma, *extra))
     out = found.call()
     chosen = np.unique(np.linspace(0, batch - 1, CHECKED).astype(int)) if what == "forward" else [batch - 1]
     off = max(difference(np.asarray(out[k], float), exact(what, cells, np.asarray(sigma[k], float))) for k in chosen)
-    return {"what": what} | row(found.call, dtype, cells, batch, off, repeats) | cost(found)
+    return size(cells) | row(found.call, what, dtype, batch, off, repeats) | cost(found)
 
 
 # --- parts
@@ -200,7 +210,7 @@ def by_cudss(cells: int, dtype: str, batch: int) -> Row:
     prepare_s, tool = seconds(cudss.Forward, problem_of(cells), batch, dtype)
     out = tool(sigma)
     off = difference(np.asarray(out[-1], float), exact("forward", cells, np.asarray(sigma[-1], float)))
-    found = {"tool": cudss.NAME, "what": "forward"} | row(lambda: tool(sigma), dtype, cells, batch, off, 10, 3.0)
+    found = {"tool": cudss.NAME} | size(cells) | row(lambda: tool(sigma), "forward", dtype, batch, off, 10, 3.0)
     found |= {"solver_ms": median_ms(partial(tool.batch.solve, tool.assembled(sigma)), 10, 3.0)}
     tool.batch.close()
     return found | {"prepare_s": prepare_s}
@@ -246,20 +256,12 @@ def shown(found: jax.Array | je.contacts.Contacts) -> jax.Array:
 
 
 def of_frames(what: str, made: Callable, dv: jax.Array, right: list[np.ndarray]) -> Row:
-    batch = len(dv)
-
-    def several(made: Callable, dv: jax.Array) -> Any:
-        return jax.tree.map(lambda a: a[None], made(dv[0])) if batch == 1 else jax.vmap(made)(dv)
-
-    found = program(several, (made, dv))
-    first = [shown(jax.tree.map(lambda a, k=k: a[k], found.call())) for k in range(min(batch, CHECKED))]
+    """Times for so many frames; of the first few it is known what is right."""
+    found = program(each, (made, dv))
+    out, batch = found.call(), len(dv)
+    first = [shown(jax.tree.map(lambda a, k=k: a[k], out)) for k in range(min(batch, CHECKED))]
     off = max(difference(np.asarray(one, float), right[k].astype(float)) for k, one in enumerate(first))
-    dtype = str(dv.dtype)
-    if not off <= LOOSE[dtype]:
-        raise SystemExit(f"{what}, {dtype}: off by {off:.1e} of the largest value: nothing is timed")
-    ms = median_ms(found.call, 10, 2.0)
-    about: Row = {"what": what, "dtype": dtype, "batch": batch, "difference": off}
-    return about | {"median_ms": ms, "per_s": 1e3 * batch / ms} | cost(found)
+    return row(found.call, what, str(dv.dtype), batch, off, 10) | cost(found)
 
 
 def learning(run: Run) -> Iterator[Row]:
