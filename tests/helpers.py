@@ -70,14 +70,19 @@ def require_identical(found, expected):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.nanmax(np.abs(expected)))
 
 
-def products(jaxpr):
-    """Every product of arrays in a program, in loops, branches and calls as well."""
+def equations(jaxpr, branches=True):
+    """Every operation of a program, in loops and calls as well; without branches, those that run in any case."""
     for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            yield equation
-        for part in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+        yield equation
+        inside = list(equation.params.values()) if branches or equation.primitive.name != "cond" else []
+        for part in jax.tree.leaves(inside, is_leaf=_is_program):
             if _is_program(part):
-                yield from products(getattr(part, "jaxpr", part))
+                yield from equations(getattr(part, "jaxpr", part), branches)
+
+
+def products(jaxpr):
+    """Every product of arrays in a program."""
+    return (equation for equation in equations(jaxpr) if equation.primitive.name == "dot_general")
 
 
 def _is_program(part):

@@ -12,7 +12,7 @@ from scipy.stats import skew
 import jaxeit as je
 from jaxeit import effects as fx
 
-from ..helpers import compiled, sheet_of, square_model
+from ..helpers import compiled, equations, sheet_of, square_model
 from ..histories import after
 
 SMALL = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.12)]
@@ -113,14 +113,8 @@ def test_no_effects_leave_no_trace(bare):
 
 def _operations(jaxpr):
     """All primitives in order, those of called programs included."""
-    out = []
-    for equation in jaxpr.eqns:
-        inner = [v for v in equation.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
-        if equation.primitive.name not in ("pjit", "jit"):
-            out.append(equation.primitive.name)
-        for value in inner:
-            out += _operations(getattr(value, "jaxpr", value))
-    return out
+    names = (equation.primitive.name for equation in equations(jaxpr))
+    return [name for name in names if name not in ("pjit", "jit")]
 
 
 @pytest.mark.parametrize("effect", EVERY, ids=IDS)

@@ -9,6 +9,8 @@ from scipy.linalg import lstsq
 import jaxeit as je
 from jaxeit.model.bases import overlap_areas
 
+from ..helpers import equations
+
 
 @pytest.fixture(scope="module")
 def recon(model, pixels):
@@ -109,20 +111,10 @@ def test_a_vmap_over_whole_frames_solves_nothing(recon):
     np.testing.assert_allclose(jax.vmap(recon)(dv), dv @ recon.matrix.T, rtol=1e-9, atol=1e-12)
     broken = dv.at[1, 5].set(jnp.nan)
     np.testing.assert_allclose(jax.vmap(recon)(broken), recon(broken), rtol=1e-9)
-    asked = _unconditional(jax.make_jaxpr(jax.vmap(recon))(dv).jaxpr)
+    always = equations(jax.make_jaxpr(jax.vmap(recon))(dv).jaxpr, branches=False)
+    asked = {equation.primitive.name for equation in always}
     assert "dot_general" in asked
     assert asked.isdisjoint({"lu", "cholesky", "triangular_solve", "while", "scan"})
-
-
-def _unconditional(jaxpr):
-    """Names of the operations that run whatever the numbers are."""
-    names = set()
-    for equation in jaxpr.eqns:
-        names.add(equation.primitive.name)
-        if equation.primitive.name != "cond":
-            for value in equation.params.values():
-                names |= _unconditional(getattr(value, "jaxpr", value)) if hasattr(value, "jaxpr") else set()
-    return names
 
 
 @pytest.fixture(scope="module")
