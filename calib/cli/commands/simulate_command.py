@@ -221,8 +221,9 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
 
     start, bench = time.monotonic(), load_bench(args.scene)
     bench = bench if args.seed is None else replace(bench, seed=args.seed)
-    fidelity, pixels = _fidelity_of(args) or je.Fidelity.standard(), je.Pixels(args.pixels or je.Pixels().columns)
-    frame_set = FrameSet(bench, args.random_scenes, fidelity, pixels, file_format=args.format or "hdf5")
+    pixels = None if args.pixels is None else je.Pixels(args.pixels)
+    given = {"fidelity": _fidelity_of(args), "pixels": pixels, "file_format": args.format}
+    frame_set = FrameSet(bench, args.random_scenes, **{name: one for name, one in given.items() if one is not None})
     with ExitStack() as stack:
         executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
         begin, tell = stack.enter_context(_frame_bar())
