@@ -27,6 +27,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -120,10 +121,10 @@ def place(mutant: Mutant, root: Path) -> tuple[Path, ast.AST, str]:
     if isinstance(pattern, ast.Expr) and isinstance(new, ast.Expr):
         pattern, new = pattern.value, new.value
     parts, every = mutant.symbol.split("."), symbols(root)
-    found = _alike(pattern, [(path, node) for path, own, node in every if own[-len(parts) :] == parts])
+    within = [(path, node) for path, own, node in every if own[-len(parts) :] == parts]
+    found = _alike(pattern, {id(node): (path, node) for path, symbol in within for node in ast.walk(symbol)}.values())
     if not found:  # anywhere, where the function or its class has another name now
-        modules = [(path, node) for path, _, node in every if isinstance(node, ast.Module)]
-        found = _exact(_alike(pattern, modules))
+        found = _exact(_alike(pattern, everywhere(root)[type(pattern)]))
     if len(found) != 1:
         raise Misfit(f"{mutant}: stands there {len(found)} times")
     path, node, names = found[0]
@@ -131,13 +132,24 @@ def place(mutant: Mutant, root: Path) -> tuple[Path, ast.AST, str]:
     return path, node, f"({text})" if isinstance(node, ast.expr) else text
 
 
-def _alike(pattern: ast.AST, there: list[tuple[Path, ast.AST]]) -> list[Place]:
+@cache
+def everywhere(root: Path) -> dict[type[ast.AST], list[tuple[Path, ast.AST]]]:
+    """All syntax of the packages by its type, with the files: half a million pieces are searched through once."""
+    found = defaultdict(list)
+    for path, _, module in symbols(root):
+        if isinstance(module, ast.Module):
+            for node in ast.walk(module):
+                found[type(node)].append((path, node))
+    return found
+
+
+def _alike(pattern: ast.AST, there: Iterable[tuple[Path, ast.AST]]) -> list[Place]:
     """The places of a pattern and what its names are called there; if it stands once under its own names, that one.
 
     Of three names or more one must still be called the same: else it is another expression of that shape.
     """
     found = []
-    for path, node in {id(node): (path, node) for path, symbol in there for node in ast.walk(symbol)}.values():
+    for path, node in there:
         names: dict[str, str] = {}
         fits = isinstance(node, ast.expr | ast.stmt) and unified(pattern, node, names)
         if fits and (len(names) < 3 or any(name == own for name, own in names.items())):
