@@ -154,7 +154,9 @@ def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, 
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
-@pytest.mark.parametrize("side", [0.08, 0.12, 0.3])
+@pytest.mark.parametrize(
+    "side", [pytest.param(0.08, marks=pytest.mark.slow), 0.12, pytest.param(0.3, marks=pytest.mark.slow)]
+)
 def test_a_contact_is_as_wide_on_a_small_sheet(side):
     """An image of as many pixels on every sheet would leave out the tails of a load on a small one."""
     grid = [[x * side, y * side] for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]
