@@ -19,6 +19,7 @@ import jaxeit as je
 from jaxeit.registry import limited, require_limits
 
 from ..calibration.calibration import Calibration
+from ..calibration.localisation.contact_tracks import NotFollowed
 from ..calibration.localisation.proposals import ProposalChoice, chosen_proposal
 from ..calibration.logs.calibration import LogCalibration
 from ..record.intake import NullSink, RecordSink, explain_silence
@@ -41,7 +42,7 @@ COMPILING = "compiling the programs of this calibration, before the devices are 
 
 
 class LiveError(ValueError):
-    """The streams do not fit the calibration, do not begin, or fail.
+    """The streams do not fit the calibration, do not begin, or fail; or they do not allow contacts to be followed.
 
     Example:
         from calib.live import LiveError
@@ -194,9 +195,9 @@ def run_live(
         begun: called when everything is compiled and the devices are connected.
 
     Raises:
-        LiveError: if the streams do not fit the calibration, do not begin, or fail.
+        LiveError: if the streams do not fit the calibration, do not begin, or fail; if contacts are to be followed
+            and the frames at rest do not tell the noise.
         InverseError: if the network was trained for another skin.
-        NotFollowed: if contacts are to be followed and the frames at rest do not tell the noise.
         PriorityError: if real-time scheduling is refused.
     """
     settings = settings or LiveSettings()
@@ -288,7 +289,7 @@ def _process_frames(
                 raise LiveError("; ".join(map(explain_silence, recorder.silent_receivers)))
             continue
         begun = True
-        result = engine.step(arrival, queue.dropped)
+        result = _step(engine, arrival, queue.dropped)
         _tell_state(control, engine, recorder)
         if result is not None:
             count += 1
@@ -298,6 +299,14 @@ def _process_frames(
                 director.update(cast(Engine, engine).pressed(arrival), cast(FrameResult, result).centre)
             engine.use_spare_time(queue.time_to_next())
     return count
+
+
+def _step(engine: Engine | LogEngine, arrival: ReceivedFrame, dropped: int) -> Result | None:
+    """Process one frame."""
+    try:
+        return engine.step(arrival, dropped)
+    except NotFollowed as error:
+        raise LiveError(f"live: --track: {error}; measure the untouched skin for longer: --rest") from error
 
 
 def _must_tare(engine: Engine | LogEngine, control: LiveControl) -> bool:

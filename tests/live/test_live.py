@@ -61,7 +61,7 @@ class FakePrograms(FramePrograms):
 
     nowhere, searches = NOWHERE, False
 
-    def __init__(self, law):
+    def __init__(self, law, most=0):
         self.searched, self.places = [], []
 
     def warm_up(self):
@@ -782,6 +782,12 @@ def test_streams_that_do_not_fit_or_do_not_come_are_said(calibration):
     plan, sources = plan_recording({"eit": "tcp://h:1", "pressure": "tcp://h:1?channels=7"}, calibration.skin)
     with pytest.raises(LiveError, match="7 pressures"):
         run_live(calibration, plan, sources, [], LiveControl())
+
+
+def test_live_says_what_to_do_where_frames_at_rest_do_not_tell_the_noise(calibration):
+    settings = LiveSettings(rest=0.01, track=True, proposal=None)
+    with small_device() as device, pytest.raises(LiveError, match=r"tell.* untouched .*--rest"):
+        run_live(calibration, *sources_of(device, calibration), [], LiveControl(), settings)
 
 
 # --- the page and the lines ----------------------------------------------------------------------
