@@ -1,6 +1,7 @@
 """The commands of the pages run as they are printed, on recordings of the kind that each page speaks of.
 
-Where a page names a device (``tcp://HOST:PORT``) or a number of frames that takes hours, the test gives another one.
+Where a page names a device (``tcp://HOST:PORT``, ``serial:///dev/ttyACM0``) or a number of frames that takes hours, the
+test gives another one.
 """
 
 import re
@@ -16,6 +17,8 @@ from scipy.io import savemat
 import calib
 import jaxeit as je
 from calib.cli import main
+from calib.record.device import SimulatedDevice, frame_packets, recording_packets
+from calib.record.plan import STREAM_KINDS
 from tests.record.test_recorder import both, journal
 from tests.tanks.instrument_files import goe_get
 from tests.tanks.rods import tank_with_rod
@@ -162,6 +165,23 @@ def do_served(line, *more):
         assert main([*given, *more]) == 0, line
 
 
+WALK = np.linspace([0.02, 0.05, 0.0], [0.16, 0.05, 0.0], 500, dtype="f4")
+"""Places of a stage (500, 3) m."""
+
+
+def do_with_devices(line, *more):
+    """Run a command with a device of its own behind each address, over TCP or a serial port as the address says."""
+    words = shlex.split(line)[1:]
+    links = {k: (words[k - 1].removeprefix("--"), word) for k, word in enumerate(words) if "://" in word}
+    walk = frame_packets(STREAM_KINDS["stage"].number, range(0, 10**10, 2 * 10**7), WALK)
+    streams = [walk if name == "stage" else recording_packets("use.h5", [name]) for name, _ in links.values()]
+    ports = [None if word.startswith("serial://") else 0 for _, word in links.values()]
+    with SimulatedDevice(streams, ports) as device:
+        for k, url in zip(links, device.urls, strict=True):
+            words[k] = url
+        assert main([*words, *more]) == 0, line
+
+
 @pytest.mark.slow
 def test_the_commands_about_recording(folder, capsys):
     record, recover, live, serve = commands("live.md")
@@ -172,13 +192,21 @@ def test_the_commands_about_recording(folder, capsys):
     do_served(live, *SHORT)
     assert int(re.findall(r"(\d+) frames$", capsys.readouterr().err, re.MULTILINE)[-1]) > 0
     assert shlex.split(serve)[-1] == "--serve"  # as `served` does, of a recording that is there
-    (checklist,) = commands("checklist.md")
+
+
+def test_the_command_of_the_checklist(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(SESSIONS / "testbed_presses.h5", "use.h5")
     Path("my_skin.toml").write_text(je.load_skin("testbed").toml)
-    stage = "--stage tcp://HOST:PORT "
-    assert stage in checklist  # the recording has none
-    do_served(checklist.replace(stage, ""), "-o", "again.h5", "--seconds", "1")
-    with calib.open_session("again.h5") as session:
-        assert session.streams.keys() == {"eit", "pressure", "force"}
+    (line,) = commands("checklist.md")
+    do_with_devices(line, "--seconds", "1")
+    with calib.open_session("session.h5") as session:
+        assert session.streams.keys() == {"eit", "pressure", "force", "stage"}
+        assert "tcp" in session.stream("stage").transport
+        assert "serial" in session.stream("pressure").transport
+        place = session.stream("stage").read()
+    assert len(place) > 20
+    assert np.isin(place, WALK).all()
 
 
 @pytest.mark.slow
