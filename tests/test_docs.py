@@ -123,11 +123,30 @@ def run(page, names):
     return names
 
 
+def test_programs_about_the_session_file(root, tmp_path, monkeypatch):
+    """Those that write come first; the file of h5py alone holds the same."""
+    monkeypatch.chdir(tmp_path)
+    page = root / "data" / "schema" / "README.md"
+    read, write, by_h5py = [text for language, _, text in blocks(page) if language == "python"]
+    names: dict = {}
+    for program in (write, by_h5py, read):
+        exec(compile(program, page.name, "exec"), names)
+    with calib.open_session("press.h5") as session, calib.open_session("by_h5py.h5") as other:
+        assert session.skin_name == other.skin_name == "testbed"
+        for found in (session.stream("force"), other.stream("force")):
+            np.testing.assert_array_equal(found.read(), [[0.0], [0.5], [1.0]])
+            np.testing.assert_array_equal(found.time, names["time"])
+
+
 def test_the_page_of_scenes_lists_every_effect(root):
-    head, *_ = (root / "docs" / "scenes.md").read_text(encoding="utf-8").split("```toml")
+    page = root / "docs" / "scenes.md"
+    head, *_ = page.read_text(encoding="utf-8").split("```toml")
     listed = re.findall(r"`(\w+)`", "".join(line for line in head.splitlines() if line.startswith("| ")))
     ours = (name for name, kind in je.effects.EFFECTS.items() if kind.__module__.startswith("jaxeit"))
     assert sorted(listed) == sorted(ours)
+    ((_, _, scene),) = blocks(page)
+    spread, hysteresis = je.toml.parse_toml(scene, "scene", je.model.read_effects)
+    assert (float(spread.width), float(hysteresis.loop)) == (0.012, 0.1)
 
 
 def rows_of(page):

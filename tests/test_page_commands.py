@@ -4,9 +4,13 @@ Where a page names a device (``tcp://HOST:PORT``, ``serial:///dev/ttyACM0``) or 
 test gives another one.
 """
 
+import os
 import re
 import shlex
 import shutil
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,6 +23,7 @@ import jaxeit as je
 from calib.cli import main
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
 from calib.record.plan import STREAM_KINDS
+from tests.live.test_bridges import FakeRos
 from tests.record.test_recorder import both, journal
 from tests.tanks.instrument_files import goe_get
 from tests.tanks.rods import tank_with_rod
@@ -35,7 +40,7 @@ SHORT = ["--port", "0", "--seconds", "20"]
 def commands(page):
     """The commands in the blocks of a page, without what explains them; those with an ellipsis are left out."""
     for language, _, text in blocks(ROOT / "docs" / page):
-        for line in re.sub(r"\\\n *", "", text).splitlines() if language in ("", "text") else ():
+        for line in re.sub(r"\\\n *", "", text).splitlines() if not language else ():
             words = re.split(r"(?<=\S) {3,}(?=\S)| +#", line)[0]
             if words.startswith("jaxeit ") and "..." not in words:
                 yield words
@@ -95,6 +100,29 @@ def write_bag(path):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not Path(sys.prefix, ".report").exists(), reason="this environment was not made by make")
+def test_the_first_commands_of_a_newcomer(tmp_path):
+    """In a folder with the files of the repository that `make demo` reads, and the environment that is there."""
+    for name in ("Makefile", "data"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    (tmp_path / "pyproject.toml").touch()
+    os.utime(tmp_path / "pyproject.toml", (0, 0))  # older than the environment, which is left as it is
+    first, *_ = [text for *_, text in blocks(ROOT / "docs" / "own-skin.md")]
+    demo, *_ = [text for *_, text in blocks(ROOT / "README.md")]
+    assert demo.startswith("make demo ")
+    assert first.startswith("make demo\n")
+    done = subprocess.run(
+        ["bash", "-ec", f"{first}\npwd; jaxeit --version"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    *_, folder, version = done.stdout.splitlines()
+    assert Path(folder).name == "my-skin"
+    assert version.startswith("jaxeit ")
+    assert (tmp_path / "demo" / "report.html").stat().st_size > 100_000
+
+
+@pytest.mark.slow
 def test_the_commands_about_import(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     seconds = {"t": np.arange(50) / 100, "f": np.ones(50), "p": np.ones(50)}
@@ -138,7 +166,8 @@ def test_the_commands_about_logs(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_the_commands_about_ros(folder, capsys):
+def test_the_commands_about_ros(folder, monkeypatch, capsys):
+    """With a stand-in for the calls of rclpy, which is not on an index of packages."""
     assert main(["apply", "calibration.h5", "use.h5", "-o", "forcemap.h5"]) == 0
     *export, ros, foxglove, again, back = commands("ros.md")
     for line in export:
@@ -150,9 +179,12 @@ def test_the_commands_about_ros(folder, capsys):
     with calib.open_session("again.h5") as found, calib.open_session("session.h5") as given:
         wanted = given.streams["eit"].read()
         np.testing.assert_allclose(found.streams["eit"].read(), wanted, atol=1e-6 * np.abs(wanted).max())
-    assert "--ros2" in ros  # which needs ROS; tests/live/test_bridges.py gives the node messages
+    replay, node = "replay://use.h5", FakeRos()
+    for name, module in node.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    do(ros, *SHORT, URL=replay)
+    assert {call[1] for call in node.log if call[0] == "publish"} > {"/skin/force_map", "/skin/taxels"}
     pytest.importorskip("foxglove")
-    replay = "replay://use.h5"
     do(foxglove.replace("URL", replay).replace("--foxglove", "--foxglove 0"), *SHORT)
     assert int(re.findall(r"(\d+) frames$", capsys.readouterr().err, re.MULTILINE)[-1]) > 0
 
@@ -174,17 +206,20 @@ def do_with_devices(line, *more):
     words = shlex.split(line)[1:]
     links = {k: (words[k - 1].removeprefix("--"), word) for k, word in enumerate(words) if "://" in word}
     walk = frame_packets(STREAM_KINDS["stage"].number, range(0, 10**10, 2 * 10**7), WALK)
-    streams = [walk if name == "stage" else recording_packets("use.h5", [name]) for name, _ in links.values()]
+    text = ((k * 10**7, b"%d, 1.5, 2.5, 3.5, 4.5\r\n" % (10_000 * k)) for k in range(1000))  # ticks, values in kPa
+    given = {"stage": walk, "text": text}
+    kinds = ["text" if "format=csv" in word else name for name, word in links.values()]
+    streams = [given.get(kind) or recording_packets("use.h5", [kind]) for kind in kinds]
     ports = [None if word.startswith("serial://") else 0 for _, word in links.values()]
     with SimulatedDevice(streams, ports) as device:
         for k, url in zip(links, device.urls, strict=True):
-            words[k] = url
+            words[k] = url + "".join(words[k].partition("?")[1:])
         assert main([*words, *more]) == 0, line
 
 
 @pytest.mark.slow
 def test_the_commands_about_recording(folder, capsys):
-    record, recover, live, serve = commands("live.md")
+    record, recover, live, serve, _ = commands("live.md")
     do_served(record, "-o", "recorded.h5", "--seconds", "1")
     journal("session.h5.part", both(), end=False)
     (folder / "session.h5").unlink()
@@ -192,6 +227,42 @@ def test_the_commands_about_recording(folder, capsys):
     do_served(live, *SHORT)
     assert int(re.findall(r"(\d+) frames$", capsys.readouterr().err, re.MULTILINE)[-1]) > 0
     assert shlex.split(serve)[-1] == "--serve"  # as `served` does, of a recording that is there
+
+
+def test_the_command_about_lines_of_text(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (line,) = commands("wire-format.md")
+    do_with_devices(line, "--seconds", "1")
+    with calib.open_session("session.h5") as session:
+        (stream,) = session.streams.values()
+        values = stream.read()
+        assert "serial" in stream.transport
+    assert len(values) > 20
+    np.testing.assert_allclose(values, np.tile([1500, 2500, 3500, 4500], (len(values), 1)))  # Pa
+
+
+@pytest.mark.slow
+def test_the_viewer_of_rerun(folder, capsys):
+    """With a server of rerun that opens no window."""
+    pytest.importorskip("rerun")
+    ((_, viewer, _),) = [
+        text.splitlines() for _, _, text in blocks(ROOT / "docs" / "live.md") if "rerun --bind" in text
+    ]
+    program, *words = shlex.split(viewer.partition(" &")[0])
+    *_, live = commands("live.md")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    command = [str(Path(sys.executable).with_name(program)), *words, "--serve-grpc", "--port", port]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+        try:
+            assert any("listening" in line.lower() for line in server.stdout)
+            do(f"{live} 127.0.0.1:{port}", *SHORT, URL="replay://use.h5")
+        finally:
+            server.terminate()
+    do(f"{live} show.rrd", *SHORT, URL="replay://use.h5")
+    assert (folder / "show.rrd").stat().st_size > 100_000
+    told = capsys.readouterr().err
+    assert min(int(count) for count in re.findall(r"(\d+) frames$", told, re.MULTILINE)) > 0
 
 
 def test_the_command_of_the_checklist(tmp_path, monkeypatch):
@@ -224,10 +295,24 @@ def test_the_command_about_mujoco(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_commands_a_week_later(folder):
-    with_force, without = commands("a-week-later.md")
+    record, with_force, without = commands("a-week-later.md")
+    do_with_devices(record, "--seconds", "1")
+    with calib.open_session("later.h5") as session:
+        assert session.streams.keys() == {"eit", "pressure", "force"}
     do(with_force, **{"later.h5": "session.h5"})
     do(without, "--from", "use", "--force", **{"use.h5": "session.h5"})
     assert calib.load_calibration("new.h5").recalibration is not None
+
+
+@pytest.mark.slow
+def test_the_command_that_trains(tmp_path, monkeypatch):
+    """For the skin of the tutorial, on few frames."""
+    monkeypatch.chdir(tmp_path)
+    write_files(ROOT / "docs" / "own-skin.md", tmp_path)
+    Path("my_skin.toml").rename("SKIN.toml")
+    (line,) = commands("proposal.md")
+    do(line, "--frames", "8192", "--epochs", "1")
+    assert je.contacts.load_proposal("proposal.npz").pads == 2
 
 
 @pytest.mark.slow

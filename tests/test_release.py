@@ -1,11 +1,14 @@
 """What a release needs to be whole: one version everywhere, and a source archive from which the tests run."""
 
+import os
 import re
 import subprocess
 import tomllib
 from importlib import metadata
 
 import pytest
+
+from .test_docs import blocks
 
 
 def described(root):
@@ -19,6 +22,21 @@ def test_the_version_is_the_same_everywhere(root):
     assert re.search(r"^version: \"?([\d.]+)\"?$", citation, re.MULTILINE)[1] == version
     newest = re.search(r"^## ([\d.]+)", (root / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[1]
     assert newest == version
+
+
+def test_links_of_the_readme_become_whole_addresses(root, tmp_path):
+    """By the command of the page on releases."""
+    (_, _, command), _ = blocks(root / "docs" / "release.md")
+    assert command.startswith("sed ")
+    (tmp_path / "README.md").write_text((root / "README.md").read_text(encoding="utf-8"), encoding="utf-8")
+    env = os.environ | {"REPOSITORY": "https://example.org/jaxeit"}
+    subprocess.run(["bash", "-c", command], cwd=tmp_path, env=env, check=True)
+    addresses = re.findall(r"\]\(([^)]*)\)", (tmp_path / "README.md").read_text(encoding="utf-8"))
+    assert len(addresses) > 30
+    for address in addresses:
+        path, _, _ = address.removeprefix("https://example.org/jaxeit/").partition("#")
+        assert path != address
+        assert (root / path).exists(), address
 
 
 def test_the_source_archive_holds_what_is_tracked(root):

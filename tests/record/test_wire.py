@@ -415,7 +415,7 @@ def output_of(code, folder):
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 def test_the_part_of_a_scan_in_c_is_the_same(reference, tmp_path):
-    code = re.findall(r"```c\n(.*?)```", reference, re.DOTALL)[1]
+    _, code = re.findall(r"```c\n(.*?)```", reference, re.DOTALL)
     main = """
     #include <stdio.h>
     int main(void) {

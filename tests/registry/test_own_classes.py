@@ -2,6 +2,7 @@
 
 import re
 import sys
+import tomllib
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -136,12 +137,15 @@ def test_the_effect_of_the_documentation(tmp_path, monkeypatch):
     """What docs/own-classes.md shows works as it stands."""
     text = (Path(__file__).parents[2] / "docs" / "own-classes.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    table = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0]
+    table, entry = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "my_effects.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     (effect,) = je.toml.parse_toml(table, "scene", je.model.read_effects, allow_import=True)
     sys.modules.pop("my_effects")
     assert je.effects.EFFECTS.text(effect) == "my_effects:Wetness:factor=1.5"
+    assert tomllib.loads(entry)["project"]["entry-points"] == {
+        je.effects.EFFECTS.group: {"Wetness": "my_effects:Wetness"}
+    }
     groups = dict(re.findall(r"\| ([\w ]+) \| [^|]* \| [^|]* \| `([\w.]+)` \|", text))
     assert groups.pop("import format") == "calib.importers"
     known = [je.effects.EFFECTS, je.skin.ELECTRODES, je.imaging.PRIORS, je.imaging.METHODS, je.imaging.HYPERPARAMETERS]
