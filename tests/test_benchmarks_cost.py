@@ -21,6 +21,7 @@ from benchmarks import (
     bench_start,
     bench_tracking,
     figures,
+    hard_case_pictures,
     harness,
     problems,
     repeat,
@@ -253,6 +254,17 @@ def test_every_question_is_listed_and_named_in_the_readme(root):
     readme = (root / "benchmarks" / "README.md").read_text(encoding="utf-8")
     assert set(re.findall(r"python -m benchmarks\.(\w+)", readme)) == set(questions())
     assert all(questions().values())
+
+
+def test_the_pictures_of_hard_cases_follow_their_tables():
+    cases = hard_case_pictures.rows(hard_case_pictures.PAGE.read_text(encoding="utf-8"))
+    lies = sum(case.startswith("lie: ") for case in cases)
+    assert sum(part.total() for part in hard_case_pictures.noticed(cases).values()) == lies > 100
+    lasts = hard_case_pictures.seconds(cases)
+    assert lasts["power cut: lost at most"] == 0.1
+    cases["fault 2: power cut while recording"][-1] = "the last 250 ms lost at most"
+    assert hard_case_pictures.seconds(cases)["power cut: lost at most"] == 0.25
+    assert len(lasts) == len(hard_case_pictures.LASTS)
 
 
 def test_a_part_measured_again_leaves_the_others(monkeypatch, tmp_path, capsys):
