@@ -22,7 +22,7 @@ COMMANDS = {
     "evaluate": "evaluate a calibration on other sessions",
     "apply": "write the force map of every frame of a session",
     "image": "draw the difference image of a tank: files of EIDORS, PyEIDORS, instruments (.get, .eit), NumPy",
-    "export": "write for other programs: a C header for firmware, ROS 2 (MCAP), LeRobot, Parquet",
+    "export": "write for other programs: a C header for firmware, CSV, ROS 2 (MCAP), LeRobot, Parquet",
     "bench": "measure what accuracy costs in time, for a skin on this machine",
     "design": "choose which readings a skin should take, out of all that its electrodes allow",
     "train": "train a network that proposes what touches a skin, on scenes drawn at random",

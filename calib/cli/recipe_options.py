@@ -55,13 +55,13 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     text = "folds of the cross-validation over places; with K of at least the number of places, "
     group.add_argument("--folds", type=count, metavar="K", help=text + "one place is left out at a time; default: 5")
     _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
-    text = "take the conductive sheet for even; default: its conductivity is fitted to the untouched frames"
+    text = "assume that the sheet is even; default: its conductivity is fitted to the untouched frames"
     group.add_argument("--even-sheet", action="store_true", help=text)
     text = (
-        "put the electrodes where untouched frames and presses tell that they sit; the places of presses must be right"
+        "move the electrodes to the places that untouched frames and presses show; the places of presses must be right"
     )
     group.add_argument("--fit-electrodes", action="store_true", help=text)
-    text = "keep what the presses tell of the contact layer's gain; helps apply `--loads`, `--track`"
+    text = "learn the gain of the contact layer from the presses; it improves apply `--loads`, `--track`"
     group.add_argument("--learn-layer", action="store_true", help=text)
     _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")
     add_low_pass_argument(group)

@@ -335,6 +335,7 @@ def test_frames_of_the_kuopio_challenge(tmp_path):
         ("a.csv", "1,2\n1,2\n1,x\n1,2\n", "line 3: 'x' is no number"),
         ("a.csv", "1\n" * 4, "lines have 1 columns"),
         ("a.mat", "no MATLAB", "is no MATLAB file"),
+        ("b.mat", "# Created by Octave 7.3.0\n# name: vh\n", r"Octave.*save\('-v7"),
         ("a.npz", "no archive", "cannot be read as a NumPy archive"),
         ("a.xyz", "", "is no file of a tank; give .mat"),
     ],

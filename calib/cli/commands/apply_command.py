@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="FORCEMAP.h5")
     text = "continue despite errors that `jaxeit check` finds; the results name them"
     parser.add_argument("--force", action="store_true", help=text)
-    text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of so many seconds"
+    text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of this duration"
     parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
     add_proposal_argument(parser, "with --loads: the network of jaxeit train, where fits begin")
     text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"

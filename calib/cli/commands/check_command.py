@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sessions or skins, and how to print what is found."""
-    text = "a session, or a skin's TOML file, of which it is said what it describes and what is wrong with it"
+    text = "a session to check, or a skin's TOML file to describe and check"
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5", help=text)
     parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
     text = "also print how far the session is off this calibration, and whether to recalibrate"

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("skin", metavar="SKIN", help="a shipped skin by its name, or the TOML file of your own")
     parser.add_argument("-o", "--output", required=True, metavar="BETTER.toml", help="the skin with the designed scan")
     time = parser.add_mutually_exclusive_group()
-    text = "time of a frame over that of a reading; default: that of the skin's scan"
+    text = "duration of a frame, as a number of readings; default: that of the skin's scan"
     time.add_argument("--readings", type=count, metavar="N", help=text)
     time.add_argument("--rate", type=above_zero, metavar="HZ", help="frames per second")
     text = "time that a change of the driven pair takes, in readings; default: 0"
@@ -52,13 +52,13 @@ def _add_placement_arguments(parser: argparse.ArgumentParser) -> None:
     moving = parser.add_argument_group("places of the electrodes")
     text = "also move the electrodes to where the scan places contacts best; takes minutes"
     moving.add_argument("--move", action="store_true", help=text)
-    text = f"between the middles of two electrodes, at least, m; default: {PlacementLimits().distance}"
+    text = f"smallest distance between the centres of two electrodes, m; default: {PlacementLimits().distance}"
     moving.add_argument("--distance", type=above_zero, metavar="M", help=text)
-    text = "from the rim, at least, m; default: that of the electrode nearest to it"
+    text = "smallest distance from the rim, m; default: that of the electrode nearest to it"
     moving.add_argument("--margin", type=above_zero, metavar="M", help=text)
     text = "no electrode in this circle, m; may be given more than once"
     moving.add_argument("--keep-out", type=_circle, action="append", default=[], metavar="X,Y,RADIUS", help=text)
-    text = "from where an electrode sits now, at most, m; default: any distance"
+    text = "largest distance of an electrode from its present place, m; default: any distance"
     moving.add_argument("--farthest", type=above_zero, metavar="M", help=text)
     text = "give up mirror symmetries that the electrodes have"
     moving.add_argument("--asymmetric", action="store_true", help=text)

@@ -33,15 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--radius", type=above_zero, metavar="M", help=text)
     text = "shape, electrodes and scan of the tank, for a file of readings alone: a TOML file, or a shipped skin's name"
     parser.add_argument("--skin", metavar="TANK.toml", help=text)
-    parser.add_argument("--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; 0")
+    parser.add_argument(
+        "--start", type=float, default=0.0, metavar="DEGREES", help="angle of electrode 0 from +x; default: 0"
+    )
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
     text = "fit conductivity and contact resistances (one, or one of each electrode) to the reference; image with them"
     parser.add_argument("--fit-contacts", choices=("one", "each"), help=text)
-    text = "what conducts less and more than the reference, in place of an image; its prior and method are its own"
+    text = "draw what conducts less and what conducts more than the reference; --prior and --method do not apply"
     parser.add_argument("--classes", action="store_true", help=text)
     parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
     parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
-    text = "weight of the prior, or a method to choose it, such as l-curve; 0.3"
+    text = "weight of the prior, or a method to choose it, such as l-curve; default: 0.3"
     parser.add_argument("--hyperparameter", default="0.3", metavar="L", help=text)
 
 

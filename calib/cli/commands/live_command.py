@@ -39,7 +39,7 @@ def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", required=True, metavar="CALIBRATION.h5")
     text = "URL of the EIT stream, as for jaxeit record; not for the calibration of a log"
     parser.add_argument("--eit", metavar="URL", help=text)
-    text = "URL of the pressure stream; for the calibration of a log, of the stream of its sensor"
+    text = "URL of the pressure stream; for the calibration of a log, URL of its sensor's stream"
     parser.add_argument("--pressure", required=True, metavar="URL", help=text)
     text = "URL of the stage, for the calibration of a log that corrects by location"
     parser.add_argument("--stage", metavar="URL", help=text)
@@ -57,7 +57,7 @@ def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8765, help="port of the page; 0: any free port; default: 8765")
     text = "send results as lines of JSON to programs that connect to this port; 0: any free port"
     parser.add_argument("--publish", type=int, metavar="PORT", help=text)
-    text = "with map and image in the lines of --publish, as base64 of little-endian float32"
+    text = "add map and image to the lines of --publish, as base64 of little-endian float32"
     parser.add_argument("--publish-maps", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
     text = "send results to the rerun viewer at HOST:PORT (default: 127.0.0.1:9876), or write them to FILE.rrd"

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "percent by which a gain may have drifted, of each pad and of all together (standard deviations); default: 10"
     )
     parser.add_argument("--drift", type=above_zero, default=10.0, metavar="PERCENT", help=text)
-    text = "also keep what presses, or contacts that are followed, tell of the contact layer's gain"
+    text = "also learn the gain of the contact layer, from presses or from contacts that are followed"
     parser.add_argument("--learn-layer", action="store_true", help=text)
     text = "continue despite errors that `jaxeit check` finds, or if the session determines the gain of no pad"
     parser.add_argument("--force", action="store_true", help=text)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A scene, or a skin for a data set, and what to do with it."""
     parser.add_argument("scene", metavar="SCENE.toml", help="a scene file, or a shipped scene by its name")
-    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="with --random-scenes, a folder")
+    parser.add_argument("-o", "--output", metavar="SESSION.h5", help="file to write; with --random-scenes, a folder")
     text = "print what the scene simulates and what each part costs, and simulate nothing"
     parser.add_argument("--explain", action="store_true", help=text)
     text = (
@@ -41,18 +41,18 @@ def _add_random_scenes(parser: argparse.ArgumentParser) -> None:
         "frames of random contacts on skins drawn anew, with pressures and true force maps; the same command resumes"
     )
     group = parser.add_argument_group("frames for training", about)
-    text = "write so many frames into the folder given by -o; the presses of the scene are not used"
+    text = "number of frames to write into the folder given by -o; the presses of the scene are not used"
     group.add_argument("--random-scenes", type=count, metavar="FRAMES", help=text)
-    group.add_argument("--seed", type=int, metavar="N", help="of all that is drawn; default: that of the scene")
+    group.add_argument("--seed", type=int, metavar="N", help="seed of the random scenes; default: that of the scene")
     text = "accuracy of the finite-element model (default: standard); one of draft, standard, reference"
     action = group.add_argument("--fidelity", metavar="NAME", help=text)
     action.suggestions = ("draft", "standard", "reference")  # type: ignore[attr-defined]
     group.add_argument("--pixels", type=count, metavar="N", help="pixels of the force map along x; default: 40")
-    text = "of the shards: hdf5 (default), or parquet for pandas, Polars, DuckDB, datasets; needs jaxeit[tables]"
+    text = "format of the shards: hdf5 (default), or parquet for pandas, Polars, DuckDB, datasets; needs jaxeit[tables]"
     group.add_argument("--format", choices=("hdf5", "parquet"), help=text)
     many = group.add_mutually_exclusive_group()
     many.add_argument(
-        "--jobs", type=count, metavar="N", help="number of processes, on which the bytes do not depend; default: 1"
+        "--jobs", type=count, metavar="N", help="number of processes; the files do not depend on it; default: 1"
     )
     text = "as --jobs, on the workers of a Dask scheduler, which must see the same folder"
     many.add_argument("--scheduler", metavar="ADDRESS", help=text)
@@ -66,7 +66,7 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--geom", nargs="+", metavar="NAME", help="geoms of the robot that the skin covers")
     text = "site of the robot at which the skin lies, with the axes of its surface"
     group.add_argument("--site", metavar="NAME", help=text)
-    group.add_argument("--seconds", type=float, metavar="S", help="of the robot's time; default: 10")
+    group.add_argument("--seconds", type=float, metavar="S", help="duration, in the robot's time; default: 10")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -16,11 +16,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="PROPOSAL.npz")
     parser.add_argument("--frames", type=count, metavar="N", help="random scenes; default: 307,200")
     parser.add_argument("--epochs", type=count, metavar="N", help="passes over the scenes; default: 30")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of scenes and weights; default: 0")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of scenes and weights; default: 0")
     text = "accuracy of the finite-element model (default: draft:dtype=float32); one of draft, standard, reference"
     action = parser.add_argument("--fidelity", metavar="NAME", help=text)
     action.suggestions = ("draft", "standard", "reference")  # type: ignore[attr-defined]
-    text = "number of processes that simulate, on which the bytes do not depend; default: 1"
+    text = "number of processes that simulate; the file does not depend on it; default: 1"
     parser.add_argument("--jobs", type=count, default=1, metavar="J", help=text)
 
 

@@ -63,6 +63,8 @@ def is_hdf5(path: Path) -> bool:
     head = first_bytes(path, 1024)
     if b"\x89HDF\r\n\x1a\n" in (head[512:520], head[:8]):
         return True
+    if head.startswith(b"# Created by Octave"):
+        raise problem(path, "file", "is in the text format of Octave", "write it by save('-v7', ...)")
     if len(head) < 128:
         raise problem(path, "file", f"is no MATLAB file ({len(head)} bytes)", DAMAGED)
     return False
