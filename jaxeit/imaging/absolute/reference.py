@@ -204,8 +204,8 @@ def _spread(model: Model, settings: ReferenceSettings, channels: int) -> np.ndar
     touching = np.asarray(model.contact) > 0
     if not touching.any() and (settings.contact or settings.contact_each):
         raise InverseError(
-            "no electrode of the model has a contact resistance to fit; give the electrodes a contact above zero, or "
-            "the settings contact=0 and contact_each=0"
+            "no electrode of the model has a contact resistance to fit, and point electrodes cannot have one; give the "
+            "electrodes a contact above zero, or fit none: contact=0 and contact_each=0, or no --fit-contacts"
         )
     if settings.common_mode and not chosen(model.effects, CommonMode):
         raise InverseError("the scene has no CommonMode whose gain could be fitted; add je.effects.CommonMode() to it")
