@@ -72,11 +72,13 @@ def rows_of(path):
     reader = pytest.importorskip("rerun.chunk").RrdReader(path)
     found = {}
     for chunk in reader.stream():
-        table = chunk.to_record_batch().to_pydict()
-        times = [at.total_seconds() for at in table.get("arrival", [])]
-        for name, values in table.items():
-            if ":" in name and times:
-                found.setdefault((chunk.entity_path, name), []).extend(zip(times, values, strict=True))
+        table = chunk.to_record_batch()
+        if "arrival" not in table.schema.names:
+            continue
+        times = [at / S for at in table["arrival"].cast("int64").to_pylist()]  # ns, which datetime does not take
+        for name in table.schema.names:
+            if ":" in name:
+                found.setdefault((chunk.entity_path, name), []).extend(zip(times, table[name].to_pylist(), strict=True))
     return found
 
 
