@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo
 
-.PHONY: demo test slow docs lint clean
+.PHONY: demo test slow pages docs lint clean
 
 # One stamp per set of extras: pip runs again only when pyproject.toml changes.
 $(VENV)/.report: pyproject.toml
@@ -31,6 +31,14 @@ test: $(VENV)/.dev
 
 slow: $(VENV)/.dev
 	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -m slow
+
+# The tests that run what the pages, the docstrings and the examples show; tests/test_page_blocks.py holds the list.
+SHOWN := test_docs test_eidors_pages test_examples test_notebook test_page_blocks test_page_commands test_program_cache \
+    test_programs test_readme test_site test_tutorials batch/test_random_frames export/test_c_header \
+    export/test_lerobot_page record/test_wire registry/test_own_classes simulators/test_mujoco tanks/test_tanks
+
+pages: $(VENV)/.dev
+	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest $(SHOWN:%=tests/%.py)
 
 # build/site, to be read without a network; a broken link is an error.
 docs: $(VENV)/.docs  # --quiet would also silence what --strict counts

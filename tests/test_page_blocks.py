@@ -62,7 +62,7 @@ OTHER_COMMANDS = {
 """How commands begin that are not those of jaxeit, and that a test runs."""
 
 NOT_RUN = {
-    "CONTRIBUTING.md": ("make test", "make slow", "make lint", "make docs"),
+    "CONTRIBUTING.md": ("make test", "make slow", "make pages", "make lint", "make docs"),
     "benchmarks/README.md": ("python -m benchmarks",),
     "docs/lerobot.md": ("lerobot-record ",),
     "docs/release.md": ("python -m build", "git checkout README.md", "tar xzf dist/", "make -C /tmp/jaxeit-* test"),
@@ -109,6 +109,14 @@ def test_every_block_of_a_page_has_its_test(root):
         for test in set(RUN.get(page, {}).values()):
             text = (root / "tests" / test).read_text(encoding="utf-8")
             assert page.rpartition("/")[2] in text or "DECISIONS" in text, (page, test)
+
+
+def test_make_pages_runs_these_tests(root):
+    text = (root / "Makefile").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"^SHOWN := ((?:.*\\\n)*.*)", text, re.MULTILINE)
+    tests = {test for page in RUN.values() for test in page.values()}
+    assert tests <= {f"{name}.py" for name in shown.replace("\\", "").split()}
+    assert "make pages" in (root / ".github" / "workflows" / "test.yml").read_text(encoding="utf-8")
 
 
 def test_every_command_of_a_page_is_run_or_listed(root):
