@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -253,12 +254,13 @@ def test_the_viewer_of_rerun(folder, capsys):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     command = [str(Path(sys.executable).with_name(program)), *words, "--serve-grpc", "--port", port]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, **output, start_new_session=True) as server:  # a script that starts the server
         try:
             assert any("listening" in line.lower() for line in server.stdout)
             do(f"{live} 127.0.0.1:{port}", *SHORT, URL="replay://use.h5")
         finally:
-            server.terminate()
+            os.killpg(server.pid, signal.SIGTERM)
     do(f"{live} show.rrd", *SHORT, URL="replay://use.h5")
     assert (folder / "show.rrd").stat().st_size > 100_000
     told = capsys.readouterr().err
