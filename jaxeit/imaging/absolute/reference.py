@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Integer
+from jaxtyping import Array, Bool, Float, Int, Integer
 from scipy.linalg import block_diag
 
 from ..._compile import full_precision
 from ...effects import CommonMode, chosen
-from ...least_squares import ImplicitStep, LevenbergMarquardt
+from ...least_squares import Cholesky, ImplicitStep, LevenbergMarquardt
 from ...linalg.lapack import eigh
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
@@ -33,8 +33,8 @@ from .images import reading_weights
 
 MODEL_ERROR = 3e-3
 """Standard error of a reading, relative, where nothing else is said: that of the mesh and the places of electrodes."""
-MORE_FITS = 2  # with errors as large as the misfit of the fit before
-TOLERANCE, MAX_STEPS = 1e-6, 64  # tolerance of the sum of squares: 1 is one standard error
+FITS = 3  # each with errors as large as the misfit of the fit before, the first with what even content leaves
+TOLERANCE, MAX_STEPS = 1e-6, 256  # tolerance of the sum of squares: 1 is one standard error
 
 
 class ReferenceSettings(eqx.Module):
@@ -174,11 +174,16 @@ def fit_reference(
     numbers = None if each is None else jnp.asarray(each, jnp.int32)
     touches, amplifies = bool(settings.contact or settings.contact_each), bool(settings.common_mode)
     problem = _Problem(model, motion, numbers, channels, touches, amplifies, level, spread)
-    fit, found = _fitted(problem, known, weight)
-    for _ in range(0 if std is not None else MORE_FITS):
-        weight = weight / jnp.maximum(fit.misfit, 1)
-        fit, found = _fitted(problem, known, weight)
-    require_explained("even content", found, known, weight > 0)
+    # Errors far below what is left bend the valley of contacts, where steps become short: begin with large ones.
+    growth = _rms(weight * (known - even / level))
+    x, converged = jnp.zeros(spread.shape[1], known.dtype), jnp.asarray(False)
+    for _ in range(FITS):
+        used = weight / growth
+        x, misfit, converged = _most_probable(problem, known, used, x)
+        growth = jnp.maximum(growth * misfit, 1) if std is None else jnp.ones_like(growth)
+    fit, found = _described(problem, known, used, jnp.where(converged, x, jnp.nan))
+    used = jnp.where(converged, used, 0)
+    require_explained("even content", found, known, used > 0)
     return fit
 
 
@@ -279,32 +284,39 @@ class _Problem(eqx.Module):
 
 @eqx.filter_jit
 @full_precision
-def _fitted(
-    problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"]
-) -> tuple[ReferenceFit, Float[Array, " readings"]]:
-    """The fit, and the frame as it explains it."""
+def _most_probable(
+    problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"], start: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], Float[Array, ""], Bool[Array, ""]]:
+    """The most probable unknowns, root mean square of what they leave of the frame, and whether the fit converged."""
 
     def residual(x: Float[Array, " k"], given: tuple[Any, ...]) -> Float[Array, " residuals"]:
         problem, known, weight = given
         return jnp.append(weight * (known - problem.read(x)), x)
 
+    # Damped steps swing from one side of the valley of contacts to the other; halved ones of Gauss and Newton do not.
+    newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
+    choice: dict[str, Any] = {"descent": newton, "search": optx.BacktrackingArmijo()}
     found: optx.Solution[Array, Any] = optx.least_squares(
         residual,
-        LevenbergMarquardt(0.0, 0.0, fall_rtol=TOLERANCE, fall_atol=TOLERANCE),
-        jnp.zeros(problem.spread.shape[1], known.dtype),
+        LevenbergMarquardt(0.0, 0.0, fall_rtol=TOLERANCE, fall_atol=TOLERANCE, **choice),
+        start,
         (problem, known, weight),
         max_steps=MAX_STEPS,
         adjoint=ImplicitStep(),
         throw=False,
     )
-    x = jnp.where(found.result == optx.RESULTS.successful, found.value, jnp.nan)
-    readings, slopes = problem.read(x), weight[:, None] * jax.jacfwd(problem.read)(x)
-    return _described(problem, x, weight * (known - readings), slopes), readings
+    misfit = _rms(weight * (known - problem.read(found.value)))
+    return found.value, misfit, found.result == optx.RESULTS.successful
 
 
+@eqx.filter_jit
+@full_precision
 def _described(
-    problem: _Problem, x: Float[Array, " k"], missed: Float[Array, " readings"], slopes: Float[Array, "readings k"]
-) -> ReferenceFit:
+    problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"], x: Float[Array, " k"]
+) -> tuple[ReferenceFit, Float[Array, " readings"]]:
+    """The fit at the most probable unknowns, and the frame as it explains it."""
+    readings, slopes = problem.read(x), weight[:, None] * jax.jacfwd(problem.read)(x)
+    missed = weight * (known - readings)
     information, axes = eigh(slopes.T @ slopes)
     information = jnp.maximum(information, 0)  # rounding
     directions = (problem.spread @ axes).T
@@ -318,5 +330,9 @@ def _described(
         common_mode=sum((effect.gain for effect in chosen(model.effects, CommonMode)), jnp.zeros_like(parts.level)),
     )
     error = _parts(jnp.sqrt(jnp.diagonal(covariance)), model.electrodes, problem.channels)
-    used = jnp.maximum(jnp.sum(missed != 0, dtype=missed.dtype), 1)
-    return ReferenceFit(value, error, covariance, information, directions, jnp.sqrt(missed @ missed / used), model)
+    return ReferenceFit(value, error, covariance, information, directions, _rms(missed), model), readings
+
+
+def _rms(missed: Float[Array, " readings"]) -> Float[Array, ""]:
+    """Root mean square over the readings that are used, whose misfits are not zero."""
+    return jnp.sqrt(missed @ missed / jnp.maximum(jnp.sum(missed != 0, dtype=missed.dtype), 1))
