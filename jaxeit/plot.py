@@ -1,4 +1,4 @@
-"""Pictures with matplotlib, one call each: sheet and electrodes, mesh, image, sensitivity, contacts.
+"""Pictures with matplotlib, one call each: sheet and electrodes, mesh, image, sensitivity, current lines, contacts.
 
 Every function draws on ``axes``, or on a new figure of `matplotlib.pyplot`, and returns the Axes; save the picture by
 ``axes.figure.savefig("picture.png")``. Lengths are drawn in mm. Install ``jaxeit[plot]``.
@@ -17,6 +17,7 @@ Example:
     je.plot.show_skin(skin, axes)  # on top of the mesh
     axes.figure.savefig("mesh.png")
     je.plot.show_sensitivity(model, reading=0).figure.savefig("sensitivity.png")
+    je.plot.show_current(model, (0, 12)).figure.savefig("current.png")  # in at electrode 0, out at 12
     sigma = model.background * jnp.where(
         jnp.linalg.norm(model.centroids - 0.06, axis=1) < 0.01, 1.5, 1.0
     )
@@ -31,13 +32,14 @@ from jaxtyping import Array, Float
 
 from .contacts import Contacts
 from .model import Model, jacobian
-from .model.bases import AbstractPictured
+from .model.bases import AbstractPictured, Picture
+from .model.forward_model import coefficients, fields
 from .skin import BoundaryPatch, Skin
 
 try:  # an extra: without it the rest of jaxeit works
     from matplotlib import pyplot
     from matplotlib.patches import Ellipse
-    from matplotlib.tri import Triangulation
+    from matplotlib.tri import LinearTriInterpolator, Triangulation
 except ImportError:
     pyplot = None  # type: ignore[assignment]
 
@@ -46,11 +48,13 @@ if TYPE_CHECKING:
 else:
     Axes = Any
 
-__all__ = ["PlotError", "show_contacts", "show_image", "show_mesh", "show_sensitivity", "show_skin"]
+__all__ = ["PlotError", "show_contacts", "show_current", "show_image", "show_mesh", "show_sensitivity", "show_skin"]
 
 MM = 1e3
 GREY, BLUE, ORANGE = "#8a8a8a", "#1f5fa8", "#d9730d"
 ELLIPSE_90 = 2.1460  # radius over standard deviation of an ellipse that holds 90 %: sqrt(-2 log 0.1)
+LINES_ACROSS = 121  # points of the grid, along the longer side, on which lines of current are followed
+MOST_DECADES = 3.0  # of current densities, below the largest
 NUMBER_OFFSET = 0.05  # of the sheet's size: from an electrode to its number
 
 
@@ -104,7 +108,7 @@ def show_mesh(model: Model, axes: Axes | None = None) -> Axes:
 
 
 def show_image(
-    where: AbstractPictured | Model,
+    where: AbstractPictured | Picture | Model,
     values: Float[Array, " n"] | Float[np.ndarray, " n"],
     axes: Axes | None = None,
     *,
@@ -113,7 +117,7 @@ def show_image(
     """An image with a colour bar; blue below zero, white at zero, red above, or shades of one colour for one sign.
 
     Args:
-        where: the reconstructor or the basis of the image; the model, for a value per element.
+        where: the reconstructor, the basis or the picture of the image; the model, for a value per element.
         values: one per coefficient or element.
         label: of the colour bar.
 
@@ -162,6 +166,70 @@ def show_sensitivity(model: Model, reading: int | None = None, axes: Axes | None
     shown = axes.tripcolor(_triangles(model), decades, cmap="viridis")
     axes.figure.colorbar(shown, ax=axes, label="log10 of V/S/m$^2$")
     return _labelled(axes)
+
+
+def show_current(
+    model: Model,
+    drive: tuple[int, int] | Float[np.ndarray, " electrodes"],
+    axes: Axes | None = None,
+    *,
+    sigma: Float[Array, " elements"] | None = None,
+) -> Axes:
+    """Lines of the current in the sheet, coloured by its density on a logarithmic scale, in A through a metre.
+
+    Args:
+        drive: numbers of the electrodes at which 1 A enters and leaves, or the current into each, (electrodes,) A,
+            such as a column of the matrix of `Protocol.from_matrices`.
+        sigma: conductivity, (elements,) S; default: that of the model.
+
+    Raises:
+        PlotError: for electrodes that the model does not have, currents that do not sum to zero, or without matplotlib.
+    """
+    flow = _current_density(model, _driven(model, drive), sigma)
+    triangles, weight = np.asarray(model.triangles), np.asarray(model.areas)
+    shares = np.bincount(triangles.ravel(), np.repeat(weight, 3), minlength=len(model.chart))
+    nodal = [np.bincount(triangles.ravel(), np.repeat(weight * part, 3), minlength=len(shares)) for part in flow.T]
+    axes, mesh = _axes(axes), _triangles(model)
+    low, high = (np.array([end(mesh.x), end(mesh.y)]) for end in (np.min, np.max))
+    step = (high - low).max() / (LINES_ACROSS - 1)
+    x, y = (np.arange(a, b + 0.5 * step, step) for a, b in zip(low, high, strict=True))
+    along, up = (LinearTriInterpolator(mesh, part / shares)(*np.meshgrid(x, y)) for part in nodal)
+    decades = np.ma.log10(np.ma.hypot(along, up))  # blank beside the sheet, and where no current flows
+    decades = np.ma.clip(decades, decades.max() - MOST_DECADES, None)
+    shown = axes.streamplot(x, y, along, up, color=decades, cmap="viridis_r", linewidth=0.8, density=1.5)
+    axes.figure.colorbar(shown.lines, ax=axes, label="log10 of A/m")
+    return _labelled(axes)
+
+
+def _driven(model: Model, drive: tuple[int, int] | Float[np.ndarray, " electrodes"]) -> np.ndarray:
+    """The current into each electrode; raises PlotError for what no scan can drive."""
+    count = model.electrodes
+    if isinstance(drive, tuple):
+        source, sink = drive
+        if source == sink or not (0 <= source < count and 0 <= sink < count):
+            raise PlotError(f"drive {drive}: give the numbers of two electrodes, from 0 to {count - 1}")
+        pair: np.ndarray = np.eye(count)[source] - np.eye(count)[sink]
+        return pair
+    current = np.asarray(drive, float)
+    largest = np.abs(current).max(initial=0)
+    if current.shape != (count,) or not largest > 0 or abs(current.sum()) > 1e-6 * largest:
+        raise PlotError(f"the drive has shape {current.shape}; give {count} currents, A, that sum to zero")
+    return current
+
+
+def _current_density(model: Model, current: np.ndarray, sigma: Float[Array, " elements"] | None) -> np.ndarray:
+    """The current through a unit of length, (elements, 2) A/m, in the sheet's flat coordinates.
+
+    Slopes are those of the potential at the corners of a triangle, also for quadratic elements.
+    """
+    theta = coefficients(model, sigma)
+    potential = np.asarray(fields(model, theta).potential) @ current
+    corners = potential[np.asarray(model.system.dofs)[:, :3]]
+    triangles = np.asarray(model.triangles)
+    sides, flat = (np.diff(np.asarray(points)[triangles], axis=1) for points in (model.nodes, model.chart))
+    rise = np.linalg.solve(sides @ sides.swapaxes(1, 2), np.diff(corners, axis=1)[..., None])
+    density: np.ndarray = -np.asarray(theta.sigma)[:, None] * (flat.swapaxes(1, 2) @ rise)[..., 0]
+    return density
 
 
 def show_contacts(contacts: Contacts, axes: Axes | None = None) -> Axes:

@@ -59,6 +59,26 @@ def test_regions_are_cut_at_half_their_height():
     assert (labels == ktc.CONDUCTIVE).sum() == 16
 
 
+def test_an_image_on_any_grid(disc):
+    """A plane is itself on a finer grid, on a part of the sheet, and from elements to within their size."""
+    basis, model = disc.image, disc.model
+    plane = 3 * np.asarray(basis.centres)[:, 0] - np.asarray(basis.centres)[:, 1]
+    extent = (-0.5, 0.3, 0.1, 0.5)
+    x, y = np.meshgrid(-0.5 + 0.8 * (np.arange(8) + 0.5) / 8, 0.1 + 0.4 * (np.arange(6) + 0.5) / 6)
+    np.testing.assert_allclose(je.imaging.on_grid(plane, basis.picture, (6, 8), extent), 3 * x - y, atol=1e-9)
+    by_element = 3 * np.asarray(model.centroids)[:, 0] - np.asarray(model.centroids)[:, 1]
+    found = je.imaging.on_grid(by_element, model, (6, 8), extent)
+    assert set(found.ravel()) <= set(by_element)
+    corners = np.asarray(model.chart)[np.asarray(model.triangles)] - np.asarray(model.centroids)[:, None]
+    furthest = np.sqrt(10) * np.linalg.norm(corners, axis=2).max()  # slope of the plane times a distance
+    np.testing.assert_allclose(found, 3 * x - y, rtol=0, atol=furthest)
+    np.testing.assert_array_equal(je.imaging.on_grid(plane, basis, (10, 10))[5], plane.reshape(10, 10)[5])
+    with pytest.raises(je.imaging.InverseError, match=r"the image has shape \(3,\); Picture has 100 values"):
+        je.imaging.on_grid(np.zeros(3), basis.picture, (4, 4))
+    with pytest.raises(je.imaging.InverseError, match="give the model in place of it"):
+        je.imaging.on_grid(by_element, je.Elements().on(model), (4, 4))
+
+
 @pytest.mark.slow
 def test_a_tank_in_classes():
     """A conductive and a resistive piece, simulated on another mesh, with the water's contacts unknown to the model."""

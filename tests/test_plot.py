@@ -74,6 +74,31 @@ def test_meshes_and_sensitivities(model):
         je.plot.show_sensitivity(model, 550)
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_current_between_two_sides_is_the_same_everywhere(order):
+    sheet, sides = je.Rectangle(0.2, 0.1), (je.BoundaryPatch(0.5, 0.6, 1e-6), je.BoundaryPatch(0.2, 0.3, 1e-6))
+    skin = je.Skin("strip", sheet, 2.0, sides, je.Protocol(np.array([[0, 1, 0, 1]])))
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft(order=order))
+    density = je.plot._current_density(model, np.array([3.0, -3.0]), 5 * model.background)
+    np.testing.assert_allclose(density, np.tile([3.0 / 0.1, 0], (len(density), 1)), atol=1e-9)
+
+
+def test_lines_of_current_go_around_what_does_not_conduct(model):
+    (lines,) = (found for found in je.plot.show_current(model, (0, 12)).collections if len(found.get_segments()) > 9)
+    ends = np.concatenate(lines.get_segments())
+    assert ends.min() > -1e-6
+    assert ends.max() < 200 + 1e-6
+    hole = jnp.linalg.norm(model.centroids - 0.08, axis=1) < 0.02
+    dark = je.plot._current_density(
+        model, np.eye(25)[0] - np.eye(25)[12], jnp.where(hole, 1e-6, 1.0) * model.background
+    )
+    assert np.linalg.norm(dark[hole], axis=1).max() < 1e-3 * np.linalg.norm(dark[~hole], axis=1).mean()
+    with pytest.raises(PlotError, match="electrodes, from 0 to 24"):
+        je.plot.show_current(model, (0, 25))
+    with pytest.raises(PlotError, match="25 currents, A, that sum to zero"):
+        je.plot.show_current(model, np.ones(25))
+
+
 def test_contacts_have_their_ellipses(monkeypatch):
     covariance = jnp.zeros((2, 4, 4)).at[0, :2, :2].set(jnp.array([[4e-6, 0.0], [0.0, 1e-6]]))
     found = Contacts(

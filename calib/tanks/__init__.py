@@ -28,13 +28,15 @@ Example:
 """
 
 from .formats import load_eidors, load_instrument, load_ktc, load_npz, load_pyeidors, load_sciospec, load_tank
-from .images import TankImage, difference_image, segmented_frame
+from .images import TankConductivity, TankImage, absolute_image, difference_image, segmented_frame
 from .recording import Tank, TankError
 
 __all__ = [
     "Tank",
+    "TankConductivity",
     "TankError",
     "TankImage",
+    "absolute_image",
     "difference_image",
     "load_eidors",
     "load_instrument",

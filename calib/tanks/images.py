@@ -1,4 +1,4 @@
-"""Difference images of tanks, relative to the even content that the reference frame shows."""
+"""Images of tanks: differences relative to the even content that the reference frame shows, and absolute ones."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,11 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 from jaxeit.imaging import (
+    AbsoluteImage,
     AbstractHyperparameter,
     AbstractIterativeMethod,
     AbstractLinearMethod,
+    AbstractPenalty,
     IterativeReconstructor,
     ReferenceFit,
     ReferenceSettings,
@@ -27,6 +29,21 @@ LEAST_CORRELATION = 0.5
 
 OPPOSITE = -0.8
 """Correlation below which the polarity alone is wrong, since the order and the places are nearly those of the model."""
+
+
+class TankConductivity(NamedTuple):
+    """An absolute image of a tank.
+
+    | meaning                                                                  |
+    |--------------------------------------------------------------------------|
+    | shown: the image and its conductivity                                    |
+    | model: of the tank, with the contacts that were fitted                   |
+    | fit: conductivity and contacts that the reference tells, where asked for |
+    """
+
+    shown: AbsoluteImage
+    model: je.Model
+    fit: ReferenceFit | None = None
 
 
 class TankImage(NamedTuple):
@@ -57,6 +74,7 @@ def difference_image(
     method: AbstractLinearMethod | AbstractIterativeMethod | None = None,
     basis: AbstractBasis | None = None,
     hyperparameter: float | AbstractHyperparameter = 0.3,
+    normalised: bool = False,
     fidelity: je.Fidelity | None = None,
     fit: ReferenceSettings | None = None,
 ) -> TankImage:
@@ -70,6 +88,7 @@ def difference_image(
         prior, method, basis, hyperparameter: as for `je.prepare`; default basis: 40 pixels along x. The default
             hyperparameter suits tanks whose geometry is known to a few percent (docs/tanks.md). A way to choose one
             looks at the difference of the two frames, unless it has frames of its own.
+        normalised: weigh each change by the reading of the reference, as where instruments err in proportion.
         fidelity: default: draft, with quadratic elements if ``fit`` is given, as linear ones add a contact resistance
             to each electrode: 10 % of that of the tank in tests/imaging/test_reference.py.
         fit: fit conductivity and contacts to the reference by `je.imaging.fit_reference`, for the image;
@@ -83,9 +102,53 @@ def difference_image(
     model = scaled.model
     dv = jnp.asarray(scaled.after - scaled.before, model.dtype)
     weight = hyperparameter.on(dv) if isinstance(hyperparameter, AbstractHyperparameter) else hyperparameter
-    recon = je.prepare(model, prior, method, basis or je.Pixels(40), hyperparameter=weight)
+    noise = _own_size(scaled.before) if normalised else None
+    recon = je.prepare(model, prior, method, basis or je.Pixels(40), noise=noise, hyperparameter=weight)
     change = recon(dv) / model.background[0]
     return TankImage(change, recon, scaled.gain * float(model.background[0]), scaled.correlation, scaled.fit)
+
+
+def _own_size(readings: np.ndarray) -> np.ndarray:
+    """The size of each reading; those that are missing or zero have that of a typical one."""
+    size = np.abs(readings)
+    found: np.ndarray = np.where(np.isfinite(size) & (size > 0), size, np.sqrt(np.nanmean(size**2)))
+    return found
+
+
+def absolute_image(
+    tank: Tank,
+    frame: int = -1,
+    *,
+    reference: int = 0,
+    penalty: AbstractPenalty | None = None,
+    error: float = 0.01,
+    basis: AbstractBasis | None = None,
+    fidelity: je.Fidelity | None = None,
+    fit: ReferenceSettings | None = None,
+) -> TankConductivity:
+    """The conductivity that one frame alone shows, by `je.imaging.absolute_image`.
+
+    What the model misses of the tank is in the image: a wrong contact, current or place of an electrode looks like an
+    object at the rim.
+
+    Args:
+        reference: a frame of even content, for ``fit`` alone.
+        penalty, error, basis: as for `je.imaging.absolute_image`.
+        fidelity, fit: as for `difference_image`; default: contacts as the tank has them.
+
+    Raises:
+        TankError: if there is no such frame, it does not look like the model, or the fit does not converge.
+        InverseError: if ``fit`` is given, and no even content explains the reference.
+    """
+    count = len(tank.frames)
+    if not (-count <= frame < count and -count <= reference < count):
+        raise TankError(f"{tank.skin.name}: has {count} frames; there is no frame {frame} or {reference}")
+    model = tank.model(fidelity or je.Fidelity.draft(order=1 if fit is None else 2))
+    _correlated(tank, model, tank.frames[frame], frame % count)
+    found = None if fit is None else _fitted(tank, model, tank.frames[reference], reference % count, fit)
+    model = model if found is None else found.model
+    shown = je.imaging.absolute_image(model, tank.frames[frame], basis, penalty=penalty, error=error)
+    return TankConductivity(shown, model, found)
 
 
 def segmented_frame(
@@ -134,18 +197,25 @@ def _scaled(
         raise TankError(
             f"{tank.skin.name}: all readings of frame {first} are the same number; give a recorded frame as reference"
         )
-    correlation = float(np.corrcoef(np.asarray(je.forward(model))[used], before[used])[0, 1])
-    if not correlation > LEAST_CORRELATION:
-        raise TankError(
-            f"{tank.skin.name}: the correlation of frame {first} with a model of even content is {correlation:.2f}; "
-            "check the order and the polarity of readings, and the place and direction of electrodes"
-            + ("; it seems to be the polarity: save the readings with the other sign" if correlation < OPPOSITE else "")
-        )
+    correlation = _correlated(tank, model, np.where(used, before, np.nan), first)
     found = None if fit is None else _fitted(tank, model, np.where(used, before, np.nan), first, fit)
     model = model if found is None else found.model
     even = np.asarray(je.forward(model))
     scale = float(even[used] @ before[used] / (before[used] @ before[used]))
     return _Scaled(model, scale * before, scale * after, scale, correlation, found)
+
+
+def _correlated(tank: Tank, model: je.Model, frame: np.ndarray, number: int) -> float:
+    """The correlation of a frame with even content; refuses a frame of another order, polarity or geometry."""
+    used = np.isfinite(frame)
+    correlation = float(np.corrcoef(np.asarray(je.forward(model))[used], frame[used])[0, 1])
+    if not correlation > LEAST_CORRELATION:
+        raise TankError(
+            f"{tank.skin.name}: the correlation of frame {number} with a model of even content is {correlation:.2f}; "
+            "check the order and the polarity of readings, and the place and direction of electrodes"
+            + ("; it seems to be the polarity: save the readings with the other sign" if correlation < OPPOSITE else "")
+        )
+    return correlation
 
 
 def _fitted(tank: Tank, model: je.Model, frame: np.ndarray, number: int, fit: ReferenceSettings) -> ReferenceFit:

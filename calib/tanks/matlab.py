@@ -126,8 +126,8 @@ def _pattern(where: str, struct: SimpleNamespace, name: str) -> np.ndarray:
 def _mesh(where: str, model: SimpleNamespace) -> tuple[je.meshing.Mesh, np.ndarray]:
     """The mesh, and the number in it of each node of the file, -1 for one without triangles."""
     nodes, elems = model.nodes, model.elems
-    if not all(isinstance(part, np.ndarray) and part.dtype.kind in "iuf" and part.size for part in (nodes, elems)):
-        raise TankError(f"{where}: nodes and elems are no arrays of numbers")
+    if not all(_is_finite(part) for part in (nodes, elems)):
+        raise TankError(f"{where}: nodes and elems are no arrays of finite numbers")
     elems = np.atleast_2d(elems)
     if elems.shape[1] != 3 or nodes.ndim != 2:
         raise TankError(f"{where}: elements have {elems.shape[1]} nodes; a sheet is a plane mesh of triangles")
@@ -135,6 +135,11 @@ def _mesh(where: str, model: SimpleNamespace) -> tuple[je.meshing.Mesh, np.ndarr
         return je.meshing.flat_mesh(nodes.astype(float), elems.astype(int) - 1)
     except je.meshing.MeshError as error:
         raise TankError(f"{where}: {error}; nodes of the file are counted from 1") from None
+
+
+def _is_finite(part: Any) -> bool:
+    numbers = isinstance(part, np.ndarray) and part.dtype.kind in "iuf" and part.size > 0
+    return numbers and bool((np.abs(part) < np.iinfo(np.int32).max).all())
 
 
 class _Rim:

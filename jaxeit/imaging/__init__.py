@@ -52,6 +52,7 @@ from .absolute.images import (
     least_squares_image,
 )
 from .absolute.misplacement import Misplacement, find_misplacement
+from .absolute.one_frame import AbsoluteImage, absolute_image
 from .absolute.reference import ReferenceFit, ReferenceParameters, ReferenceSettings, fit_reference
 from .hyperparameters import (
     HYPERPARAMETERS,
@@ -62,6 +63,7 @@ from .hyperparameters import (
     HyperparameterError,
     LCurve,
     NoiseFigure,
+    PriorDeviation,
 )
 from .level_set import LevelSet
 from .measured_noise import NOISES, AbstractNoise, CorrelatedNoise, EqualNoise, MeasuredNoise
@@ -112,6 +114,7 @@ __all__ = [
     "NOISES",
     "NUMBERS",
     "PRIORS",
+    "AbsoluteImage",
     "AbstractFrameChoice",
     "AbstractHyperparameter",
     "AbstractIterativeMethod",
@@ -151,6 +154,7 @@ __all__ = [
     "Noser",
     "OneStep",
     "Precision",
+    "PriorDeviation",
     "Problem",
     "Provenance",
     "Quadratic",
@@ -166,6 +170,7 @@ __all__ = [
     "Tikhonov",
     "TotalVariation",
     "TruncatedSvd",
+    "absolute_image",
     "find_misplacement",
     "fit_background",
     "fit_electrodes",

@@ -221,6 +221,33 @@ class NoiseFigure(AbstractHyperparameter):
         return float(tried[within[0]])
 
 
+class PriorDeviation(AbstractHyperparameter):
+    """The hyperparameter with which images have this standard deviation before a frame is seen: root mean square over
+    the area, S.
+
+    Then the image of `OneStep` is the mean, and its variance that of the posterior of a Gaussian prior ``N(0, C)`` and
+    Gaussian noise, with C the inverse of the prior's R times one number. Needs ``noise`` in `prepare`, in V.
+
+    Example:
+        strength = je.imaging.PriorDeviation(0.1 * float(model.background.mean()))  # S
+        recon = je.prepare(model, basis=coarse, noise=noise, hyperparameter=strength)
+        print(recon.provenance["hyperparameter"])
+    """
+
+    needs_noise: ClassVar[bool] = True
+
+    deviation: float | None = limited(None, above=0, unit="S")
+
+    def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
+        del whiten
+        if self.deviation is None:
+            raise HyperparameterError("PriorDeviation has no deviation; give it in S, such as PriorDeviation(1e-4)")
+        problem = replace(spectrum.problem, hyperparameter=jnp.ones_like(spectrum.problem.hyperparameter))
+        precision, areas = problem.precision(), problem.picture.areas
+        unscaled = jnp.sum(areas * precision.variance()) / jnp.sum(areas)  # of x, for noise and R as they are
+        return float(jnp.sqrt(unscaled / problem.strength(precision.solve(problem.jacobian.T))) / self.deviation)
+
+
 def _changes(frames: Float[Array, "... readings"], whiten: Whiten) -> Float[Array, "... k"]:
     """Whitened frames, (..., k); refuses frames without change and readings that are not finite."""
     y = whiten(frames)

@@ -17,29 +17,23 @@ from jaxtyping import Array, DTypeLike, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from .._compile import require_known
-from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
+from ..model.bases import AbstractBasis, AbstractPictured, BasisMap, Picture
 from ..model.discretisation import Model, require_model
 from ..model.forward_model import forward
+from ..model.metal_sheet import containing_triangles
 from .absolute.background import require_frame, require_positive
 from .absolute.images import (
     AbstractPenalty,
     ImagePosterior,
-    IsotropicVariation,
     LogConductivity,
-    gauss_newton,
     reading_weights,
 )
+from .absolute.one_frame import believed_image, picture_basis, variation_of
 from .level_set import LevelSet, fitted_level, signed_distances
 from .noise import InverseError, require_real
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
 """The classes."""
-WEIGHT = 0.0064
-"""Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
-COLUMNS = 30
-"""Pixels along x where no basis is given."""
-MORE_FITS, BELIEVED_MISFIT = 3, 1.05
-"""Fits with larger errors, of an image that leaves more of a frame than these; root mean square over the errors."""
 
 
 class ChangeErrors(eqx.Module):
@@ -155,11 +149,10 @@ def segment(
     seen = _seen(model, reference, frame, missed)
     require_positive(**{f"errors.{name}": value for name, value in vars(errors).items()})
     require_positive(**{f"regions.{name}": value for name, value in vars(regions).items()})
-    image = _picture_basis(model, basis)
-    if penalty is None:
-        penalty = IsotropicVariation(weight=WEIGHT * seen.used(model.dtype))
+    image = picture_basis(model, basis)
+    penalty = variation_of(seen.used(model.dtype)) if penalty is None else penalty
     physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
-    found, std = _believed_image(physics, penalty, seen, errors)
+    found, std, _ = believed_image(physics, penalty, seen.target, lambda growth: seen.std(errors, growth))
     grid = on_grid(found, image.picture, (regions.pixels, regions.pixels))
     classes = half_height_classes(grid, regions.floor, regions.least, regions.weakest)
     classes = classes if start is None else _checked_start(start, classes.shape)
@@ -174,15 +167,6 @@ def _checked_start(start: Int[ArrayLike, "rows columns"], shape: tuple[int, ...]
     if classes.shape != shape or not np.isin(classes, (UNCHANGED, RESISTIVE, CONDUCTIVE)).all():
         raise InverseError(f"start is no array {shape} of classes 0, 1 and 2; give one, or another number of pixels")
     return classes
-
-
-def _picture_basis(model: Model, basis: AbstractBasis | BasisMap | None) -> BasisMap:
-    """The basis laid over the model; a picture."""
-    basis = Pixels(COLUMNS) if basis is None else basis
-    image = basis if isinstance(basis, BasisMap) else basis.on(model)
-    if len(image.picture.shape) != 2:
-        raise InverseError("the basis is no picture; give pixels, such as basis=Pixels(40)")
-    return image
 
 
 class _Seen(NamedTuple):
@@ -223,23 +207,6 @@ def _seen(
     return _Seen(even, before, after - before, before - even if missed is None else jnp.asarray(missed, model.dtype))
 
 
-def _believed_image(
-    physics: LogConductivity, penalty: AbstractPenalty, seen: _Seen, errors: ChangeErrors
-) -> tuple[Float[Array, " basis"], Float[Array, " readings"]]:
-    """The image, fitted anew with larger errors where it leaves more of the frame than they tell; and its errors, V."""
-    growth = 1.0
-    std = seen.std(errors, growth)
-    found = gauss_newton(physics, penalty, seen.target, std)
-    for _ in range(MORE_FITS):
-        misfit = float(jnp.sqrt(jnp.nanmean(((seen.target - physics.voltages(found)) / std) ** 2)))
-        if not misfit > BELIEVED_MISFIT:
-            break
-        growth *= misfit
-        std = seen.std(errors, growth)
-        found = gauss_newton(physics, penalty, seen.target, std)
-    return found, std
-
-
 def _shaped(
     physics: LogConductivity,
     penalty: AbstractPenalty,
@@ -258,18 +225,55 @@ def _shaped(
 
 
 def on_grid(
-    image: Shaped[ArrayLike, " basis"], picture: Picture, shape: tuple[int, int]
+    image: Shaped[ArrayLike, " n"],
+    where: AbstractPictured | Picture | Model,
+    shape: tuple[int, int],
+    extent: tuple[float, float, float, float] | None = None,
 ) -> Float[np.ndarray, "rows columns"]:
-    """An image of pixels on another grid over the same extent, by bilinear interpolation; row 0 at low y.
+    """An image on any grid: pixels by bilinear interpolation, elements of a model by the one at each point.
 
-    Pixels that miss the sheet have the value of the nearest one that does not.
+    Points beside the sheet have the value of the nearest pixel or element.
+
+    Args:
+        image: one number for each pixel of a picture, (basis,), or for each element of a model, (elements,).
+        where: the picture, the reconstructor or the model that the image belongs to.
+        shape: rows and columns of the grid; row 0 at low y.
+        extent: of the grid, x0, x1, y0, y1 in m; default: that of the picture or the model.
+
+    Raises:
+        InverseError: if the image does not fit, or the picture has no grid.
+
+    Example:
+        sheet = je.imaging.on_grid(model.background, model, (32, 32))  # S
+        corner = je.imaging.on_grid(image, recon.picture, (20, 20), extent=(0, 0.1, 0, 0.1))
     """
-    inside = (np.asarray(picture.areas) > 0).reshape(picture.shape)
+    values = np.asarray(image, float)
+    if values.shape != (len(where.areas),):
+        raise InverseError(f"the image has shape {values.shape}; {type(where).__name__} has {len(where.areas)} values")
+    bounds = _extent(where)
+    x0, x1, y0, y1 = bounds if extent is None else extent
+    x, y = (a + (np.arange(n) + 0.5) / n * (b - a) for a, b, n in ((x0, x1, shape[1]), (y0, y1, shape[0])))
+    if isinstance(where, Model):
+        element, _ = containing_triangles(where.mesh, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+        by_element: np.ndarray = values[element].reshape(shape)
+        return by_element
+    inside = (np.asarray(where.areas) > 0).reshape(where.shape)
     nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    filled = np.asarray(image, float).reshape(picture.shape)[tuple(nearest)]
-    rows, columns = ((np.arange(n) + 0.5) / n * old - 0.5 for n, old in zip(shape, picture.shape, strict=True))
-    found: np.ndarray = map_coordinates(filled, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest")
+    (rows, columns), (left, right, low, high) = where.shape, bounds
+    places = (y - low) / (high - low) * rows - 0.5, (x - left) / (right - left) * columns - 0.5
+    grid = np.meshgrid(*places, indexing="ij")
+    found: np.ndarray = map_coordinates(values.reshape(where.shape)[tuple(nearest)], grid, order=1, mode="nearest")
     return found
+
+
+def _extent(where: AbstractPictured | Picture | Model) -> tuple[float, ...]:
+    """x0, x1, y0, y1 of a picture or a model, m; raises InverseError for a picture without a grid."""
+    if isinstance(where, Model):
+        low, high = (np.asarray(end(where.chart, 0)) for end in (jnp.min, jnp.max))
+        return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+    if len(where.shape) != 2:
+        raise InverseError("the basis is no picture; give the model in place of it, for a value per element")
+    return tuple(float(end) for end in where.extent)
 
 
 def half_height_classes(

@@ -74,8 +74,7 @@ def read_mesh(path: str | Path) -> Mesh:
 def write_mesh(path: str | Path, mesh: Mesh, **values: Float[Any, " m"]) -> None:
     """Write a mesh, with values on its triangles by name, for ParaView (.vtu, .vtk) and other programs.
 
-    The mesh of a model is ``Mesh(np.asarray(model.nodes), np.asarray(model.triangles), np.asarray(model.chart))``.
-    Install ``jaxeit[meshes]``.
+    The mesh of a model is ``model.mesh``. Install ``jaxeit[meshes]``.
 
     Raises:
         MeshError: if meshio is not installed or cannot write the file, or values do not fit the mesh.

@@ -89,6 +89,12 @@ class Model(eqx.Module):
         return self.contact.shape[0]
 
     @property
+    def mesh(self) -> Mesh:
+        """The mesh, as arrays of NumPy in float64: for `je.meshing.write_mesh`, or another scene."""
+        nodes, chart = np.asarray(self.nodes, float), np.asarray(self.chart, float)
+        return Mesh(nodes, np.asarray(self.triangles), chart)
+
+    @property
     def dtype(self) -> np.dtype:
         """Precision of every floating-point array of the model."""
         return self.background.dtype

@@ -109,7 +109,7 @@ def lay_coat(
     end = sheet.n + len(metal.points)
     v = np.append(end, np.arange(sheet.n, end - 1))
     nodes, areas, touching = _contact_nodes(space)
-    triangle, corners = _containing_triangles(metal.mesh, space.chart[nodes])
+    triangle, corners = containing_triangles(metal.mesh, space.chart[nodes])
     potential = np.append(electrode_dof, end)[above[nodes]]
     common = np.full(len(nodes), end - 1)
     sides = np.column_stack([index[nodes], potential, v[metal.dofs[triangle]], common])
@@ -138,7 +138,7 @@ def _contact_nodes(space: Space) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return nodes, space.mesh.areas[:, None] * share[used], touching.reshape(-1, np.count_nonzero(used))
 
 
-def _containing_triangles(mesh: Mesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def containing_triangles(mesh: Mesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The triangle around each place, and the weights of its corners; beyond the rim, the nearest triangle."""
     _, near = cKDTree(mesh.chart_centroids).query(places, min(CANDIDATE_TRIANGLES, len(mesh.triangles)))
     first, *others = np.moveaxis(mesh.chart[mesh.triangles[near]], 2, 0)

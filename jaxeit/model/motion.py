@@ -80,7 +80,7 @@ def electrode_motion(model: Model) -> Motion:
         raise MotionError(
             "the electrodes of a sheet with a metal coat cannot be moved; leave the coat out of the scene"
         )
-    mesh = Mesh(np.asarray(model.nodes, float), np.asarray(model.triangles), np.asarray(model.chart, float))
+    mesh = model.mesh
     unknown = np.zeros(len(mesh.nodes), int)
     unknown[mesh.triangles] = np.asarray(model.system.dofs)[:, :3]
     follows = _follow(mesh, _nodes_of_electrodes(model, unknown))

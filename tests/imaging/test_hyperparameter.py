@@ -97,6 +97,21 @@ def test_the_noise_figure_is_what_simulated_noise_gives(model, coarse, jac):
         chosen(model, coarse, je.NoiseFigure(1e-9))
 
 
+def test_a_deviation_in_siemens_gives_the_mean_of_the_posterior(model, coarse, jac, frames):
+    """``C J^T (J C J^T + N)^-1 dv``, with C the covariance of the prior in S^2 and N that of the noise in V^2."""
+    deviation, areas = 2e-4, np.asarray(coarse.areas)
+    variance = 1 / image_matrix(jac, 1.0)[1]
+    c = deviation**2 * variance / (areas @ variance / areas.sum())
+    expected = c[:, None] * jac.T @ np.linalg.solve(jac * c @ jac.T + STD**2 * np.eye(550), frames[0])
+    how = je.imaging.PriorDeviation(deviation)
+    recon = je.prepare(model, basis=coarse, noise=np.full(550, STD), hyperparameter=how)
+    np.testing.assert_allclose(recon(frames[0]), expected, rtol=1e-5, atol=1e-7 * np.abs(expected).max())
+    with pytest.raises(je.imaging.HyperparameterError, match="give it in S"):
+        chosen(model, coarse, je.imaging.PriorDeviation())
+    with pytest.raises(je.imaging.InverseError, match=r"noise=\.\.\."):
+        je.prepare(model, basis=coarse, hyperparameter=how)
+
+
 def test_the_corner_of_the_l_curve_bends_most(model, coarse, jac, frames, held):
     h = chosen(model, coarse, je.imaging.LCurve(frames))
 

@@ -31,8 +31,8 @@ def saline():
     """Contact impedances of a tank of saline, ohm m, and its potentials, by the seed."""
     potentials = even_disc(COUNT)
 
-    def simulated(seed, currents):
-        z = 6e-2 * np.exp(0.7 * np.random.default_rng([5, seed]).normal(size=COUNT))
+    def simulated(seed, currents, typical=6e-2):
+        z = typical * np.exp(0.7 * np.random.default_rng([5, seed]).normal(size=COUNT))
         return z, potentials(z * SIGMA / RADIUS, currents) / SIGMA
 
     return simulated
@@ -94,6 +94,33 @@ def test_what_a_draft_mesh_leaves_is_in_the_errors(saline):
         contacts.append(np.log(fit.value.contact / z) / np.asarray(fit.standard_error.contact))
     assert np.max(np.abs(levels)) < 1.645
     assert np.sqrt(np.mean(np.square(contacts))) < 1.3
+
+
+def test_what_a_mesh_misses_near_electrodes_is_in_the_errors(saline):
+    """Good contacts, of which the mesh misses more than readings all but free of noise do."""
+    model = _tank(je.Protocol.from_matrices(CURRENT * RING, RING), edge_length=0.06)
+    z, potential = saline(11, CURRENT * RING, 4e-3)
+    frame = _recorded((RING.T @ potential).T.ravel(), 11, 1e-3)
+    fit = fit_reference(model, frame)
+    error = np.log(np.asarray(fit.value.contact) / z)
+    assert np.sqrt(np.mean(np.square(error / np.asarray(fit.standard_error.contact)))) < 1.3
+    exact = fit_reference(model, frame, ReferenceSettings(scale=0))
+    assert np.sqrt(np.mean(np.square(error / np.asarray(exact.standard_error.contact)))) > 3
+    np.testing.assert_allclose(jnp.sqrt(jnp.diag(fit.covariance))[1:17], fit.standard_error.contact)
+
+
+def test_an_offset_of_the_readings_is_named_and_fitted(saline, adjacent):
+    """As in the tank of PyEIDORS: damped steps did not end, and the refusal did not say why."""
+    _, potential = saline(12, np.eye(COUNT) - 1 / COUNT)
+    frame = _rows(potential)
+    offset = 0.35 * np.sqrt(np.mean(frame**2))
+    with pytest.raises(
+        InverseError, match=r"[2-9]\d% of it is left.* leaves \d%: fit it by ReferenceSettings\(offset="
+    ):
+        fit_reference(adjacent, frame - offset)
+    fit = fit_reference(adjacent, frame - offset, ReferenceSettings(offset=2 * offset))
+    assert abs(fit.value.level / SIGMA - 1) < 0.02
+    np.testing.assert_allclose(fit.value.offset, -offset, rtol=0.02)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import itertools
 import re
 
+import equinox as eqx
 import h5py
 import jax.numpy as jnp
 import numpy as np
@@ -404,10 +405,66 @@ def test_matrices_of_the_kuopio_challenge_explain_its_water():
     assert np.corrcoef(np.asarray(je.forward(tank.model())), water)[0, 1] > 0.99
 
 
+def test_one_frame_shows_the_conductivity(bench, tmp_path, capsys):
+    """A rod that conducts five times better, and a frame of readings that err by a thousandth."""
+    frames = bench.frames * (1 + 1e-3 * np.random.default_rng(4).normal(size=bench.frames.shape))
+    np.savez(tmp_path / "one.npz", frames=frames[1:], pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
+    tank = load_tank(tmp_path / "one.npz", bench.skin.domain, bench.skin.electrodes)
+    found = calib.tanks.absolute_image(tank, basis=je.Pixels(20), error=2e-3)
+    shown, model = found.shown, found.model
+    np.testing.assert_allclose(np.asarray(shown.picture.centres)[np.argmax(shown.image)], PLACE, atol=0.004)
+    rod = np.linalg.norm(model.centroids - PLACE, axis=1) < 0.003
+    assert 1.8 < np.mean(shown.sigma[rod]) < 7
+    assert abs(np.median(shown.sigma) - 1) < 0.05
+    assert shown.misfit < 1.2
+    shape = (40, 40)
+    by_pixel = je.imaging.on_grid(shown.image, shown.picture, shape)
+    by_element = je.imaging.on_grid(shown.sigma, model, shape)
+    assert np.corrcoef(by_pixel.ravel(), by_element.ravel())[0, 1] > 0.95
+    args = [str(tmp_path / "one.npz"), "--radius", str(RADIUS), "-o", str(tmp_path / "p.png")]
+    assert main(["image", *args, "--absolute"]) == 0
+    assert re.search(r"p\.png: conductivity [\d.]+ to [\d.]+ S", capsys.readouterr().out)
+    assert (tmp_path / "p.png").stat().st_size > 5000
+    assert main(["image", *args, "--absolute", "--classes"]) == 2
+    assert main(["image", *args, "--absolute", "--normalised"]) == 2
+    with pytest.raises(TankError, match="has 1 frames; there is no frame 2"):
+        calib.tanks.absolute_image(tank, 2)
+
+
+def test_a_normalised_difference_weighs_readings_by_their_size(bench, tmp_path):
+    """As inv_solve of EIDORS with normalize_measurements: ``dv / v0``, with each row of the Jacobian over v0 too."""
+    tank = load_tank(write_csv(tmp_path / CSV, bench.frames), bench.skin.domain)
+    found = difference_image(tank, basis=je.Pixels(12), hyperparameter=0.2, normalised=True)
+    model = tank.model()
+    even = np.asarray(je.forward(model))
+    scale = even @ tank.frames[0] / (tank.frames[0] @ tank.frames[0])
+    before, after = scale * tank.frames
+    jac = np.asarray(je.jacobian(model, basis=je.Pixels(12))) / before[:, None]
+    found_by_hand = _noser_image(jac, (after - before) / before, 0.2) / float(model.background[0])
+    np.testing.assert_allclose(found.change, found_by_hand, rtol=1e-3, atol=1e-3 * np.abs(found_by_hand).max())
+
+
+def _noser_image(jac, dv, h):
+    size = np.linalg.norm(jac, axis=0)
+    r = np.maximum(size, 1e-3 * size.max())
+    strength = h**2 * np.trace(jac / r @ jac.T) / len(jac)
+    return np.linalg.solve(jac.T @ jac + strength * np.diag(r), jac.T @ dv)
+
+
 @pytest.mark.slow
-def test_a_fit_of_the_reference_that_does_not_converge_is_refused(tmp_path, capsys):
-    """Linear elements add a contact resistance, so that quadratic ones would need one below zero."""
+def test_good_contacts_are_fitted_as_hardly_known(tmp_path, capsys):
+    """Linear elements miss a resistance, so that quadratic ones would need one below zero; damped steps did not end."""
     write_ktc(tmp_path)
+    assert main(["image", str(tmp_path / "data1.mat"), "--fit-contacts", "one", "-o", str(tmp_path / "p.png")]) == 0
+    error = re.search(r"\+- ([\d.e+]+) to [\d.e+]+ %$", capsys.readouterr().out, re.MULTILINE)
+    assert float(error[1]) > 100
+
+
+def test_a_fit_of_the_reference_that_does_not_converge_is_refused(tmp_path, capsys, monkeypatch):
+    write_ktc(tmp_path)
+    fitted = calib.tanks.images.fit_reference
+    lost = lambda *given: eqx.tree_at(lambda fit: fit.value.level, fitted(*given), jnp.asarray(jnp.nan))  # noqa: E731
+    monkeypatch.setattr(calib.tanks.images, "fit_reference", lost)
     assert main(["image", str(tmp_path / "data1.mat"), "--fit-contacts", "one", "-o", str(tmp_path / "p.png")]) == 2
     assert "does not converge" in (told := capsys.readouterr().err)
     assert "leave out --fit-contacts" in told

@@ -41,6 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fit-contacts", choices=("one", "each"), help=text)
     text = "draw what conducts less and what conducts more than the reference; --prior and --method do not apply"
     parser.add_argument("--classes", action="store_true", help=text)
+    text = "the conductivity that --frame alone shows, in S, in place of a change; its prior and method are its own"
+    parser.add_argument("--absolute", action="store_true", help=text)
+    text = "weigh each change by the reading of the reference, as where instruments err in proportion"
+    parser.add_argument("--normalised", action="store_true", help=text)
     parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
     parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
     text = "weight of the prior, or a method to choose it, such as l-curve; default: 0.3"
@@ -48,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the difference image of two frames, and print what was found."""
+    """Write the image of two frames or of one, and print what was found."""
     from ...runtime import set_up
 
     set_up()
@@ -64,12 +68,17 @@ def run(args: argparse.Namespace) -> int:
     if kind not in ("png", "pdf", "svg"):
         raise ValueError(f"{args.output}: give a name that ends in .png, .pdf or .svg")
     prior, method = je.imaging.PRIORS.make(args.prior), je.imaging.METHODS.make(args.method)
+    _require_one_kind(args)
     tank = _tank(args)
     figure = Figure(layout="constrained")  # without a window, on any machine
     axes = figure.subplots()
-    lines = _classes(args, tank, axes) if args.classes else _change(args, tank, prior, method, axes)
+    if args.absolute:
+        lines = _conductivity(args, tank, axes)
+    else:
+        lines = _classes(args, tank, axes) if args.classes else _change(args, tank, prior, method, axes)
     je.plot.show_skin(tank.skin, axes)
-    axes.set_title(f"{tank.names[args.frame]} less {tank.names[args.reference]}", fontsize=9)
+    compared = "" if args.absolute else f" less {tank.names[args.reference]}"
+    axes.set_title(f"{tank.names[args.frame]}{compared}", fontsize=9)
     with replacing(Path(args.output)) as new:
         figure.savefig(new, format=kind, dpi=150)
     count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
@@ -95,6 +104,7 @@ def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", meth
     except ValueError as error:
         raise ValueError(f"--hyperparameter: {error}") from None
     choices = {"prior": prior, "method": method, "hyperparameter": weight, "fit": _fit(args)}
+    choices["normalised"] = args.normalised
     found = difference_image(tank, args.frame, args.reference, **choices)
     je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
     low, high = float(found.change.min()), float(found.change.max())
@@ -104,6 +114,27 @@ def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", meth
     used = float(found.recon.provenance["hyperparameter"])
     chosen = [] if isinstance(weight, float) else [f"hyperparameter {used:.3g}"]
     return [f"reference: {of_reference}", *fitted, *chosen, of_image]
+
+
+def _require_one_kind(args: argparse.Namespace) -> None:
+    """Refuse options that belong to another kind of image."""
+    if args.classes and args.absolute:
+        raise ValueError("--classes shows a change and --absolute one frame: give one of them")
+    if args.normalised and (args.classes or args.absolute):
+        raise ValueError("--normalised weighs a difference image: leave out --classes and --absolute")
+
+
+def _conductivity(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:
+    """Draw the absolute image of the frame; what is printed of it."""
+    import jaxeit as je
+
+    from ...tanks import absolute_image
+
+    found = absolute_image(tank, args.frame, reference=args.reference, fit=_fit(args))
+    je.plot.show_image(found.shown.picture, found.shown.image, axes, label="conductivity, S")
+    fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
+    low, high = float(found.shown.sigma.min()), float(found.shown.sigma.max())
+    return [*fitted, f"{args.output}: conductivity {low:.3g} to {high:.3g} S"]
 
 
 def _classes(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:

@@ -170,12 +170,16 @@ def _unexplained(
 
 
 def require_explained(
-    what: str, found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
+    what: str,
+    found: Float[Array, " readings"],
+    known: Float[Array, " readings"],
+    there: Bool[Array, " readings"],
+    hint: str = "",
 ) -> None:
-    """Raise InverseError if too much of a frame is left by the readings that were found for it."""
+    """Raise InverseError if too much of a frame is left by the readings that were found for it; ``hint`` ends it."""
     left: Array = _unexplained(found, known, there)
     if _is_known(left) and not left < MAX_UNEXPLAINED:
         raise InverseError(
             f"no {what} explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
-            "the skin's protocol"
+            f"the skin's protocol{hint}"
         )
