@@ -17,7 +17,7 @@ from jaxeit.geometry import Polygon
 
 from ..session import SessionError
 from ..session.importers.mat_trees import read_mat_tree
-from .recording import Tank, TankError
+from .recording import Tank, TankError, named_errors
 
 REFERENCES = ("vh", "v_h", "homg", "ref", "reference", "Uelref")
 """Names under which a frame is the reference, and comes first."""
@@ -38,6 +38,11 @@ def read_matlab(path: Path) -> dict[str, Any]:
 
 def eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol | None = None) -> Tank:
     """A forward model of EIDORS, on its own mesh, and every variable that holds a frame of it."""
+    with named_errors(path.name):
+        return _eidors_tank(path, variables, protocol)
+
+
+def _eidors_tank(path: Path, variables: Mapping[str, Any], protocol: je.Protocol | None) -> Tank:
     model = next(forward_models(variables), None)
     if model is None:
         raise TankError(
@@ -87,7 +92,8 @@ def stimulation_protocol(where: str, model: SimpleNamespace, electrodes: int) ->
     if sizes != {electrodes}:
         raise TankError(f"{where}.stimulation: patterns are for {sorted(sizes)} electrodes, not {electrodes}")
     columns = np.stack([column.ravel() for column in current], 1)
-    return je.Protocol.from_matrices(columns, [matrix.T for matrix in measured])
+    with named_errors(f"{where}.stimulation"):
+        return je.Protocol.from_matrices(columns, [matrix.T for matrix in measured])
 
 
 def forward_models(variables: Mapping[str, Any]) -> Iterator[SimpleNamespace]:
@@ -232,5 +238,6 @@ def ktc_tank(path: Path, variables: Mapping[str, Any]) -> Tank:
     count = len(frame.current)
     disc = je.Disc(KTC_RADIUS)
     rim = je.skin.rim_electrodes(disc, count, contact=KTC_CONTACT, start=np.pi / 2)
-    protocol = je.Protocol.from_matrices(frame.current, frame.measurement)
+    with named_errors(path.name):
+        protocol = je.Protocol.from_matrices(frame.current, frame.measurement)
     return Tank(je.Skin(path.stem, disc, 1.0, rim, protocol), np.array(frames), tuple(names))

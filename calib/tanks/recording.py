@@ -1,6 +1,7 @@
 """What every file of a tank becomes: a skin without pads, a mesh if the file has one, and frames in volts."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,17 @@ class TankError(ValueError):
         except calib.tanks.TankError as error:
             print(error)
     """
+
+
+@contextmanager
+def named_errors(where: str) -> Iterator[None]:
+    """Errors of what a file describes, such as currents that do not sum to zero, as a TankError that says where."""
+    try:
+        yield
+    except TankError:
+        raise
+    except ValueError as error:
+        raise TankError(f"{where}: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from jaxeit.skin import AbstractElectrode
 from ..session import SessionError
 from ..session.importers.formats.text_files import every_line, is_data
 from ..session.importers.formats.text_layout import FIRST_LINES, Dialect, layout_of
-from .recording import Tank, TankError, tank_of
+from .recording import Tank, TankError, named_errors, tank_of
 
 CURRENT_IN_NAME = re.compile(r"_([\d.]+)(uA|mA)(?:_([\d.]+)Hz)?")
 AMPERE = {"uA": 1e-6, "mA": 1e-3}
@@ -134,9 +134,9 @@ def sciospec_tank(paths: Sequence[Path], domain: Domain | None, rim: Sequence[Ab
     )
     stack = np.array(frames)
     readings = stack[:, drive, pattern[:, 2]] - stack[:, drive, pattern[:, 3]]
-    skin = tank_of(
-        paths[0].parent.name or "sciospec", je.Protocol(pattern, current, frequency), electrodes, domain, rim
-    )
+    with named_errors(names[0]):
+        protocol = je.Protocol(pattern, current, frequency)
+    skin = tank_of(paths[0].parent.name or "sciospec", protocol, electrodes, domain, rim)
     return Tank(skin, np.ascontiguousarray(readings.real), tuple(names), np.ascontiguousarray(readings.imag))
 
 

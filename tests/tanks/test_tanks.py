@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 import calib
 import jaxeit as je
@@ -87,6 +87,8 @@ def test_a_model_of_eidors_is_the_same_model(bench, tmp_path):
     ("change", "message"),
     [
         ({"elems": np.ones((9, 4))}, "elements have 4 nodes; a sheet is a plane mesh of triangles"),
+        ({"elems": np.full((9, 3), np.nan)}, "no arrays of finite numbers"),
+        ({"nodes": np.full((9, 2), np.inf)}, "no arrays of finite numbers"),
         ({"elems": np.full((9, 3), 1e4)}, "its triangles name nodes outside 0 to"),
         ({"electrode": []}, "electrode: missing"),
         ({"electrode": struct("e", [{"nodes": [2.0, 9.0]}])["e"]}, r"electrode\(1\): its nodes are no single stretch"),
@@ -469,3 +471,23 @@ def test_a_fit_of_the_reference_that_does_not_converge_is_refused(tmp_path, caps
     assert "does not converge" in (told := capsys.readouterr().err)
     assert "leave out --fit-contacts" in told
     assert not (tmp_path / "p.png").exists()
+
+
+def test_what_a_damaged_file_describes_is_refused_by_its_name(bench, tmp_path):
+    """Numbers that are well formed and describe no scan, or no sheet."""
+    lost = forward_model(bench)
+    lost["stimulation"][0, 3]["stim_pattern"][2] += 1e-3
+    with pytest.raises(TankError, match=r"tank\.mat: fwd_model\.stimulation: the current of drive 3 sums to"):
+        load_tank(write_mat(tmp_path / "tank.mat", bench, **lost))
+    write_ktc(tmp_path)
+    variables = loadmat(tmp_path / "data1.mat")
+    variables["Mpat"][0, 0] = 0.5
+    savemat(tmp_path / "data1.mat", {name: variables[name] for name in ("Inj", "Mpat", "Uel")})
+    with pytest.raises(TankError, match=r"data1\.mat: the measurement 0 of drive 0 sums to"):
+        load_tank(tmp_path / "data1.mat")
+    write_sciospec(tmp_path, bench)
+    lines = (tmp_path / "setup_00001.eit").read_text().splitlines()
+    lines[18] = "1 1"
+    (tmp_path / "setup_00001.eit").write_text("\n".join(lines))
+    with pytest.raises(TankError, match=r"setup_00001: row 0 of the pattern.* uses one electrode twice"):
+        load_tank(tmp_path / "setup_00001.eit", je.Disc(RADIUS))
