@@ -28,7 +28,7 @@ Example:
 """
 
 from .formats import load_eidors, load_instrument, load_ktc, load_npz, load_pyeidors, load_sciospec, load_tank
-from .images import TankConductivity, TankImage, absolute_image, difference_image, segmented_frame
+from .images import TankConductivity, TankImage, conductivity_image, difference_image, segmented_frame
 from .recording import Tank, TankError
 
 __all__ = [
@@ -36,7 +36,7 @@ __all__ = [
     "TankConductivity",
     "TankError",
     "TankImage",
-    "absolute_image",
+    "conductivity_image",
     "difference_image",
     "load_eidors",
     "load_instrument",

@@ -115,7 +115,7 @@ def _own_size(readings: np.ndarray) -> np.ndarray:
     return found
 
 
-def absolute_image(
+def conductivity_image(
     tank: Tank,
     frame: int = -1,
     *,
@@ -139,6 +139,12 @@ def absolute_image(
     Raises:
         TankError: if there is no such frame, it does not look like the model, or the fit does not converge.
         InverseError: if ``fit`` is given, and no even content explains the reference.
+
+    Example:
+        recorded = calib.tanks.load_npz("tank.npz", disc)
+        settings = {"basis": je.Pixels(12), "error": 1e-3, "fidelity": je.Fidelity.draft(edge_length=0.1)}
+        shown = calib.tanks.conductivity_image(recorded, **settings).shown
+        print(f"{shown.sigma.min():.2g} to {shown.sigma.max():.2g} S")
     """
     count = len(tank.frames)
     if not (-count <= frame < count and -count <= reference < count):

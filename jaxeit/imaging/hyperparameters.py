@@ -236,7 +236,7 @@ class PriorDeviation(AbstractHyperparameter):
 
     needs_noise: ClassVar[bool] = True
 
-    deviation: float | None = limited(None, above=0, unit="S")
+    deviation: float | None = limited(None, above=0)
 
     def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
         del whiten

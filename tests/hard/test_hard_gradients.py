@@ -71,6 +71,7 @@ HOST = {
     "noise_covariance": _PREPARES,
     "opposite": _DESCRIBES,
     **dict.fromkeys(("half_height_classes", "on_grid", "segment"), "finds regions, on the host, and says so under jit"),
+    "absolute_image": "an image with errors that grow, on the host, and says so under jit",
     "pad_masks": "geometry, on the host, and says so under jit",
     "pad_response": _GEOMETRY,
     "pad_overlap": _DESCRIBES,

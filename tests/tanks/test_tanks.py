@@ -412,7 +412,7 @@ def test_one_frame_shows_the_conductivity(bench, tmp_path, capsys):
     frames = bench.frames * (1 + 1e-3 * np.random.default_rng(4).normal(size=bench.frames.shape))
     np.savez(tmp_path / "one.npz", frames=frames[1:], pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
     tank = load_tank(tmp_path / "one.npz", bench.skin.domain, bench.skin.electrodes)
-    found = calib.tanks.absolute_image(tank, basis=je.Pixels(20), error=2e-3)
+    found = calib.tanks.conductivity_image(tank, basis=je.Pixels(20), error=2e-3)
     shown, model = found.shown, found.model
     np.testing.assert_allclose(np.asarray(shown.picture.centres)[np.argmax(shown.image)], PLACE, atol=0.004)
     rod = np.linalg.norm(model.centroids - PLACE, axis=1) < 0.003
@@ -430,7 +430,7 @@ def test_one_frame_shows_the_conductivity(bench, tmp_path, capsys):
     assert main(["image", *args, "--absolute", "--classes"]) == 2
     assert main(["image", *args, "--absolute", "--normalised"]) == 2
     with pytest.raises(TankError, match="has 1 frames; there is no frame 2"):
-        calib.tanks.absolute_image(tank, 2)
+        calib.tanks.conductivity_image(tank, 2)
 
 
 def test_a_normalised_difference_weighs_readings_by_their_size(bench, tmp_path):

@@ -128,9 +128,9 @@ def _conductivity(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[
     """Draw the absolute image of the frame; what is printed of it."""
     import jaxeit as je
 
-    from ...tanks import absolute_image
+    from ...tanks import conductivity_image
 
-    found = absolute_image(tank, args.frame, reference=args.reference, fit=_fit(args))
+    found = conductivity_image(tank, args.frame, reference=args.reference, fit=_fit(args))
     je.plot.show_image(found.shown.picture, found.shown.image, axes, label="conductivity, S")
     fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
     low, high = float(found.shown.sigma.min()), float(found.shown.sigma.max())
