@@ -352,7 +352,7 @@ def test_the_commands_about_tanks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_tanks(tmp_path)
     lines = list(commands("tanks.md"))
-    assert len(lines) == 6
+    assert len(lines) == 7
     for line in lines:
         do(line)
         picture = Path(shlex.split(line)[-1])
