@@ -91,7 +91,8 @@ def difference_image(
         normalised: weigh each change by the reading of the reference, as where instruments err in proportion.
         fidelity: default: draft, with quadratic elements if ``fit`` is given, as linear ones add a contact resistance
             to each electrode: 10 % of that of the tank in tests/imaging/test_reference.py.
-        fit: fit conductivity and contacts to the reference by `je.imaging.fit_reference`, for the image;
+        fit: fit conductivity and contacts, or gains and offsets of channels, to the reference by
+            `je.imaging.fit_reference`, for the image;
             default: contacts as the tank has them.
 
     Raises:
@@ -152,8 +153,10 @@ def conductivity_image(
     model = tank.model(fidelity or je.Fidelity.draft(order=1 if fit is None else 2))
     _correlated(tank, model, tank.frames[frame], frame % count)
     found = None if fit is None else _fitted(tank, model, tank.frames[reference], reference % count, fit)
-    model = model if found is None else found.model
-    shown = je.imaging.absolute_image(model, tank.frames[frame], basis, penalty=penalty, error=error)
+    seen = tank.frames[frame]
+    if found is not None:
+        model, seen = found.model, np.asarray(found.corrected(seen))
+    shown = je.imaging.absolute_image(model, seen, basis, penalty=penalty, error=error)
     return TankConductivity(shown, model, found)
 
 
@@ -205,7 +208,8 @@ def _scaled(
         )
     correlation = _correlated(tank, model, np.where(used, before, np.nan), first)
     found = None if fit is None else _fitted(tank, model, np.where(used, before, np.nan), first, fit)
-    model = model if found is None else found.model
+    if found is not None:
+        model, (before, after) = found.model, np.asarray(found.corrected(np.stack([before, after])))
     even = np.asarray(je.forward(model))
     scale = float(even[used] @ before[used] / (before[used] @ before[used]))
     return _Scaled(model, scale * before, scale * after, scale, correlation, found)

@@ -433,6 +433,28 @@ def test_one_frame_shows_the_conductivity(bench, tmp_path, capsys):
         calib.tanks.conductivity_image(tank, 2)
 
 
+def test_an_offset_that_is_fitted_is_taken_from_the_frames(bench, tmp_path, capsys):
+    offset = 0.35 * np.sqrt(np.mean(bench.frames**2))
+    path, args = tmp_path / "offset.npz", ["--radius", str(RADIUS), "-o", str(tmp_path / "offset.png")]
+    np.savez(path, frames=bench.frames - offset, pattern=bench.skin.protocol.pattern, amplitude=CURRENT)
+    assert main(["image", str(path), *args, "--fit-offset", "1"]) == 2
+    assert "add --fit-contacts one or each" in capsys.readouterr().err
+    assert main(["image", str(path), *args, "--fit-contacts", "one"]) == 2
+    assert "(--fit-offset)" in capsys.readouterr().err
+    assert main(["image", str(path), *args, "--fit-contacts", "one", "--fit-offset", f"{2 * offset}"]) == 0
+    level = re.search(r"fitted to the reference: (\S+) S", capsys.readouterr().out)[1]
+    assert abs(float(level) - 1) < 0.02
+    tank = load_tank(path, bench.skin.domain, bench.skin.electrodes)
+    choices = {"basis": je.Pixels(12), "fidelity": je.Fidelity.draft(order=2)}
+    settings = je.imaging.ReferenceSettings(contact=0, contact_each=0, offset=2 * offset)
+    found = difference_image(tank, fit=settings, **choices)
+    wanted = difference_image(calib.tanks.Tank(tank.skin, bench.frames, tank.names), **choices)
+    assert found.background == pytest.approx(1, abs=0.02)
+    np.testing.assert_allclose(found.change, wanted.change, atol=0.03 * float(jnp.max(wanted.change)))
+    seen = np.asarray(found.fit.corrected(tank.frames))
+    np.testing.assert_allclose(seen, bench.frames, atol=0.02 * np.abs(bench.frames).max())
+
+
 def test_a_normalised_difference_weighs_readings_by_their_size(bench, tmp_path):
     """As inv_solve of EIDORS with normalize_measurements: ``dv / v0``, with each row of the Jacobian over v0 too."""
     tank = load_tank(write_csv(tmp_path / CSV, bench.frames), bench.skin.domain)

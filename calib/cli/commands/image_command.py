@@ -39,6 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clockwise", action="store_true", help="electrodes follow each other clockwise")
     text = "fit conductivity and contact resistances (one, or one of each electrode) to the reference; image with them"
     parser.add_argument("--fit-contacts", choices=("one", "each"), help=text)
+    text = "with --fit-contacts: also fit an offset of each channel; how large such offsets are, in V"
+    parser.add_argument("--fit-offset", type=above_zero, metavar="V", help=text)
     text = "draw what conducts less and what conducts more than the reference; --prior and --method do not apply"
     parser.add_argument("--classes", action="store_true", help=text)
     text = "the conductivity that --frame alone shows, in S, in place of a change; its prior and method are its own"
@@ -157,8 +159,11 @@ def _fit(args: argparse.Namespace) -> "ReferenceSettings | None":
     import jaxeit as je
 
     if args.fit_contacts is None:
+        if args.fit_offset is not None:
+            raise ValueError("--fit-offset belongs to the fit of the reference: add --fit-contacts one or each")
         return None
-    return je.imaging.ReferenceSettings(**({} if args.fit_contacts == "each" else {"contact_each": 0.0}))
+    one = {} if args.fit_contacts == "each" else {"contact_each": 0.0}
+    return je.imaging.ReferenceSettings(offset=args.fit_offset or 0.0, **one)
 
 
 def _fitted(fit: "ReferenceFit") -> str:

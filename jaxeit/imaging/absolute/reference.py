@@ -111,6 +111,7 @@ class ReferenceFit(eqx.Module):
     | directions: independent before and after; each is one standard deviation before    | (k, n) |
     | misfit: root mean square of what is left of the readings, in their errors          | ()     |
     | model with the conductivity, contacts and electrodes that were found               |        |
+    | channel: number of the channel of each reading; None without gains and offsets     | (readings,) |
     """
 
     value: ReferenceParameters
@@ -120,6 +121,14 @@ class ReferenceFit(eqx.Module):
     directions: Float[Array, "k n"]
     misfit: Float[Array, ""]
     model: Model
+    channel: Int[Array, " readings"] | None = None
+
+    def corrected(self, frames: Float[ArrayLike, "... readings"]) -> Float[Array, "... readings"]:
+        """Frames, V, as the model reads them: without the gains, the offsets and the scale that were fitted."""
+        readings = jnp.asarray(frames, self.model.dtype)
+        if self.channel is not None:
+            readings = (readings - self.value.offset[self.channel]) / (1 + self.value.gain[self.channel])
+        return readings / (1 + self.value.scale)
 
     @property
     def untold(self) -> list[ReferenceParameters]:
@@ -207,7 +216,8 @@ def _with_offset(known: Float[Array, " readings"], even: Float[Array, " readings
     left = np.linalg.norm(seen - like @ np.linalg.lstsq(like, seen)[0]) / np.linalg.norm(seen)
     if not left < MAX_UNEXPLAINED:
         return ""
-    return f"; with an offset of all readings it leaves {left:.0%}: fit it by ReferenceSettings(offset=...), V"
+    remedy = "fit it by ReferenceSettings(offset=...), V (--fit-offset)"
+    return f"; with an offset of all readings it leaves {left:.0%}: {remedy}"
 
 
 def _channels(model: Model, channel: Integer[ArrayLike, " readings"] | None) -> np.ndarray:
@@ -215,7 +225,8 @@ def _channels(model: Model, channel: Integer[ArrayLike, " readings"] | None) -> 
     if channel is None:
         if model.mixing is not None:
             raise InverseError(
-                "the readings are those of matrices; give channel=, the number of each reading's channel"
+                "the readings are those of matrices; give channel=, the number of each reading's channel, or fit "
+                "neither gains nor offsets (no --fit-offset)"
             )
         _, number = np.unique(np.asarray(model.pattern)[:, 2:], axis=0, return_inverse=True)
         return np.asarray(number).ravel()
@@ -357,7 +368,8 @@ def _described(
         common_mode=sum((effect.gain for effect in chosen(model.effects, CommonMode)), jnp.zeros_like(parts.level)),
     )
     error = _parts(jnp.sqrt(jnp.diagonal(covariance)), model.electrodes, problem.channels)
-    return ReferenceFit(value, error, covariance, information, directions, _rms(missed), model), readings
+    fit = ReferenceFit(value, error, covariance, information, directions, _rms(missed), model, problem.channel)
+    return fit, readings
 
 
 def _missed_by_mesh(problem: _Problem, model: Model) -> Float[Array, " n"]:
