@@ -115,7 +115,7 @@ def test_an_offset_of_the_readings_is_named_and_fitted(saline, adjacent):
     frame = _rows(potential)
     offset = 0.35 * np.sqrt(np.mean(frame**2))
     with pytest.raises(
-        InverseError, match=r"[2-9]\d% of it is left.* leaves \d%: fit it by ReferenceSettings\(offset="
+        InverseError, match=r"[2-9]\d% of it is left.*an offset of -.* leaves \d%: fit it by ReferenceSettings\(offset="
     ):
         fit_reference(adjacent, frame - offset)
     fit = fit_reference(adjacent, frame - offset, ReferenceSettings(offset=2 * offset))

@@ -213,11 +213,12 @@ def _with_offset(known: Float[Array, " readings"], even: Float[Array, " readings
         return ""
     used = np.asarray(weight) > 0
     seen, like = np.asarray(known)[used], np.stack([np.asarray(even)[used], np.ones(used.sum())], 1)
-    left = np.linalg.norm(seen - like @ np.linalg.lstsq(like, seen)[0]) / np.linalg.norm(seen)
+    sizes = np.linalg.lstsq(like, seen)[0]
+    left = np.linalg.norm(seen - like @ sizes) / np.linalg.norm(seen)
     if not left < MAX_UNEXPLAINED:
         return ""
-    remedy = "fit it by ReferenceSettings(offset=...), V (--fit-offset)"
-    return f"; with an offset of all readings it leaves {left:.0%}: {remedy}"
+    remedy = f"fit it by ReferenceSettings(offset={abs(sizes[1]):.2g}) or --fit-offset {abs(sizes[1]):.2g}"
+    return f"; with an offset of {sizes[1]:.2g} V in all readings it leaves {left:.0%}: {remedy}"
 
 
 def _channels(model: Model, channel: Integer[ArrayLike, " readings"] | None) -> np.ndarray:
