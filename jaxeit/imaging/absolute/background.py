@@ -1,5 +1,6 @@
 """The conductivity of an untouched sheet, from a frame of it."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -174,12 +175,16 @@ def require_explained(
     found: Float[Array, " readings"],
     known: Float[Array, " readings"],
     there: Bool[Array, " readings"],
-    hint: str = "",
+    hint: Callable[[], str] = str,
 ) -> None:
-    """Raise InverseError if too much of a frame is left by the readings that were found for it; ``hint`` ends it."""
+    """Raise InverseError if too much of a frame is left by the readings that were found for it.
+
+    Args:
+        hint: what ends the message, asked for where there is one.
+    """
     left: Array = _unexplained(found, known, there)
     if _is_known(left) and not left < MAX_UNEXPLAINED:
         raise InverseError(
             f"no {what} explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
-            f"the skin's protocol{hint}"
+            f"the skin's protocol{hint()}"
         )

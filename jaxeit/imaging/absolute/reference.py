@@ -8,7 +8,9 @@ All unknowns are Gaussian before the frame is seen, conductivity and contacts by
 ones are found through the full forward map by `LevenbergMarquardt`; their covariance is that of the curvature there.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,7 +22,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 from scipy.linalg import block_diag
 
-from ..._compile import full_precision, is_traced
+from ..._compile import full_precision
 from ...effects import CommonMode, chosen
 from ...least_squares import Cholesky, ImplicitStep, LevenbergMarquardt
 from ...linalg.lapack import eigh
@@ -201,16 +203,13 @@ def fit_reference(
         growth = jnp.maximum(growth * misfit, 1) if std is None else jnp.ones_like(growth)
     fit, found = _described(problem, known, used, jnp.where(converged, x, jnp.nan))
     used = jnp.where(converged, used, 0)
-    require_explained(
-        "even content", found, known, used > 0, "" if settings.offset else _with_offset(known, even, used)
-    )
+    hint: Callable[[], str] = str if settings.offset else partial(_with_offset, known, even, used)
+    require_explained("even content", found, known, used > 0, hint)
     return fit
 
 
 def _with_offset(known: Float[Array, " readings"], even: Float[Array, " readings"], weight: Array) -> str:
     """What an offset that all readings share would leave, for the error that even content alone leaves too much."""
-    if is_traced(known, weight):
-        return ""
     used = np.asarray(weight) > 0
     seen, like = np.asarray(known)[used], np.stack([np.asarray(even)[used], np.ones(used.sum())], 1)
     sizes = np.linalg.lstsq(like, seen)[0]
