@@ -26,6 +26,7 @@ from benchmarks import (
     problems,
     repeat,
     tables,
+    tank_pictures,
     tools,
 )
 from benchmarks.__main__ import questions
@@ -265,6 +266,24 @@ def test_the_pictures_of_hard_cases_follow_their_tables():
     cases["fault 2: power cut while recording"][-1] = "the last 250 ms lost at most"
     assert hard_case_pictures.seconds(cases)["power cut: lost at most"] == 0.25
     assert len(lasts) == len(hard_case_pictures.LASTS)
+
+
+def test_the_images_of_a_tank_are_turned_alike():
+    """Discs with a change at electrode 5, whose electrodes begin elsewhere and follow the other way round."""
+    assert "mk_common_model" in tank_pictures.program("matlab")
+    assert "JAC(" in tank_pictures.program("python", "tank_with_pyeit.py")
+    images = {}
+    for name, sense in (("one", 1), ("other", -1)):
+        angle = 0.7 + sense * 2 * np.pi * np.arange(16) / 16
+        nodes = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1), np.zeros((1, 2))])
+        triangles = np.stack([np.arange(16), np.roll(np.arange(16), -1), np.full(16, 16)], 1)
+        images[name] = tank_pictures.Image(nodes, triangles, np.arange(16), (np.arange(16) == 4).astype(float))
+    one, other, _ = tank_pictures.picture(images).axes
+    for axes in (one, other):
+        (numbered,) = [text for text in axes.texts if text.get_text() == "5"]
+        np.testing.assert_allclose(numbered.get_position(), (0, 1.13), atol=1e-9)
+    alike = [np.stack([path.vertices for path in axes.collections[0].get_paths()]) for axes in (one, other)]
+    np.testing.assert_allclose(*alike, atol=1e-9)
 
 
 def test_a_part_measured_again_leaves_the_others(monkeypatch, tmp_path, capsys):

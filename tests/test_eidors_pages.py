@@ -13,6 +13,8 @@ import calib
 import jaxeit as je
 from benchmarks.peers.eidors import missing
 
+from .tanks.rods import PLACE, RADIUS, tank_with_rod
+from .tanks.tank_files import change_on_mesh, write_csv
 from .test_docs import blocks, run
 from .test_tutorials import close
 
@@ -22,6 +24,9 @@ BEGIN = """
 run([getenv('EIDORS') '/startup.m']);
 set(0, 'defaultfigurevisible', 'off');
 save_default_options('-mat7-binary');  % that of MATLAB
+"""
+TANK = """
+elem_data = change.elem_data; fmdl = imdl.fwd_model; save('change.mat', 'elem_data', 'fmdl', 'vh', 'vi')
 """
 END = """
 elem_data = rec.elem_data; save('image.mat', 'elem_data')
@@ -35,11 +40,12 @@ def matlab(page):
 
 @pytest.fixture(scope="module")
 def folder(root, tmp_path_factory):
-    """A folder with what the programs of both pages save; the second goes on from a model `fmdl` of the reader."""
+    """A folder with what the programs of both pages save; the last ones go on from a model `fmdl` of the reader."""
     folder = tmp_path_factory.mktemp("eidors")
     (task,) = matlab(root / "docs" / "from-eidors.md")
-    with_model, without = matlab(root / "docs" / "tanks.md")
-    script = "".join([BEGIN, task, "fmdl = imdl.fwd_model;\n", with_model, without, END])
+    recorded, with_model, without = matlab(root / "docs" / "tanks.md")
+    write_csv(folder / "tank_55uA_1000Hz.csv", tank_with_rod().frames)
+    script = "".join([BEGIN, recorded, TANK, task, "fmdl = imdl.fwd_model;\n", with_model, without, END])
     (folder / "pages.m").write_text(script, encoding="utf-8")
     home = os.path.abspath(os.environ["EIDORS"])
     command = ["octave-cli", "--norc", "--quiet", "pages.m"]
@@ -74,3 +80,15 @@ def test_eidors_itself_gives_the_same_voltages_and_the_same_image(root, folder):
     taken_over = run(root / "docs" / "from-eidors.md", {})["from_eidors"](model, 0.03, je.Elements())
     recon = je.prepare(model, je.Noser(), basis=je.Elements(), hyperparameter=taken_over)
     close(recon(vi - vh), loadmat(folder / "image.mat")["elem_data"].ravel())
+
+
+def test_eidors_itself_shows_the_same_change_in_the_file_of_a_tank(root, folder):
+    own = calib.tanks.load_tank(folder / "change.mat")
+    model = own.model()
+    weight = run(root / "docs" / "from-eidors.md", {})["from_eidors"](model, 3e-4, je.Elements())
+    assert weight == pytest.approx(0.3, rel=0.05)  # as the page says
+    theirs = loadmat(folder / "change.mat")["elem_data"].ravel()
+    close(change_on_mesh(folder / "tank_55uA_1000Hz.csv", own.mesh, own.skin.electrodes, weight), theirs)
+    highest = np.asarray(model.centroids)[np.argmax(theirs)]
+    x, y = PLACE / RADIUS  # counter-clockwise from +x; those of EIDORS are clockwise from +y
+    np.testing.assert_allclose(highest, [y, x], atol=0.15)

@@ -40,6 +40,7 @@ RUN = {
         "python": "tanks/test_tanks.py",
         "matlab": "test_eidors_pages.py",
         "tank.toml": "test_page_commands.py",
+        "tank_with_pyeit.py": "test_tutorials.py",
         "": "test_page_commands.py",
     },
     "docs/train.md": {"python": "test_tutorials.py"},

@@ -8,6 +8,8 @@ import pytest
 
 import jaxeit as je
 
+from .tanks.rods import PLACE, RADIUS, tank_with_rod
+from .tanks.tank_files import change_on_mesh, write_csv
 from .test_docs import blocks, run
 
 
@@ -79,13 +81,22 @@ def test_a_disc_as_in_pyeit(pyeit):
     close(je.forward(again), pyeit["v0"])
 
 
+def with_pyeit(root, page, title):
+    """What a program of a page, for pyEIT, defines."""
+    (program,) = [text for _, name, text in blocks(root / "docs" / page) if name == title]
+    names: dict = {}
+    exec(compile(program, title, "exec"), names)
+    return names
+
+
+needs_pyeit = pytest.mark.skipif(find_spec("pyeit") is None, reason="the extra bench is not installed")
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("pyeit") is None, reason="the extra bench is not installed")
+@needs_pyeit
 @pytest.mark.filterwarnings("ignore")  # of another program
 def test_pyeit_itself_gives_the_same_voltages_and_the_same_image(pyeit, root):
-    (program,) = [text for _, title, text in blocks(root / "docs" / "from-pyeit.md") if title == "with_pyeit.py"]
-    theirs: dict = {}
-    exec(compile(program, "with_pyeit.py", "exec"), theirs)
+    theirs = with_pyeit(root, "from-pyeit.md", "with_pyeit.py")
     mesh = theirs["mesh_obj"]
     model = pyeit["on_mesh"](mesh.node, mesh.element, mesh.el_pos)
     v0, v1 = je.forward(model), je.forward(model, jnp.asarray(np.real(theirs["touched"].perm)))
@@ -94,6 +105,24 @@ def test_pyeit_itself_gives_the_same_voltages_and_the_same_image(pyeit, root):
     weight = pyeit["from_pyeit"](model, 0.01, 0.5)
     recon = je.prepare(model, je.Noser(exponent=0.5), basis=je.Elements(), hyperparameter=weight)
     close(recon(v1 - v0), np.real(theirs["ds"]))
+
+
+@pytest.mark.slow
+@needs_pyeit
+@pytest.mark.filterwarnings("ignore")  # of another program
+def test_pyeit_itself_shows_the_same_change_in_the_file_of_a_tank(pyeit, root, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = write_csv(tmp_path / "tank_55uA_1000Hz.csv", tank_with_rod().frames)
+    theirs = with_pyeit(root, "tanks.md", "tank_with_pyeit.py")
+    mesh, change = theirs["mesh_obj"], np.real(theirs["change"])
+    model = pyeit["on_mesh"](mesh.node, mesh.element, mesh.el_pos)
+    weight = pyeit["from_pyeit"](model, 0.0016, 0.5)
+    assert weight == pytest.approx(0.3, rel=0.02)  # as the page says
+    electrodes = tuple(je.PointElectrode(tuple(place)) for place in mesh.node[mesh.el_pos, :2].tolist())
+    close(change_on_mesh(path, model.mesh, electrodes, weight), change)
+    highest = np.asarray(model.centroids)[np.argmax(change)]
+    x, y = PLACE / RADIUS  # counter-clockwise from +x; those of pyEIT are clockwise from -x
+    np.testing.assert_allclose(highest, [-x, y], atol=0.15)
 
 
 @pytest.mark.slow

@@ -211,7 +211,13 @@ def _scaled(
     if found is not None:
         model, (before, after) = found.model, np.asarray(found.corrected(np.stack([before, after])))
     even = np.asarray(je.forward(model))
-    scale = float(even[used] @ before[used] / (before[used] @ before[used]))
+    alike = float(even[used] @ before[used])
+    if not alike > 0:
+        raise TankError(
+            f"{tank.skin.name}: the readings of frame {first} follow an even tank, and have an offset that turns their "
+            "sign; take it out, or fit it: fit=ReferenceSettings(offset=...), --fit-offset with --fit-contacts"
+        )
+    scale = float(even[used] @ even[used]) / alike  # least squares of the readings: the errors are theirs
     return _Scaled(model, scale * before, scale * after, scale, correlation, found)
 
 

@@ -1,9 +1,12 @@
 """Files of tanks, written as other programs write them."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.io import savemat
 
 import jaxeit as je
+from calib.tanks import difference_image, load_tank
 
 from ..helpers import skin_of
 from .rods import COUNT, CURRENT, RADIUS
@@ -15,6 +18,14 @@ def write_csv(path, frames):
     """Real and imaginary part by turns, of the polarity of PyEIDORS."""
     np.savetxt(path, np.stack([-frames[0], 0.1 * frames[0], -frames[1], 0.1 * frames[1]], 1), delimiter=",")
     return path
+
+
+def change_on_mesh(path, mesh, electrodes, hyperparameter):
+    """Change between the two frames of a file by NOSER, for each triangle of a mesh of a disc of radius 1."""
+    tank = load_tank(path, je.Disc(1.0), rim=electrodes)
+    basis = je.Elements()
+    found = difference_image(replace(tank, mesh=mesh), prior=je.Noser(), basis=basis, hyperparameter=hyperparameter)
+    return found.change
 
 
 def struct(name, values):

@@ -462,11 +462,29 @@ def test_a_normalised_difference_weighs_readings_by_their_size(bench, tmp_path):
     found = difference_image(tank, basis=je.Pixels(12), hyperparameter=0.2, normalised=True)
     model = tank.model()
     even = np.asarray(je.forward(model))
-    scale = even @ tank.frames[0] / (tank.frames[0] @ tank.frames[0])
+    scale = even @ even / (even @ tank.frames[0])
     before, after = scale * tank.frames
     jac = np.asarray(je.jacobian(model, basis=je.Pixels(12))) / before[:, None]
     found_by_hand = _noser_image(jac, (after - before) / before, 0.2) / float(model.background[0])
     np.testing.assert_allclose(found.change, found_by_hand, rtol=1e-3, atol=1e-3 * np.abs(found_by_hand).max())
+
+
+def test_noise_of_the_reference_does_not_lower_the_conductivity(bench):
+    """By the readings' own least squares; the readings over the model's would lose the share of the noise, 4 %."""
+    noise = np.random.default_rng(0).normal(0, 1, bench.frames.shape[1])
+    even = bench.frames[0]
+    noise -= even * (noise @ even) / (even @ even)
+    before = even + 0.2 * np.linalg.norm(even) / np.linalg.norm(noise) * noise
+    choices = {"basis": je.Pixels(8), "fidelity": je.Fidelity(edge_length=0.06)}
+    tank = calib.tanks.Tank(bench.skin, np.stack([before, bench.frames[1]]), ("noisy", "rod"))
+    assert difference_image(tank, **choices).background == pytest.approx(1, rel=1e-3)
+
+
+def test_an_offset_that_turns_the_sign_of_the_readings_is_refused(bench):
+    frames = bench.frames + 3 * np.sqrt(np.mean(bench.frames**2))  # readings of an even tank are below zero
+    tank = calib.tanks.Tank(bench.skin, frames, ("even", "rod"))
+    with pytest.raises(TankError, match="have an offset that turns their sign"):
+        difference_image(tank, basis=je.Pixels(8), fidelity=je.Fidelity.draft())
 
 
 def _noser_image(jac, dv, h):
