@@ -106,8 +106,9 @@ def _most_probable(
 
 def _with_model_error(tracker: Tracker, error: float) -> Tracker:
     settings = replace(tracker.settings, loads=replace(tracker.settings.loads, model_error=error))
-    changed = eqx.tree_at(lambda f: f.model_error, tracker.filter, jnp.asarray(error, tracker.filter.model_error.dtype))
-    return Tracker(changed, settings, tracker.area, tracker.field)
+    value = jnp.asarray(error, tracker.filter.model_error.dtype)
+    changed = (eqx.tree_at(lambda f: f.model_error, one, value) for one in (tracker.filter, tracker.of_presses))
+    return Tracker(*changed, settings, tracker.area, tracker.field)
 
 
 def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads) -> float:

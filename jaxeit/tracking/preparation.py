@@ -1,5 +1,6 @@
 """Preparation of a tracker from a model of the skin."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -31,6 +32,9 @@ from .settings import TrackerSettings
 
 # Cells of the grid of neighbours, along the longer side.
 GRID = 20
+# How many times as many modes, unknowns and pixels the fit of a single press takes as a frame that is followed. Such a
+# fit may end a centimetre from where it began, and is not done again there: what it left out it would take for gain.
+PRESS_REACH = 2.5
 # Share of the variance of an unknown coat that its modes hold.
 COAT_VARIANCE = 0.99
 # Usual loads along each side of the sheet, of which an unknown coat changes the signal.
@@ -47,8 +51,8 @@ def prepare_filter(
     noise: Float[ArrayLike, "..."],
     sigma: Float[Array, " elements"] | None,
     channels: Bool[ArrayLike, " readings"] | None,
-) -> tuple[ContactFilter, GainField]:
-    """The filter of a skin and the gain before any contact; see `prepare_tracker`."""
+) -> tuple[ContactFilter, ContactFilter, GainField]:
+    """The filter of a skin, that of single presses, and the gain before any contact; see `prepare_tracker`."""
     loads = settings.loads
     found = whitened_readings(model, noise, channels)
     finder = prepare_contacts(model, ContactSettings(most=1), noise=noise, sigma=sigma, channels=channels)
@@ -57,8 +61,9 @@ def prepare_filter(
     put = partial(on_device, dtype=model.dtype)
     whole = conductivity(model) if sigma is None else sigma
     coat = loads.coat_spread(sigma is not None)
-    field, sheet = _loaded_sheet(model, skin, settings, whole, coat, found.electrodes, kept @ found.factor)
+    field, sheet, around = _loaded_sheet(model, skin, settings, whole, coat, found.electrodes, kept @ found.factor)
     unit = put(np.eye(len(finder.whitening.channels)))
+    far = _reaching(settings)
     tracker = ContactFilter(
         finder=finder,
         compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
@@ -72,7 +77,7 @@ def prepare_filter(
         spread=put([PLACE, PLACE, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,
     )
-    return tracker, field
+    return tracker, replace(tracker, sheet=replace(sheet, neighbours=around), active_modes=far.modes), field
 
 
 def _loaded_sheet(
@@ -83,8 +88,8 @@ def _loaded_sheet(
     coat: float,
     pairs: np.ndarray,
     mixing: np.ndarray,
-) -> tuple[GainField, LoadedSheet]:
-    """The gain before any contact, and what contacts show."""
+) -> tuple[GainField, LoadedSheet, Neighbours]:
+    """The gain before any contact, what contacts show, and what is near a single press."""
     loads, light = settings.loads, partial(on_device, dtype=np.dtype(settings.dtype))
     coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(_columns(model, settings)).on(model)
     response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
@@ -102,7 +107,7 @@ def _loaded_sheet(
     of_coat = light(_coat_modes(coarse, coat, loads.coat_length))
     sheet = LoadedSheet(
         sheet=reanalysis,
-        neighbours=_neighbours(coarse, centres, settings),
+        neighbours=_neighbours(coarse, centres, settings, half_lengths()),
         sigma=light(mean),
         points=light(points),
         weights=light(weights),
@@ -115,7 +120,15 @@ def _loaded_sheet(
         by_coat=reanalysis.slopes_along(light(mean) * of_coat.T, reanalysis.potential),
         law=loads.law,
     )
-    return field, sheet
+    return field, sheet, _neighbours(coarse, centres, _reaching(settings), half_lengths()[:1])  # a press is round
+
+
+def _reaching(settings: TrackerSettings) -> TrackerSettings:
+    """Settings of the fit of a single press."""
+    modes, unknowns, pixels = (
+        int(PRESS_REACH * count) for count in (settings.modes, settings.unknowns, settings.pixels)
+    )
+    return replace(settings, modes=modes, unknowns=unknowns, pixels=pixels)
 
 
 def _columns(model: Model, settings: TrackerSettings) -> int:
@@ -174,7 +187,10 @@ def _coat_modes(model: Model, spread: float, length: float) -> Float[np.ndarray,
     return found
 
 
-def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings) -> Neighbours:
+def _neighbours(
+    model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings, halves: Float[np.ndarray, "edges 2"]
+) -> Neighbours:
+    """What is nearest to loads of these half lengths."""
     chart = np.asarray(model.chart, float)
     low, high = chart.min(0), chart.max(0)
     pitch = float((high - low).max() / GRID)
@@ -185,7 +201,7 @@ def _neighbours(model: Model, pixels: Float[np.ndarray, "p 2"], settings: Tracke
 
     def nearest(places: np.ndarray, count: int) -> Array:
         count = min(count, len(places))
-        along = np.linspace(-1, 1, 5)[:, None, None, None] * half_lengths()[:, None]  # (5, edges, 1, 2)
+        along = np.linspace(-1, 1, 5)[:, None, None, None] * halves[:, None]  # (5, edges, 1, 2)
         squares = np.full((along.shape[1], len(cells), len(places)), np.inf, np.float32)
         for part in along:
             squares = np.minimum(squares, _squares(cells + part, places))

@@ -5,7 +5,7 @@ into (`looks`).
 """
 
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -60,10 +60,18 @@ class Tracker:
         print(len(now.tracks), now.misfit)
     """
 
-    def __init__(self, tracker: ContactFilter, settings: TrackerSettings, area: float, field: GainField):
-        self.filter, self.events, self.field = tracker, Events(settings, area), field
+    def __init__(
+        self, tracker: ContactFilter, presses: ContactFilter, settings: TrackerSettings, area: float, field: GainField
+    ):
+        """`presses`: the filter of single presses, which reaches farther; `area`: of the skin, m^2."""
+        self.filter, self.of_presses, self.events, self.field = tracker, presses, Events(settings, area), field
         self.area = area
         self._settings, self.programs = settings, Programs(tracker)
+
+    @cached_property
+    def press_programs(self) -> Programs:
+        """The programs of single presses."""
+        return Programs(self.of_presses)
 
     @property
     def settings(self) -> TrackerSettings:
@@ -193,9 +201,9 @@ class Tracker:
         return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
 
     def _updated(self, belief: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
-        """A careful update, as of a contact that begins."""
-        attempt = self.programs.completed(belief, frame, pads, PRESS_STEPS)
-        return self.programs.concluded(belief, frame, pads, attempt)
+        """A careful update, as of a contact that begins, by the filter of single presses."""
+        attempt = self.press_programs.completed(belief, frame, pads, PRESS_STEPS)
+        return self.press_programs.concluded(belief, frame, pads, attempt)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
@@ -337,5 +345,5 @@ def prepare_tracker(
     require_known("prepare_tracker", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or TrackerSettings()
     sheet = sheet_of(model, untouched, sigma, channels)
-    tracker, field = prepare_filter(model, skin, settings, noise, sheet, channels)
-    return Tracker(tracker, settings, float(np.sum(np.asarray(model.areas))), field)
+    tracker, presses, field = prepare_filter(model, skin, settings, noise, sheet, channels)
+    return Tracker(tracker, presses, settings, float(np.sum(np.asarray(model.areas))), field)
