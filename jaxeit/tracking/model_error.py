@@ -14,12 +14,15 @@ from .._compile import require_known
 from ..imaging.noise import InverseError
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
-from .tracker import Tracker
+from .looks import is_finite
+from .tracker import PRESS_STEPS, Tracker
 
 # Model errors that are tried: each is larger than the one before by this factor, up to the last.
 STEP, LAST = 2**0.5, 0.15
 # Share of the presses whose model error is no larger than that of the tracker.
 SHARE = 0.9
+# Numbers of frames that an error names.
+SHOWN = 10
 
 
 def fit_model_error(
@@ -33,15 +36,16 @@ def fit_model_error(
     Mesh, contact layer and loads of a real skin are not those of the model. A tracker that takes the model for better
     than it is explains what the model leaves of a press by further contacts. Here one contact is fitted to each frame
     under each of some model errors, from that of the settings on, until the evidence of the frame falls (empirical
-    Bayes; MacKay 1992, Neural Computation 4, 415). Presses differ: near an electrode a model may err ten times as
-    much as elsewhere, and the tracker must not err there either.
+    Bayes; MacKay 1992, Neural Computation 4, 415). Frames for which no such fit converges are left out. Presses differ:
+    near an electrode a model may err ten times as much as elsewhere, and the tracker must not err there either.
 
     Args:
         dv: difference frames, (n, readings) V, in each of which one contact presses, as means over holds.
         pad_forces, pad_errors: forces on the pads and their standard errors, (n, pads) N, as for `Tracker.step`.
 
     Raises:
-        InverseError: if there is no frame, an array has another shape, or jit hides the values.
+        InverseError: if there is no frame, an array has another shape, the fit of one contact converges for half of the
+            frames or less, or jit hides the values.
 
     Example:
         presses = jnp.stack(frames[:2])  # one contact in each
@@ -54,7 +58,14 @@ def fit_model_error(
     last = max(0, int(np.ceil(np.log(LAST / least) / np.log(STEP))))
     tried = cache(lambda k: _with_model_error(tracker, least * STEP**k))  # most presses ask for the first few
     found = [_most_probable(tried, last, *one) for one in seen]
-    return tried(int(np.quantile(found, SHARE, method="higher")))
+    fitted = [k for k in found if k is not None]
+    if 2 * len(fitted) <= len(found):
+        failed = [number for number, k in enumerate(found) if k is None]
+        raise InverseError(
+            f"one contact is fitted to {len(fitted)} of {len(found)} frames, and its fit does not converge for frames "
+            f"{failed[:SHOWN]}; give frames in each of which one contact presses and rests"
+        )
+    return tried(int(np.quantile(fitted, SHARE, method="higher")))
 
 
 def press_evidence(
@@ -93,32 +104,46 @@ def _seen(
 
 def _most_probable(
     tried: Callable[[int], Tracker], last: int, frame: Float[np.ndarray, " readings"], pads: Pads
-) -> int:
-    """Which of the trackers 0 to ``last`` makes a frame most probable; the evidence falls from there on."""
-    best = _evidence(tried(0), frame, pads)
-    for k in range(last):
-        evidence = _evidence(tried(k + 1), frame, pads)
-        if evidence < best:
-            return k
-        best = evidence
-    return last
+) -> int | None:
+    """Which of the trackers 0 to ``last`` makes a frame most probable; the evidence falls from there on.
+
+    None if no fit converges.
+    """
+    best, most = None, -np.inf
+    for k in range(last + 1):
+        evidence = _evidence(tried(k), frame, pads)
+        if evidence < most:
+            break
+        if evidence > most:
+            best, most = k, evidence
+    return best
 
 
 def _with_model_error(tracker: Tracker, error: float) -> Tracker:
     settings = replace(tracker.settings, loads=replace(tracker.settings.loads, model_error=error))
     value = jnp.asarray(error, tracker.filter.model_error.dtype)
-    changed = (eqx.tree_at(lambda f: f.model_error, one, value) for one in (tracker.filter, tracker.of_presses))
-    return Tracker(*changed, settings, tracker.area, tracker.field)
+    filters = tracker.filter, tracker.of_presses
+    followed, single = (eqx.tree_at(lambda one: one.model_error, each, value) for each in filters)
+    return Tracker(followed, single, settings, tracker.area, tracker.field)
 
 
 def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads) -> float:
     """Log of the probability of a frame with one contact, up to a constant that all model errors share.
 
-    The contact begins as contacts of the tracker do. Where its fit then ends elsewhere, a tracker that believes its
-    model less goes less astray.
+    The contact begins where the fit of a single press has found it, which tries several places: a fit that ends
+    elsewhere, or does not converge, would ask for a larger error of the model only to be led less astray. Where no fit
+    converges the probability counts as zero.
     """
     programs, before = tracker.programs, tracker.start().belief
+    press = tracker.press_update(before, frame, pads)
+    if not (is_finite(press) and press.converged):
+        return -np.inf
+    begin = tracker.events.with_contact(before, np.asarray(press.belief.contacts)[0, :2])
+    # The frames of a tracker reach less far than a single press, and the error is to hold what that leaves out.
+    attempt = programs.completed(begin, frame, pads, PRESS_STEPS)
+    update = programs.concluded(begin, frame, pads, attempt)
+    if not (is_finite(update) and update.converged):
+        return -np.inf
     left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
-    belief = tracker.events.with_contact(before, programs.explaining_place(left))
     share = 1 - float(tracker.filter.error_share) * float(left @ left) / len(left)  # 1 / s^2
-    return float(programs.completed(belief, frame, pads).evidence) + 0.5 * len(left) * float(np.log(share))
+    return float(update.evidence) + 0.5 * len(left) * float(np.log(share))

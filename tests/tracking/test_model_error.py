@@ -6,8 +6,9 @@ import pytest
 from scipy.stats import chi2
 
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import fit_model_error, press_evidence
+from jaxeit.tracking import fit_model_error, model_error, press_evidence
 from jaxeit.tracking.belief.filter import SIZE
+from jaxeit.tracking.belief.programs import Programs
 from jaxeit.tracking.model_error import STEP
 
 from .conftest import SECONDS, load
@@ -46,6 +47,36 @@ def test_the_error_that_was_made_is_found(tracker, humble, presses):
     truth = np.median([np.linalg.norm(error) / np.linalg.norm(signal) for error, signal in zip(*parts, strict=True)])
     assert truth / STEP < humble.settings.loads.model_error < truth * STEP**2
     assert float(humble.filter.model_error) == pytest.approx(humble.settings.loads.model_error)
+
+
+def test_a_fit_that_begins_at_the_wrong_place_asks_for_no_error(tracker, presses, monkeypatch):
+    """A press between bolts is found from another place: the model is right, and its error stays the least."""
+    expected = fit_model_error(tracker, presses[:2]).settings.loads.model_error
+    best = Programs.explaining_places
+    wrong = np.array([0.02, 0.18])
+    monkeypatch.setattr(Programs, "explaining_place", lambda self, left: wrong)
+    monkeypatch.setattr(Programs, "explaining_places", lambda self, left: iter([wrong, *best(self, left)]))
+    assert fit_model_error(tracker, presses[:2]).settings.loads.model_error == expected
+
+
+def test_frames_whose_fit_does_not_converge_are_left_out_or_refused(tracker, presses, monkeypatch):
+    wild, whole = np.full(presses.shape[1], np.nan), model_error._evidence
+
+    def evidence(tracker, frame, pads):
+        return -np.inf if np.isnan(frame).all() else whole(tracker, frame, pads)
+
+    monkeypatch.setattr(model_error, "_evidence", evidence)
+    least = fit_model_error(tracker, presses[:2]).settings.loads.model_error
+    assert fit_model_error(tracker, np.array([wild, *presses[:2]])).settings.loads.model_error == least
+    with pytest.raises(InverseError, match=r"fitted to 1 of 3 frames, .* does not converge for frames \[0, 2\]"):
+        fit_model_error(tracker, np.array([wild, presses[0], wild]))
+
+
+def test_a_fit_that_has_not_converged_has_no_probability(tracker, presses, monkeypatch):
+    frame, pads = tracker.frame(presses[0]), tracker.pads(None, None)
+    assert np.isfinite(model_error._evidence(tracker, frame, pads))
+    monkeypatch.setattr(model_error, "PRESS_STEPS", 1)  # for the second fit, from the place that was found
+    assert model_error._evidence(tracker, frame, pads) == -np.inf
 
 
 @pytest.mark.slow
