@@ -10,7 +10,15 @@ import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
 from calib.calibration.application import FORMAT, LOADS, TRACKS
-from calib.calibration.localisation.contact_tracks import ABOUT, MIN_SECONDS, PAD_SHARE, ContactTracks, pad_errors
+from calib.calibration.localisation import contact_tracks
+from calib.calibration.localisation.contact_tracks import (
+    ABOUT,
+    MIN_SECONDS,
+    PAD_SHARE,
+    ContactTracks,
+    NotFollowed,
+    pad_errors,
+)
 from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, MOST
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
@@ -45,6 +53,18 @@ class FakeTracker(Tracker):
     def step(self, now, change, seconds, force, error):
         self.seconds.append(seconds)
         return self._after(int(np.nan_to_num(change[0])), 1e-3 * len(self.seconds))
+
+
+def test_presses_to_which_no_contact_is_fitted_are_named(monkeypatch):
+    """As recordings of contacts cannot be followed that the calibration's own presses do not show."""
+
+    def refuse(*_):
+        raise je.imaging.InverseError("one contact is fitted to 0 of 24 frames")
+
+    monkeypatch.setattr(je.tracking, "fit_model_error", refuse)
+    monkeypatch.setattr(contact_tracks, "probe_presses", lambda _: (np.zeros((24, 3)),) * 3)
+    with pytest.raises(NotFollowed, match="do not tell how far the model errs: one contact is fitted to 0 of 24"):
+        contact_tracks._with_model_error(FakeTracker(), None)
 
 
 def test_rows_are_the_contacts_of_each_frame():

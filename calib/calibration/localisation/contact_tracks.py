@@ -41,7 +41,7 @@ def prepare_calibrated_tracker(
         noise: standard deviation of the readings of a frame, V; readings without noise are left out.
 
     Raises:
-        NotFollowed: if the noise is not known.
+        NotFollowed: if the noise is not known, or the presses of the calibration do not tell the model error.
     """
     if noise is None:
         raise NotFollowed("no frames without contact tell the noise")
@@ -52,8 +52,18 @@ def prepare_calibrated_tracker(
     sheet, _ = fit_untouched_sheet(model, untouched, channels)
     noise = np.where(channels, noise, 1.0)
     tracker = je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=sheet, channels=channels)
+    return _with_model_error(tracker, calibration)
+
+
+def _with_model_error(tracker: Tracker, calibration: Calibration) -> Tracker:
+    """The tracker with the model error that presses of the calibration show, or its own where the file has none."""
     presses = probe_presses(calibration)
-    return tracker if presses is None else je.tracking.fit_model_error(tracker, *presses)
+    if presses is None:
+        return tracker
+    try:
+        return je.tracking.fit_model_error(tracker, *presses)
+    except je.imaging.InverseError as error:
+        raise NotFollowed(f"the presses of the calibration do not tell how far the model errs: {error}") from error
 
 
 def quiet_tracker(calibration: Calibration, blocks: FrameBlocks) -> Tracker:
