@@ -3,6 +3,7 @@
 import ctypes
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache, lru_cache, partial, wraps
 from importlib import import_module
 from itertools import chain
@@ -58,7 +59,8 @@ def verb(function: F) -> F:
     def call(*args: Any, **kwargs: Any) -> Any:
         if _is_transformed(args, kwargs):
             return inner(*args, **kwargs)
-        return outer(changes_of_folder())(*args, **kwargs)
+        with _plain_precision():
+            return outer(changes_of_folder())(*args, **kwargs)
 
     return call  # type: ignore[return-value]
 
@@ -75,6 +77,13 @@ def full_precision(function: F) -> F:
             return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def _plain_precision() -> AbstractContextManager[Any]:
+    """Within functions of full precision a verb is the program that it is elsewhere, since the verb says so itself."""
+    settings: Any = jax.config  # its type leaves out the settings
+    plain: AbstractContextManager[Any] = nullcontext()
+    return jax.default_matmul_precision(None) if settings.jax_default_matmul_precision == "highest" else plain
 
 
 def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | None = None) -> Callable[..., T]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import lineax  # noqa: F401, gives stop_gradient its transpose rule, as every use of optimistix does
 import numpy as np
 import pytest
+from jax import monitoring
 
 import jaxeit as je
 from jaxeit import _compile as verbs
@@ -42,6 +43,26 @@ def test_a_verb_of_constants_inside_a_program(first_call):
     """No argument tells that a program is being made; options are for whole programs only."""
     constant = jnp.ones(3)
     assert float(jax.jit(lambda y: double(constant)[0] + y)(1.0)) == 3.0
+
+
+def test_a_verb_is_one_program_within_functions_of_full_precision():
+    compiled: list[str] = []
+
+    def listen(event, _, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(about["fun_name"])
+
+    @verbs.verb
+    def triple(x):
+        return 3 * x
+
+    monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for function in (triple, verbs.full_precision(triple)):
+            np.testing.assert_array_equal(function(jnp.ones(7)), 3)
+    finally:
+        monitoring.unregister_event_duration_listener(listen)
+    assert compiled.count("jit(triple)") == 1
 
 
 def test_options_that_xla_does_not_know_are_left_out(first_call, monkeypatch):

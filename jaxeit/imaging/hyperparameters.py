@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .._compile import full_precision
+from .._compile import verb
 from ..linalg.lapack import eigh
 from ..registry import AbstractChoice, Registry, limited
 from .methods import Problem
@@ -58,8 +58,7 @@ class Spectrum(eqx.Module):
         return _RANGE, 1 / (self.squares + jnp.asarray(_RANGE, self.squares.dtype)[:, None] ** 2)
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def spectrum(problem: Problem) -> Spectrum:
     """The eigenvectors and eigenvalues that all choices use."""
     gained = problem.precision().solve(problem.jacobian.T)

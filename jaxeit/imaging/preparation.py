@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import full_precision, is_traced
+from .._compile import full_precision, is_traced, verb
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
@@ -188,8 +188,7 @@ def _traced(choice: T, dtype: np.dtype) -> T:
     return found
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def _build(
     problem: Problem,
     method: AbstractLinearMethod,

@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from .._compile import compiler_options, full_precision, is_traced, require_known, usually
+from .._compile import compiler_options, full_precision, is_traced, require_known, usually, verb
 from ..linalg.array_libraries import JAX
 from ..model.bases import AbstractPictured, Picture
 from ..notebook import card, picture
@@ -241,8 +241,7 @@ class Reconstructor(AbstractReconstructor):
         return replace(_without(self, used), provenance=self.provenance)
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def _without(recon: Reconstructor, used: Bool[Array, " readings"]) -> Reconstructor:
     found, gram = without_readings(recon.whitening, used)
     predict, factor = removed(JAX, gram, recon.predict, recon.factor)

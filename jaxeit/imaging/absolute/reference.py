@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 from scipy.linalg import block_diag
 
-from ..._compile import full_precision
+from ..._compile import full_precision, verb
 from ...effects import CommonMode, chosen
 from ...least_squares import Cholesky, ImplicitStep, LevenbergMarquardt
 from ...linalg.lapack import eigh
@@ -317,8 +317,7 @@ class _Problem(eqx.Module):
         return (1 + parts.gain[self.channel]) * readings + parts.offset[self.channel]
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def _most_probable(
     problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"], start: Float[Array, " k"]
 ) -> tuple[Float[Array, " k"], Float[Array, ""], Bool[Array, ""]]:
@@ -344,8 +343,7 @@ def _most_probable(
     return found.value, misfit, jnp.asarray(found.result == optx.RESULTS.successful)
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def _described(
     problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"], x: Float[Array, " k"]
 ) -> tuple[ReferenceFit, Float[Array, " readings"]]:
