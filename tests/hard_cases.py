@@ -179,9 +179,14 @@ def merge(rows: list[Row]) -> list[Row]:
 
 
 def _merged(case: str, rows: list[Row]) -> Row:
-    reached, beyond = ("; ".join(sorted({getattr(r, field) for r in rows})) for field in ("reached", "beyond"))
+    reached, beyond = (_together({getattr(r, field) for r in rows}) for field in ("reached", "beyond"))
     float64, float32, naive = (worst([getattr(r, field) for r in rows]) for field in ("float64", "float32", "naive"))
     return Row(case, reached, float64, float32, naive, beyond)
+
+
+def _together(texts: set[str]) -> str:
+    """All parts of the texts, each once."""
+    return "; ".join(dict.fromkeys(part for text in sorted(texts) for part in text.split("; ")))
 
 
 def worst(errors: list[float | None]) -> float | None:

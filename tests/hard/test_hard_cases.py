@@ -90,11 +90,12 @@ def test_rows_of_a_case_merge_to_the_worst_in_any_order():
     rows = [
         Row("b", "1e3", 1e-9, None, 0.1, "an error"),
         Row("a", "2", None, None, None, "nothing"),
-        Row("b", "1e4", 1e-12, 1e-3, math.nan, "an error"),
+        Row("b", "1e4", 1e-12, 1e-3, math.nan, "an error; no file"),
     ]
-    merged = [Row("a", "2", None, None, None, "nothing"), Row("b", "1e3; 1e4", 1e-9, 1e-3, math.inf, "an error")]
+    beyond = "an error; no file"
+    merged = [Row("a", "2", None, None, None, "nothing"), Row("b", "1e3; 1e4", 1e-9, 1e-3, math.inf, beyond)]
     assert merge(rows) == merge(rows[::-1]) == merged
-    assert table(merged).splitlines()[-1] == "| b | 1e3; 1e4 | 1e-09 | 1e-03 | not finite | an error |"
+    assert table(merged).splitlines()[-1] == f"| b | 1e3; 1e4 | 1e-09 | 1e-03 | not finite | {beyond} |"
     assert worst([None]) is None
 
 
