@@ -61,7 +61,7 @@ def follow_commands(text, served_words):
         elif words[:1] == ["jaxeit"] and any("tcp://" in word for word in words):
             with served(served_words) as urls:
                 given = [urls.get(before, word) for before, word in pairwise(words)]
-                limits = {"live": ["--port", "0", "--seconds", "40"], "record": ["--seconds", "2"]}[given[0]]
+                limits = {"live": ["--port", "0", "--seconds", "90"], "record": ["--seconds", "2"]}[given[0]]
                 assert main([*given, *limits]) == 0, line
         elif words[:1] == ["jaxeit"]:
             assert main(words[1:]) == 0, line

@@ -55,18 +55,24 @@ RUN = {
 """The test that runs the blocks of each language, or of each name, of each page."""
 
 OTHER_COMMANDS = {
+    "CONTRIBUTING.md": ("make lint", "make docs"),
     "README.md": ("make demo", "make test"),  # the latter by .ci/run
     "docs/live.md": ("rerun --bind 127.0.0.1 &",),
     "docs/own-skin.md": ("make demo", ". .venv/bin/activate", "mkdir my-skin && cd my-skin", "sed -e "),
-    "docs/release.md": ("sed -i ",),
+    "docs/release.md": (
+        "sed -i ",
+        "python -m build",
+        "git checkout README.md",
+        "tar xzf dist/",
+        "make -C /tmp/jaxeit-* test",
+    ),
 }
 """How commands begin that are not those of jaxeit, and that a test runs."""
 
 NOT_RUN = {
-    "CONTRIBUTING.md": ("make test", "make slow", "make pages", "make lint", "make docs"),
+    "CONTRIBUTING.md": ("make test", "make slow", "make pages"),
     "benchmarks/README.md": ("python -m benchmarks",),
     "docs/lerobot.md": ("lerobot-record ",),
-    "docs/release.md": ("python -m build", "git checkout README.md", "tar xzf dist/", "make -C /tmp/jaxeit-* test"),
 }
 """How commands begin that no test runs; each page says so."""
 
