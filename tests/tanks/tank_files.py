@@ -24,7 +24,8 @@ def change_on_mesh(path, mesh, electrodes, hyperparameter):
     """Change between the two frames of a file by NOSER, for each triangle of a mesh of a disc of radius 1."""
     tank = load_tank(path, je.Disc(1.0), rim=electrodes)
     basis = je.Elements()
-    found = difference_image(replace(tank, mesh=mesh), prior=je.Noser(), basis=basis, hyperparameter=hyperparameter)
+    weight = float(hyperparameter)
+    found = difference_image(replace(tank, mesh=mesh), prior=je.Noser(), basis=basis, hyperparameter=weight)
     return found.change
 
 
