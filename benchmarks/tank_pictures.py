@@ -8,7 +8,6 @@ python -m benchmarks.tank_pictures TABLE.csv     # needs Octave with EIDORS, and
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -34,7 +33,6 @@ RADIUS = 0.03  # m, that of the tank; discs of the other programs have 1
 LIMIT = 1.0  # change at which the colours end
 SAVED = "picture.mat"
 SHOWN = (1, 5, 9, 13)  # electrodes with a number
-BEGIN = "run([getenv('EIDORS') '/startup.m']); set(0, 'defaultfigurevisible', 'off');\n"
 END = f"""
 fmdl = imdl.fwd_model; at = [fmdl.electrode.nodes]; change = change.elem_data;
 nodes = fmdl.nodes; elems = fmdl.elems; save('-v7', '{SAVED}', 'nodes', 'elems', 'at', 'change')
@@ -60,12 +58,7 @@ def program(language: str, title: str = "") -> str:
 
 
 def by_eidors(folder: Path) -> Image:
-    (folder / "page.m").write_text(BEGIN + program("matlab") + END, encoding="utf-8")
-    home = str(Path(os.environ["EIDORS"]).resolve())
-    words = ["octave-cli", "--norc", "--quiet", "page.m"]
-    done = subprocess.run(
-        words, cwd=folder, env=os.environ | {"EIDORS": home}, input="\n", capture_output=True, text=True, check=False
-    )
+    done = eidors.run_program(folder, program("matlab") + END)
     if not (folder / SAVED).exists():
         raise SystemExit(f"Octave ended without an image: {done.stderr[-500:]}")
     saved = loadmat(folder / SAVED)

@@ -1,8 +1,6 @@
 """What the pages let users of EIDORS write runs in EIDORS itself, under GNU Octave; the numbers are ours."""
 
-import os
 import shutil
-import subprocess
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ from scipy.io import loadmat
 
 import calib
 import jaxeit as je
-from benchmarks.peers.eidors import missing
+from benchmarks.peers.eidors import missing, run_program
 
 from .tanks.rods import PLACE, RADIUS, tank_with_rod
 from .tanks.tank_files import change_on_mesh, write_csv
@@ -21,8 +19,6 @@ from .test_tutorials import close
 WHY = missing() or (None if shutil.which("gnuplot") else "gnuplot, with which Octave draws, is not on PATH")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(WHY is not None, reason=str(WHY))]
 BEGIN = """
-run([getenv('EIDORS') '/startup.m']);
-set(0, 'defaultfigurevisible', 'off');
 save_default_options('-mat7-binary');  % that of MATLAB
 """
 TANK = """
@@ -46,12 +42,7 @@ def folder(root, tmp_path_factory):
     recorded, with_model, without = matlab(root / "docs" / "tanks.md")
     write_csv(folder / "tank_55uA_1000Hz.csv", tank_with_rod().frames)
     script = "".join([BEGIN, recorded, TANK, task, "fmdl = imdl.fwd_model;\n", with_model, without, END])
-    (folder / "pages.m").write_text(script, encoding="utf-8")
-    home = os.path.abspath(os.environ["EIDORS"])
-    command = ["octave-cli", "--norc", "--quiet", "pages.m"]
-    done = subprocess.run(
-        command, cwd=folder, env=os.environ | {"EIDORS": home}, input="\n", capture_output=True, text=True, check=False
-    )
+    done = run_program(folder, script)
     assert (folder / "image.mat").exists(), done.stdout + done.stderr
     return folder
 

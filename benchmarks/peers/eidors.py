@@ -33,6 +33,15 @@ def missing() -> str | None:
     return None
 
 
+def run_program(folder: Path, program: str) -> subprocess.CompletedProcess[str]:
+    """Run a program of EIDORS's users in a folder, without windows."""
+    begin = "run([getenv('EIDORS') '/startup.m']); set(0, 'defaultfigurevisible', 'off');\n"
+    (folder / "program.m").write_text(begin + program, encoding="utf-8")
+    command = ["octave-cli", "--norc", "--quiet", "program.m"]
+    env = os.environ | {"EIDORS": str(Path(os.environ["EIDORS"]).resolve())}
+    return subprocess.run(command, cwd=folder, env=env, input="\n", capture_output=True, text=True, check=False)
+
+
 class Eidors:
     """A tool that has Octave at work; `last_seconds` is what Octave measured around its last call.
 
