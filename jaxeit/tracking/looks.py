@@ -196,6 +196,11 @@ def is_finite(update: Update) -> bool:
     return all(bool(np.isfinite(np.asarray(one)).all()) for one in numbers)
 
 
+def has_ended(update: Update) -> bool:
+    """Whether an update can be believed, and has converged."""
+    return is_finite(update) and bool(update.converged)
+
+
 def without_contacts(now: Tracking) -> Tracking:
     """No contact is believed in any longer; the gain stays known."""
     left = _as_is(now)

@@ -14,8 +14,9 @@ from .._compile import require_known
 from ..imaging.noise import InverseError
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
-from .looks import is_finite
-from .tracker import PRESS_STEPS, Tracker
+from .looks import has_ended
+from .preparation import MESH_GAIN
+from .tracker import Tracker
 
 # Model errors that are tried: each is larger than the one before by this factor, up to the last.
 STEP, LAST = 2**0.5, 0.15
@@ -124,7 +125,8 @@ def _with_model_error(tracker: Tracker, error: float) -> Tracker:
     value = jnp.asarray(error, tracker.filter.model_error.dtype)
     filters = tracker.filter, tracker.of_presses
     followed, single = (eqx.tree_at(lambda one: one.model_error, each, value) for each in filters)
-    return Tracker(followed, single, settings, tracker.area, tracker.field)
+    field = replace(tracker.field, mesh_error=MESH_GAIN * error)
+    return Tracker(followed, single, settings, tracker.area, field)
 
 
 def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pads) -> float:
@@ -136,13 +138,12 @@ def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pad
     """
     programs, before = tracker.programs, tracker.start().belief
     press = tracker.press_update(before, frame, pads)
-    if not (is_finite(press) and press.converged):
+    if not has_ended(press):
         return -np.inf
     begin = tracker.events.with_contact(before, np.asarray(press.belief.contacts)[0, :2])
     # The frames of a tracker reach less far than a single press, and the error is to hold what that leaves out.
-    attempt = programs.completed(begin, frame, pads, PRESS_STEPS)
-    update = programs.concluded(begin, frame, pads, attempt)
-    if not (is_finite(update) and update.converged):
+    update = programs.careful(begin, frame, pads)
+    if not has_ended(update):
         return -np.inf
     left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
     share = 1 - float(tracker.filter.error_share) * float(left @ left) / len(left)  # 1 / s^2

@@ -16,6 +16,7 @@ from ..contacts.loads.preparation import field_modes
 from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
+from ..imaging.absolute.background import UntouchedSheet
 from ..imaging.noise import whitened_readings
 from ..linalg.base import on_device
 from ..model.bases import Pixels
@@ -24,6 +25,7 @@ from ..model.forward_model import conductivity
 from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
+from .belief.apparent_gain import apparent_gain
 from .belief.filter import PLACE, SIZE, ContactFilter
 from .belief.layer import GainField
 from .belief.reanalysis import prepare_reanalysis
@@ -35,6 +37,9 @@ GRID = 20
 # How many times as many modes, unknowns and pixels the fit of a single press takes as a frame that is followed. Such a
 # fit may end a centimetre from where it began, and is not done again there: what it left out it would take for gain.
 PRESS_REACH = 2.5
+# Log gain that what a mesh errs by at a place looks like, to the model error: a contact's signal errs by about as much,
+# and its place and width take part of that away and add to the rest.
+MESH_GAIN = 2.0
 # Share of the variance of an unknown coat that its modes hold.
 COAT_VARIANCE = 0.99
 # Usual loads along each side of the sheet, of which an unknown coat changes the signal.
@@ -49,11 +54,11 @@ def prepare_filter(
     skin: Skin,
     settings: TrackerSettings,
     noise: Float[ArrayLike, "..."],
-    sigma: Float[Array, " elements"] | None,
+    untouched: UntouchedSheet | None,
     channels: Bool[ArrayLike, " readings"] | None,
 ) -> tuple[ContactFilter, ContactFilter, GainField]:
     """The filter of a skin, that of single presses, and the gain before any contact; see `prepare_tracker`."""
-    loads = settings.loads
+    loads, sigma = settings.loads, None if untouched is None else untouched.sigma
     found = whitened_readings(model, noise, channels)
     finder = prepare_contacts(model, ContactSettings(most=1), noise=noise, sigma=sigma, channels=channels)
     # E C^T = 1, so that the directions which the finder kept are its rows times C^T.
@@ -77,6 +82,9 @@ def prepare_filter(
         spread=put([PLACE, PLACE, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,
     )
+    doubted = sheet if untouched is None else with_errors(sheet, model, untouched.errors)
+    by_sheet = apparent_gain(tracker, doubted, np.log([loads.width, loads.force]), loads.gain_length)
+    field = replace(field, sheet_error=by_sheet, mesh_error=MESH_GAIN * loads.model_error)
     return tracker, replace(tracker, sheet=replace(sheet, neighbours=around), active_modes=far.modes), field
 
 
@@ -96,7 +104,7 @@ def _loaded_sheet(
     total, covered = (np.asarray(fine.restrict(values)) for values in (sigma, jnp.ones_like(sigma)))
     background = np.divide(total, covered, out=np.zeros_like(total), where=covered > 0)  # 0 beside the sheet
     mean, masks, (points, weights) = (
-        _carried(model, sigma, coarse),
+        _carried(model, sigma, np.asarray(coarse.centroids, float)),
         pad_masks(skin, fine),
         points_of(coarse, loads.width),
     )
@@ -232,10 +240,19 @@ def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:
     return np.stack(sums, 1) / count[:, None]
 
 
-def _carried(model: Model, sigma: Float[Array, " elements"], other: Model) -> np.ndarray:
-    """A conductivity on the elements of another mesh of the same sheet: of the nearest element."""
-    near = cKDTree(np.asarray(model.centroids, float)).query(np.asarray(other.centroids, float))[1]
-    found: np.ndarray = np.asarray(sigma, float)[near]
+def with_errors(sheet: LoadedSheet, model: Model, errors: Float[np.ndarray, "elements c"]) -> LoadedSheet:
+    """The sheet with modes of its error, which are those on the elements of the model, in place of a coat's."""
+    coat = on_device(_carried(model, errors, np.asarray(sheet.points, float).mean(1)), sheet.sigma.dtype)
+    by_coat = sheet.sheet.slopes_along(sheet.sigma * coat.T, sheet.sheet.potential)
+    return replace(sheet, coat=coat, by_coat=by_coat)
+
+
+def _carried(
+    model: Model, values: Float[ArrayLike, "elements ..."], places: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n ..."]:
+    """Values of elements at places: of the nearest element."""
+    near = cKDTree(np.asarray(model.centroids, float)).query(places)[1]
+    found: np.ndarray = np.asarray(values, float)[near]
     return found
 
 

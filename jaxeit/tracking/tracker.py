@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known
-from ..imaging.absolute.background import sheet_of
+from ..imaging.absolute.background import UntouchedSheet, fitted_sheet, untouched_frame
 from ..imaging.noise import InverseError
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
@@ -26,6 +26,7 @@ from .looks import (
     begun,
     calmer,
     caught_up,
+    has_ended,
     is_finite,
     is_given_up,
     looked,
@@ -46,8 +47,6 @@ MOST_GAIN = 4.0
 WORSE = 1.3
 # Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
 UNSEEN = 0.01
-# Evaluations of the fit of a single press.
-PRESS_STEPS = 24
 
 
 class Tracker:
@@ -89,6 +88,7 @@ class Tracker:
         """
         layer = LearnedLayer.unknown(self.field) if layer is None else layer
         self.field.require_same(layer.field)
+        layer = layer._replace(field=self.field)  # what errors of sheet and mesh look like is known of this tracker
         return Tracking(self._untouched(layer), layer)
 
     def _untouched(self, layer: LearnedLayer) -> Belief:
@@ -195,15 +195,10 @@ class Tracker:
         """
         found: list[Update] = []
         for place in self.programs.explaining_places(self.programs.unexplained(before, frame, pads)):
-            found.append(self._updated(self.events.with_contact(before, place), frame, pads))
-            if is_finite(found[-1]) and bool(found[-1].converged) and not self._is_far(found[-1]):
+            found.append(self.press_programs.careful(self.events.with_contact(before, place), frame, pads))
+            if has_ended(found[-1]) and not self._is_far(found[-1]):
                 break
         return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
-
-    def _updated(self, belief: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
-        """A careful update, as of a contact that begins, by the filter of single presses."""
-        attempt = self.press_programs.completed(belief, frame, pads, PRESS_STEPS)
-        return self.press_programs.concluded(belief, frame, pads, attempt)
 
     def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
         if now.backlog is not None and is_given_up(now.backlog):
@@ -336,7 +331,8 @@ def prepare_tracker(
         model: of the skin; a draft suffices where the model's error is a hundredth of the signal.
         skin: whose pads tell forces.
         settings: default `TrackerSettings()`.
-        noise, untouched, sigma, channels: as for `prepare_contacts`.
+        noise, untouched, sigma, channels: as for `prepare_contacts`. The error of a sheet that is fitted to
+            ``untouched`` is in the deviations of the learned gain; ``sigma`` counts as exact.
 
     Raises:
         InverseError: as for `prepare_contacts`.
@@ -344,6 +340,8 @@ def prepare_tracker(
     require_model(model)
     require_known("prepare_tracker", InverseError, model, noise, untouched, sigma, channels)
     settings = settings or TrackerSettings()
-    sheet = sheet_of(model, untouched, sigma, channels)
+    frame = untouched_frame(model, untouched, sigma, channels)
+    sheet = None if sigma is None else UntouchedSheet(sigma, np.zeros((len(sigma), 0)))
+    sheet = sheet if frame is None else fitted_sheet(model, frame)
     tracker, presses, field = prepare_filter(model, skin, settings, noise, sheet, channels)
     return Tracker(tracker, presses, settings, float(np.sum(np.asarray(model.areas))), field)

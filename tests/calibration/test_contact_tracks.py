@@ -10,6 +10,7 @@ import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
 from calib.calibration.application import FORMAT, LOADS, TRACKS
+from calib.calibration.calibration import Calibration
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import (
     ABOUT,
@@ -65,6 +66,27 @@ def test_presses_to_which_no_contact_is_fitted_are_named(monkeypatch):
     monkeypatch.setattr(contact_tracks, "probe_presses", lambda _: (np.zeros((24, 3)),) * 3)
     with pytest.raises(NotFollowed, match="do not tell how far the model errs: one contact is fitted to 0 of 24"):
         contact_tracks._with_model_error(FakeTracker(), None)
+
+
+def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
+    """Else its error is in the deviations of the gain that is learned."""
+    asked, untouched = [], np.ones(3)
+
+    def prepare(model, skin, untouched=None, **options):
+        asked.append(untouched)
+        if untouched is not None and untouched[0] < 0:
+            raise je.imaging.InverseError("no coating explains v0")
+        return FakeTracker()
+
+    monkeypatch.setattr(je.tracking, "prepare_tracker", prepare)
+    monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
+    monkeypatch.setattr(je, "discretise", lambda *_: None)
+    calibration = stand_in(Calibration, recon=stand_in(je.Reconstructor, channels=untouched > 0), skin=skin)
+    for frame in (untouched, -untouched):
+        contact_tracks.prepare_calibrated_tracker(calibration, frame, untouched)
+    np.testing.assert_array_equal(asked[0], untouched)
+    np.testing.assert_array_equal(asked[1], -untouched)
+    assert asked[2:] == [None]
 
 
 def test_rows_are_the_contacts_of_each_frame():

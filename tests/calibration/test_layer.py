@@ -36,6 +36,7 @@ def layer():
     rng = np.random.default_rng(0)
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
     field = GainField.over(corners, rng.uniform(0, 0.2, (50, 2)), LoadSettings(gain_length=0.05), level=0.3)
+    field = replace(field, sheet_error=0.1 * rng.normal(size=(len(field.places), 4)), mesh_error=0.02)
     half = np.eye(len(field.places)) - 0.2
     return LearnedLayer.normal(field, rng.normal(size=len(half)), half @ half.T / len(half), 7)
 
@@ -129,6 +130,16 @@ def test_a_layer_of_an_early_version_is_read(calibration, layer, tmp_path):
         np.testing.assert_array_equal(getattr(found, name), getattr(layer, name))
 
 
+def test_a_layer_without_errors_of_sheet_and_mesh_is_read(calibration, layer, tmp_path):
+    path = tmp_path / "c.h5"
+    replace(calibration, layer=layer).save(path)
+    for name in ("sheet_error", "mesh_error"):
+        damage(path, f"layer/{name}", lambda a: None)
+    found = calib.load_calibration(path).layer
+    assert found.field.errors().sum() == 0
+    np.testing.assert_array_equal(found.covariance, layer.covariance)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
@@ -142,6 +153,9 @@ def test_a_layer_of_an_early_version_is_read(calibration, layer, tmp_path):
         ("places", lambda a: a[1:], "layer/places is float64 of shape"),
         ("evidence", lambda a: a * np.nan, "layer/evidence holds a number that is not finite"),
         ("evidence", lambda a: a[1:], "layer/evidence is float64 of shape"),
+        ("sheet_error", lambda a: a[1:], "layer/sheet_error is float64 of shape"),
+        ("sheet_error", lambda a: a * np.nan, "layer/sheet_error holds a number that is not finite"),
+        ("mesh_error", lambda a: -a, "layer/mesh_error holds -0.02, below zero"),
         ("length", lambda a: 0 * a, "layer/length holds a number that is not finite, or zero or less"),
         ("contacts", lambda a: a - 100, "layer/contacts is -93; nothing is learned from less than none"),
     ],
@@ -269,7 +283,9 @@ def test_live_goes_on_with_the_layer_and_writes_it(calibration, tracker, layer, 
 
 
 def test_a_line_tells_how_much_is_known(calibration, layer):
-    known = LearnedLayer.normal(layer.field, layer.mean, 0.25 * np.eye(len(layer.mean)), 7)
+    size = len(layer.mean)
+    exact = replace(layer.field, sheet_error=np.zeros((size, 0)), mesh_error=0.0)
+    known = LearnedLayer.normal(exact, layer.mean, 0.25 * np.eye(size), 7)
     line = render_layer(known, calibration.recon)
     assert "learned from 7 contacts; its uncertainty is 50 % of that before any contact" in line
 

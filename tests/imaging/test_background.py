@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.imaging.absolute.background import fit_background
+from jaxeit.imaging.absolute.background import coat_precision, even_coat, fit_background, fitted_sheet
 from jaxeit.imaging.noise import InverseError
 
 from ..helpers import require_identical, square_model
@@ -47,6 +47,23 @@ def test_the_field_is_found_whatever_the_gain_and_without_a_reading(model, untou
     found = [_log(model, fit_background(model, gain * untouched, columns=15)) for gain in (1.0, 3.0)]
     assert np.std(found[0] - truth) < 0.3 * np.std(truth)
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+
+
+def test_a_fitted_sheet_states_its_error(model):
+    """Coats of the prior, and readings that err by 1 %: intervals of 90 % hold the logarithm of the conductivity."""
+    physics = even_coat(model, je.forward(model), je.Pixels(20).on(model))
+    precision = np.asarray(coat_precision(physics.image, 0.03).matrix())
+    held = []
+    for seed in range(3):
+        rng = np.random.default_rng([31, seed])
+        x = 0.15 * np.linalg.solve(np.linalg.cholesky(precision).T, rng.normal(size=len(precision)))
+        v0 = physics.voltages(jnp.asarray(x))
+        found = fitted_sheet(model, v0 * (1 + 0.01 * rng.normal(size=len(v0))))
+        error = np.log(np.asarray(found.sigma / physics.sigma(jnp.asarray(x))))
+        deviation = np.linalg.norm(found.errors, axis=1)
+        assert 0.01 < np.median(deviation) < 0.05
+        held.append(np.average(np.abs(error) < 1.645 * deviation, weights=np.asarray(model.areas)))
+    assert 0.83 < np.mean(held) < 0.95
 
 
 @pytest.mark.slow

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
+import jaxeit as je
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import GainField, LearnedLayer, prepare_tracker
+from jaxeit.tracking.belief.apparent_gain import apparent_gain
 from jaxeit.tracking.belief.layer import OUTLIER, PRESS_VARIANCES
 from jaxeit.tracking.belief.programs import APART
-from jaxeit.tracking.belief.response import Near
+from jaxeit.tracking.belief.response import Near, load_pressure
+from jaxeit.tracking.preparation import with_errors
 from jaxeit.tracking.tracker import MOST_GAIN, bounded
 
 from .conftest import SECONDS, load
@@ -171,8 +174,10 @@ def test_the_gain_for_fits_of_loads_is_that_of_the_next_press(layer):
     mean, modes, covariance = layer.over(points)
     of_layer, deviation = layer.at(points)
     np.testing.assert_array_equal(mean, of_layer)
+    of_readings = layer._replace(field=replace(layer.field, mesh_error=0.0)).at(points)[1]
+    assert (deviation > of_readings).all()  # what the mesh errs by tells forces as gain does
     effect = layer.press_variance * (modes**2).sum(1)
-    np.testing.assert_allclose(((modes @ covariance) * modes).sum(1), deviation**2 + effect)
+    np.testing.assert_allclose(((modes @ covariance) * modes).sum(1), of_readings**2 + effect)
 
 
 def test_what_was_learned_tells_the_force_without_pads(tracker, frame_of, layer):
@@ -203,6 +208,12 @@ def test_learning_goes_on_where_it_ended(tracker, layer):
     assert again.contacts == layer.contacts
 
 
+def test_a_layer_has_its_trackers_own_errors_of_sheet_and_mesh(tracker, layer):
+    """It may have been learned with another fit of the sheet, or under another model error."""
+    other = layer._replace(field=replace(layer.field, mesh_error=0.5))
+    assert tracker.start(other).layer.field is tracker.field
+
+
 def test_ageing_leads_back_to_the_prior(layer):
     half, gone = layer.aged(0.5), layer.aged(1.0)
     np.testing.assert_allclose(half.means, 0.5 * layer.means)
@@ -221,7 +232,15 @@ def test_a_layer_of_another_sheet_is_refused(tracker, layer):
             tracker.start(layer._replace(field=field))
 
 
-SMALL = GainField(np.concatenate([np.full((1, 2), np.inf), np.zeros((7, 2))]), 0.015, 0.3, 0.12, 1.0)
+SMALL = GainField(
+    places=np.concatenate([np.full((1, 2), np.inf), np.zeros((7, 2))]),
+    length=0.015,
+    level=0.3,
+    deviation=0.12,
+    norm=1.0,
+    sheet_error=np.zeros((8, 0)),
+    mesh_error=0.0,
+)
 NOISE = 0.05  # of what a press tells of the gain under it
 SEEDS, INTERVAL = 40, 1.645  # layers, and standard deviations in half a 90 % interval
 
@@ -277,6 +296,57 @@ def test_how_far_presses_differ_is_learned_and_the_layer_states_its_error(varian
     assert 0.7 < np.mean(squares) < 1.4
 
 
+def test_errors_that_all_presses_share_are_in_the_deviation():
+    """Sheet and mesh look like gain: presses tell the sum, and intervals of 90 % are to hold the gain itself."""
+    rng = np.random.default_rng(705)
+    field = replace(SMALL, sheet_error=0.2 * rng.normal(size=(8, 3)), mesh_error=0.3 * SMALL.deviation)
+    points = np.stack([np.linspace(0, 0.02, 5), np.zeros(5)], 1)
+    told = SMALL.modes_at(points)
+    found = []
+    for seed in range(3 * SEEDS):
+        errors = field.errors() @ np.random.default_rng([706, seed]).normal(size=3 + 7)
+        for layer, shown in after_presses(np.random.default_rng([707, seed]), (30,), 0.01):
+            for known in (SMALL, field):  # without these errors, and with them
+                mean, deviation = layer._replace(field=known).at(points)
+                found.append(np.abs(mean - told @ (shown - errors)) < INTERVAL * deviation)
+    without, covered = np.mean(found[::2]), np.mean(found[1::2])
+    assert without < 0.7
+    assert 0.85 < covered < 0.95
+
+
+def test_errors_of_sheet_and_mesh_do_not_matter_where_nothing_was_told():
+    field = replace(SMALL, sheet_error=np.ones((8, 2)), mesh_error=0.1)
+    layer = LearnedLayer.unknown(field)
+    np.testing.assert_allclose(layer.true_covariance, np.eye(8), atol=1e-14)
+    flat = replace(field, deviation=0.0)
+    np.testing.assert_array_equal(flat.errors(), np.concatenate([np.ones((8, 2)), np.zeros((8, 7))], 1))
+
+
+def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
+    """The true gain is one everywhere. On one side of the sheet the conductivity is 2 % higher than the tracker's sheet
+    has it, and as much lower on the other. Presses of known force then teach the gain that is foreseen."""
+    error, sheet = 0.02 * np.sin(np.pi * (np.asarray(model.centroids)[:, 0] - 0.1) / 0.2), tracker.filter.sheet
+    loads, true = tracker.settings.loads, model.background * jnp.exp(error)
+
+    @jax.jit
+    def change(one):
+        pressed = true * loads.law.factor(load_pressure(one, model.centroids))
+        return je.forward(model, pressed) - je.forward(model, true)
+
+    before = tracker.start(LearnedLayer.unknown(tracker.field)._replace(evidence=np.where(PRESS_VARIANCES, -1e3, 0.0)))
+    layer, at = before.layer, np.stack(np.meshgrid(*2 * [np.linspace(0.04, 0.16, 5)]), -1).reshape(-1, 2)
+    for place in at:
+        one = jnp.array(load(*place, loads.force, loads.width))
+        on_pads = np.asarray(sheet.on_pads(one[None], tracker.of_presses.sheet.near(one[None])))[0]
+        layer = tracker.learned(tracker.press(np.asarray(change(one)), on_pads, np.full(4, 0.05), layer=layer))
+    usual = np.log([loads.width, loads.force])
+    foreseen = apparent_gain(tracker.filter, with_errors(sheet, model, error[:, None]), usual, loads.gain_length)
+    expected, (mean, _) = tracker.field.modes_at(at) @ foreseen[:, 0], layer.at(at)
+    mean = mean - mean.mean()  # the mesh errs by about as much everywhere
+    assert np.corrcoef(mean, expected)[0, 1] > 0.9
+    assert np.linalg.norm(mean - expected) < 0.4 * np.linalg.norm(mean)
+
+
 def test_no_single_press_rules_a_variance_out():
     ((layer, _),) = after_presses(np.random.default_rng(704), (10,), 0.0)
     wild = layer.told(layer.mean + 100, 0.5 * layer.under_press, 1)
@@ -298,4 +368,5 @@ def test_after_a_press_the_next_one_has_an_effect_of_its_own(tracker, frame_of):
     assert now.taught == now.begun == known.contacts == 1
     np.testing.assert_allclose(now.belief.covariance, known.under_press)
     assert np.trace(known.covariance) < np.trace(start.covariance)
-    assert tracker.learned(tracker.start(start)) is start
+    again = tracker.start(start)
+    assert tracker.learned(again) is again.layer

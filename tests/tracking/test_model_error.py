@@ -10,6 +10,7 @@ from jaxeit.tracking import fit_model_error, model_error, press_evidence
 from jaxeit.tracking.belief.filter import SIZE
 from jaxeit.tracking.belief.programs import Programs
 from jaxeit.tracking.model_error import STEP
+from jaxeit.tracking.preparation import MESH_GAIN
 
 from .conftest import SECONDS, load
 
@@ -47,6 +48,7 @@ def test_the_error_that_was_made_is_found(tracker, humble, presses):
     truth = np.median([np.linalg.norm(error) / np.linalg.norm(signal) for error, signal in zip(*parts, strict=True)])
     assert truth / STEP < humble.settings.loads.model_error < truth * STEP**2
     assert float(humble.filter.model_error) == pytest.approx(humble.settings.loads.model_error)
+    assert humble.field.mesh_error == MESH_GAIN * humble.settings.loads.model_error
 
 
 def test_a_fit_that_begins_at_the_wrong_place_asks_for_no_error(tracker, presses, monkeypatch):
@@ -75,7 +77,8 @@ def test_frames_whose_fit_does_not_converge_are_left_out_or_refused(tracker, pre
 def test_a_fit_that_has_not_converged_has_no_probability(tracker, presses, monkeypatch):
     frame, pads = tracker.frame(presses[0]), tracker.pads(None, None)
     assert np.isfinite(model_error._evidence(tracker, frame, pads))
-    monkeypatch.setattr(model_error, "PRESS_STEPS", 1)  # for the second fit, from the place that was found
+    whole = tracker.programs.completed  # of the second fit, from the place that was found
+    monkeypatch.setattr(tracker.programs, "completed", lambda belief, dv, pads, most: whole(belief, dv, pads, 1))
     assert model_error._evidence(tracker, frame, pads) == -np.inf
 
 

@@ -373,6 +373,7 @@ _NOT_NEGATIVE = (
     "location/noise",
     "location/spread",
     "location/error_scale",
+    "layer/mesh_error",
 )
 _RANGES = ("pads/pressure_range", "baseline/pressure_range")
 _COVARIANCES = (

@@ -6,6 +6,7 @@ their standard errors, by the calibration, are data of each frame beside its rea
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,6 @@ from jaxeit.tracking import ContactLaw, LearnedLayer, Smoother, TimedTracks, Tra
 from ..calibration import Calibration
 from ..frame_blocks import FrameBlocks
 from .load_windows import FIDELITY
-from .press_images import fit_untouched_sheet
 from .quiet_frames import ENOUGH, QuietFrames
 
 MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
@@ -49,9 +49,12 @@ def prepare_calibrated_tracker(
     if not channels.any():
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
-    sheet, _ = fit_untouched_sheet(model, untouched, channels)
     noise = np.where(channels, noise, 1.0)
-    tracker = je.tracking.prepare_tracker(model, calibration.skin, noise=noise, sigma=sheet, channels=channels)
+    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, noise=noise, channels=channels)
+    try:
+        tracker = prepare(untouched=untouched)
+    except je.imaging.InverseError:  # no sheet fits the untouched frame, which is taken for even
+        tracker = prepare()
     return _with_model_error(tracker, calibration)
 
 

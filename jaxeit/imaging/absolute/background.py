@@ -1,9 +1,11 @@
 """The conductivity of an untouched sheet, from a frame of it."""
 
 from collections.abc import Callable
-from typing import Any
+from inspect import signature
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -16,10 +18,12 @@ from ...model.discretisation import Model
 from ...model.forward_model import forward
 from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision, GaussianSmooth
-from .images import LogConductivity, Quadratic, gauss_newton
+from .images import ImagePosterior, LogConductivity, Quadratic, most_probable, reading_weights
 
 # Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
 ERROR_FLOOR = 1e-3
+# Steps of the fit, and share of the variance of its error that is kept.
+STEPS, ERROR_VARIANCE = 12, 0.95
 # Largest fraction of the readings that may stay unexplained. A larger one means another skin, another order of the
 # readings or a wrong polarity.
 MAX_UNEXPLAINED = 0.1
@@ -71,11 +75,52 @@ def fit_background(
     frame = jnp.asarray(v0, model.dtype)
     require_positive(std=std, length=length, model_error=model_error, columns=columns)
     physics = even_coat(model, frame, Pixels(columns).on(model) if basis is None else basis)
+    return _fitted(physics, frame, std, length, model_error, tolerance)[0]
+
+
+def _fitted(
+    physics: LogConductivity,
+    frame: Float[Array, " readings"],
+    std: Float[ArrayLike, ""],
+    length: Float[ArrayLike, ""],
+    model_error: Float[ArrayLike, ""],
+    tolerance: float,
+) -> tuple[Float[Array, " elements"], Float[Array, "basis basis"]]:
+    """The most probable conductivity of `fit_background`, S, and the precision of the logarithm of its pixels."""
     penalty = Quadratic(coat_precision(physics.image, length), 1 / jnp.asarray(std) ** 2)
-    x = gauss_newton(physics, penalty, frame, frame_error(frame, model_error), tolerance=tolerance)
-    there = jnp.isfinite(frame)
-    require_explained("coating", physics.voltages(x), jnp.where(there, frame, 0), there)
-    return physics.sigma(x)
+    weight, readings = reading_weights(frame, frame_error(frame, model_error))
+    posterior, start = ImagePosterior(physics, penalty, readings, weight), jnp.zeros(physics.image.size, frame.dtype)
+    x, state = most_probable(posterior, start, STEPS, tolerance)
+    require_explained("coating", physics.voltages(x), readings, jnp.isfinite(frame))
+    return physics.sigma(x), state.quadratic.hessian.matrix
+
+
+class UntouchedSheet(NamedTuple):
+    """The conductivity of the untouched sheet, (elements,) S, and modes of the error of its logarithm, (elements, c).
+
+    The error is the sum of the modes, each times a standard normal number.
+    """
+
+    sigma: Float[Array, " elements"]
+    errors: Float[np.ndarray, "elements c"]
+
+
+def fitted_sheet(model: Model, v0: Float[Array, " readings"]) -> UntouchedSheet:
+    """The sheet of `fit_background` and its error: the principal components of its posterior covariance, as many as
+    hold `ERROR_VARIANCE` of it.
+
+    Raises:
+        InverseError: as for `fit_background`.
+    """
+    usual = {name: each.default for name, each in signature(fit_background).parameters.items()}
+    physics = even_coat(model, v0, Pixels(usual["columns"]).on(model))
+    names = ("std", "length", "model_error", "tolerance")
+    sigma, precision = _fitted(physics, v0, *(usual[name] for name in names))
+    values, vectors = np.linalg.eigh(np.asarray(precision, float))  # ascending: the largest variances first
+    share = np.cumsum(1 / values) / np.sum(1 / values)
+    count = 1 + int(np.searchsorted(share, ERROR_VARIANCE))
+    pixels = jnp.asarray((vectors / np.sqrt(values))[:, :count].T, sigma.dtype)
+    return UntouchedSheet(sigma, np.asarray(jax.vmap(physics.image.expand)(pixels), float).T)
 
 
 def even_coat(model: Model, v0: Float[Array, "..."], image: BasisMap) -> LogConductivity:
@@ -109,14 +154,29 @@ def sheet_of(
     Raises:
         InverseError: if both a frame and a conductivity are given, or no coating explains the frame.
     """
+    frame = untouched_frame(model, untouched, sigma, channels)
+    return sigma if frame is None else fit_background(model, frame)
+
+
+def untouched_frame(
+    model: Model,
+    untouched: Float[ArrayLike, " readings"] | None,
+    sigma: Float[Array, " elements"] | None,
+    channels: Bool[ArrayLike, " readings"] | None,
+) -> Float[Array, "..."] | None:
+    """The frame to which the sheet is fitted, with NaN for readings that are not used; None without a frame.
+
+    Raises:
+        InverseError: if both a frame and a conductivity are given.
+    """
     if untouched is None:
-        return sigma
+        return None
     if sigma is not None:
         raise InverseError("untouched and sigma both tell the sheet; give one of them")
     frame = jnp.asarray(untouched, model.dtype)
     if channels is not None and frame.shape == np.shape(channels):
         frame = jnp.where(jnp.asarray(channels, bool), frame, jnp.nan)
-    return fit_background(model, frame)
+    return frame
 
 
 def _is_known(value: Any) -> bool:

@@ -47,6 +47,10 @@ class GainField(eqx.Module):
     | length: over which the field changes                       | ()     | m    |
     | level, deviation: standard deviations of level and field   | ()     | 1    |
     | norm: root of the sum of squares of the bumps at a place   | ()     | 1    |
+    | sheet_error: modes that an error of the untouched sheet    | (g, c) | 1    |
+    |   looks like, for each mode of this error (`apparent_gain`) |        |      |
+    | mesh_error: standard deviation of the log gain that errors | ()     | 1    |
+    |   of the mesh look like at a place                         |        |      |
     """
 
     places: Float[np.ndarray, "g 2"]
@@ -54,21 +58,35 @@ class GainField(eqx.Module):
     level: float
     deviation: float
     norm: float
+    sheet_error: Float[np.ndarray, "g c"]
+    mesh_error: float
 
     @classmethod
     def over(
         cls, corners: Float[np.ndarray, "2 2"], points: Float[np.ndarray, "n 2"], loads: LoadSettings, level: float
     ) -> "GainField":
-        """The field of load settings over a sheet between two corners, m, of variance one at its points on average."""
+        """The field of load settings over a sheet between two corners, m, of variance one at its points on average.
+
+        The sheet counts as known, and the mesh as without error.
+        """
         length = loads.gain_length
         nodes = field_nodes(corners[0], corners[1], length)
         norm = field_norm(field_bumps(points, nodes, length))
-        return cls(np.concatenate([np.full((1, 2), np.inf), nodes]), length, level, loads.gain, norm)
+        places = np.concatenate([np.full((1, 2), np.inf), nodes])
+        return cls(places, length, level, loads.gain, norm, np.zeros((len(places), 0)), 0.0)
 
     def modes_at(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n g"]:
         """Log gain of each mode at points (n, 2) m, per prior standard deviation of the mode."""
         bumps = field_bumps(points, self.places[1:], self.length)
         return np.concatenate([np.full((len(points), 1), self.level), self.deviation / self.norm * bumps], 1)
+
+    def errors(self) -> Float[np.ndarray, "g e"]:
+        """Modes that errors of sheet and mesh look like in all presses, for each of some standard normal numbers.
+
+        What the mesh errs by looks like a field of gain with the covariance of that of the layer.
+        """
+        of_mesh = np.eye(len(self.places))[:, 1:] * (self.mesh_error / self.deviation if self.deviation else 0.0)
+        return np.concatenate([self.sheet_error, of_mesh], 1)
 
     def require_same(self, other: "GainField") -> None:
         """Refuse what was learned under another field.
@@ -151,6 +169,19 @@ class LearnedLayer(NamedTuple):
         """Covariance of the gain under the next press, whose effect is not known; its mean is that of the layer."""
         return self.covariance + self.press_variance * np.eye(len(self.field.places))
 
+    @property
+    def true_covariance(self) -> Float[np.ndarray, "g g"]:
+        """Covariance of the modes of the true gain, with errors of sheet and mesh that are the same in all presses.
+
+        `covariance` is that of the gain with which the model's sheet shows what was read, and tells forces by readings.
+        Errors b of this gain that all presses share move the mean by (1 - P) b, where P is the covariance: to the whole
+        of b where presses have told the gain, and not at all elsewhere (a consider covariance: Schmidt 1966, Advances
+        in Control Systems 3).
+        """
+        covariance, errors = self.covariance, self.field.errors()
+        moved = errors - covariance @ errors
+        return np.asarray(covariance + moved @ moved.T)
+
     def told(
         self, gain: Float[Array | np.ndarray, " g"], covariance: Float[Array | np.ndarray, "n n"], contacts: int
     ) -> "LearnedLayer":
@@ -184,9 +215,9 @@ class LearnedLayer(NamedTuple):
         )
 
     def at(self, points: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Mean and standard deviation of the log gain at points (n, 2) m."""
+        """Mean and standard deviation of the log gain at points (n, 2) m, by `true_covariance`."""
         modes = self.field.modes_at(points)
-        variance = ((modes @ self.covariance) * modes).sum(1)
+        variance = ((modes @ self.true_covariance) * modes).sum(1)
         return modes @ self.mean, np.sqrt(np.maximum(variance, 0))
 
     def over(

@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 from ..._compile import bind
 from .consider import consider_covariance
 from .filter import (
-    MANY_STEPS,
     Attempt,
     Belief,
     ContactFilter,
@@ -24,6 +23,8 @@ from .filter import (
 
 # Places where the fit of a contact begins, and their least distance, m.
 STARTS, APART = 4, 0.01
+# Evaluations of the fit of a single press.
+PRESS_STEPS = 24
 
 
 class Programs:
@@ -59,9 +60,11 @@ class Programs:
         """See `filter.attempted`."""
         return self._attempted(_free(belief), dv, pads, attempt)
 
-    def completed(
-        self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, most: int = MANY_STEPS
-    ) -> Attempt:
+    def careful(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Update:
+        """The update of a frame by itself that may begin far from its end, as that of a single press."""
+        return self.concluded(belief, dv, pads, self.completed(belief, dv, pads, PRESS_STEPS))
+
+    def completed(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, most: int) -> Attempt:
         """What is `attempted`, until it has converged or taken ``most`` steps."""
         attempt = self.attempted(belief, dv, pads, None)
         while attempt.state is not None and not attempt.state.converged and attempt.state.steps < most:
