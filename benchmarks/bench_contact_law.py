@@ -14,6 +14,10 @@ pads: none tells a force, or the one that bears most of the press is dead and th
 
 Force: median and 90th percentile of the relative error of the sum of all contacts. covered: forces within the 90 %
 interval that the standard error states. skins: those on which the law is used.
+
+gain of the layer covered: share of the places, 1 cm apart, at which the true log gain lies in the 90 % interval of the
+gain that was learned. On the second simulator the true gain is what the protrusions conduct under a usual press; as its
+law has no gain of its own, both gains count less their means over all places.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,7 +37,7 @@ from .force_ways import HELD, LIFTED, PAD_ERROR, SECONDS
 from .harness import Question, Run
 from .problems import Pressed, fit_model
 from .rows import Row, grouped, rounded
-from .second_simulator import FORCES, Wear, presses, recorded, true_map
+from .second_simulator import FORCES, Press, Wear, presses, recorded, relative_gain, true_map
 
 FIRST_SEED = 7300
 # Presses after which the force is asked, and skins.
@@ -44,17 +48,22 @@ RESTING = 10  # frames of a contact that no pad tells
 WIDTHS = (0.008, 0.018)  # m, of Gaussian loads
 NONE, DEAD = "none", "one is dead"  # pads that tell forces
 INTERVAL = 1.645  # standard errors in half a 90 % interval
+GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.18, 17)]), -1).reshape(-1, 2)  # m, where the gain is judged
+USUAL = Press(np.array([[0.1, 0.1]]), np.array([8.0]), 0.02)  # N, m
 
 
 class Skin(NamedTuple):
     """Presses on a skin: changes of frames (n, readings) V, forces (n,) and forces on pads (n, pads) N; noise of the
-    readings (readings,) V; and the model's sheet (elements,) S, fitted to an untouched frame."""
+    readings (readings,) V; an untouched frame (readings,) V; the true log gain at the places of `GRID`, and whether a
+    constant of it is not known."""
 
     changes: np.ndarray
     forces: np.ndarray
     pads: np.ndarray
     noise: np.ndarray
-    sheet: np.ndarray
+    untouched: np.ndarray
+    gain: np.ndarray
+    relative: bool
 
 
 def second_simulator(model: je.Model, seed: int, count: int) -> Skin:
@@ -67,28 +76,29 @@ def second_simulator(model: je.Model, seed: int, count: int) -> Skin:
     masks, centres = np.asarray(je.pad_masks(je.load_skin("testbed"), image).weights), np.asarray(image.centres)
     pads = np.array([true_map(press, centres) for press in given]) @ masks.T
     forces = np.array([press.forces.sum() for press in given])
-    return Skin(found.change, forces, pads, found.std, np.asarray(je.fit_background(model, blank)))
+    return Skin(found.change, forces, pads, found.std, blank, relative_gain(seed, Wear(), GRID, USUAL), True)
 
 
 def own_scene(model: je.Model, seed: int, count: int) -> Skin:
     """A skin whose contacts follow the law that the tracker takes for granted."""
-    rng, skin = np.random.default_rng([seed, 23]), je.load_skin("testbed")
-    effects = (
-        je.effects.LoadSpreading(),
-        je.effects.CoatingNonUniformity(seed=seed),
-        je.effects.ContactGain(seed=seed),
-        je.effects.ContactPiezoresistance(),
-    )
+    rng, skin, gain = np.random.default_rng([seed, 23]), je.load_skin("testbed"), je.effects.ContactGain(seed=seed)
+    effects = (je.effects.CoatingNonUniformity(seed=seed), gain, je.effects.ContactPiezoresistance())
     true = je.discretise(je.Scene(skin, effects), je.Fidelity.standard())
     v0 = np.asarray(je.forward(true, je.conductivity(true)))
     places, forces = rng.uniform(0.02, 0.18, (count, 2)), rng.uniform(*FORCES, count)
-    spread = [je.model.load_spread(true, *one) for one in zip(places, rng.uniform(*WIDTHS, count), strict=True)]
+    spread = [gaussian(true, *one) for one in zip(places, rng.uniform(*WIDTHS, count), strict=True)]
     volts = [je.forward(true, je.conductivity(true, f * one)) for f, one in zip(forces, spread, strict=True)]
     pixels = je.Pixels(20).on(true)
     on_pixels = np.array([pixels.restrict(f * one * true.areas) for f, one in zip(forces, spread, strict=True)])
     pads = on_pixels @ np.asarray(je.pad_masks(skin, pixels).weights).T
-    found = Pressed.of(v0, np.array(volts) - v0)
-    return Skin(found.change, forces, pads, found.std, np.asarray(je.fit_background(model, found.blank(rng))))
+    found, field = Pressed.of(v0, np.array(volts) - v0), gain.laid(jnp.asarray(GRID)).field
+    return Skin(found.change, forces, pads, found.std, found.blank(rng), np.asarray(gain.std * field), False)
+
+
+def gaussian(model: je.Model, place: np.ndarray, width: float) -> np.ndarray:
+    """Pressure of a Gaussian load of one newton on the elements, Pa."""
+    square = ((np.asarray(model.centroids) - place) ** 2).sum(1)
+    return np.exp(-0.5 * square / width**2) / (2 * np.pi * width**2)
 
 
 SCENES: dict[str, Callable[[je.Model, int, int], Skin]] = {
@@ -102,7 +112,7 @@ class Session:
 
     def __init__(self, model: je.Model, skin: Skin, seed: int, probes: int):
         self.skin, self.rng = skin, np.random.default_rng([seed, 29])
-        tracker = prepare_tracker(model, je.load_skin("testbed"), noise=skin.noise, sigma=jnp.asarray(skin.sheet))
+        tracker = prepare_tracker(model, je.load_skin("testbed"), noise=skin.noise, untouched=skin.untouched)
         forces, errors = self.told(skin.pads[:probes])
         self.tracker: Tracker = fit_model_error(tracker, self.noisy(skin.changes[:probes]), forces, errors)
 
@@ -142,6 +152,15 @@ class Session:
         return found, law.without_pads(found, self.tracker.told_by_pads(found, errors[-1]))
 
 
+def places_covered(layer: LearnedLayer, skin: Skin) -> float:
+    """Share of the places at which the true gain lies in its 90 % interval."""
+    modes, true = layer.field.modes_at(GRID), skin.gain
+    if skin.relative:
+        modes, true = modes - modes.mean(0), true - true.mean()
+    deviation = np.sqrt(((modes @ layer.true_covariance) * modes).sum(1))
+    return float(np.mean(np.abs(modes @ layer.mean - true) < INTERVAL * deviation))
+
+
 def judged(tracks: tuple[Track, ...], true: float) -> Row:
     """What is right of the sum of the contacts' forces; without any, all of it is missed."""
     force = sum(one.force for one in tracks)
@@ -159,7 +178,7 @@ def one_scene(run: Run, scene: str) -> Iterator[Row]:
         skin = SCENES[scene](model, seed, max(stages) + 1 + given)
         session = Session(model, skin, seed, min(PROBES, max(stages)))
         for number, layer, law in session.taught(stages):
-            about = {"presses": number, "seed": seed, "used": law.is_better}
+            about = {"presses": number, "seed": seed, "used": law.is_better, "layer": places_covered(layer, skin)}
             for press, pads in product(range(max(stages) + 1, len(skin.forces)), (NONE, DEAD)):
                 for way, each in zip(("gain", "law"), session.alone(press, layer, law, pads), strict=True):
                     rows.append(about | {"way": way, "pads": pads} | judged(each, skin.forces[press]))
@@ -180,6 +199,7 @@ def summary(presses: int, rows: list[Row]) -> Row:
         error, covered = (np.array([row[name] for row in mine]) for name in ("error", "covered"))
         figures = {"error": np.median(error), "error 90": np.quantile(error, 0.9), "covered": covered.mean()}
         found |= rounded({f"{way} {name}": value for name, value in figures.items()})
+    found |= rounded({"layer covered": np.mean([row["layer"] for row in rows])})
     return found | {"used": len({row["seed"] for row in rows if row["used"]})}
 
 

@@ -79,11 +79,25 @@ def pairs(rng: np.random.Generator, count: int) -> list[Press]:
     ]
 
 
+def drawn(skin: Skin, wear: Wear, own: np.random.Generator) -> tuple[np.ndarray, contact.Layer]:
+    """Places of the bolts (bolts, 2) m, and the contact layer of a skin."""
+    bolts = skin.bolts + wear.misplaced * own.standard_normal(skin.bolts.shape)
+    return bolts, contact.make_layer(skin, bolts, SCATTER, own)
+
+
+def relative_gain(seed: int, wear: Wear, places: np.ndarray, usual: Press, name: str = "testbed") -> np.ndarray:
+    """Log of what the protrusions conduct under a usual press at each of some places (n, 2) m, up to a constant."""
+    _, layer = drawn(described(name), wear, np.random.default_rng([seed, 11]))
+    (force,) = usual.forces
+    loads = np.array([force * contact.shares(layer, place, "flat", usual.tip, force) for place in places])
+    return np.log(contact.conductances(layer, loads).sum(1))
+
+
 def recorded(seed: int, given: list[Press], wear: Wear, name: str = "testbed") -> Pressed:
     """A skin of a seed under presses, of which each change is that from the untouched skin of its time."""
     skin, own = described(name), np.random.default_rng([seed, 11])
-    bolts = skin.bolts + wear.misplaced * own.standard_normal(skin.bolts.shape)
-    layer, mesh = contact.make_layer(skin, bolts, SCATTER, own), make_mesh(skin, bolts, SPACING)
+    bolts, layer = drawn(skin, wear, own)
+    mesh = make_mesh(skin, bolts, SPACING)
     sigma = coating(mesh.points[mesh.triangles].mean(1), wear.coat, own) / skin.resistance
     sheet = make_sheet(mesh, sigma, skin.contact)
     loads = [
