@@ -2,13 +2,14 @@
 
 Presses on a grid that is aligned with the walls have few distances to walls. Between these a field follows its basis
 and not the pads, and so do its errors: on a simulated testbed with a grid of 12 x 12, whose presses lie 10 and 24 mm
-from the walls, forces 14 to 18 mm from a wall were 5 to 11 % too large, and 90 % intervals covered 70 % of them.
+from the walls, forces 14 to 18 mm from a wall were 5 to 11 % too large, and 90 % intervals covered 70 % of them. The
+errors of `edge-spline` grow between the distances of the presses, so that nothing is said of it.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-from .fields import FittedField, Geometry, PadEdge, Places
+from .fields import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
 from .fields.geometry import distance, nearest_points, onto_pads
 
 # Octaves between two distances that are worth a word: the grid above has 0.68 to 0.71, one of 15 x 15, whose intervals
@@ -25,7 +26,9 @@ def unpressed_note(field: FittedField | None, places: Places | None, share: Floa
         places: of the presses.
         share: of each pad in a press, (presses, pads).
     """
-    if field is None or not isinstance(field.field, PadEdge) or places is None:
+    if field is None or places is None or isinstance(field.field, PadEdgeSpline):
+        return ""
+    if not isinstance(field.field, PadEdge):
         return ""
     metres = np.sort(_wall_distances(field.geometry, places, share))
     octaves, few = np.log2(1 + metres / float(field.field.width)), max(1, round(FEW * len(metres)))
@@ -35,7 +38,8 @@ def unpressed_note(field: FittedField | None, places: Places | None, share: Floa
     low, high = 1e3 * metres[[gaps.argmax(), gaps.argmax() + few]]
     return (
         f"hardly a press lies {low:.0f} to {high:.0f} mm from the walls of its pad, where the correction by location "
-        "bends most: forces there may err by more than is stated; press also at places on no grid along the walls"
+        "bends most: forces there may err by more than is stated; calibrate with --location edge-spline, or press "
+        "also at places on no grid along the walls"
     )
 
 

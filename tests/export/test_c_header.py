@@ -273,14 +273,20 @@ def test_a_correction_by_location_is_that_of_python(field, place, calibration, r
     assert told.split() == [str(n) for n in (sizes.rest, sizes.tare, sizes.result)]
     plain = calib.export_c(calibration, tmp_path / "plain.h")
     sides, rim, numbers = 4, 4, chosen.field.field.shapes().shape[1] - (field == "edge-size") + 1
+    if field == "edge-spline":  # products of all pairs of bumps, in place of those of the principal functions
+        numbers = 2 * chosen.field.field.bumps * (1 + chosen.field.field.bumps) + 1
     assert sizes.flash - plain.flash == 4 * (3 * 400 + 4 * 4 * sides + 2 * 4 * 4 + 4 * rim + 4 * numbers)
 
 
 @needs_compiler
-@pytest.mark.parametrize("field", ["edge", "rbf", "gp"])
+@pytest.mark.parametrize("field", ["edge", "edge-spline", "rbf", "gp"])
 def test_a_field_with_other_settings_is_that_of_python(field, calibration, recorded, tmp_path):
     """Coefficients of all pads together or of each, other numbers of them, no corners."""
-    settings = {"edge": "corners=false,width=0.011,bumps=3,shared=false", "rbf": "nodes=3,shared=true"}
+    settings = {
+        "edge": "corners=false,width=0.011,bumps=3,shared=false",
+        "edge-spline": "corners=false",
+        "rbf": "nodes=3,shared=true",
+    }
     chosen = located(calibration, FIELDS.make(f"{field}:{settings.get(field, 'modes=3,shared=true')}"), "half")
     calib.export_c(chosen, tmp_path / "skin.h")
     compare(chosen, recorded, built(tmp_path))

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import fields, replace
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 from scipy.interpolate import BSpline
+from scipy.special import gamma, kv
 
 import jaxeit as je
 from calib import cli
@@ -76,35 +76,56 @@ def dip(skin, place):
 # --- geometry --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("field", [PadEdge(), PadEdgeSpline(), PadEdgeSpline(bumps=7, steps=3, order=2)])
-def test_edge_features_are_distances_to_sides_and_rim(skin, geometry, field):
-    place = grid(7)
+def walls(skin, place):
+    """Distances of places to the four sides of their pad, and to the two nearest sides of the rim, nearest first."""
+    x, y = place.T
+    sides = np.sort([x % 0.1, 0.1 - x % 0.1, y % 0.1, 0.1 - y % 0.1], 0)
+    rim = np.sort([x, 0.2 - x, y, 0.2 - y], 0)[:2]
+    np.testing.assert_allclose(rim[0], skin.domain.boundary_distance(place), atol=1e-12)
+    return sides, rim
+
+
+def test_edge_features_are_distances_to_sides_and_rim(skin, geometry):
+    place, field = grid(7), PadEdge()
     inside = np.eye(4, dtype=bool)[owner(place)]
     features = np.asarray(features_of(field, geometry, single_places(place, 4)))[inside]
-    x, y = place.T
-    one = partial(near, field=field)
-    sides = sum(map(one, (x % 0.1, 0.1 - x % 0.1, y % 0.1, 0.1 - y % 0.1)))
-    rim = one(skin.domain.boundary_distance(place))
-    corner = (rim * one(np.sort([x, 0.2 - x, y, 0.2 - y], 0)[1]))[:, :-1]
-    expected = np.concatenate([summed(part, field.order) for part in (sides, rim, corner)], 1)
+    sides, rim = (near(distance, field) for distance in walls(skin, place))
+    expected = np.concatenate([sides.sum(0), rim[0], (rim[0] * rim[1])[:, :-1]], 1)
     np.testing.assert_allclose(features, expected, rtol=1e-9, atol=1e-12)
     few = np.asarray(features_of(replace(field, corners=False), geometry, single_places(place, 4)))[inside]
     require_identical(few, features[:, : 2 * field.bumps])
 
 
-def near(distance, field):
-    """Cubic B-splines by SciPy, (n, bumps), at steps of octaves of distance."""
+@pytest.mark.parametrize("field", [PadEdgeSpline(), PadEdgeSpline(bumps=7, length=0.7, modes=7)])
+def test_a_spline_of_distance_is_a_process_over_octaves_that_falls_off(skin, geometry, field):
+    """Covariances of the field at all pairs of places, against those of Matern's kernel at the knots."""
+    place = grid(7)
+    inside = np.eye(4, dtype=bool)[owner(place)]
+    features = np.asarray(features_of(field, geometry, single_places(place, 4)))[inside]
+    sides, rim = (near(distance, field, 2, 1) for distance in walls(skin, place))
+    u = (np.arange(field.bumps) - 1) / 2
+    kernel = matern(np.abs(u[:, None] - u) / field.length) * 0.5 ** (u[:, None] + u)
+    values, vectors = np.linalg.eigh(kernel / np.trace(kernel) * field.bumps)
+    kernel, kept = ((vectors[:, -k:] * values[-k:]) @ vectors[:, -k:].T for k in (field.bumps, field.modes))
+    expected = sum(part @ kernel @ part.T for part in (sides.sum(0), rim[0]))
+    expected += sum((a @ kept @ a.T) * (b @ kept @ b.T) for a, b in (rim, sides[:2]))
+    np.testing.assert_allclose(features @ features.T, expected, rtol=1e-9, atol=1e-9)
+    few = np.asarray(features_of(replace(field, corners=False), geometry, single_places(place, 4)))[inside]
+    require_identical(few, features[:, : 2 * field.bumps])
+
+
+def matern(distance, smoothness=2.5):
+    """Matern's correlation at distances over the length, by Bessel's function (Rasmussen and Williams 2006, 4.14)."""
+    z = np.sqrt(2 * smoothness) * np.where(distance > 0, distance, 1)
+    found = 2 ** (1 - smoothness) / gamma(smoothness) * z**smoothness * kv(smoothness, z)
+    return np.where(distance > 0, found, 1.0)
+
+
+def near(distance, field, steps=1, first=0):
+    """Cubic B-splines by SciPy, (..., bumps), at steps of octaves of distance."""
     bump = BSpline.basis_element(np.arange(-2.0, 3), extrapolate=False)
-    place = field.steps * np.log2(1 + distance / float(field.width)) + (field.order > 0)
-    return np.nan_to_num(bump(place[:, None] - np.arange(field.bumps)))
-
-
-def summed(parts, order):
-    """Functions of coefficients that are sums of sums of independent steps, of mean variance one at the bumps."""
-    each = np.eye(parts.shape[1])
-    for _ in range(order):
-        each = each[::-1].cumsum(0)[::-1]
-    return parts @ each / np.sqrt((each**2).sum(1).mean())
+    place = steps * np.log2(1 + distance / float(field.width)) + first
+    return np.nan_to_num(bump(place[..., None] - np.arange(field.bumps)))
 
 
 def test_a_place_beside_a_pad_counts_as_its_nearest_edge(geometry):
@@ -322,8 +343,9 @@ def test_distances_to_walls_without_presses_are_told(skin, geometry, place, told
     share, places = np.eye(4)[owner(place)], single_places(place, 4)
     note = unpressed_note(fit(PadEdge(), geometry, places, *press_rows(place, dip(skin, place))), places, share)
     assert re.search(told, note) if told else not note
-    other = fit(RadialBasis(), geometry, places, *press_rows(place, dip(skin, place)))
-    assert not unpressed_note(other, places, share)
+    for field in (RadialBasis(), PadEdgeSpline()):  # no walls, and errors that grow where nothing was pressed
+        other = fit(field, geometry, places, *press_rows(place, dip(skin, place)))
+        assert not unpressed_note(other, places, share)
     assert not unpressed_note(None, places, share)
 
 

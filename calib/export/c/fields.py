@@ -13,7 +13,8 @@ import jaxeit as je
 
 from ...calibration import Calibration
 from ...calibration.localisation.locators import CentroidLocator
-from ...fitting.fields import FIELDS, FittedField, PadEdge
+from ...fitting.fields import FIELDS, FittedField, PadEdge, PadEdgeSpline
+from ...fitting.fields.pad_edge import KNOTS_PER_OCTAVE
 from ...fitting.fields.tensor_products import BOX_HALF_WIDTH
 from ..errors import ExportError
 
@@ -129,42 +130,85 @@ def _constant(fitted: FittedField) -> FieldInC:
 def _edge(fitted: FittedField) -> FieldInC:
     """Without the size of `edge-size`: an image does not tell the width, and such a feature counts as its mean."""
     edge = cast(PadEdge, fitted.field)
-    bumps, pairs, width = edge.bumps, edge.pairs, float(edge.width)
-    formula = f"B-splines of the distance to the sides of the pad and to the rim, over octaves of {width:g} m"
-    operations = (15 + 8 * bumps) * fitted.geometry.start.shape[1] + 15 * len(fitted.geometry.rim) + 24 * bumps
-    *independent, level = np.split(_by_pad(fitted, 2 * bumps + pairs), [bumps, 2 * bumps, 2 * bumps + pairs], 1)
-    rows = [part @ edge.smooth(part.shape[1]).T for part in independent]
-    return FieldInC(formula, np.hstack([*rows, level]), _edge_body(edge), operations)
-
-
-def _edge_body(edge: PadEdge) -> tuple[str, ...]:
-    """The log of the gain in C: of bumps over octaves of a distance, and pairs of them at corners."""
-    bumps, pairs, first = edge.bumps, edge.pairs, f" + {_literal(-edge.first)}" if edge.first else ""
-    place = f"{_literal(edge.steps)} * log2f(1.0f + sqrtf({{}}) / {_literal(float(edge.width))}){first}"
+    bumps, pairs = edge.bumps, edge.pairs
     corners = (
         f"for (uint32_t k = 0; k < {pairs}; k++)",
-        f"    log_gain += b[{2 * bumps} + k] * skin_bspline(nearest - (float)k) * skin_bspline(second - (float)k);",
+        f"    log_gain += b[{2 * bumps} + k] * skin_bspline(rim[0] - (float)k) * skin_bspline(rim[1] - (float)k);",
+    )
+    body = _walls(edge, 2 * bumps + pairs, "log2f(1.0f + sqrtf({}) / {})", corners if pairs else ())
+    return FieldInC(_edge_formula(edge), _by_pad(fitted, 2 * bumps + pairs), body, _edge_operations(fitted, 24 * bumps))
+
+
+def _edge_spline(fitted: FittedField) -> FieldInC:
+    """Products of principal functions of two distances become those of all pairs of bumps."""
+    edge = cast(PadEdgeSpline, fitted.field)
+    bumps, pairs, functions = edge.bumps, edge.pairs, edge.principal()
+    paired = functions[:, :pairs]
+    sizes = [bumps, bumps, pairs**2, pairs**2]
+    *parts, level = np.split(_by_pad(fitted, sum(sizes)), np.cumsum(sizes), 1)
+    single = [part @ functions.T for part in parts[:2]]
+    double = [
+        np.einsum("bi,pij,cj->pbc", paired, part.reshape(-1, pairs, pairs), paired).reshape(len(part), -1)
+        for part in (parts[2:] if pairs else ())
+    ]
+    coefficients = np.hstack([*single, *double, level])
+    corners = (
+        f"for (uint32_t k = 0; k < {bumps}; k++)",
+        f"    for (uint32_t m = 0; m < {bumps}; m++) {{",
+        f"        const float *both = b + {2 * bumps} + {bumps} * k + m;",
+        "        log_gain += both[0] * skin_bspline(rim[0] - (float)k) * skin_bspline(rim[1] - (float)m);",
+        f"        log_gain += both[{bumps**2}] * skin_bspline(own[0] - (float)k) * skin_bspline(own[1] - (float)m);",
+        "    }",
+    )
+    place = f"1.0f + {_literal(KNOTS_PER_OCTAVE)} * log2f(1.0f + sqrtf({{}}) / {{}})"
+    body = _walls(edge, coefficients.shape[1] - 1, place, corners if pairs else ())
+    return FieldInC(_edge_formula(edge), coefficients, body, _edge_operations(fitted, 24 * bumps + 36 * bumps**2))
+
+
+def _edge_formula(edge: PadEdge) -> str:
+    return f"B-splines of the distance to the sides of the pad and to the rim, over octaves of {float(edge.width):g} m"
+
+
+def _edge_operations(fitted: FittedField, corners: int) -> int:
+    bumps = cast(PadEdge, fitted.field).bumps
+    return (15 + 8 * bumps) * fitted.geometry.start.shape[1] + 15 * len(fitted.geometry.rim) + corners
+
+
+def _walls(edge: PadEdge, level: int, place: str, corners: tuple[str, ...]) -> tuple[str, ...]:
+    """The log of the gain in C: of bumps of the distances to all sides of the pad and to the rim, and `corners`.
+
+    Args:
+        level: number of the coefficient of the level.
+        place: number of the bump at a distance, from its square and the width of the field.
+        corners: statements with the numbers ``own`` and ``rim`` of the two nearest sides of the pad and of the rim.
+    """
+    bumps, width = edge.bumps, _literal(float(edge.width))
+    nearest = (
+        "    {0}[1] = fminf({0}[1], fmaxf({0}[0], square));",
+        "    {0}[0] = fminf({0}[0], square);",
     )
     return (
-        f"float log_gain = -b[{2 * bumps + pairs}], nearest = INFINITY, second = INFINITY;",
+        f"float log_gain = -b[{level}], own[2] = {{INFINITY, INFINITY}}, rim[2] = {{INFINITY, INFINITY}};",
         "for (uint32_t s = 0; s < SKIN_SIDES; s++) {",
         "    const float *side = skin_side[pad][s];",
-        f"    const float place = {place.format('skin_square(side, x, y, 0)')};",
+        "    const float square = skin_square(side, x, y, 0);",
         "    if (side[0] == side[2] && side[1] == side[3])",
         "        continue;",
+        *(line.format("own") for line in nearest),
         f"    for (uint32_t k = 0; k < {bumps}; k++)",
-        "        log_gain += b[k] * skin_bspline(place - (float)k);",
+        f"        log_gain += b[k] * skin_bspline({place.format('square', width)} - (float)k);",
         "}",
         "for (uint32_t s = 0; s < SKIN_RIM; s++) {",
         "    const float square = skin_square(skin_rim[s], x, y, 0);",
-        "    second = fminf(second, fmaxf(nearest, square));",
-        "    nearest = fminf(nearest, square);",
+        *(line.format("rim") for line in nearest),
         "}",
-        f"nearest = {place.format('nearest')};",
-        f"second = {place.format('second')};",
+        "for (uint32_t i = 0; i < 2; i++) {",
+        f"    own[i] = {place.format('own[i]', width)};",
+        f"    rim[i] = {place.format('rim[i]', width)};",
+        "}",
         f"for (uint32_t k = 0; k < {bumps}; k++)",
-        f"    log_gain += b[{bumps} + k] * skin_bspline(nearest - (float)k);",
-        *(corners if pairs else ()),
+        f"    log_gain += b[{bumps} + k] * skin_bspline(rim[0] - (float)k);",
+        *corners,
         "return log_gain;",
     )
 
@@ -215,7 +259,7 @@ FORMULAS: dict[str, Callable[[FittedField], FieldInC]] = {
     "constant": _constant,
     "edge": _edge,
     "edge-size": _edge,
-    "edge-spline": _edge,
+    "edge-spline": _edge_spline,
     "bilinear": _product("nodes over the pad, bilinear", "fmaxf(1.0f - fabsf(z), 0.0f)", _nodes(0)),
     "rbf": _product("Gaussian bumps over the pad", "expf(-0.5f * z * z)", _nodes(0)),
     "spline": _product("cubic B-splines over the pad", "skin_bspline(z)", _nodes(1)),
