@@ -50,11 +50,18 @@ class LocatedPresses(NamedTuple):
     | data     | pressures and forces of the presses                        |
     | geometry | outlines of the pads and of the sheet                      |
     | places   | place of each press by its image; None: not estimated      |
+    | steady   | the same, without errors of single images; None: not known |
     """
 
     data: PressData
     geometry: Geometry
     places: Places | None = None
+    steady: Places | None = None
+
+    @property
+    def fitted(self) -> Places | None:
+        """The places to which a field is fitted: `steady` ones where they are known."""
+        return self.places if self.steady is None else self.steady
 
 
 class PadModel(eqx.Module):
@@ -245,7 +252,7 @@ def fit_pads(
 
     Check `curves.result` and `field.result`: no error is raised for samples that do not determine a fit.
     """
-    data, places = presses.data, presses.places
+    data, places = presses.data, presses.fitted
     use = np.ones(len(data.force), bool) if use is None else use
     gain, fitted = np.zeros_like(data.pressure), None
     curves = _curves(curve, data, data.share[data.sample_press].T * data.sample_force, gain, use, loss)
@@ -296,7 +303,7 @@ def _field(
     weight = np.where(use, _weights(data.force, data.place, use), 0)
     extra = bucket(len(use)) - len(use)  # presses without weight, so that compiled fits are reused
     rows = [np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (log_ratio, share, weight)]
-    wide = jax.tree.map(lambda a: jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.places)
+    wide = jax.tree.map(lambda a: jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.fitted)
     y, x, w = map(jnp.asarray, rows)
     return _fit_field(field, presses.geometry, wide, y, x, w, jnp.asarray(data.reach))
 

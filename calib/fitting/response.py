@@ -22,6 +22,7 @@ from .neighbourhoods import error_scale, hold_out_scaled
 from .pads import LocatedPresses, PadModel
 from .results import FitError, FitResult
 from .selection import Choice, choose, chosen_without
+from .steady_places import steady_places
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +62,23 @@ class HeldOutForces(NamedTuple):
     splits: tuple[Split, ...]
 
 
-def fold_presses(skin: je.Skin, data: PressData, places: Places | None, loss: AbstractLoss, folds: int) -> Folds:
-    """The presses on a skin, whose places are divided into `folds` folds."""
+def fold_presses(
+    skin: je.Skin,
+    data: PressData,
+    places: Places | None,
+    loss: AbstractLoss,
+    folds: int,
+    stage: np.ndarray | None = None,
+) -> Folds:
+    """The presses on a skin, whose places are divided into `folds` folds.
+
+    Args:
+        places: of the presses, by their images.
+        stage: the same by the stage, (presses, 2) m; None: not known.
+    """
     geometry = geometry_of(skin, places.position.dtype if places else None)
-    return Folds(LocatedPresses(data, geometry, places), loss, folds_by_place(data.place, folds))
+    steady = None if places is None or stage is None else steady_places(geometry, places, stage)
+    return Folds(LocatedPresses(data, geometry, places, steady), loss, folds_by_place(data.place, folds))
 
 
 def fit_response(
@@ -134,7 +148,7 @@ def hold_out_response(
         "hybrid": folds.hold_out(*_baseline(response.choice)).hold.force.sum(1),
     }
     if field is not None and true_position is not None:
-        true = presses._replace(places=single_places(true_position, presses.geometry.pads))
+        true = presses._replace(places=single_places(true_position, presses.geometry.pads), steady=None)
         others["true_place"] = Folds(true, folds.loss, folds.fold).hold_out(curve, field).hold.force.sum(1)
     held = hold_out_scaled(folds, response.without, 1.0)
     hold_noise = held.hold_noise(data)

@@ -1,10 +1,10 @@
 """The interface of a field of log-gain over the place of a contact on a pad.
 
 The force on pad i is F_i = exp(g_i(x)) h_i(P_i), with h_i the curve of the pad and g_i a *field* over the place x of
-the contact. The place is the one that the image tells, never the one that the stage reports. Log-gain keeps the gain
-positive, and the field is linear in its coefficients: g_i(x) = (phi_i(x) - c_i) @ beta, with c_i the mean of the
-features over the presses of the pad. The mean log-gain over the presses of a pad is therefore zero, and the level of
-the pad belongs to its curve alone.
+the contact. The place is the one that the image tells; presses of a calibration are placed where images show them on
+average (`calib.fitting.steady_places`). Log-gain keeps the gain positive, and the field is linear in its coefficients:
+g_i(x) = (phi_i(x) - c_i) @ beta, with c_i the mean of the features over the presses of the pad. The mean log-gain over
+the presses of a pad is therefore zero, and the level of the pad belongs to its curve alone.
 """
 
 import abc

@@ -1,0 +1,85 @@
+"""Places of presses without the errors of single images, from the places that the stage reports.
+
+A field over places that err is too flat wherever presses lie close together: presses on one line of a grid seem to lie
+at several distances from a wall, and their forces are alike. Between the lines the field is then too large. A field is
+therefore fitted to the place where the images show presses at a stage's place *on average*: forces predicted at the
+place of a single image then err at random only (regression calibration; Carroll et al. 2006, Measurement Error in
+Nonlinear Models, ch. 4).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .fields import Geometry, Places
+from .fields.base import cubic_bspline
+from .fields.geometry import distance, nearest_points
+from .order_statistics import MAD_TO_SIGMA
+
+# Images err towards the middle near the rim of the sheet, alike at all sides: by B-splines over octaves of distance.
+RIM_WIDTH, BUMPS = 8e-3, 3
+# Scatter (m) of single places about their average, from which on the average of a field over them is another field.
+MOST_SCATTER = 2e-3
+# Shift of all places, over the scatter of single ones, from which on the stage is taken to be off as a whole: errors of
+# neighbouring places are alike, so that a smaller shift is not told from them.
+LEAST_SHIFT = 0.5
+LEAST_SCATTER = 1e-6  # m; exact places scatter by rounding only
+OUTLYING = 5.0  # over the scatter: places that the stage and the image tell apart
+MIN_PRESSES = 10  # single contacts; fewer determine no average
+ROUNDS = 3  # fits of the average, each without the outlying places of the one before
+
+
+def steady_places(geometry: Geometry, places: Places, stage: Float[np.ndarray, "presses 2"]) -> Places | None:
+    """Places of presses as images show them on average; None where images err too much, or presses are too few.
+
+    Args:
+        places: of the presses, by their images. Presses with several contacts keep them.
+        stage: places that the stage reports, m; NaN: not known.
+    """
+    position = np.array(places.position, float)
+    seen = np.isfinite(position).all(-1)
+    contact = seen.argmax(1)
+    single = (seen.sum(1) == 1) & np.isfinite(stage).all(1)
+    if single.sum() < MIN_PRESSES:
+        return None
+    image = np.take_along_axis(position, contact[:, None, None], 1)[:, 0]
+    average, scatter = _average(geometry, stage, image, single)
+    if scatter > MOST_SCATTER:
+        return None
+    rows = np.flatnonzero(single)
+    position[rows, contact[rows]] = average[rows]
+    found: Places = eqx.tree_at(lambda p: p.position, places, jnp.asarray(position, places.position.dtype))
+    return found
+
+
+def _average(
+    geometry: Geometry, stage: np.ndarray, image: np.ndarray, use: Bool[np.ndarray, " presses"]
+) -> tuple[np.ndarray, float]:
+    """Average places (presses, 2) of images, and the scatter of a coordinate of single images about them, m."""
+    features, near = _inward(geometry, np.where(use[:, None], stage, 0)), use
+    error = np.where(use[:, None], image - stage, 0)
+    for _ in range(ROUNDS):
+        coefficients = np.linalg.lstsq(features[near].reshape(-1, BUMPS), error[near].ravel(), rcond=None)[0]
+        average = features @ coefficients
+        shift = np.median((error - average)[near], 0)
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(error - average - shift)[near]))
+        if np.linalg.norm(shift) > LEAST_SHIFT * scatter:
+            average = average + shift
+        near = use & (np.linalg.norm(error - average, axis=1) <= OUTLYING * max(scatter, LEAST_SCATTER))
+    return stage + average, scatter
+
+
+def _inward(geometry: Geometry, place: Float[np.ndarray, "presses 2"]) -> Float[np.ndarray, "presses 2 bumps"]:
+    """Bumps of the distance to each of the two nearest sides of the rim, times the direction away from the side."""
+    here = jnp.asarray(place, geometry.rim.dtype)
+    on_rim = nearest_points(here, geometry.rim[:, 0], geometry.rim[:, 1])
+    metres = np.asarray(distance(on_rim, here[:, None]))
+    two = np.argsort(metres, 1)[:, :2]
+    metres = np.take_along_axis(metres, two, 1)
+    away = place[:, None] - np.take_along_axis(np.asarray(on_rim), two[..., None], 1)
+    away = away / np.where(metres > 0, metres, 1)[..., None]
+    octaves = np.log2(1 + metres / RIM_WIDTH)
+    bumps = np.asarray(cubic_bspline(jnp.asarray(octaves[..., None] - np.arange(BUMPS))))
+    found: np.ndarray = np.einsum("psd,psb->pdb", away, bumps)
+    return found
