@@ -260,7 +260,7 @@ def _by_other_pads(
     use: np.ndarray,
 ) -> PadModel:
     """As `fit_pads`; a pad without presses of its own in `use` gets one curve, fitted to the samples of all others."""
-    data, places = presses.data, presses.fitted
+    data, places = presses.data, presses.of(field)
     empty = np.flatnonzero(~(use[:, None] & (data.share >= DOMINANT_SHARE)).any(0))
     use = use & (data.share[:, empty] < MIN_SHARE).all(1)
     found = fit_pads(curve, field, presses, loss, use=use)

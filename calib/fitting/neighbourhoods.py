@@ -58,9 +58,10 @@ def error_scale(folds: Folds, curve: AbstractCurve, model: PadModel, noise: Nois
         noise: of means over holds.
     """
     presses = folds.presses
-    if model.field is None or presses.fitted is None:
+    places = None if model.field is None else presses.of(model.field.field)
+    if model.field is None or places is None:
         return 1.0
-    group = field_neighbourhoods(model.field, presses.fitted, presses.data.share)
+    group = field_neighbourhoods(model.field, places, presses.data.share)
     count = len(np.unique(group))
     if count < 2:
         return 1.0

@@ -58,10 +58,9 @@ class LocatedPresses(NamedTuple):
     places: Places | None = None
     steady: Places | None = None
 
-    @property
-    def fitted(self) -> Places | None:
-        """The places to which a field is fitted: `steady` ones where they are known."""
-        return self.places if self.steady is None else self.steady
+    def of(self, field: AbstractField | None) -> Places | None:
+        """The places to which a field is fitted: `steady` ones where it asks for them and they are known."""
+        return self.steady if field is not None and field.steady and self.steady is not None else self.places
 
 
 class PadModel(eqx.Module):
@@ -252,7 +251,7 @@ def fit_pads(
 
     Check `curves.result` and `field.result`: no error is raised for samples that do not determine a fit.
     """
-    data, places = presses.data, presses.fitted
+    data, places = presses.data, presses.of(field)
     use = np.ones(len(data.force), bool) if use is None else use
     gain, fitted = np.zeros_like(data.pressure), None
     curves = _curves(curve, data, data.share[data.sample_press].T * data.sample_force, gain, use, loss)
@@ -303,7 +302,7 @@ def _field(
     weight = np.where(use, _weights(data.force, data.place, use), 0)
     extra = bucket(len(use)) - len(use)  # presses without weight, so that compiled fits are reused
     rows = [np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (log_ratio, share, weight)]
-    wide = jax.tree.map(lambda a: jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.fitted)
+    wide = jax.tree.map(lambda a: jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.of(field))
     y, x, w = map(jnp.asarray, rows)
     return _fit_field(field, presses.geometry, wide, y, x, w, jnp.asarray(data.reach))
 

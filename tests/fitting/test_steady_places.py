@@ -8,7 +8,7 @@ import pytest
 
 import jaxeit as je
 from calib.fitting.curves import Linear
-from calib.fitting.fields import PadEdgeSpline, Places, geometry_of, single_places
+from calib.fitting.fields import PadEdge, PadEdgeSpline, Places, geometry_of, single_places
 from calib.fitting.losses import SoftL1
 from calib.fitting.neighbourhoods import with_error_scale
 from calib.fitting.response import fit_response, fold_presses, hold_out_response
@@ -74,6 +74,15 @@ def test_presses_of_several_contacts_or_of_no_known_place_keep_those_of_the_imag
     found = np.asarray(steady_places(geometry_of(skin), places, stage).position)
     require_identical(found[[5, 9]], position[[5, 9]])
     assert (found[:5, 0] != position[:5, 0]).any(1).all()
+
+
+def test_only_a_field_that_asks_for_it_is_fitted_to_average_places(skin):
+    rng = np.random.default_rng(6)
+    data, image = pressed(skin, GRID, rng, 0.4, 0.01, 0.012), single_places(seen(GRID, rng)[0], 4)
+    presses = fold_presses(skin, data, image, SoftL1(), 5, GRID).presses
+    assert presses.of(PadEdge()) is presses.of(None) is image
+    assert presses.of(PadEdgeSpline()) is presses.steady is not None
+    assert fold_presses(skin, data, image, SoftL1(), 5).presses.of(PadEdgeSpline()) is image
 
 
 def test_a_round_sheet_has_averages_too(skin):

@@ -1,10 +1,10 @@
 """The interface of a field of log-gain over the place of a contact on a pad.
 
 The force on pad i is F_i = exp(g_i(x)) h_i(P_i), with h_i the curve of the pad and g_i a *field* over the place x of
-the contact. The place is the one that the image tells; presses of a calibration are placed where images show them on
-average (`calib.fitting.steady_places`). Log-gain keeps the gain positive, and the field is linear in its coefficients:
-g_i(x) = (phi_i(x) - c_i) @ beta, with c_i the mean of the features over the presses of the pad. The mean log-gain over
-the presses of a pad is therefore zero, and the level of the pad belongs to its curve alone.
+the contact. The place is the one that the image tells; a field may be fitted to the places where images show presses on
+average (`steady`). Log-gain keeps the gain positive, and the field is linear in its coefficients: g_i(x) = (phi_i(x) -
+c_i) @ beta, with c_i the mean of the features over the presses of the pad. The mean log-gain over the presses of a pad
+is therefore zero, and the level of the pad belongs to its curve alone.
 """
 
 import abc
@@ -33,9 +33,12 @@ class AbstractField(AbstractChoice):
 
     `shared`: all pads have one field, in coordinates relative to the pad; otherwise each pad has its own coefficients.
     ``early`` holds settings that files of early versions lack, with the values that these versions had.
+    ``steady``: the field is fitted to the places where images show presses on average, by the stage
+    (`calib.fitting.steady_places`), where they are known; otherwise to the place of each image.
     """
 
     early: ClassVar[Mapping[str, Any]] = {}
+    steady: ClassVar[bool] = False
     shared: eqx.AbstractVar[bool]
 
     @abc.abstractmethod

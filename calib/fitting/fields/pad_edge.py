@@ -76,6 +76,7 @@ class PadEdgeSpline(PadEdge):
 
     name: ClassVar[str] = "edge-spline"
     early: ClassVar[Mapping[str, Any]] = {}
+    steady: ClassVar[bool] = True
 
     bumps: int = limited(12, least=1, most=20, static=True)
     length: float = limited(2.0, above=0, static=True, converter=float)
