@@ -5,7 +5,8 @@ of place that `place_sensitivity` states at sites that the search has not seen, 
 "Fitted": presses of 8 N by a 20 mm tip all over the sheet, 8 mm or more from the rim, simulated on a third mesh, with
 noise 60 and 50 dB below the readings of the shipped skin, the same for all, and without noise: what is left then is
 the error of the fit's model, to which the weights of 60 dB are kept; "region": mean error in the worst of 36 equal
-parts of the sheet.
+parts of the sheet, over some twenty presses with three draws of the noise each, so that chance does not choose the
+part. The search knows none of the presses.
 """
 
 from collections.abc import Iterator
@@ -24,13 +25,14 @@ from .rows import Row
 CASES = (("testbed", None), ("testbed", 0.01), ("chest", None))  # skin, and how near to the rim electrodes may sit, m
 WORST = je.scan.PlaceError(8.0)
 COLUMNS = 13  # of the sites at which errors are stated; the search has 8
-REGIONS, PRESSES, CLEAR, LOAD, SEED = 6, 288, 0.008, 8.0, 2040
+REGIONS, PRESSES, DRAWS, CLEAR, LOAD, SEED = 6, 720, 3, 0.008, 8.0, 2060
 LOUD = 10**0.5  # a second noise over the first
 AS_IT_IS, MOVED, DESIGNED = "as it is", "electrodes moved", "electrodes moved, scan designed"
 
 
 def measure(run: Run) -> Iterator[Row]:
     """Rows of a skin as it is, with its electrodes moved, and with a scan designed for these."""
+    shown: dict[tuple[str, str], Row] = {}  # of skins as they are, which does not depend on the margin
     for name, margin in run.sizes(CASES, CASES[1:2]):
         shipped = je.load_skin(name)
         model = je.discretise(je.Scene(shipped), je.Fidelity.draft())
@@ -49,8 +51,10 @@ def measure(run: Run) -> Iterator[Row]:
             "margin_mm": 1e3 * float(shipped.domain.boundary_distance(moved.electrode_positions).min()),
         }
         for way, skin in skins.items():
-            spent = seconds if way == MOVED else None
-            yield {"rows": [about | {"way": way, "search_s": spent} | errors(run, skin, noise, (low, high))]}
+            row = about | {"way": way, "search_s": seconds if way == MOVED else None}
+            found = shown.get((name, way)) or errors(run, skin, noise, (low, high))
+            shown |= {(name, AS_IT_IS): found} if way == AS_IT_IS else {}
+            yield {"rows": [found | row]}
 
 
 def errors(run: Run, skin: je.Skin, noise: float, bounds: tuple[np.ndarray, np.ndarray]) -> Row:
@@ -66,7 +70,7 @@ def errors(run: Run, skin: je.Skin, noise: float, bounds: tuple[np.ndarray, np.n
     sites = sites[clear][: 6 if run.smoke else PRESSES]
     region = np.clip(((sites - low) / (high - low) * REGIONS).astype(int), 0, REGIONS - 1) @ [REGIONS, 1]
     for name, fitted in fits(run, skin, model, noise, sites).items():
-        means = [np.nanmean(fitted[region == one]) for one in np.unique(region)]
+        means = [np.nanmean(fitted[:, region == one]) for one in np.unique(region)]
         found = {"mm": np.nanmean(fitted), "median_mm": np.nanmedian(fitted), "region_mm": np.max(means)}
         out |= {f"{name}_{figure}": float(value) for figure, value in found.items()}
         out[f"{name}_lost"] = float(np.mean(np.isnan(fitted)))
@@ -74,16 +78,16 @@ def errors(run: Run, skin: je.Skin, noise: float, bounds: tuple[np.ndarray, np.n
 
 
 def fits(run: Run, skin: je.Skin, model: je.Model, noise: float, sites: np.ndarray) -> dict[str, np.ndarray]:
-    """Errors of the contacts fitted at sites, (presses,) mm, for both noises and for none; NaN: none found."""
+    """Errors of the contacts fitted at sites, (draws, presses) mm, for both noises and for none; NaN: none found."""
     loads = np.full((len(sites), 1), LOAD)
     change = pressed((), sites[:, None], loads, 0.06 if run.smoke else 0.026, skin=skin).change
     settings = je.contacts.ContactSettings(most=2, columns=21 if run.smoke else 41)
     rng, errors = np.random.default_rng(SEED + 1), {}
     for name, std, part in (("fit", noise, 1.0), ("loud", LOUD * noise, 1.0), ("exact", noise, 0.0)):
         fit = je.prepare_contacts(model, settings, noise=np.full(change.shape[1], std))
-        frames = jnp.asarray(change + part * std * rng.normal(size=change.shape))
-        places = je.contacts.strongest(fit(frames))
-        errors[name] = 1e3 * np.asarray(je.localisation_error(places, jnp.asarray(sites)))
+        drawn = [change + part * std * rng.normal(size=change.shape) for _ in range(DRAWS if part else 1)]
+        places = [je.contacts.strongest(fit(jnp.asarray(frames))) for frames in drawn]
+        errors[name] = 1e3 * np.asarray([je.localisation_error(place, jnp.asarray(sites)) for place in places])
     return errors
 
 
