@@ -166,6 +166,14 @@ def test_every_field_has_its_features_priors_and_settings(name, geometry):
     assert eqx.tree_equal(restored(type(field), settings), field)
 
 
+def test_settings_that_a_field_has_no_more_are_read_where_they_change_nothing():
+    same = {"steps": np.asarray(1), "order": np.asarray(0)}
+    assert eqx.tree_equal(restored(PadEdge, same | {"corners": np.asarray(True)}), PadEdge())
+    for kind, settings in ((PadEdge, same | {"order": np.asarray(1)}), (PadEdgeSpline, same)):
+        with pytest.raises(TypeError, match="unexpected keyword"):
+            restored(kind, settings)
+
+
 def test_the_command_line_knows_every_field_and_curve(capsys):
     with pytest.raises(SystemExit):
         cli.main(["calibrate", "--help"])

@@ -32,12 +32,14 @@ class AbstractField(AbstractChoice):
     """Features of a place on a pad, and the priors of their coefficients.
 
     `shared`: all pads have one field, in coordinates relative to the pad; otherwise each pad has its own coefficients.
-    ``early`` holds settings that files of early versions lack, with the values that these versions had.
+    ``early`` holds settings that files of early versions lack, with the values that these versions had; ``former``
+    those that this version lacks, with the values at which its fields are the same.
     ``steady``: the field is fitted to the places where images show presses on average, by the stage
     (`calib.fitting.steady_places`), where they are known; otherwise to the place of each image.
     """
 
     early: ClassVar[Mapping[str, Any]] = {}
+    former: ClassVar[Mapping[str, Any]] = {}
     steady: ClassVar[bool] = False
     shared: eqx.AbstractVar[bool]
 
@@ -81,7 +83,9 @@ def cubic_bspline(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def restored(kind: type[AbstractField], settings: Mapping[str, np.ndarray]) -> AbstractField:
     """The field of this class whose settings were stored as arrays, by setting."""
-    return kind(**{**kind.early, **{name: _setting(value) for name, value in settings.items()}})
+    given = {name: _setting(value) for name, value in settings.items()}
+    kept = {name: value for name, value in given.items() if name not in kind.former or value != kind.former[name]}
+    return kind(**{**kind.early, **kept})
 
 
 def _setting(value: np.ndarray) -> Any:

@@ -31,6 +31,7 @@ class PadEdge(AbstractField):
 
     name: ClassVar[str] = "edge"
     early: ClassVar[Mapping[str, Any]] = {"corners": False}
+    former: ClassVar[Mapping[str, Any]] = {"steps": 1, "order": 0}
 
     width: Float[Array, ""] = limited(8e-3, above=0, converter=jnp.asarray)
     bumps: int = limited(4, least=1, most=20, static=True)
@@ -76,6 +77,7 @@ class PadEdgeSpline(PadEdge):
 
     name: ClassVar[str] = "edge-spline"
     early: ClassVar[Mapping[str, Any]] = {}
+    former: ClassVar[Mapping[str, Any]] = {}
     steady: ClassVar[bool] = True
 
     bumps: int = limited(12, least=1, most=20, static=True)
