@@ -10,6 +10,9 @@ most probable kind is the true one, and for two both places are nearer than half
 bumps (`prepare_contacts`) sees the same frames; it tells one from two, and an edge is one. "reliability": how often
 kinds of a stated probability are the true ones.
 
+drawn: touches that are drawn as `LoadSettings` believes of them before a frame, each kind as often as the others, on
+further sheets, each with loads of a width of its own; their reliability, and how often the most probable kind is true.
+
 coverage: single tips of several shapes (Gaussian; flat, ring and tilted of 40 mm, which the pad spreads by 6 mm), noise
 40, 60 and 80 dB below the readings, the sheet known or not: how often they are told as one.
 
@@ -121,6 +124,35 @@ def _tip(shape: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
 def _touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> Touch:
     spare = TIPS - len(places)
     return Touch(name, kind, np.concatenate([places, np.repeat(places[-1:], spare, 0)]), np.pad(loads, (0, spare)))
+
+
+def drawn(rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> list[Touch]:
+    """Touches as the settings of the fit believe of them; loads too near, or an edge too short, count as one."""
+    known, found = je.contacts.LoadSettings(), []
+    while len(found) < count:
+        kind = LoadKind(rng.choice(len(LoadKind), p=known.prior))
+        places, loads = _drawn(rng, kind, known, low, high)
+        if (places >= low).all() and (places <= high).all():
+            length = float(np.linalg.norm(places[-1] - places[0]))
+            least = {LoadKind.TWO: known.nearest, LoadKind.EDGE: known.shortest}.get(kind, 0.0)
+            found.append(_touch(kind.name.lower(), LoadKind.ONE if length < least else kind, places, loads))
+    return found
+
+
+def _drawn(
+    rng: np.random.Generator, kind: LoadKind, known: je.contacts.LoadSettings, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n, 2) m, which may lie beside the sheet, and loads (n,) N of a touch."""
+    place, force = rng.uniform(low, high), known.force * np.exp(known.force_spread * rng.normal())
+    if kind is LoadKind.NONE:
+        return place[None], np.zeros(1)
+    if kind is LoadKind.EDGE:
+        return place + np.linspace(-1, 1, 9)[:, None] * known.length * rng.normal(size=2), np.full(9, force / 9)
+    more = {LoadKind.ONE: 0, LoadKind.TWO: 1, LoadKind.MORE: 2}[kind]
+    near = place + 2 * known.length * rng.normal(size=(more, 2))
+    others = np.where(rng.uniform(size=(more, 1)) < 0.5, near, rng.uniform(low, high, (more, 2)))
+    forces = force * np.exp(np.append(0, known.force_difference * rng.normal(size=more)))
+    return np.concatenate([place[None], others]), forces
 
 
 def simulated(seed: int, given: list[Touch], **how: Any) -> Pressed:
@@ -258,6 +290,35 @@ def measure_chest(run: Run) -> Iterator[Row]:
     yield {"chest": [{"touch": row.pop("name")} | row for row in rows]}
 
 
+def measure_drawn(run: Run) -> Iterator[Row]:
+    seeds, count = run.sizes((6, 40), (1, 2))
+    model, known = fit_model(), je.contacts.LoadSettings()
+    low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
+    stated, true = [], []
+    for seed in range(FIRST_SEED + 80, FIRST_SEED + 80 + seeds):
+        rng = np.random.default_rng(seed)
+        width = known.width * np.exp(known.width_spread * np.clip(rng.normal(), -1.5, 1.5))
+        given = drawn(rng, count, low, high)
+        for one in seen(prepared(model, simulated(seed, given, spread=width), seed, 60, True), given):
+            stated.append(np.asarray(one.loads.probability))
+            true.append(np.arange(len(LoadKind)) == one.touch.kind)
+        print(f"seed {seed}, width {1e3 * width:.0f} mm", flush=True)
+    yield {"drawn": reliability(np.stack(stated), np.stack(true)), "drawn_kinds": list(told_kinds(stated, true))}
+
+
+def told_kinds(stated: list[np.ndarray], true: list[np.ndarray]) -> Iterator[Row]:
+    """For each kind: frames of it, how often it is the most probable, and how often it is true where it is."""
+    best, kind = np.argmax(stated, 1), np.argmax(true, 1)
+    for one in LoadKind:
+        here, said = kind == one, best == one
+        yield {
+            "kind": one.name.lower(),
+            "frames": int(here.sum()),
+            "told": float(np.mean(said[here])) if here.any() else None,
+            "right": float(np.mean(here[said])) if said.any() else None,
+        }
+
+
 def measure_coverage(run: Run) -> Iterator[Row]:
     seeds, count = run.sizes((4, 8), (1, 1))
     yield {"coverage": means(list(_cases(range(FIRST_SEED + 50, FIRST_SEED + 50 + seeds), count, _told)), "case")}
@@ -341,7 +402,13 @@ def picture(data: Row) -> Figure:
     return figure
 
 
-PARTS = {"kinds": measure_kinds, "coverage": measure_coverage, "ellipses": measure_ellipses, "chest": measure_chest}
+PARTS = {
+    "kinds": measure_kinds,
+    "drawn": measure_drawn,
+    "coverage": measure_coverage,
+    "ellipses": measure_ellipses,
+    "chest": measure_chest,
+}
 main = Question("loads", __doc__, PARTS, picture=picture, file="separation.png")
 
 if __name__ == "__main__":
