@@ -4,7 +4,7 @@ The scene of the bundled session is simulated on skins whose bolts are drilled a
 and in y), for seeds that nothing was chosen by. Each session is calibrated three times: by the skin's file, which knows
 nothing of that; by the same file with the electrodes fitted; and by the skin as it is, the bound. Rows are means over
 the seeds. "stated": what the fit itself says that its places err by, from the posterior of the untouched frame and the
-presses; "within": share of the coordinates that err by less than 1.645 of these standard errors.
+presses; "within": share of the coordinates that lie in their 90 % interval by these standard errors.
 
 announced: skins of the second simulator (`tests/oracles/bench`), on which nothing was tuned, whose bolts sit aside by
 so much in each direction (standard deviation). "said": share of untouched frames that `check`, `calibrate` and `apply`
@@ -32,6 +32,7 @@ from calib.check import check_session
 from calib.check.electrodes import FIDELITY as PLACING
 from calib.check.placement import FIDELITY, WHERE, placement_finding, with_placement
 from calib.check.report import CheckReport
+from calib.fitting.intervals import NORMAL_MULTIPLE
 from jaxeit.imaging import KnownPresses, find_misplacement, fit_electrodes
 from tests.oracles import bench as oracle
 
@@ -84,7 +85,7 @@ def stated(placed: PlacedElectrodes | None, off: np.ndarray) -> Row:
     error = placed.standard_error
     return {
         "stated_mm": 1e3 * float(np.sqrt(np.mean(error**2))),
-        "within": float(np.mean(np.abs(off) < 1.645 * error)),
+        "within": float(np.mean(np.abs(off) < NORMAL_MULTIPLE * error)),
     }
 
 

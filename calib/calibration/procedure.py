@@ -118,7 +118,8 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
     imager = prepare_imager(skin, presses, recipe)
     images = imager.presses(presses.dv)
     progress("fitting")
-    folds = fold_presses(skin, presses.data, images.places, recipe.loss, recipe.folds, presses.position)
+    stage = presses.position if any(field is not None and field.steady for field in recipe.locations) else None
+    folds = fold_presses(skin, presses.data, images.places, recipe.loss, recipe.folds, stage)
     response = fit_response(folds, skin, recipe.curves, recipe.locations)
     progress("holding out")
     true_position = presses.position if presses.true_place else None

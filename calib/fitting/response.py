@@ -74,7 +74,7 @@ def fold_presses(
 
     Args:
         places: of the presses, by their images.
-        stage: the same by the stage, (presses, 2) m; None: not known.
+        stage: the same by the stage, (presses, 2) m, for fields that are fitted to `steady_places`; None: for others.
     """
     geometry = geometry_of(skin, places.position.dtype if places else None)
     steady = None if places is None or stage is None else steady_places(geometry, places, stage)
