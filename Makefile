@@ -30,7 +30,7 @@ test: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "not slow"
 
 slow: $(VENV)/.dev
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -o faulthandler_timeout=1800 -m slow
+	XLA_FLAGS=--xla_backend_optimization_level=3 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -o faulthandler_timeout=1800 -m slow
 
 # The tests that run what the pages, the docstrings and the examples show; tests/test_page_blocks.py holds the list.
 SHOWN := test_docs test_eidors_pages test_examples test_notebook test_page_blocks test_page_commands test_program_cache \
@@ -38,7 +38,7 @@ SHOWN := test_docs test_eidors_pages test_examples test_notebook test_page_block
     export/test_lerobot_page record/test_wire registry/test_own_classes simulators/test_mujoco tanks/test_tanks
 
 pages: $(VENV)/.dev
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -o faulthandler_timeout=1800 $(SHOWN:%=tests/%.py)
+	XLA_FLAGS=--xla_backend_optimization_level=3 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -o faulthandler_timeout=1800 $(SHOWN:%=tests/%.py)
 
 # build/site, to be read without a network; a broken link is an error.
 docs: $(VENV)/.docs  # --quiet would also silence what --strict counts

@@ -4,14 +4,16 @@ For the worst places (`PlaceError(8.0)`), for the adjacent scan and for one desi
 of place that `place_sensitivity` states at sites that the search has not seen, on a finer mesh than that of the search.
 "Fitted": presses of 8 N by a 20 mm tip all over the sheet, 8 mm or more from the rim, simulated on a third mesh, with
 noise 60 and 50 dB below the readings of the shipped skin, the same for all, and without noise: what is left then is
-the error of the fit's model, to which the weights of 60 dB are kept; "region": mean error in the worst of 36 equal
-parts of the sheet, over some twenty presses with three draws of the noise each, so that chance does not choose the
-part. The search knows none of the presses.
+the error of the fit's model, to which the weights of 60 dB are kept; "as loads": by `prepare_loads` in place of bumps,
+one draw; "region": mean error in the worst of 36 equal parts of the sheet, over some twenty presses with three draws of
+the noise each, so that chance does not choose the part. The search knows none of the presses.
 """
 
 from collections.abc import Iterator
+from operator import itemgetter
 from time import perf_counter
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -86,9 +88,22 @@ def fits(run: Run, skin: je.Skin, model: je.Model, noise: float, sites: np.ndarr
     for name, std, part in (("fit", noise, 1.0), ("loud", LOUD * noise, 1.0), ("exact", noise, 0.0)):
         fit = je.prepare_contacts(model, settings, noise=np.full(change.shape[1], std))
         drawn = [change + part * std * rng.normal(size=change.shape) for _ in range(DRAWS if part else 1)]
-        places = [je.contacts.strongest(fit(jnp.asarray(frames))) for frames in drawn]
-        errors[name] = 1e3 * np.asarray([je.localisation_error(place, jnp.asarray(sites)) for place in places])
+        bumps = [fit(jnp.asarray(frames)) for frames in drawn]
+        errors[name] = np.stack([_errors(je.contacts.strongest(found), sites) for found in bumps])
+        if name == "fit":
+            errors["loads"] = _errors(_as_loads(model, std, drawn[0], bumps[0]), sites)[None]
     return errors
+
+
+def _as_loads(model: je.Model, std: float, frames: np.ndarray, bumps: je.contacts.Contacts) -> jax.Array:
+    """Places (frames, 2), m, of the one load that fits a frame best, from the bumps found in it."""
+    fit = je.contacts.prepare_loads(model, noise=np.full(frames.shape[1], std), sigma=model.background)
+    found = (fit(frame, jax.tree.map(itemgetter(k), bumps)) for k, frame in enumerate(frames))
+    return jnp.stack([loads.one.position[0] for loads in found])
+
+
+def _errors(places: jax.Array, sites: np.ndarray) -> np.ndarray:
+    return 1e3 * np.asarray(je.localisation_error(places, jnp.asarray(sites)))
 
 
 main = Question("placement", __doc__, {"rows": measure}, prepare=set_up)

@@ -5,12 +5,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 # Before JAX is imported, and for the processes that tests start: half of the suite's time was XLA at work on programs
-# that run once. `make slow` compiles as users do.
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-# The verbs of jaxeit are compiled without fusion emitters. What the tests compile themselves takes half the time so.
-# XLA ends the process for a flag that it does not know, and jaxlib 0.11 knows this one no more.
-if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and version("jaxlib").startswith("0.10."):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+# that run once. At this level XLA and what it compiles take least together. `make slow` compiles as users do.
+if "xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", ""):
+    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=1"]
+    flags.append("--xla_llvm_disable_expensive_passes=true")
+    # The verbs of jaxeit are compiled without fusion emitters. What the tests compile themselves takes half the time so.
+    # XLA ends the process for a flag that it does not know, and jaxlib 0.11 knows this one no more.
+    if version("jaxlib").startswith("0.10."):
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 # Nobody reads where in Python each operation of a program comes from: 100 frames of every one, unless told otherwise.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # There is a worker a core.
