@@ -30,6 +30,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import pdist, squareform
 from scipy.stats import binom, chi2, norm
 
 import jaxeit as je
@@ -133,10 +135,19 @@ def drawn(rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarra
         kind = LoadKind(rng.choice(len(LoadKind), p=known.prior))
         places, loads = _drawn(rng, kind, known, low, high)
         if (places >= low).all() and (places <= high).all():
-            length = float(np.linalg.norm(places[-1] - places[0]))
-            least = {LoadKind.TWO: known.nearest, LoadKind.EDGE: known.shortest}.get(kind, 0.0)
-            found.append(_touch(kind.name.lower(), LoadKind.ONE if length < least else kind, places, loads))
+            found.append(_touch(kind.name.lower(), _counted(kind, places, known), places, loads))
     return found
+
+
+def _counted(kind: LoadKind, places: np.ndarray, known: je.contacts.LoadSettings) -> LoadKind:
+    """The kind of loads whose places (n, 2), m, were drawn, where those near one another count as one."""
+    if kind is LoadKind.NONE:
+        return kind
+    if kind is LoadKind.EDGE:
+        return kind if np.linalg.norm(places[-1] - places[0]) > known.shortest else LoadKind.ONE
+    near = pdist(places) < known.nearest
+    count = connected_components(squareform(near))[0] if len(places) > 1 else 1
+    return {1: LoadKind.ONE, 2: LoadKind.TWO, 3: LoadKind.MORE}[count]
 
 
 def _drawn(

@@ -12,13 +12,14 @@ import pytest
 import jaxeit as je
 from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
+from jaxeit.contacts.loads.comparison import Comparison, Fit, padded
 from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import MOST, SIZE, Form, elongations, line, pressure, shape_directions, spot
 from jaxeit.imaging import InverseError
 from jaxeit.model.forward_model import coefficients, transfer
 from tests.compiled import compiled
 
-from .touches import GAIN, TOUCHES, frames_of, ring, single, tilted
+from .touches import GAIN, TOUCHES, frames_of, pair, ring, single, tilted
 
 
 def seen(ready, number):
@@ -55,6 +56,44 @@ def test_a_tip_that_is_no_gaussian_is_one(ready, touch):
     assert np.linalg.norm(np.asarray(found.one.position[0]) - touch[1] @ touch[0] / touch[1].sum()) < 0.002
     apart = eqx.tree_at(lambda f: f.least, fitter, jnp.full(2, 1e-4))
     assert found.probability[LoadKind.ONE] > apart(frame, finder(frame)).probability[LoadKind.ONE]
+
+
+STRONG_TOUCHES = {
+    "two": (LoadKind.TWO, pair(0.08, 0.045, 0.08, 0.8, 0.6, force=55.0)),
+    "three, one weak": (LoadKind.MORE, (np.array([[0.03, 0.14], [0.15, 0.11], [0.08, 0.12]]), np.array([40, 60, 6.0]))),
+}
+
+
+@pytest.mark.parametrize(("kind", "touch"), STRONG_TOUCHES.values(), ids=STRONG_TOUCHES)
+def test_loads_that_saturate_the_sheet_are_told(ready, kind, touch):
+    """The finder takes them for several times as strong as they are, from where the fit still finds them."""
+    fitter, finder, _, _ = ready
+    frame = frames_of([touch] * len(TOUCHES), seed=4, spread=0.018)[0][0]
+    contacts = finder(frame)
+    assert np.asarray(contacts.present).sum() >= 2
+    assert np.exp(fitter.starts.seen(contacts, 2)[0][0, 3]) > 1.3 * touch[1].max()
+    found = fitter(frame, contacts)
+    assert found.kind is kind
+    assert found.best.misfit < 1.4
+    away = np.linalg.norm(np.asarray(found.best.position)[:, None] - touch[0], axis=2)
+    assert away.min(0).max() < 0.006
+    np.testing.assert_allclose(np.sort(found.best.force), np.sort(touch[1]), rtol=0.35)
+
+
+def test_three_loads_of_which_two_are_near_are_two(ready):
+    """Of the evidence of three, that of two near one another is evidence of two, and of all three of one."""
+    fitter, finder, frames, _ = ready
+    whole = Comparison(fitter, fitter.whitened(frames[0], 0), finder(frames[0]))
+    for away, kind in (((0.008, 0.07), LoadKind.TWO), ((0.008, 0.016), LoadKind.ONE)):
+        places = np.array([0.06, 0.1]) + np.array([[0.0, 0.0], [away[0], 0.0], [away[1], 0.0]])
+        three = np.column_stack([places, np.full(3, np.log(0.012)), np.full(3, np.log(20.0))])
+        loads, root = padded(three, LoadKind.MORE)[0], np.eye(len(whole.y))
+        curved = np.diag(np.tile([1e6, 1e6, 10.0, 10.0, 0.0, 0.0], MOST))  # places to 1 mm
+        fits = {of: Fit(loads, 0.0, curved, root) for of in (LoadKind.ONE, LoadKind.TWO, LoadKind.MORE)}
+        alone, found = whole.evidence(LoadKind.MORE, fits[LoadKind.MORE]), whole.evidences(fits)
+        assert found[LoadKind.MORE] < alone - 10
+        own = whole.evidences({of: fit for of, fit in fits.items() if of is not LoadKind.MORE})
+        assert found[kind] == pytest.approx(np.logaddexp(own[kind], alone), abs=1e-3)
 
 
 def test_a_blank_frame_holds_nothing(ready):
@@ -115,9 +154,19 @@ def test_halves_of_a_split_load_have_the_moments_of_elongations():
     assert np.abs(change - expected).max() < 0.05 * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("loads", [(SPOT,), (LONG,), (SPOT, SPOT.at[:2].set(0.07))], ids=["one", "edge", "two"])
+STRONG = SPOT.at[2:4].set(jnp.log(jnp.array([0.02, 100.0])))
+
+
+@pytest.mark.parametrize(
+    "loads",
+    [(SPOT,), (LONG,), (SPOT, SPOT.at[:2].set(0.07)), (STRONG.at[:2].set(jnp.array([0.06, 0.14])), SPOT)],
+    ids=["one", "edge", "two", "two, one strong"],
+)
 def test_slopes_are_those_of_the_forward_map(ready, loads):
-    """Against derivatives of the readings by JAX, through another path: `transfer` and all elements."""
+    """Against derivatives of the readings by JAX, through another path: `transfer` and all elements.
+
+    A strong load saturates its middle, which then tells nothing of it.
+    """
     sheet = ready[0].sheet
     theta, forms = rows(*loads)
     by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MOST * SIZE)

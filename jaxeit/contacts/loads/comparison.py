@@ -26,6 +26,7 @@ FORMS = {
     LoadKind.EDGE: (Form.LONG,),
     LoadKind.MORE: (Form.ROUND, Form.ROUND, Form.ROUND),
 }
+PAIRS = ((0, 1), (0, 2), (1, 2))  # of three loads
 # Half of the fall of chi-square at which a fit ends: one whose errors are those at its start, and the last one.
 TRIAL_FALL, LAST_FALL = 1.0, 0.02
 MIN_FALL = 12.0  # of chi-square by a third load, below which none is fitted
@@ -109,8 +110,9 @@ class Comparison:
         two = fits[LoadKind.TWO]
         share, between = self.fitter.starts.between(two.loads[:2])
         fits[LoadKind.EDGE] = self.best(LoadKind.EDGE, [between if share > MIN_SHARE else long])
-        left = self.left(LoadKind.TWO, two)[0]
-        fall, three = self.fitter.starts.another(two, left)
+        left, known = self.left(LoadKind.TWO, two)
+        slopes = np.asarray(known.loads)[:, self.free(LoadKind.TWO, two)]
+        fall, three = self.fitter.starts.another(two, left, slopes)
         if fall > MIN_FALL:
             fits[LoadKind.MORE] = self.best(LoadKind.MORE, [three, *self.seen(3)])
         return fits
@@ -199,24 +201,32 @@ class Comparison:
     def evidences(self, fits: dict[LoadKind, Fit]) -> dict[LoadKind, float]:
         """Evidence of each kind that is fitted, and of none.
 
-        Two loads near one another, and a short edge, describe a flat, ringlike or tilted tip better than the slopes in
-        the shape of a Gaussian do. The part of their evidence where they are so near or short is evidence of one load.
+        Loads near one another, and a short edge, describe a flat, ringlike or tilted tip better than the slopes in the
+        shape of a Gaussian do. The part of their evidence where they are so near or short is evidence of fewer loads.
         """
         found = {kind: self.evidence(kind, fit) for kind, fit in fits.items()}
-        for kind, least in zip((LoadKind.TWO, LoadKind.EDGE), np.asarray(self.fitter.least), strict=True):
+        nearest, shortest = np.asarray(self.fitter.least)
+        for kind, least in ((LoadKind.TWO, nearest), (LoadKind.EDGE, shortest), (LoadKind.MORE, nearest)):
             if kind not in fits:
                 continue
-            beyond = self.beyond(kind, fits[kind], float(least))
-            found[LoadKind.ONE] = np.logaddexp(found[LoadKind.ONE], found[kind] + norm.logcdf(-beyond))
-            found[kind] += norm.logcdf(beyond)
+            beyond = sorted(self.beyond(kind, fits[kind], step, float(least)) for step in self.steps(kind, fits[kind]))
+            fewer = LoadKind.TWO if kind is LoadKind.MORE and beyond[1] > 0 else LoadKind.ONE
+            if fewer in found:
+                found[fewer] = np.logaddexp(found[fewer], found[kind] + norm.logcdf(-beyond[0]))
+                found[kind] += norm.logcdf(beyond[0])
         return found | {LoadKind.NONE: -0.5 * float(self.y @ self.y)}
 
-    def beyond(self, kind: LoadKind, fit: Fit, least: float) -> float:
+    def steps(self, kind: LoadKind, fit: Fit) -> list[np.ndarray]:
+        """From the parameters of a fit to the way from one load to another, or along an edge; (2, m) each."""
+        place = [np.eye(2, int(np.count_nonzero(self.free(kind, fit))), k=4 * k) for k in range(MOST)]
+        if kind is LoadKind.EDGE:
+            return [2 * place[1]]  # after place, width and force come the half lengths
+        return [place[j] - place[i] for i, j in PAIRS if j < len(FORMS[kind])]
+
+    def beyond(self, kind: LoadKind, fit: Fit, step: np.ndarray, least: float) -> float:
         """By how many standard deviations two loads are farther apart, or an edge is longer, than the least."""
-        covariance, free = self.covariance(kind, fit), self.free(kind, fit)
-        second = np.eye(2, len(covariance), k=4)  # the half length of an edge, or the second place
-        step = 2 * second if kind is LoadKind.EDGE else second - np.eye(2, len(covariance))
-        away = step @ fit.loads.ravel()[free]
+        covariance = self.covariance(kind, fit)
+        away = step @ fit.loads.ravel()[self.free(kind, fit)]
         distance = max(float(np.linalg.norm(away)), np.finfo(float).tiny)
         along = away @ step / distance
         return (distance - least) / float(np.sqrt(max(along @ covariance @ along, np.finfo(float).tiny)))

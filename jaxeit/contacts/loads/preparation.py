@@ -21,7 +21,9 @@ from .settings import LoadSettings
 from .sheet import KnownGain, PressedSheet
 from .starts import Starts
 
-REACH = 2.5  # widths from the middle of a usual load within which elements count
+# Elements that count: so many times those within so many widths of the middle of a usual load. Half of them miss most
+# of what strong and wide loads do, on whose slopes a fit then ends far from the minimum.
+REACHES, REACH = 4, 2.5
 
 
 @runtime_checkable
@@ -115,7 +117,7 @@ def _sheet(
         by_coat=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),
         law=settings.law,
-        reach=min(len(centroids), 2 * _reach(centroids, REACH * settings.width)),
+        reach=min(len(centroids), REACHES * _reach(centroids, REACH * settings.width)),
         known=about,
     )
     return _without_loads(sheet)

@@ -29,7 +29,7 @@ class Linearised(NamedTuple):
     | meaning                                                                  | shape  |
     |--------------------------------------------------------------------------|--------|
     | value: whitened readings                                                 | (r,)   |
-    | near: elements whose conductivity changes most                           | (e,)   |
+    | near: elements whose conductivity changes most with the loads            | (e,)   |
     | by_element: slopes of the pair sums in the conductivity of these         | (e, k) |
     """
 
@@ -109,9 +109,9 @@ class PressedSheet(eqx.Module):
         return self.white(z) - self.untouched
 
     def linearised(self, loads: Parameters, forms: Forms) -> Linearised:
-        """Readings, and their slopes in the conductivity of the elements that the loads change most."""
+        """Readings, and their slopes in the conductivity of the elements that changes of the loads change most."""
         sigma = self._pressed(loads, forms)
-        near = jax.lax.top_k(sigma / self.sigma, self.reach)[1]
+        near = self._near(loads, forms)
         theta = coefficients(self.model, sigma)
         x = fields(self.model, theta)
         z = x.terminal + jnp.diag(series_resistance(self.model.system, theta))
@@ -165,6 +165,17 @@ class PressedSheet(eqx.Module):
         """Conductivity of elements under loads, S."""
         felt = pressure(loads, forms, self.points[elements]) * self._factor(elements)
         return self.sigma[elements] * (self.law.factor(felt) @ self.weights)
+
+    def _near(self, loads: Parameters, forms: Forms) -> Int[Array, " e"]:
+        """Elements that a change of some load's force changes most, as parts of the most that it changes any.
+
+        Those that are most changed would be the wrong ones: a strong load saturates its middle, where another force is
+        not felt, and would leave none to a weaker one.
+        """
+        by_force = jax.jacfwd(lambda force: self._pressed(loads.at[:, 3].set(force), forms) / self.sigma)(loads[:, 3])
+        most = jnp.maximum(jnp.max(by_force, 0), jnp.finfo(by_force.dtype).tiny)
+        near: Int[Array, " e"] = jax.lax.top_k(jnp.max(by_force / most, 1), self.reach)[1]
+        return near
 
     def _factor(self, elements: Int[Array, " e"] | slice) -> Float[Array, "e 1"] | float:
         """Factor of the pressure on elements: the mean gain, where it is known."""

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 from scipy.special import logsumexp
 
 from ...effects.material import ContactPiezoresistance
@@ -67,14 +67,18 @@ class Starts(eqx.Module):
         half = np.sqrt(3 * share[0] * share[1]) * (two[1, :2] - two[0, :2])
         return float(share.min()), np.concatenate([share @ two[:, :3], [logsumexp(two[:, 3])], half])[None]
 
-    def another(self, two: "Fit", left: np.ndarray) -> tuple[float, np.ndarray]:
-        """Two loads and the atom that explains most of what they leave, (3, 4); and by how much chi-square falls."""
-        fall, atom = self.atom(left, two.root)
+    def another(self, two: "Fit", left: np.ndarray, slopes: np.ndarray) -> tuple[float, np.ndarray]:
+        """Two loads and the atom that explains most of what they leave, (3, 4); and by how much chi-square falls with
+        it, where the two give way along their slopes (r, m)."""
+        fall, atom = self.atom(left, two.root, slopes)
         return fall, np.concatenate([two.loads[:2, :4], atom])
 
-    def atom(self, left: np.ndarray, root: np.ndarray) -> tuple[float, np.ndarray]:
+    def atom(self, left: np.ndarray, root: np.ndarray, slopes: np.ndarray | None = None) -> tuple[float, np.ndarray]:
         """The atom that explains most of what is left in units of errors: fall of chi-square, and the load (1, 4)."""
         atoms = solve_triangular(root, np.asarray(self.atoms).T, lower=True)
+        if slopes is not None:
+            along = orth(solve_triangular(root, slopes, lower=True))
+            atoms, left = (part - along @ (along.T @ part) for part in (atoms, left))
         norms = np.linalg.norm(atoms, axis=0)
         gain = atoms.T @ left / norms
         best = int(np.argmax(gain))
