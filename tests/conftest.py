@@ -9,8 +9,8 @@ from pathlib import Path
 if "xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", ""):
     flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=1"]
     flags.append("--xla_llvm_disable_expensive_passes=true")
-    # The verbs of jaxeit are compiled without fusion emitters. What the tests compile themselves takes half the time so.
-    # XLA ends the process for a flag that it does not know, and jaxlib 0.11 knows this one no more.
+    # The verbs of jaxeit are compiled without fusion emitters, and so in half the time is what the tests compile
+    # themselves. XLA ends the process for a flag that it does not know, and jaxlib 0.11 knows this one no more.
     if version("jaxlib").startswith("0.10."):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join(flags).strip()
