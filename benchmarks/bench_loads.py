@@ -306,7 +306,7 @@ def measure_drawn(run: Run) -> Iterator[Row]:
     model, known = fit_model(), je.contacts.LoadSettings()
     low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
     stated, true = [], []
-    for seed in range(FIRST_SEED + 80, FIRST_SEED + 80 + seeds):
+    for seed in range(FIRST_SEED + 90, FIRST_SEED + 90 + seeds):
         rng = np.random.default_rng(seed)
         width = known.width * np.exp(known.width_spread * np.clip(rng.normal(), -1.5, 1.5))
         given = drawn(rng, count, low, high)
