@@ -66,7 +66,7 @@ STRONG_TOUCHES = {
 
 @pytest.mark.parametrize(("kind", "touch"), STRONG_TOUCHES.values(), ids=STRONG_TOUCHES)
 def test_loads_that_saturate_the_sheet_are_told(ready, kind, touch):
-    """The finder takes them for several times as strong as they are, from where the fit still finds them."""
+    """The finder overrates their forces, and the fit finds them from there."""
     fitter, finder, _, _ = ready
     frame = frames_of([touch] * len(TOUCHES), seed=4, spread=0.018)[0][0]
     contacts = finder(frame)

@@ -186,7 +186,7 @@ def test_a_proposal_that_leads_astray_is_not_followed(ready, monkeypatch):
     right = proposed(LoadKind.ONE, [(np.array([0.09, 0.12]), 20.0)])
     np.testing.assert_allclose(fitter.refine(frames[0], right, contacts).one.position, searched.one.position, atol=1e-4)
     assert len(calls) == 1
-    wrong = proposed(LoadKind.ONE, [(np.array([0.195, 0.005]), 200.0)])  # from less far the fit finds the load
+    wrong = proposed(LoadKind.ONE, [(np.array([0.195, 0.005]), 200.0)])  # the fit finds the load from a nearer start
     found = fitter.refine(frames[0], wrong, contacts)
     assert len(calls) == 2
     np.testing.assert_allclose(found.one.position, searched.one.position, atol=1e-6)
