@@ -29,8 +29,11 @@ demo: $(VENV)/.report
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -m "not slow"
 
+# Programs compiled as users have them, and annotations not checked.
+AS_USERS := XLA_FLAGS=--xla_backend_optimization_level=3 JAXTYPING_DISABLE=1
+
 slow: $(VENV)/.dev
-	XLA_FLAGS=--xla_backend_optimization_level=3 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -o faulthandler_timeout=1800 -m slow
+	$(AS_USERS) $(BIN)/python -m pytest -o faulthandler_timeout=1800 -m slow
 
 # The tests that run what the pages, the docstrings and the examples show; tests/test_page_blocks.py holds the list.
 SHOWN := test_docs test_eidors_pages test_examples test_notebook test_page_blocks test_page_commands test_program_cache \
@@ -38,7 +41,7 @@ SHOWN := test_docs test_eidors_pages test_examples test_notebook test_page_block
     export/test_lerobot_page record/test_wire registry/test_own_classes simulators/test_mujoco tanks/test_tanks
 
 pages: $(VENV)/.dev
-	XLA_FLAGS=--xla_backend_optimization_level=3 JAXTYPING_DISABLE=1 $(BIN)/python -m pytest -o faulthandler_timeout=1800 $(SHOWN:%=tests/%.py)
+	$(AS_USERS) $(BIN)/python -m pytest -o faulthandler_timeout=1800 $(SHOWN:%=tests/%.py)
 
 # build/site, to be read without a network; a broken link is an error.
 docs: $(VENV)/.docs  # --quiet would also silence what --strict counts

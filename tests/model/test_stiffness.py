@@ -17,7 +17,7 @@ from ..helpers import square_model
 POINTS = [(0.05, 0.05), (0.15, 0.10), (0.10, 0.15), (0.05, 0.10)]
 PATTERN = [[0, 1, 2, 3], [0, 2, 1, 3]]
 PAIRS = np.triu_indices(3)
-# And not with the little optimisation of `conftest`.
+# In place of the little optimisation of `conftest`.
 AS_USERS = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False, **je.compiler_options()}
 
 
