@@ -44,6 +44,8 @@ MESH_GAIN = 2.0
 COAT_VARIANCE = 0.99
 # Usual loads along each side of the sheet, of which an unknown coat changes the signal.
 COAT_PLACES = 5
+# Square of a half length, m^2, below which a load is round.
+TINY = 1e-12
 # Pixels of the first order to the usual width of a load; least and largest number of them along x.
 PIXELS_A_WIDTH, LEAST_MOST_COLUMNS = 3, (12, 150)
 
@@ -208,11 +210,8 @@ def _neighbours(
     middles, unknowns = chart[np.asarray(model.triangles)].mean(1), _places_of_unknowns(model)
 
     def nearest(places: np.ndarray, count: int) -> Array:
+        squares = squares_to_lines(cells, places, halves)
         count = min(count, len(places))
-        along = np.linspace(-1, 1, 5)[:, None, None, None] * halves[:, None]  # (5, edges, 1, 2)
-        squares = np.full((along.shape[1], len(cells), len(places)), np.inf, np.float32)
-        for part in along:
-            squares = np.minimum(squares, _squares(cells + part, places))
         return on_device(np.argpartition(squares, count - 1, -1)[..., :count], np.int32)
 
     return Neighbours(
@@ -225,10 +224,16 @@ def _neighbours(
     )
 
 
-def _squares(first: Float[np.ndarray, "... n 2"], second: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "... n p"]:
-    """Squared distances of places, m^2."""
-    both = (first**2).sum(-1)[..., None] + (second**2).sum(-1) - 2 * first @ second.T
-    return np.asarray(both, np.float32)
+def squares_to_lines(
+    middles: Float[np.ndarray, "n 2"], places: Float[np.ndarray, "p 2"], halves: Float[np.ndarray, "edges 2"]
+) -> Float[np.ndarray, "edges n p"]:
+    """Squared distances, m^2, of places from straight lines of each half length around each middle."""
+    x, y = (places - middles[:, None]).astype(np.float32).transpose(2, 0, 1)
+    squares = np.empty((len(halves), *x.shape), np.float32)
+    for (a, b), square in zip(halves.astype(np.float32), squares, strict=True):
+        along = np.clip((a * x + b * y) / max(a * a + b * b, np.float32(TINY)), -1, 1)
+        square[:] = (x - a * along) ** 2 + (y - b * along) ** 2
+    return squares
 
 
 def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:

@@ -12,6 +12,7 @@ from jaxeit.model.sensitivity import pair_jacobian
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.reanalysis import prepare_reanalysis
 from jaxeit.tracking.belief.response import load_pressure
+from jaxeit.tracking.preparation import squares_to_lines
 from tests.compiled import compiled
 
 from .conftest import in_double_precision
@@ -154,6 +155,15 @@ def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, 
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
+def test_distances_from_loads_are_those_from_their_lines():
+    rng = np.random.default_rng(0)
+    middles, places = rng.uniform(0, 0.2, (2, 20, 2))
+    halves = np.array([[0, 0], [0.01, 0.02], [-0.03, 0]])
+    lines = middles[:, None] + np.linspace(-1, 1, 2001)[:, None] * halves[:, None, None]  # (edges, n, points, 2)
+    sampled = np.linalg.norm(lines[:, :, None] - places[:, None], axis=-1).min(-1)
+    np.testing.assert_allclose(np.sqrt(squares_to_lines(middles, places, halves)), sampled, rtol=1e-3, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "side", [pytest.param(0.08, marks=pytest.mark.slow), 0.12, pytest.param(0.3, marks=pytest.mark.slow)]
 )
@@ -173,6 +183,7 @@ def test_a_contact_is_as_wide_on_a_small_sheet(side):
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
+@pytest.mark.slow
 def test_single_precision_errs_below_a_tenth_of_the_noise(tracker, exact):
     gain = jnp.zeros(exact.modes.shape[1])
     single = compiled(tracker.filter.sheet.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
